@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pbdkit.identification.report import Identity
     from pbdkit.stability.analysis import Analysis
 
-Components = Iterable[type[Component]]
+ComponentClasses = Iterable[type[Component]]
 Given = Experiment | Mapping[str, Any] | str | Path
 """An experiment, or the dict, the file or the name of a shipped one of which it is made."""
 
@@ -39,7 +39,7 @@ Given = Experiment | Mapping[str, Any] | str | Path
 def load(
     name: str | Path,
     *,
-    components: Components = (),
+    components: ComponentClasses = (),
     settings: Settings = (),
     allow_outside: bool = False,
 ) -> Experiment:
@@ -72,7 +72,7 @@ def load(
 def run(
     experiment: Given,
     *,
-    components: Components = (),
+    components: ComponentClasses = (),
     settings: Settings = (),
     output: str | Path | None = None,
     force: bool = False,
@@ -158,7 +158,9 @@ def _warn(texts: Iterable[str]) -> None:
         warn_caller(text)
 
 
-def analyse(experiment: Given, *, components: Components = (), settings: Settings = ()) -> Analysis:
+def analyse(
+    experiment: Given, *, components: ComponentClasses = (), settings: Settings = ()
+) -> Analysis:
     """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
     and the step operator as a sparse matrix (``.operator``)."""
     from pbdkit.stability.analysis import Analysis
@@ -167,7 +169,7 @@ def analyse(experiment: Given, *, components: Components = (), settings: Setting
 
 
 def identify(
-    experiment: Given, *, components: Components = (), settings: Settings = ()
+    experiment: Given, *, components: ComponentClasses = (), settings: Settings = ()
 ) -> Identity:
     """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
     elastic body, with its constants, from the rule's answer to plane waves.
@@ -182,7 +184,7 @@ def identify(
 
 
 def rerun(
-    dataset: xarray.Dataset, *, components: Components = (), progress: bool = True
+    dataset: xarray.Dataset, *, components: ComponentClasses = (), progress: bool = True
 ) -> xarray.Dataset:
     """The same run again, bit for bit, from the experiment that the dataset carries.
 
@@ -264,7 +266,7 @@ def fit(
     description: Mapping[str, Any] | str | Path,
     *,
     experiment: Given | None = None,
-    components: Components = (),
+    components: ComponentClasses = (),
 ) -> Fitted:
     """Parameters of an experiment from what was measured, with their uncertainty.
 
@@ -288,7 +290,7 @@ def fit_strength(
     description: Mapping[str, Any] | str | Path,
     *,
     experiment: Given | None = None,
-    components: Components = (),
+    components: ComponentClasses = (),
 ) -> FittedStrength:
     """The strength of bonds and its scatter from the peaks of repeated tests, with their
     uncertainty.
@@ -308,7 +310,9 @@ def fit_strength(
         raise DivergedError(str(error)) from None
 
 
-def as_experiment(given: Given, components: Components, settings: Settings = ()) -> Experiment:
+def as_experiment(
+    given: Given, components: ComponentClasses, settings: Settings = ()
+) -> Experiment:
     """Return the experiment that is given in one of these ways, with the settings."""
     if isinstance(given, Experiment):
         Registry(components)  # what is handed over is checked, needed or not

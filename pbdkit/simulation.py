@@ -228,7 +228,9 @@ class SteppingDriver(Driver):
                 Stepper(self.scene, strict=True).advance(start, steps)
         except FloatingPointError as error:
             found = f", from {worded(error, rule.__module__.split('.')[0])}"
-        return f": a displacement is NaN{found}; guard divisions and roots with `pbdkit.where`"
+        return (
+            f": a displacement is NaN{found}; guard divisions and roots with `pbdkit.plugin.where`"
+        )
 
 
 class EquilibriumDriver(Driver):

@@ -194,7 +194,7 @@ class Probe(pbdkit.Diagnostic):
     every_step: ClassVar[bool] = True
 
     def variables(self):
-        return (pbdkit.Variable("NAME", DIMS, "zero", "1"),)
+        return (pbdkit.plugin.Variable("NAME", DIMS, "zero", "1"),)
 
     def measure(self, now):
         if now.step == 3:

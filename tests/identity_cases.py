@@ -4,7 +4,7 @@ import math
 from typing import Any, ClassVar, Literal
 
 import pbdkit
-from pbdkit import BasisSite, Cell, Vector
+from pbdkit.plugin import BasisSite, Cell, Vector
 
 SQUARE = {"type": "square", "a": 1.0}
 HEXAGONAL = {"type": "hexagonal", "a": 0.7}
@@ -78,7 +78,7 @@ class Central(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        return (2 * pbdkit.dot(d, r) / pbdkit.squared_length(r)) * r, 1.0
+        return (2 * pbdkit.plugin.dot(d, r) / pbdkit.plugin.squared_length(r)) * r, 1.0
 
 
 class Twice(Mean):
@@ -159,7 +159,7 @@ class Bent(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        return Vector(pbdkit.where(d.x > 0.0, d.x, 0.5 * d.x), d.y), 1.0
+        return Vector(pbdkit.plugin.where(d.x > 0.0, d.x, 0.5 * d.x), d.y), 1.0
 
 
 class Idle(Mean):
@@ -210,7 +210,7 @@ class Dividing(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        return Vector(d.x * d.x / pbdkit.squared_length(d), d.y), 1.0
+        return Vector(d.x * d.x / pbdkit.plugin.squared_length(d), d.y), 1.0
 
 
 def subclasses(of: type) -> list[type]:

@@ -5,9 +5,21 @@ from typing import Literal
 import numpy as np
 
 import pbdkit
+from pbdkit.plugin import (
+    Draws,
+    Remembered,
+    RenewsBonds,
+    RenewsParticles,
+    SharesParticles,
+    Softens,
+    TurnsParticles,
+    Vector,
+    length,
+    where,
+)
 
 
-class Weakest(pbdkit.Draws, pbdkit.RenewsBonds, pbdkit.Softens, pbdkit.FractureModel):
+class Weakest(Draws, RenewsBonds, Softens, pbdkit.FractureModel):
     """A bond's force falls linearly from strain `onset` to strain `failure`; the onset of each bond
     is drawn, uniform over `onset` (1 ± spread), and that of the bond in the middle is lower."""
 
@@ -22,13 +34,13 @@ class Weakest(pbdkit.Draws, pbdkit.RenewsBonds, pbdkit.Softens, pbdkit.FractureM
         return self.frame_bonds
 
     def constants(self, slot):
-        return {"rest": pbdkit.length(slot.rest)}
+        return {"rest": length(slot.rest)}
 
     def remembered(self):
         return (
-            pbdkit.Remembered("onset", "strain at which softening begins", "1", changes=False),
-            pbdkit.Remembered("damage", "damage", "1"),
-            pbdkit.Remembered("visits", "steps with more damage than before", "1", dtype="i4"),
+            Remembered("onset", "strain at which softening begins", "1", changes=False),
+            Remembered("damage", "damage", "1"),
+            Remembered("visits", "steps with more damage than before", "1", dtype="i4"),
         )
 
     def draw(self, bonds, generator):
@@ -39,11 +51,11 @@ class Weakest(pbdkit.Draws, pbdkit.RenewsBonds, pbdkit.Softens, pbdkit.FractureM
 
     @staticmethod
     def update(d, r, c, p):
-        strain = (pbdkit.length(r + d) - c.rest) / c.rest
+        strain = (length(r + d) - c.rest) / c.rest
         over = strain > c.onset
-        law = p.failure / (p.failure - c.onset) * (1.0 - c.onset / pbdkit.where(over, strain, 1.0))
+        law = p.failure / (p.failure - c.onset) * (1.0 - c.onset / where(over, strain, 1.0))
         more = over & (law > c.damage)
-        return pbdkit.where(more, law, c.damage), pbdkit.where(more, c.visits + 1, c.visits)
+        return where(more, law, c.damage), where(more, c.visits + 1, c.visits)
 
     @staticmethod
     def breaks(d, r, c, p):
@@ -58,7 +70,7 @@ class Weakest(pbdkit.Draws, pbdkit.RenewsBonds, pbdkit.Softens, pbdkit.FractureM
         return (1.0 - c.damage) * d + c.damage * lost
 
 
-class Tiring(pbdkit.Draws, pbdkit.RenewsParticles, pbdkit.FollowerRule):
+class Tiring(Draws, RenewsParticles, pbdkit.FollowerRule):
     """Particles follow the barycentre the less, the farther they have come in all."""
 
     type: Literal["tiring"] = "tiring"
@@ -67,8 +79,8 @@ class Tiring(pbdkit.Draws, pbdkit.RenewsParticles, pbdkit.FollowerRule):
 
     def remembered(self):
         return (
-            pbdkit.Remembered("way", "way made in x", "lattice unit"),
-            pbdkit.Remembered("zeal", "share of the move that is made", "1", 0.9, changes=False),
+            Remembered("way", "way made in x", "lattice unit"),
+            Remembered("zeal", "share of the move that is made", "1", 0.9, changes=False),
         )
 
     def draw(self, particles, generator):
@@ -86,10 +98,10 @@ class Tiring(pbdkit.Draws, pbdkit.RenewsParticles, pbdkit.FollowerRule):
     @staticmethod
     def remember(total, here, p):
         move = total[0].x / total[2]
-        return (here.own.way + pbdkit.where(move > 0.0, move, -move),)
+        return (here.own.way + where(move > 0.0, move, -move),)
 
 
-class Vanes(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.FollowerRule):
+class Vanes(SharesParticles, TurnsParticles, pbdkit.FollowerRule):
     """Each particle has a direction, goes halfway to the mean of its neighbours, of which those
     that point as it does count more, and turns halfway to theirs."""
 
@@ -98,9 +110,9 @@ class Vanes(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.FollowerRule):
 
     def remembered(self):
         return (
-            pbdkit.Remembered("vane_cos", "cosine of the vane's rotation", "1", 1.0),
-            pbdkit.Remembered("vane_sin", "sine of the vane's rotation", "1"),
-            pbdkit.Remembered("lift", "lift of the vane", "1", 0.1, changes=False),
+            Remembered("vane_cos", "cosine of the vane's rotation", "1", 1.0),
+            Remembered("vane_sin", "sine of the vane's rotation", "1"),
+            Remembered("lift", "lift of the vane", "1", 0.1, changes=False),
         )
 
     def rotations(self):
@@ -120,5 +132,5 @@ class Vanes(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.FollowerRule):
     @staticmethod
     def remember(total, here, p):
         c, s = here.own.vane_cos + total[2], here.own.vane_sin + total[3]
-        size = pbdkit.length(pbdkit.Vector(c, s)) + 1e-9
+        size = length(Vector(c, s)) + 1e-9
         return c / size, s / size

@@ -25,4 +25,4 @@ class Turning(pbdkit.FramePolicy):
         near = turn.transpose(2, 0, 1)
         weight = np.stack([near, np.eye(2) - near], axis=1).reshape(-1, 2, 2)
         bodies = np.stack([body[first], np.full(len(points), centre)], axis=1).ravel()
-        return pbdkit.FrameMap(np.repeat(points, 2), bodies, weight)
+        return pbdkit.plugin.FrameMap(np.repeat(points, 2), bodies, weight)

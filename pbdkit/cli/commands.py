@@ -16,18 +16,14 @@ import pluggy
 
 from pbdkit.cli.options import with_no_plugins
 from pbdkit.errors import PbdkitError, PluginError, did_you_mean
-from pbdkit.plugin import GROUP
 from pbdkit.plugin.discovery import (
-    COMMAND_GROUP,
     DISABLE,
-    Command,
-    Hooks,
     Plugin,
-    hookimpl,
     installed_plugins,
     with_commands,
     worded,
 )
+from pbdkit.plugin.hooks import COMMAND_GROUP, GROUP, Command, Hooks, hookimpl
 
 T = TypeVar("T")
 OWN_MODULES = ("pbdkit.cli.commands", "pbdkit.web", "pbdkit.bench")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from pbdkit.plugin import Component
-from pbdkit.plugin.discovery import hookimpl
+from pbdkit.plugin import Component, hookimpl
 
 COMPONENTS = {
     "lattices": "Square Rectangular CentredRectangular Hexagonal Oblique",

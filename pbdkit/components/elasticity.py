@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from functools import cache
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,15 @@ from pbdkit.plugin import (
     Here,
     Loadable,
     MixesCells,
+    Number,
+    Parameters,
     Setting,
     Slot,
     Stiffness,
     TearsCells,
     Torn,
     Vector,
+    Weights,
     dot,
     where,
 )
@@ -133,7 +136,11 @@ def springs_in(stiffness: Floats, c: Stiffness, cells: Tiling) -> Floats:
     return np.where(np.isfinite(found), found, 0.0)
 
 
-def torn_pull(d: Any, r: Any, w: Any, t: Any) -> Any:
+Sums = tuple[Vector, Number, Number, Number]
+"""Σ W d, and the entries xx, xy, yy of Σ W."""
+
+
+def torn_pull(d: Vector, r: Vector, w: Weights, t: Torn) -> Vector:
     """The pull of a bond in damaged cells: of K = (1 - m) K_whole + Σ_b (m - D_b) K_b, with the
     damage D_b of each bond b in the cell, the largest of them m, and the cell's springs K_b."""
     left, right = w.left * (1.0 - t.left), w.right * (1.0 - t.right)
@@ -146,7 +153,7 @@ def torn_pull(d: Any, r: Any, w: Any, t: Any) -> Any:
     )
 
 
-def pulled(d: Any, w: Any) -> tuple[Any, ...]:
+def pulled(d: Vector, w: Weights) -> Sums:
     """W d with the weight of a bond, and the entries xx, xy, yy of W."""
     whole = w.left + w.right
     xx, yy = w.xx * whole, w.yy * whole
@@ -154,7 +161,7 @@ def pulled(d: Any, w: Any) -> tuple[Any, ...]:
     return Vector(xx * d.x + xy * d.y, yx * d.x + yy * d.y), xx, xy, yy
 
 
-def mean_move(total: Any) -> Vector:
+def mean_move(total: Sums) -> Vector:
     """(Σ W)⁻¹ Σ W d from the sums; zero where there is no cell."""
     pull, xx, xy, yy = total
     det = xx * yy - xy * xy
@@ -256,29 +263,29 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
         return springs_in(c / (self.stiffness * modulus), material, setting.cells)
 
     @staticmethod
-    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> Sums:
         """W d, and entries of W, of which the sum is symmetric."""
         return pulled(d, w)
 
     @staticmethod
-    def torn(d: Any, r: Any, w: Any, t: Torn, p: Any) -> tuple[Any, ...]:
+    def torn(d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters) -> Sums:
         """The same with what torn cells pull in place of W d; the entries of W stay, so that moves
         are no larger for a given force, whatever is broken."""
         _, xx, xy, yy = pulled(d, w)
         return torn_pull(d, r, w, t), xx, xy, yy
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> Vector:
+    def apply(total: Sums, here: Here, p: Parameters) -> Vector:
         """(Σ W)⁻¹ Σ W d; no move where there is no cell."""
         return mean_move(total)
 
     @staticmethod
-    def force(total: Any, here: Here, p: Any) -> Any:
+    def force(total: Sums, here: Here, p: Parameters) -> Vector:
         """Modulus · Σ W d."""
         return p.modulus * total[0]
 
     @staticmethod
-    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+    def loaded(total: Sums, load: Vector, p: Parameters) -> Sums:
         """The load over the modulus, besides Σ W d."""
         pull, xx, xy, yy = total
         return pull + load / p.modulus, xx, xy, yy
@@ -398,31 +405,31 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
         return parameters | {"c": self.length**2 / diffusion}
 
     @staticmethod
-    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> Sums:
         """c W d, and entries of W."""
         pull, xx, xy, yy = pulled(d, w)
         return p.c * pull, xx, xy, yy
 
     @staticmethod
-    def torn(d: Any, r: Any, w: Any, t: Torn, p: Any) -> tuple[Any, ...]:
+    def torn(d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters) -> Sums:
         """The same with what torn cells pull in place of W d."""
         _, xx, xy, yy = pulled(d, w)
         return p.c * torn_pull(d, r, w, t), xx, xy, yy
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> Any:
+    def apply(total: Sums, here: Here, p: Parameters) -> Vector:
         """z - (Σ W)⁻¹ c Σ W (z_k - z_j)."""
         return here.u - mean_move(total)
 
     @staticmethod
-    def force(total: Any, here: Here, p: Any) -> Any:
+    def force(total: Sums, here: Here, p: Parameters) -> Vector:
         """Modulus · (Σ W z_j - c Σ W (z_k - z_j))."""
         pull, xx, xy, yy = total
         x, y = here.u
         return p.modulus * (Vector(xx * x + xy * y, xy * x + yy * y) - pull)
 
     @staticmethod
-    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+    def loaded(total: Sums, load: Vector, p: Parameters) -> Sums:
         """Less the load over the modulus, besides c Σ W d: that counts against z."""
         pull, xx, xy, yy = total
         return pull - load / p.modulus, xx, xy, yy

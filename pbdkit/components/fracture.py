@@ -20,10 +20,13 @@ from pbdkit.plugin import (
     BreaksAtStrain,
     Calibrated,
     CellStress,
-    Components,
+    Condition,
+    Constants,
     Draws,
     FractureModel,
     KnowsStiffness,
+    Number,
+    Parameters,
     Remembered,
     RenewsBonds,
     Setting,
@@ -68,12 +71,12 @@ class NoFracture(FractureModel):
         return {}
 
     @staticmethod
-    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+    def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """Never."""
         return False
 
     @staticmethod
-    def fictitious(u: Any, r: Any, p: Any) -> Any:
+    def fictitious(u: Vector, r: Vector, p: Parameters) -> Vector:
         """The undeformed cell."""
         return 0.0 * r
 
@@ -118,7 +121,7 @@ class Parting(StartsCracked, FractureModel):
         return self.cracks
 
     @staticmethod
-    def fictitious(u: Any, r: Any, p: Any) -> Any:
+    def fictitious(u: Vector, r: Vector, p: Parameters) -> Vector:
         """(λ - 1) r: the point at m_j + λ r; or -u_j: the point at X_k."""
         return where(p.at_reference, -u, p.excess * r)
 
@@ -167,12 +170,12 @@ class Threshold(BreaksAtStrain, Parting):
         return {"limit": max(threshold**2, rest) if at_rest else threshold**2}
 
     @staticmethod
-    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+    def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """|r + d|² > threshold²."""
         return squared_length(r + d) > c.limit
 
     @staticmethod
-    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
+    def breaking_strain(r: Vector, c: Constants, p: Parameters) -> Number:
         """The threshold as a strain."""
         return np.sqrt(c.limit) / length(r) - 1.0
 
@@ -263,13 +266,13 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
         return _in_percent(failure=self.failure)
 
     @staticmethod
-    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+    def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """|r + d|² > (1 + failure)² |r|²."""
         stretch = 1.0 + c.failure_strain
         return squared_length(r + d) > c.square * (stretch * stretch)
 
     @staticmethod
-    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
+    def breaking_strain(r: Vector, c: Constants, p: Parameters) -> Number:
         """The failure strain of the bond."""
         return np.sqrt(c.square) * (1.0 + c.failure_strain) / length(r) - 1.0
 
@@ -324,23 +327,23 @@ class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
         return {"onset_strain": self.onset, "failure_strain": self.failure}
 
     @staticmethod
-    def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
+    def update(d: Vector, r: Vector, c: Constants, p: Parameters) -> tuple[Number, ...]:
         """The damage, where there is more than before."""
         strain = length(r + d) * c.per_rest - 1.0
         return (softened(strain, c.onset_strain, c.failure_strain, c.damage),)
 
     @staticmethod
-    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+    def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """D = 1."""
         return c.damage >= 1.0
 
     @staticmethod
-    def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
+    def seen(d: Vector, lost: Vector, r: Vector, c: Constants, p: Parameters) -> Vector:
         """(1 - D) d + D lost."""
         return (1.0 - c.damage) * d + c.damage * lost
 
     @staticmethod
-    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
+    def breaking_strain(r: Vector, c: Constants, p: Parameters) -> Number:
         """The failure strain of the bond."""
         return c.failure_strain
 
@@ -439,8 +442,8 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
 
     @staticmethod
     def update(  # type: ignore[override]  # SoftensCells: it is given the cells
-        d: Any, r: Any, c: Any, p: Any, left: CellStress, right: CellStress
-    ) -> tuple[Any, ...]:
+        d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
+    ) -> tuple[Number, ...]:
         """Those of both cells; where there is one alone they are the same."""
         here, fails = _of_cell(left, c.damage_left, c.failure_left, r, c)
         there, parts = _of_cell(right, c.damage_right, c.failure_right, r, c)
@@ -453,13 +456,13 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
         )
 
     @staticmethod
-    def load(stress: CellStress, c: Any, p: Any) -> Any:
+    def load(stress: CellStress, c: Constants, p: Parameters) -> Number:
         """κ over the onset."""
         largest, cos, sin = _principal(stress)
         return largest * _along(cos, sin, c.along_y, c.across) / c.onset_strain
 
     @staticmethod
-    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+    def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """D = 1 on both sides."""
         return (c.damage_left >= 1.0) & (c.damage_right >= 1.0)
 
@@ -484,7 +487,7 @@ def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> A
     return where(crosses, law, damage), failure
 
 
-def _principal(stress: CellStress) -> Any:
+def _principal(stress: CellStress) -> tuple[Number, Number, Number]:
     """The largest principal stress, and cosine and sine of twice the angle of its direction."""
     mean, half = 0.5 * (stress.xx + stress.yy), 0.5 * (stress.xx - stress.yy)
     radius = np.sqrt(half * half + stress.xy * stress.xy)
@@ -499,7 +502,7 @@ def _projection(r: Any, cos: Any, sin: Any) -> Any:
     return 0.5 * (x + y + cos * (x - y)) + sin * r.x * r.y
 
 
-def _along(cos: Any, sin: Any, along_y: Any, across: Any) -> Any:
+def _along(cos: Number, sin: Number, along_y: Number, across: Number) -> Number:
     """A compliance or a stiffness along that direction, over that along x."""
     x, y = 0.5 * (1.0 + cos), 0.5 * (1.0 - cos)
     return x * x + along_y * y * y + across * 0.25 * sin * sin
@@ -516,7 +519,7 @@ def _material(rule: Calibrated) -> tuple[float, tuple[float, float, float, float
     return xx / material.own_modulus(rule.through_thickness()) ** 2, ratios
 
 
-def _bonds_of_a_cell(setting: Setting) -> tuple[Components, Components, Components]:
+def _bonds_of_a_cell(setting: Setting) -> tuple[Vector, Vector, Vector]:
     """Those that are longest in some direction: the sides of a triangle, the diagonals of a
     rectangle."""
     origin, one, other, *more = setting.cells.polygons[0].rest

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -13,6 +13,8 @@ from pbdkit.plugin import (
     FollowerRule,
     Here,
     Loadable,
+    Number,
+    Parameters,
     Setting,
     Slot,
     Stiffness,
@@ -20,6 +22,7 @@ from pbdkit.plugin import (
     TearsCells,
     Torn,
     Vector,
+    Weights,
     dot,
     length,
     where,
@@ -39,12 +42,12 @@ class Barycentre(FollowerRule):
     linear: ClassVar[bool] = True
 
     @staticmethod
-    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector, Vector, Number]:
         """(d, r, 1)."""
         return d, r, 1.0
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> Any:
+    def apply(total: tuple[Vector, Vector, Number], here: Here, p: Parameters) -> Vector:
         """(Σd + Σr) / N."""
         return (total[0] + total[1]) / total[2]
 
@@ -57,12 +60,12 @@ class MeanDisplacement(FollowerRule):
     linear: ClassVar[bool] = True
 
     @staticmethod
-    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector, Number]:
         """(d, 1)."""
         return d, 1.0
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> Any:
+    def apply(total: tuple[Vector, Number], here: Here, p: Parameters) -> Vector:
         """Σd / N."""
         return total[0] / total[1]
 
@@ -77,14 +80,14 @@ class DistanceWeighted(FollowerRule):
     type: Literal["distance-weighted"] = "distance-weighted"
 
     @staticmethod
-    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector, Number]:
         """(|r + d| (r + d), |r + d|)."""
         there = r + d
         distance = length(there)
         return distance * there, distance
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> Any:
+    def apply(total: tuple[Vector, Number], here: Here, p: Parameters) -> Vector:
         """Σ |r + d| (r + d) / Σ |r + d|."""
         there, distance = total
         return there / where(distance > 0.0, distance, 1.0)
@@ -114,12 +117,12 @@ class MixedCoordinate(FollowerRule):
         return {"K": self.K, "along": ("x", "y").index(self.axis)}
 
     @staticmethod
-    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector, Vector, Number]:
         """(d, r, 1)."""
         return d, r, 1.0
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> Vector:
+    def apply(total: tuple[Vector, Vector, Number], here: Here, p: Parameters) -> Vector:
         """The barycentre's move, and K · (u + move along the axis) · da across it."""
         move = (total[0] + total[1]) / total[2]
         there = here.u + move
@@ -165,43 +168,43 @@ class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
         )
 
     @staticmethod
-    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector, Number]:
         """(k e n, k) with the elongation e = |r + d| - |r| along n = (r + d)/|r + d|."""
         stiffness = w.half * (w.left + w.right)
         return spring_pull(d, r, stiffness, w.rest), stiffness
 
     @staticmethod
-    def torn(d: Any, r: Any, w: Any, t: Torn, p: Any) -> tuple[Any, ...]:
+    def torn(d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters) -> tuple[Vector, Number]:
         """((1 - D) k e n, k): the stiffness k stays, so that moves are no larger for a given force,
         whatever is broken."""
         left, right = w.left * (1.0 - t.bond_left), w.right * (1.0 - t.bond_right)
         return spring_pull(d, r, w.half * (left + right), w.rest), w.half * (w.left + w.right)
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> Any:
+    def apply(total: tuple[Vector, Number], here: Here, p: Parameters) -> Vector:
         """Σ k e n / Σ k; no move where there is no cell."""
         pull, stiffness = total
         return pull / where(stiffness > 0.0, stiffness, 1.0)
 
     @staticmethod
-    def force(total: Any, here: Here, p: Any) -> Any:
+    def force(total: tuple[Vector, Number], here: Here, p: Parameters) -> Vector:
         """Σ k e n."""
         return total[0]
 
     @staticmethod
-    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+    def loaded(total: tuple[Vector, Number], load: Vector, p: Parameters) -> tuple[Vector, Number]:
         """The load besides Σ k e n."""
         return total[0] + load, total[1]
 
     @staticmethod
-    def energy(d: Any, r: Any, w: Any, p: Any) -> Any:
+    def energy(d: Vector, r: Vector, w: Weights, p: Parameters) -> Number:
         """Half of ½ k e²."""
         v = r + d
         elongation = dot(d, r + v) / (length(v) + w.rest)
         return w.half * (w.left + w.right) * elongation * elongation / 4
 
 
-def spring_pull(d: Any, r: Any, stiffness: Any, rest: Any) -> Any:
+def spring_pull(d: Vector, r: Vector, stiffness: Number, rest: Number) -> Vector:
     """k e n with the elongation e = |r + d| - |r| along n = (r + d)/|r + d|."""
     v = r + d
     distance = length(v)

@@ -28,7 +28,7 @@ from pbdkit.model.reading import with_value
 from pbdkit.plugin.component import Component
 from pbdkit.stepping.state import Floats
 
-Components = Iterable[type[Component]]
+ComponentClasses = Iterable[type[Component]]
 GIVEN = "as given"
 """What the experiment of the fit is called among candidates."""
 INSET = 1e-6
@@ -38,7 +38,7 @@ TINY = 1e-6
 Below that share of it again they are rounding."""
 
 
-def fit_experiment(fit: Fit, experiment: Experiment, components: Components = ()) -> Fitted:
+def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasses = ()) -> Fitted:
     """Carries a fit out, on one thread; its `settings` may name these components. Raises
     ExperimentError for what cannot be fitted."""
     import scipy.linalg  # noqa: F401  # what is loaded later would work on all threads
@@ -61,7 +61,7 @@ def _placed(error: ExperimentError, experiment: Experiment) -> ExperimentError:
     return ExperimentError(f"{place}: {error}", error.where)
 
 
-def _fitted(fit: Fit, experiment: Experiment, components: Components) -> Fitted:
+def _fitted(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitted:
     if fit.sampler:
         refuse_no_sampler()
     problem, solution = _solved(problem_of(fit, experiment, components=components), fit)
@@ -76,7 +76,7 @@ def _fitted(fit: Fit, experiment: Experiment, components: Components) -> Fitted:
 
 
 def _compared(
-    fit: Fit, experiment: Experiment, own: Posed, components: Components
+    fit: Fit, experiment: Experiment, own: Posed, components: ComponentClasses
 ) -> tuple[Candidate, ...]:
     """The experiment as it is given, and all that the fit names."""
     if not fit.candidates:
@@ -100,7 +100,7 @@ def problem_of(
     fit: Fit,
     experiment: Experiment,
     asked: Mapping[str, tuple[float, float]] | None = None,
-    components: Components = (),
+    components: ComponentClasses = (),
 ) -> Problem:
     """The problem that a fit file poses, or that with something else unknown. Raises
     ExperimentError."""
@@ -131,7 +131,7 @@ def _with_settings(
     settings: Mapping[str, Any],
     fit: Fit,
     where: str,
-    components: Components,
+    components: ComponentClasses,
 ) -> Experiment:
     if not settings:
         return experiment

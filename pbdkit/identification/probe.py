@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,9 @@ def _places(scene: Scene) -> list[Here]:
     lower, upper = body_box(scene.raster)
     local = [scene.middle, *map(vector, product(*zip(lower, upper, strict=True)))]
     origin = vector(scene.experiment.lattice.origin)
-    return [Here(None, (at + origin).each(np.float64), at - scene.middle) for at in local]
+    return [
+        Here(cast(Any, None), (at + origin).each(np.float64), at - scene.middle) for at in local
+    ]
 
 
 def _one_side(slots: Slots) -> Slots:

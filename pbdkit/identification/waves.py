@@ -76,7 +76,7 @@ class Primitive:
 
 def spacing_of(cell: Cell) -> float:
     """The smallest distance between two sites, in lattice units."""
-    reach = min(float(np.hypot(*v)) for v in cell.vectors) * (1 + NEAR)
+    reach = min(float(np.hypot(v.x, v.y)) for v in cell.vectors) * (1 + NEAR)
     return min(o.length for s in range(len(cell.sites)) for o in cell.offsets(s, reach))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.lattice.raster import FOLLOWER, Block, Floats, Mask, Raster, Where
-from pbdkit.plugin import Cell, Components, Offset, Slot, Vector
+from pbdkit.plugin import Cell, Offset, Slot, Vector
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.lattice import CellPolygon, Index, Side, Tiling
 
@@ -172,7 +172,7 @@ def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[Cell
     return (CellPolygon(source, kind, corners) for kind, corners in enumerate(found))
 
 
-def _is_ahead(r: Components) -> bool:
+def _is_ahead(r: Vector[float]) -> bool:
     level = abs(r.y) <= LEVEL * math.hypot(*r)
     return bool(r.x > 0.0 if level else r.y > 0.0)
 

@@ -27,7 +27,7 @@ from pbdkit.lattice.raster import (
     hull,
     positions,
 )
-from pbdkit.plugin import Cell, Components, Lattice, NeighbourMetric, Offset, Setting, Slot, Vector
+from pbdkit.plugin import Cell, Lattice, NeighbourMetric, Offset, Setting, Slot, Vector
 from pbdkit.plugin.fracture import Segment
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.lattice import Index, Tiling
@@ -227,10 +227,10 @@ class _ExactVectors:
     """
 
     def __init__(self) -> None:
-        self._known: list[Components] = []
+        self._known: list[Vector[float]] = []
         self._near: dict[Index, int] = {}
 
-    def of(self, v: Components) -> tuple[int, bool, Components]:
+    def of(self, v: Vector[float]) -> tuple[int, bool, Vector[float]]:
         """(which known vector, whether negated, the value to use)."""
         if (number := self._near.get(self._key(v))) is not None:
             return number, False, self._known[number]
@@ -242,7 +242,7 @@ class _ExactVectors:
             self._near.setdefault(near, number)
         return number, False, self._known[number]
 
-    def _key(self, v: Components) -> Index:
+    def _key(self, v: Vector[float]) -> Index:
         """The place on a grid much finer than any lattice and much coarser than rounding."""
         unit = 1e-6 * math.hypot(*(self._known[0] if self._known else v))
         return tuple(math.floor(component / unit) for component in v)
@@ -366,7 +366,7 @@ def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
     return Setting(cell, slots, lower, upper, neighbourhood.tiling)
 
 
-def body_box(raster: Raster) -> tuple[Components, Components]:
+def body_box(raster: Raster) -> tuple[Vector[float], Vector[float]]:
     """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
     ends = (raster.ends_of_rows(s) for s in range(raster.shape[0]))
     at = [positions(raster.lattice.cell(), s, *cells) for s, cells in enumerate(ends)]

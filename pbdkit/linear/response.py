@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pbdkit.lattice.raster import EMPTY, Places, slot_step
 from pbdkit.linear.stencil import SMALL, array_of, derivative
-from pbdkit.plugin import Components, Here, Slot, Softens, SoftensCells
+from pbdkit.plugin import Here, Slot, Softens, SoftensCells, Vector
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.vector import vector
@@ -230,7 +230,7 @@ class _Followers:
 
     def _total(self, parts: Sequence[Any], kept: int) -> Any:
         """Return the totals of one number or vector, given by slot."""
-        if isinstance(parts[0], Components):
+        if isinstance(parts[0], Vector):
             return vector(self._total(along, kept) for along in zip(*parts, strict=True))
         shape = (2 * kept - 1, self._shape[1])
         parts = [np.broadcast_to(part, shape) for part in parts]

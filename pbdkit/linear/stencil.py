@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from operator import add
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ def array_of(components: tuple[Any, ...], shape: tuple[int, ...]) -> NDArray[Any
 
 
 Floats = NDArray[np.float64]
-NOWHERE = Here(None)
+NOWHERE = Here(cast(Any, None))
 
 
 @dataclass(frozen=True)

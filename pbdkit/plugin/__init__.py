@@ -1,12 +1,39 @@
-"""The interfaces that component authors implement and the data that they exchange, and the registry
-of installed components.
+"""Everything that the author of a component needs: the six interfaces, what only some components
+can do, the data that they exchange, and the marker of the hook by which a distribution offers them.
+
+Examples
+--------
+>>> from typing import Literal
+>>> from pbdkit.plugin import FollowerRule, Vector
+>>> class Mean(FollowerRule):
+...     type: Literal["mean"] = "mean"
+...
+...     @staticmethod
+...     def gather(d: Vector, r: Vector, w, p):
+...         return d, 1.0
+...
+...     @staticmethod
+...     def apply(total, here, p):
+...         return total[0] / total[1]
 """
 
 from __future__ import annotations
 
-from pbdkit.plugin.component import Bonds, Component, Draws, Pair, Particles, Remembered, Remembers
+from pbdkit.plugin.component import (
+    Bonds,
+    Component,
+    Drawn,
+    Draws,
+    Pair,
+    Particles,
+    Remembered,
+    Remembers,
+)
 from pbdkit.plugin.diagnostic import (
+    BondHistory,
+    CellValues,
     Diagnostic,
+    ForceValues,
     LeaderRows,
     LoadRows,
     Moment,
@@ -19,12 +46,24 @@ from pbdkit.plugin.fracture import (
     FractureModel,
     KnowsStiffness,
     RenewsBonds,
+    Segment,
     Softens,
     SoftensCells,
     StartsCracked,
 )
 from pbdkit.plugin.frame import Anchors, FrameMap, FramePolicy, FrameSites
-from pbdkit.plugin.lattice import BasisSite, Cell, Lattice, Nearness, NeighbourMetric, Offset, Slot
+from pbdkit.plugin.hooks import GROUP, Command, hookimpl
+from pbdkit.plugin.lattice import (
+    BasisSite,
+    Cell,
+    Lattice,
+    Nearness,
+    NeighbourMetric,
+    Offset,
+    Polygon,
+    Slot,
+    Tiling,
+)
 from pbdkit.plugin.operation import ParticleOperation
 from pbdkit.plugin.rule import (
     AppliesTwice,
@@ -43,7 +82,20 @@ from pbdkit.plugin.rule import (
     TurnsParticles,
 )
 from pbdkit.plugin.units import AREA, ENERGY, FORCE, FRACTURE_ENERGY, LENGTH, STRESS, Quantity
-from pbdkit.plugin.vector import Components, SpaceVector, Vector, dot, length, squared_length, where
+from pbdkit.plugin.vector import (
+    Condition,
+    Constants,
+    Number,
+    Numbers,
+    Parameters,
+    SpaceVector,
+    Vector,
+    Weights,
+    dot,
+    length,
+    squared_length,
+    where,
+)
 
 INTERFACES: dict[str, type[Component]] = {
     "lattice": Lattice,
@@ -58,20 +110,19 @@ INTERFACES: dict[str, type[Component]] = {
 LISTS = frozenset({"operations", "diagnostics"})
 """The fields that list any number of components."""
 
+BUILTIN = GROUP
+"""The distribution of the built-in components."""
+
 __all__ = [
-    "AREA", "ENERGY", "FORCE", "FRACTURE_ENERGY", "INTERFACES", "LENGTH", "LISTS", "STRESS",
-    "Anchors", "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell",
-    "CellStress", "Component", "Components", "Diagnostic", "Draws", "FollowerRule",
-    "FractureModel", "FrameMap", "FramePolicy", "FrameSites", "Here", "KnowsStiffness", "Lattice",
-    "LeaderRows", "LoadRows", "Loadable", "MixesCells", "Moment", "Nearness", "NeighbourMetric",
-    "Offset", "Pair", "ParticleOperation", "Particles", "Quantity", "Remembered", "Remembers",
-    "RenewsBonds", "RenewsParticles", "Setting", "SharesParticles", "Slot", "Softens",
-    "SoftensCells", "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells",
-    "Torn", "TouchingRows", "TurnsParticles", "Variable", "Vector", "dot", "length",
-    "squared_length", "where",
+    "AREA", "ENERGY", "FORCE", "FRACTURE_ENERGY", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
+    "BasisSite", "BondHistory", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellStress",
+    "CellValues", "Command", "Component", "Condition", "Constants", "Diagnostic", "Drawn", "Draws",
+    "FollowerRule", "ForceValues", "FractureModel", "FrameMap", "FramePolicy", "FrameSites",
+    "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows", "Loadable", "MixesCells",
+    "Moment", "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair", "Parameters",
+    "ParticleOperation", "Particles", "Polygon", "Quantity", "Remembered", "Remembers", "RenewsBonds",
+    "RenewsParticles", "Segment", "Setting", "SharesParticles", "Slot", "Softens", "SoftensCells",
+    "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells", "Tiling", "Torn",
+    "TouchingRows", "TurnsParticles", "Variable", "Vector", "Weights", "dot", "hookimpl",
+    "length", "squared_length", "where",
 ]  # fmt: skip
-
-
-BUILTIN = GROUP = "pbdkit"
-"""The distribution of the built-in components, and the entry-point group of plugins, which is the
-project name of their hook markers too."""

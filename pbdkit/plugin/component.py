@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from pbdkit.errors import did_you_mean, printable
-from pbdkit.plugin.vector import Components
+from pbdkit.plugin.vector import Vector
 
 Pair = Annotated[tuple[float, float], Field(strict=False)]
 """Two numbers, (x, y); an experiment file writes them as a list of two."""
@@ -122,7 +122,7 @@ def as_vector(answer: Any, what: str, like: Any) -> Any:
         names = ", ".join(type(like)._fields)
         raise AnswerError(
             f"`{what}` returned {_kind(answer)}: return a vector, as "
-            f"`pbdkit.{_kind(like)}({names})`"
+            f"`pbdkit.plugin.{_kind(like)}({names})`"
         )
     return answer
 
@@ -138,7 +138,7 @@ def as_verdict(answer: Any) -> Any:
 def as_values(answer: Any, what: str) -> tuple[Any, ...]:
     """The answer of a function that gives any number of values; AnswerError where it is one, as
     where the comma of ``(value,)`` is forgotten."""
-    if isinstance(answer, Components) or not isinstance(answer, (tuple, list)):
+    if isinstance(answer, Vector) or not isinstance(answer, (tuple, list)):
         raise AnswerError(f"`{what}` returned {_kind(answer)}, not a tuple: write `(value,)`")
     return tuple(answer)
 

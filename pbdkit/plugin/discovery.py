@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import chdir, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import import_module
 from importlib.metadata import (
     Distribution,
     EntryPoint,
@@ -32,8 +31,9 @@ import pluggy
 from pydantic import ValidationError
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError, did_you_mean, one_line
-from pbdkit.plugin import BUILTIN, GROUP, INTERFACES, Component, SharesParticles
+from pbdkit.plugin import BUILTIN, INTERFACES, Component, SharesParticles
 from pbdkit.plugin.component import AnswerError
+from pbdkit.plugin.hooks import GROUP, Command, Hooks
 
 NUMBERS = {"Parameters": "p", "Weights": "w", "Constants": "c", "Own": "here.own"}
 """What authors call the tuples of numbers that their functions are given."""
@@ -114,7 +114,7 @@ def worded(
 def remedy(error: BaseException, component: type[Component] | None = None) -> str:
     """Return what elementwise functions are to do instead, where the fault is a frequent one."""
     if isinstance(error, ValueError) and "truth value of an array" in str(error):
-        return "; choose with `pbdkit.where` in the place of `if`, `and` and `or`"
+        return "; choose with `pbdkit.plugin.where` in the place of `if`, `and` and `or`"
     of_none = isinstance(error, AttributeError | TypeError) and "'NoneType'" in str(error)
     if of_none and not getattr(component, "uses_reference", True):
         return f"; {NO_REFERENCE}"
@@ -135,61 +135,11 @@ API = 1
 """The version of the hook and the interfaces. A plugin may declare the one that it was written for
 as `pbdkit_api`, in the module or on the object that its entry point names."""
 
-hookspec = pluggy.HookspecMarker(GROUP)
-hookimpl = pluggy.HookimplMarker(GROUP)
 DISABLE, ALL = "PBDKIT_DISABLE_PLUGINS", "*"
 """The variable that lists what is not to be loaded, distributions or entry points, and its value
 for: nothing at all."""
 SEVERITY = ("ok", "conflict", "broken")
 """The states of what a plugin offers; its own is the worst of them."""
-
-
-COMMAND_GROUP = "pbdkit.commands"
-"""The entry-point group of modules that implement `pbdkit_commands`. They are imported to list
-commands, those of the group "pbdkit" are not."""
-
-
-class Hooks:
-    """What a plugin may implement, as functions of the module that its entry point names."""
-
-    @hookspec
-    def pbdkit_components(self) -> list[type[Component]]:
-        """The component classes that the distribution offers."""
-        raise NotImplementedError  # a specification only: pluggy never calls it
-
-    @hookspec
-    def pbdkit_commands(self) -> list[Command]:
-        """Return the commands that the distribution adds to the program `pbdkit`. The modules of
-        the commands are imported when they are called, so the module of this hook should import
-        nothing but `pbdkit.plugin`."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command of the program `pbdkit`.
-
-    Parameters
-    ----------
-    name : str
-        The word after `pbdkit`: lower-case letters, digits and hyphens.
-    target : str
-        The click command, as ``module:attribute``.
-    does : str
-        One sentence for `pbdkit --help`.
-    group : str
-        Heading in `pbdkit --help` under which the command is listed.
-    """
-
-    name: str
-    target: str
-    does: str
-    group: str = "Plugins"
-
-    def load(self) -> Any:
-        """Import the click command."""
-        module, _, attribute = self.target.partition(":")
-        return getattr(import_module(module), attribute)
 
 
 @dataclass(frozen=True)
@@ -411,7 +361,7 @@ def _answer_of(entry: EntryPoint, hook: str, elements: str) -> list[Any]:
 def _checked_command(command: Any) -> Command:
     """Return the command; raise TypeError, with what to mend, where it cannot be used."""
     if not isinstance(command, Command):
-        raise TypeError(f"{command!r} is no pbdkit.Command")
+        raise TypeError(f"{command!r} is no pbdkit.plugin.Command")
     if not re.fullmatch(r"[a-z][a-z0-9-]*", command.name):
         raise TypeError(
             f"'{command.name}' is no name for a command: it begins with a lower-case letter and "

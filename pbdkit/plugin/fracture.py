@@ -14,6 +14,7 @@ from pbdkit.plugin.fields import TakesFields
 from pbdkit.plugin.lattice import Slot
 from pbdkit.plugin.rule import Calibrated, Setting
 from pbdkit.plugin.units import Place
+from pbdkit.plugin.vector import Condition, Constants, Number, Parameters, Vector
 
 Segment = tuple[Place, Place]
 """A straight crack, from one point to another (lattice units)."""
@@ -55,12 +56,12 @@ class FractureModel(TakesFields):
 
     @staticmethod
     @abstractmethod
-    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+    def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """Whether the bond breaks in the intermediate configuration; called for one end only."""
 
     @staticmethod
     @abstractmethod
-    def fictitious(u: Any, r: Any, p: Any) -> Any:
+    def fictitious(u: Vector, r: Vector, p: Parameters) -> Vector:
         """The difference that stands in for d once the bond is broken, a vector; u is that of this
         end."""
 
@@ -77,7 +78,7 @@ class RenewsBonds(Remembers):
 
     @staticmethod
     @abstractmethod
-    def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
+    def update(d: Vector, r: Vector, c: Constants, p: Parameters) -> tuple[Number, ...]:
         """The new values of the numbers that change, in their order; called for one end only.
 
         Where a configuration lasts the values must come to an end (a largest value so far does, a
@@ -103,7 +104,7 @@ class Softens(ABC):
 
     @staticmethod
     @abstractmethod
-    def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
+    def seen(d: Vector, lost: Vector, r: Vector, c: Constants, p: Parameters) -> Vector:
         """The difference that the rule sees; `lost` is the fictitious one: damage D softens a bond
         as (1 - D) d + D lost."""
 
@@ -112,10 +113,10 @@ class CellStress(NamedTuple):
     """The stress that a cell would have without damage, over its own Young's modulus, and the
     `share` of it that belongs to the body: 0 where there is no cell."""
 
-    xx: Any
-    yy: Any
-    xy: Any
-    share: Any
+    xx: Number
+    yy: Number
+    xy: Number
+    share: Number
 
 
 class SoftensCells(RenewsBonds):
@@ -131,14 +132,14 @@ class SoftensCells(RenewsBonds):
     @staticmethod
     @abstractmethod
     def update(  # type: ignore[override]  # it is given the cells besides
-        d: Any, r: Any, c: Any, p: Any, left: CellStress, right: CellStress
-    ) -> tuple[Any, ...]:
+        d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
+    ) -> tuple[Number, ...]:
         """The new values of the numbers that change, in their order, from the stress of the cell
         on either side of the bond as well."""
 
     @staticmethod
     @abstractmethod
-    def load(stress: CellStress, c: Any, p: Any) -> Any:
+    def load(stress: CellStress, c: Constants, p: Parameters) -> Number:
         """How far the stress of a cell has come on the way to where it begins to soften: 1 there.
 
         Of cells that would begin together under `solver: equilibrium`, the most loaded do."""
@@ -157,7 +158,7 @@ class BreaksAtStrain(ABC):
 
     @staticmethod
     @abstractmethod
-    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
+    def breaking_strain(r: Vector, c: Constants, p: Parameters) -> Number:
         """The strain |r + d| / |r| - 1 beyond which the bond breaks."""
 
 

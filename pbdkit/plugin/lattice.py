@@ -16,7 +16,7 @@ from pydantic import Field
 
 from pbdkit.plugin.component import Component
 from pbdkit.plugin.units import Place
-from pbdkit.plugin.vector import Components, Vector, vector
+from pbdkit.plugin.vector import Vector, vector
 
 Index = tuple[int, ...]
 """One number an axis."""
@@ -35,7 +35,7 @@ class BasisSite:
     period, `primitive` the same in the primitive basis, in which Chebyshev distance is counted.
     """
 
-    at: Components = PLANE_ORIGIN
+    at: Vector[float] = PLANE_ORIGIN
     index: Index = (0, 0)
     primitive: Index = (0, 0)
 
@@ -52,7 +52,7 @@ class Offset:
     cell: Index
     site: Index
     primitive: Index
-    rest: Components
+    rest: Vector[float]
 
     @property
     def length(self) -> float:
@@ -79,7 +79,7 @@ class Cell:
     out is that of one site a cell, at its corner.
     """
 
-    vectors: tuple[Components, ...]
+    vectors: tuple[Vector[float], ...]
     sites: tuple[BasisSite, ...] = ()
     period: Index = ()
     primitive: tuple[Index, ...] = ()
@@ -178,7 +178,7 @@ class Slot:
     target: int
     cell: Index
     site: Index
-    rest: Components
+    rest: Vector[float]
     shell: int
 
 
@@ -225,7 +225,7 @@ class CellPolygon:
     corners: tuple[Offset, ...]
 
     @cached_property
-    def rest(self) -> tuple[Components, ...]:
+    def rest(self) -> tuple[Vector[float], ...]:
         """X_k - X_0 of the corners, lattice units."""
         return tuple(corner.rest for corner in self.corners)
 

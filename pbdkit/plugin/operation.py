@@ -5,12 +5,13 @@ their rule.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from pydantic import Field
 
 from pbdkit.plugin.component import Component
 from pbdkit.plugin.particles import Selection
+from pbdkit.plugin.vector import Parameters, Vector
 
 
 class ParticleOperation(Component):
@@ -38,6 +39,6 @@ class ParticleOperation(Component):
 
     @staticmethod
     @abstractmethod
-    def displacement(u: Any, new: Any, p: Any) -> Any:
+    def displacement(u: Vector, new: Vector, p: Parameters) -> Vector:
         """The displacement of a particle at the end of the step, a vector, elementwise: `u` is that
         at its beginning, and `new` where the rule, and operations before, have moved it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pbdkit.plugin.component import Remembers
 from pbdkit.plugin.fields import TakesFields
 from pbdkit.plugin.lattice import Cell, Slot, Tiling
-from pbdkit.plugin.vector import Components
+from pbdkit.plugin.vector import Number, Numbers, Parameters, Vector, Weights
 
 
 class Here(NamedTuple):
@@ -26,10 +26,10 @@ class Here(NamedTuple):
     by name.
     """
 
-    u: Any
-    X: Any = None
-    centred: Any = None
-    own: Any = ()
+    u: Vector
+    X: Vector = cast(Vector, None)
+    centred: Vector = cast(Vector, None)
+    own: Numbers = cast(Numbers, ())
 
 
 class Stiffness(NamedTuple):
@@ -57,8 +57,8 @@ class Setting:
 
     cell: Cell
     slots: tuple[tuple[Slot, ...], ...]
-    lower: Components
-    upper: Components
+    lower: Vector[float]
+    upper: Vector[float]
     cells: Tiling = field(default_factory=Tiling)
 
 
@@ -123,12 +123,12 @@ class FollowerRule(TakesFields):
 
     @staticmethod
     @abstractmethod
-    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector | Number, ...]:
         """The contributions of one neighbour, elementwise."""
 
     @staticmethod
     @abstractmethod
-    def apply(total: Any, here: Here, p: Any) -> Any:
+    def apply(total: tuple[Any, ...], here: Here, p: Parameters) -> Vector:
         """The move of the follower (target - where it stands in m), elementwise."""
 
 
@@ -146,7 +146,7 @@ class Calibrated(ABC):
 
     @staticmethod
     @abstractmethod
-    def force(total: Any, here: Here, p: Any) -> Any:
+    def force(total: tuple[Any, ...], here: Here, p: Parameters) -> Vector:
         """The force of the neighbours on the particle over Young's modulus and thickness, a vector
         in the lattice's units, from the sums. It vanishes in equilibrium."""
 
@@ -156,7 +156,7 @@ class Loadable(Calibrated):
 
     @staticmethod
     @abstractmethod
-    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+    def loaded(total: tuple[Any, ...], load: Vector, p: Parameters) -> tuple[Vector | Number, ...]:
         """The sums as they would be if a neighbour exerted the force `load` besides, a vector over
         Young's modulus and thickness in the lattice's units, elementwise:
 
@@ -171,7 +171,7 @@ class StoresEnergy(Calibrated):
 
     @staticmethod
     @abstractmethod
-    def energy(d: Any, r: Any, w: Any, p: Any) -> Any:
+    def energy(d: Vector, r: Vector, w: Weights, p: Parameters) -> Number:
         """The half of a bond's strain energy that falls to this end, over Young's modulus and
         thickness, elementwise."""
 
@@ -180,10 +180,10 @@ class Torn(NamedTuple):
     """Damage beside a bond, 0 where nothing is damaged and 1 where a bond is broken: the largest of
     any bond of the cell to the left and to the right of it, and its own in each of the two."""
 
-    left: Any
-    right: Any
-    bond_left: Any
-    bond_right: Any
+    left: Number
+    right: Number
+    bond_left: Number
+    bond_right: Number
 
 
 class TearsCells(Calibrated):
@@ -196,7 +196,9 @@ class TearsCells(Calibrated):
 
     @staticmethod
     @abstractmethod
-    def torn(d: Any, r: Any, w: Any, t: Torn, p: Any) -> tuple[Any, ...]:
+    def torn(
+        d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters
+    ) -> tuple[Vector | Number, ...]:
         """The contributions of one neighbour, as `gather` returns them, with the damage t beside
         the bond; those of `gather`, to the last bit, where t is zero."""
 
@@ -226,7 +228,7 @@ class RenewsParticles(Remembers):
 
     @staticmethod
     @abstractmethod
-    def remember(total: Any, here: Here, p: Any) -> tuple[Any, ...]:
+    def remember(total: tuple[Any, ...], here: Here, p: Parameters) -> tuple[Number, ...]:
         """The new values of the numbers that change, in their order, from what `apply` is given.
 
         Leaders remember as followers do; who has no neighbour keeps its numbers.
@@ -240,7 +242,9 @@ class SharesParticles(Remembers):
 
     @staticmethod
     @abstractmethod
-    def gather(d: Any, r: Any, w: Any, p: Any, own: Any, there: Any) -> tuple[Any, ...]:
+    def gather(
+        d: Vector, r: Vector, w: Weights, p: Parameters, own: Numbers, there: Numbers
+    ) -> tuple[Vector | Number, ...]:
         """The contributions of one neighbour, elementwise. ``own.name`` is what is remembered of
         the particle, ``there.name`` what is remembered of the neighbour, both before the step."""
 

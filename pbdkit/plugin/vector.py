@@ -1,108 +1,182 @@
-"""Vectors, and the operations in which elementwise functions are written.
+"""Vectors, and the functions in which elementwise functions are written.
 
-The functions of a rule are called with whole arrays, single numbers or probes, always one value a
-component. They use + - * /, the functions of numpy, and `where` for choices.
+A rule's functions are called with whole arrays, with single numbers or with probes, always one
+value a component. They use + - * /, the functions of numpy, and choose with `where`.
 """
 
 from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Callable, Iterable
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast, overload
 
 import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import TypeVar
+
+Number: TypeAlias = float | NDArray[np.floating[Any]]
+"""A value of an elementwise function: one number, or an array with one for each place."""
+Condition: TypeAlias = bool | NDArray[np.bool_]
+"""A comparison of such values."""
+
+T = TypeVar("T", covariant=True, default=Number)
+V = TypeVar("V", bound="Vector[Any]")
+
+if TYPE_CHECKING:
+
+    class _Plane(tuple[T, ...]):
+        @property
+        def x(self) -> T: ...
+        @property
+        def y(self) -> T: ...
+        def __new__(cls, x: T, y: T) -> Self: ...
+
+    class _Space(tuple[T, ...]):
+        @property
+        def z(self) -> T: ...
+        def __new__(cls, x: T, y: T, z: T) -> Self: ...
+
+else:  # named tuples, which numba compiles
+    _Plane = namedtuple("Vector", ("x", "y"))
+    _Space = namedtuple("SpaceVector", ("x", "y", "z"))
 
 
-class Components(tuple[Any, ...]):
-    """A vector by components; each is a number or an array, all of one shape.
+class Vector(_Plane[T]):
+    """A vector by components: numbers, or arrays of one shape.
 
     Vectors add, subtract and are scaled as vectors are; with `+` no tuple is made longer.
+
+    Parameters
+    ----------
+    x, y : T
+        The components along the axes. ``Vector[float]`` has numbers, and ``Vector`` alone, as
+        elementwise functions take it, numbers or arrays (`Number`).
+
+    Examples
+    --------
+    >>> 2.0 * Vector(1.0, 2.0) - Vector(0.5, 0.0)
+    Vector(x=1.5, y=4.0)
     """
 
     __slots__ = ()
-    __array_ufunc__ = None  # so that array * vector asks the vector
-
-    @property
-    def x(self) -> Any:
-        """The component along the first axis."""
-        return self[0]
-
-    @property
-    def y(self) -> Any:
-        """The component along the second axis."""
-        return self[1]
+    __array_ufunc__ = None  # array * vector is then computed by the vector
 
     def each(self, function: Callable[..., Any], *others: Iterable[Any]) -> Self:
-        """The vector of function(component, ...), component by component."""
+        """Return the vector of function(component, ...), component by component."""
         return self._of([function(*parts) for parts in zip(self, *others, strict=True)])
 
     def _of(self, components: list[Any]) -> Self:
         return tuple.__new__(type(self), components)
 
-    def __add__(self, other: Any) -> Self:
-        return self._of([a + b for a, b in zip(self, other, strict=True)])
+    def __add__(self, other: Vector[Any]) -> Self:  # type: ignore[override]  # no concatenation
+        return self._of([a + b for a, b in zip(cast(Any, self), other, strict=True)])
 
-    def __sub__(self, other: Any) -> Self:
-        return self._of([a - b for a, b in zip(self, other, strict=True)])
+    def __sub__(self, other: Vector[Any]) -> Self:
+        return self._of([a - b for a, b in zip(cast(Any, self), other, strict=True)])
 
     def __neg__(self) -> Self:
-        return self._of([-component for component in self])
+        return self._of([-component for component in cast(Any, self)])
 
-    def __mul__(self, factor: Any) -> Self:
-        return self._of([component * factor for component in self])
+    def __mul__(self, factor: Number) -> Self:  # type: ignore[override]  # no repetition
+        return self._of([component * factor for component in cast(Any, self)])
 
-    def __rmul__(self, factor: Any) -> Self:
-        return self._of([factor * component for component in self])
+    def __rmul__(self, factor: Number) -> Self:  # type: ignore[override]
+        return self._of([factor * component for component in cast(Any, self)])
 
-    def __truediv__(self, divisor: Any) -> Self:
-        return self._of([component / divisor for component in self])
+    def __truediv__(self, divisor: Number) -> Self:
+        return self._of([component / divisor for component in cast(Any, self)])
 
 
-class Vector(namedtuple("Vector", ("x", "y")), Components):
-    """A vector in the plane."""
+class SpaceVector(_Space[T], Vector[T]):
+    """A vector in space, with a third component `z`.
+
+    Parameters
+    ----------
+    x, y, z : T
+        The components along the axes.
+    """
 
     __slots__ = ()
 
 
-class SpaceVector(namedtuple("SpaceVector", ("x", "y", "z")), Components):
-    """A vector in space."""
-
-    __slots__ = ()
-
-
-KINDS: dict[int, type[Components]] = {2: Vector, 3: SpaceVector}
+KINDS: dict[int, type[Vector[Any]]] = {2: Vector, 3: SpaceVector}
 """The kind of vector by its number of components."""
 
 
 def vector(components: Iterable[Any]) -> Any:
-    """The vector with these components; ValueError where there are neither two nor three."""
+    """Return the vector with these components; ValueError unless there are two or three."""
     values = tuple(components)
     if len(values) not in KINDS:
         raise ValueError(f"a vector has two or three components, not {len(values)}")
     return KINDS[len(values)](*values)
 
 
+@overload
+def where(condition: Any, yes: V, no: V) -> V: ...
+@overload
+def where(condition: Any, yes: Number, no: Number) -> Number: ...
 def where(condition: Any, yes: Any, no: Any) -> Any:
-    """`yes` where the condition holds, else `no`, elementwise; both numbers or both vectors.
+    """Return `yes` where the condition holds, else `no`, elementwise.
 
-    Elementwise functions choose with this and not with `numpy.where`: a compiled engine knows it.
+    Elementwise functions choose with this and not with `numpy.where`, which compiled engines do
+    not take for vectors.
+
+    Parameters
+    ----------
+    condition : bool or array of bool
+        A comparison.
+    yes, no : Number or Vector
+        Both numbers, or both vectors.
+
+    Returns
+    -------
+    Number or Vector
+        As `yes` and `no` are.
     """
-    if isinstance(yes, Components):
+    if isinstance(yes, Vector):
         return yes.each(lambda a, b: np.where(condition, a, b), no)
     return np.where(condition, yes, no)
 
 
-def dot(a: Components, b: Components) -> Any:
-    """a·b = a_x b_x + a_y b_y."""
-    products = [one * other for one, other in zip(a, b, strict=True)]
-    return sum(products[1:], products[0])
+def dot(a: Vector[T], b: Vector[T]) -> T:
+    """Return a·b = a_x b_x + a_y b_y."""
+    products: list[Any] = [one * other for one, other in zip(a, cast(Any, b), strict=True)]
+    return cast(T, sum(products[1:], products[0]))
 
 
-def squared_length(v: Components) -> Any:
-    """v·v; the same to the last bit for v and -v."""
+def squared_length(v: Vector[T]) -> T:
+    """Return v·v; the same to the last bit for v and -v."""
     return dot(v, v)
 
 
-def length(v: Components) -> Any:
-    """√(v·v)."""
-    return np.sqrt(squared_length(v))
+def length(v: Vector[T]) -> T:
+    """Return √(v·v)."""
+    square: Any = squared_length(v)
+    root: T = np.sqrt(square)
+    return root
+
+
+if TYPE_CHECKING:
+
+    class Numbers:
+        """Named numbers that an elementwise function sees as attributes."""
+
+        def __getattr__(self, name: str) -> Number: ...
+
+else:
+
+    class Numbers:
+        """Named numbers that an elementwise function sees as attributes; named tuples at run
+        time."""
+
+
+class Parameters(Numbers):
+    """The parameters of a component, seen as ``p.name``."""
+
+
+class Weights(Numbers):
+    """The constants of a slot that a rule declares, seen as ``w.name``."""
+
+
+class Constants(Numbers):
+    """The constants of a slot, and what is remembered of the bond, seen as ``c.name``."""

@@ -119,7 +119,7 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
     for name, region in experiment.regions.items():
         cell = experiment.lattice.cell()
         x, y = raster.reference(raster.body_rows).T
-        near = max(float(np.hypot(*vector)) for vector in cell.vectors)
+        near = max(float(np.hypot(v.x, v.y)) for v in cell.vectors)
         if name not in named:
             yield f"regions.{name}: nothing names it, so that it changes nothing"
         elif not raster.communicator.any((signed_distance(region, cell, x, y) <= near).any()):

@@ -36,12 +36,12 @@ from pbdkit.lattice.raster import LeftOut, Raster, RowLayout, RowRange, distinct
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
     AppliesTwice,
-    Components,
     MixesCells,
     Remembers,
     Setting,
     StartsCracked,
     TearsCells,
+    Vector,
 )
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.fracture import Segment
@@ -189,7 +189,7 @@ class Scene:
     leading: tuple[Leading, ...]
     loads: Loads | None
     setting: Setting
-    middle: Components
+    middle: Vector[float]
     warnings: tuple[str, ...]
     barriers: tuple[Barrier, ...] = ()
     operations: tuple[Operated, ...] = ()

@@ -15,7 +15,7 @@ import numpy as np
 from pbdkit.lattice.neighbourhood import Neighbourhood
 from pbdkit.lattice.raster import positions
 from pbdkit.model.solver import Stepping
-from pbdkit.plugin import Components, Here, StoresEnergy
+from pbdkit.plugin import Here, StoresEnergy, Vector
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.rule import shares_particles
@@ -249,7 +249,7 @@ def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
 
 def _summed(part: Any, owner: Indices, count: int) -> Any:
     """Σ over the pairs of each owner, in their order."""
-    if isinstance(part, Components):
+    if isinstance(part, Vector):
         return part.each(lambda values: _summed(values, owner, count))
     return np.bincount(owner, np.broadcast_to(part, owner.shape), count)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.lattice.neighbourhood import bonds_in, plane_block
-from pbdkit.plugin import CellStress, Components, FractureModel, SoftensCells, length
+from pbdkit.plugin import CellStress, FractureModel, SoftensCells, Vector, length
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers
@@ -93,7 +93,7 @@ class Fracturing:
         )
 
     def _renewed(
-        self, m: NDArray[Any], state: State, when: str, nudge: Components | None = None
+        self, m: NDArray[Any], state: State, when: str, nudge: Vector | None = None
     ) -> Iterator[_Renewed]:
         """Part by part the bonds of each slot where they are kept. What is remembered is renewed in
         place; not where d is nudged, all alike, to see."""
@@ -153,8 +153,8 @@ class _Renewed(NamedTuple):
     """Some bonds along a slot where they are kept, with what is remembered of them."""
 
     home: Home
-    d: Components
-    r: Components
+    d: Vector
+    r: Vector
     limits: Any
     own: list[NDArray[Any]]
     intact: NDArray[np.bool_]

@@ -23,7 +23,6 @@ from pbdkit.lattice.raster import EMPTY, FOLLOWER, Raster, Where
 from pbdkit.plugin import (
     Calibrated,
     CellStress,
-    Components,
     FollowerRule,
     Here,
     Loadable,
@@ -34,6 +33,7 @@ from pbdkit.plugin import (
     SoftensCells,
     StoresEnergy,
     Torn,
+    Vector,
     where,
 )
 from pbdkit.plugin.component import as_values, as_vector, as_verdict
@@ -59,7 +59,7 @@ class Neighbour:
     beside the bond, for rules that tear cells, where there is any; such rules see the difference
     as it is."""
 
-    r: Components
+    r: Vector
     w: Any
     present: Mask | None = None
     broken: Mask | None = None
@@ -87,20 +87,20 @@ class Evaluator:
         found._p = p
         return found
 
-    def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
+    def contribution(self, d: Vector, u: Vector, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
         seen = d if self.tears else self.seen(d, u, to)
         parts = (self._of_weights(seen, to, w) for w in (to.w, *to.more))
         return summed((as_values(part, "gather"), None) for part in parts)
 
-    def _of_weights(self, d: Components, to: Neighbour, w: Any) -> Any:
+    def _of_weights(self, d: Vector, to: Neighbour, w: Any) -> Any:
         """What the rule makes of a difference with some weights."""
         rule: Any = self.rule  # some are given more than others
         if to.torn is not None:
             return rule.torn(d, to.r, w, to.torn, self._p)
         return rule.gather(d, to.r, w, self._p, *to.shared)
 
-    def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
+    def energy(self, d: Vector, u: Vector, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""
         assert isinstance(self.rule, StoresEnergy)
         if self.tears:
@@ -111,7 +111,7 @@ class Evaluator:
             return (self.rule.energy(d, to.r, w, self._p),)
         return (self.rule.energy(self.seen(d, u, to), to.r, to.w, self._p),)
 
-    def seen(self, d: Components, u: Components, to: Neighbour) -> Components:
+    def seen(self, d: Vector, u: Vector, to: Neighbour) -> Vector:
         """The difference that the rule sees: softened, or that of the fictitious point where the
         bond broke."""
         model = self._model
@@ -124,7 +124,7 @@ class Evaluator:
                 d = as_vector(model.seen(d, lost, to.r, to.c, self._q), "seen", u)
         return d if to.broken is None else where(to.broken, lost, d)
 
-    def damage(self, r: Components, c: Any) -> tuple[Any, Any]:
+    def damage(self, r: Vector, c: Any) -> tuple[Any, Any]:
         """The share of its pull that a bond with the constants c, which has not broken, has lost in
         the cells to its left and right."""
         model: Any = self._model
@@ -135,7 +135,7 @@ class Evaluator:
             seen = as_vector(model.seen(ahead, nothing, r, c, self._q), "seen", ahead)
         return (1.0 - seen[0],) * 2
 
-    def move(self, total: Contributions, here: Here, load: Components | None = None) -> Any:
+    def move(self, total: Contributions, here: Here, load: Vector | None = None) -> Any:
         """From where the particle stands to its target, under a load if there is any."""
         if load is not None:
             assert isinstance(self.rule, Loadable)
@@ -161,8 +161,8 @@ class Evaluator:
 
     def renew_bonds(
         self,
-        d: Components,
-        r: Components,
+        d: Vector,
+        r: Vector,
         limits: Any,
         own: Sequence[Any],
         intact: Mask,
@@ -186,7 +186,7 @@ class Evaluator:
         assert isinstance(self._model, SoftensCells)
         return self._model.load(cell, self._scene.constants.of_bond(*limits, *shown(own)), self._q)
 
-    def breaks(self, d: Components, r: Components, limits: Any, own: Sequence[Any]) -> Any:
+    def breaks(self, d: Vector, r: Vector, limits: Any, own: Sequence[Any]) -> Any:
         """Whether bonds break that remember these numbers."""
         c = self._scene.constants.of_bond(*limits, *shown(own))
         return as_verdict(self._model.breaks(d, r, c, self._q))
@@ -224,12 +224,12 @@ def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
 
 
 def _nothing(like: Any) -> Any:
-    return like.each(lambda _: 0.0) if isinstance(like, Components) else 0.0
+    return like.each(lambda _: 0.0) if isinstance(like, Vector) else 0.0
 
 
 BLOCK_CELLS = 16384
 """Places a block: small enough for its temporaries to stay in the cache."""
-Contributing = Callable[[Components, Components, Neighbour], Contributions]
+Contributing = Callable[[Vector, Vector, Neighbour], Contributions]
 """What a neighbour contributes, given d and u."""
 
 
@@ -264,7 +264,7 @@ class Surroundings:
         origin = self._scene.raster.lattice.origin
         return local.each(np.add, origin), local.each(np.subtract, self._scene.middle)
 
-    def differences(self, u: NDArray[Any]) -> list[Components]:
+    def differences(self, u: NDArray[Any]) -> list[Vector]:
         """u_k - u_j along each slot."""
         here = vector(self.where.of(u))
         return [vector(there.of(u)) - here for there in self._there]

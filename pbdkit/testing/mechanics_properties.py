@@ -50,7 +50,7 @@ AXES: dict[str, Floats] = {
 }
 REMEDY = (
     "compare lengths with those of the neighbours at rest, and annotate parameters that are "
-    "lengths with `pbdkit.LENGTH`, powers of lengths with a `pbdkit.Quantity`"
+    "lengths with `pbdkit.plugin.LENGTH`, powers of lengths with a `pbdkit.plugin.Quantity`"
 )
 EVEN = {"type": "grid", "columns": 5, "rows": 5}
 """A body that is its own image."""

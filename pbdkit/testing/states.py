@@ -133,7 +133,7 @@ def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> An
 
 def standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
     """What stands at a particle."""
-    place = X if scene.experiment.rule.uses_reference else None
+    place: Any = X if scene.experiment.rule.uses_reference else None
     return Here(u, place, place, scene.constants.of_particle(*own))
 
 

@@ -140,7 +140,9 @@ def follows_translations(subject: Subject) -> None:
             if isinstance(component, FollowerRule):
                 remedy = ": use differences `d`, not `here.u`, or declare `uses_reference`"
             elif isinstance(component, FramePolicy):
-                remedy = ": let the weights of each point sum to 1, or take on `pbdkit.Anchors`"
+                remedy = (
+                    ": let the weights of each point sum to 1, or take on `pbdkit.plugin.Anchors`"
+                )
             fault = f"a translated body moves otherwise, by {most:.3g} of its displacement"
             raise PropertyError(f"{fault}, {place_of(scene.experiment)}{remedy}")
     if anchors and most <= STEP_ROUNDING:

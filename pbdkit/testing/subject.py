@@ -26,7 +26,6 @@ from pbdkit.plugin import (
     LISTS,
     CellStress,
     Component,
-    Components,
     Diagnostic,
     Draws,
     FollowerRule,
@@ -42,6 +41,7 @@ from pbdkit.plugin import (
     RenewsParticles,
     Softens,
     SoftensCells,
+    Vector,
 )
 from pbdkit.plugin.component import as_vector
 from pbdkit.plugin.discovery import interface_of
@@ -76,7 +76,7 @@ Arrays = dict[str, Any]
 
 def flat(tree: Any, name: str = "") -> Arrays:
     """The arrays and numbers of a tree by name."""
-    if isinstance(tree, Components):
+    if isinstance(tree, Vector):
         parts = {f"{name}.{c}".lstrip("."): v for c, v in zip("xyz", tree, strict=False)}
     elif isinstance(tree, dict) or is_dataclass(tree):
         named = tree if isinstance(tree, dict) else vars(tree)
@@ -90,7 +90,7 @@ def flat(tree: Any, name: str = "") -> Arrays:
 
 def each(change: Callable[[Any], Any], tree: Any) -> Any:
     """The tree of what a function makes of every array and number."""
-    if isinstance(tree, Components):
+    if isinstance(tree, Vector):
         return tree.each(change)
     if isinstance(tree, dict):
         return {name: each(change, part) for name, part in tree.items()}

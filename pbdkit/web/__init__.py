@@ -5,7 +5,7 @@ A body that answers to the mouse: what is done to it is what an experiment file 
 
 from __future__ import annotations
 
-from pbdkit.plugin.discovery import Command, hookimpl
+from pbdkit.plugin import Command, hookimpl
 
 
 @hookimpl

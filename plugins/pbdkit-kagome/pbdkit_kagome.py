@@ -12,26 +12,34 @@ from typing import Literal
 
 from pydantic import Field
 
-import pbdkit
+from pbdkit.plugin import (
+    BasisSite,
+    Cell,
+    Component,
+    Lattice,
+    NeighbourMetric,
+    Offset,
+    Vector,
+    hookimpl,
+    length,
+)
 
 pbdkit_api = 1
 
 
-class _Vacant(pbdkit.Lattice):
+class _Vacant(Lattice):
     """What hexagonal lattices with vacancies share: the sites that are left of a rectangle."""
 
     a: float = Field(1.0, gt=0.0, description="Length of a bond (lattice units).")
 
-    def _cell(self, period: tuple[int, int], kept: Sequence[tuple[int, int]]) -> pbdkit.Cell:
+    def _cell(self, period: tuple[int, int], kept: Sequence[tuple[int, int]]) -> Cell:
         """The rectangle of `period` sites of the hexagonal lattice, with those that are `kept`."""
         a, row = _triangle(self.a)
         columns, rows = period
-        return pbdkit.Cell(
-            vectors=(pbdkit.Vector(columns * a, 0.0), pbdkit.Vector(0.0, rows * row)),
+        return Cell(
+            vectors=(Vector(columns * a, 0.0), Vector(0.0, rows * row)),
             sites=tuple(
-                pbdkit.BasisSite(
-                    pbdkit.Vector((i + j % 2 / 2) * a, j * row), (i, j), (i - j // 2, j)
-                )
+                BasisSite(Vector((i + j % 2 / 2) * a, j * row), (i, j), (i - j // 2, j))
                 for i, j in kept
             ),
             period=period,
@@ -48,7 +56,7 @@ class Kagome(_Vacant):
 
     type: Literal["kagome"] = "kagome"
 
-    def cell(self) -> pbdkit.Cell:
+    def cell(self) -> Cell:
         """Six sites in a rectangle of 2 a × 2√3 a."""
         return self._cell((2, 4), ((0, 0), (1, 0), (0, 1), (0, 2), (1, 2), (1, 3)))
 
@@ -62,12 +70,12 @@ class Honeycomb(_Vacant):
 
     type: Literal["honeycomb"] = "honeycomb"
 
-    def cell(self) -> pbdkit.Cell:
+    def cell(self) -> Cell:
         """Four sites in a rectangle of 3 a × √3 a."""
         return self._cell((3, 2), ((0, 0), (1, 0), (1, 1), (2, 1)))
 
 
-class BondSteps(pbdkit.NeighbourMetric):
+class BondSteps(NeighbourMetric):
     """Shell n is everybody who is n bonds away, where bonds join the nearest sites.
 
     Distance alone cannot tell the neighbours of a lattice with a basis apart: on the kagome
@@ -80,7 +88,7 @@ class BondSteps(pbdkit.NeighbourMetric):
         1, ge=1, le=8, description="How many bonds away neighbours are at most.", examples=[2]
     )
 
-    def shells_around(self, cell: pbdkit.Cell, sublattice: int) -> list[list[pbdkit.Offset]]:
+    def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
         """Breadth first over the bonds of all sublattices."""
         bonds = _nearest(cell)
         reach = self.shells * max(bond.length for own in bonds for bond in own) * (1 + 1e-9)
@@ -99,7 +107,7 @@ class BondSteps(pbdkit.NeighbourMetric):
         return shells
 
 
-def _nearest(cell: pbdkit.Cell) -> list[list[pbdkit.Offset]]:
+def _nearest(cell: Cell) -> list[list[Offset]]:
     """The bonds of each sublattice: to the nearest sites of the lattice, within 1e-6 relative."""
     # A cell vector leads to a site of the same sublattice: nobody's nearest is farther away.
     radius = min(math.hypot(*vector) for vector in cell.vectors) * (1 + 1e-6)
@@ -123,13 +131,13 @@ def _triangle(side: float) -> tuple[float, float]:
 
 
 def _heights(side: float) -> list[float]:
-    """Floating-point numbers around side · √3/2 that pbdkit.length finds to be the height."""
+    """Floating-point numbers around side · √3/2 that length finds to be the height."""
     height = side * math.sqrt(3.0) / 2
     near = (height + n * math.ulp(height) for n in range(-4, 5))
-    return [h for h in near if pbdkit.length(pbdkit.Vector(side / 2, h)) == side]
+    return [h for h in near if length(Vector(side / 2, h)) == side]
 
 
-@pbdkit.hookimpl
-def pbdkit_components() -> list[type[pbdkit.Component]]:
+@hookimpl
+def pbdkit_components() -> list[type[Component]]:
     """What this distribution offers."""
     return [Kagome, Honeycomb, BondSteps]

@@ -8,12 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-import pbdkit
+from pbdkit.plugin import (
+    Bonds,
+    BreaksAtStrain,
+    Component,
+    Draws,
+    FractureModel,
+    Remembered,
+    Slot,
+    Vector,
+    hookimpl,
+    length,
+)
 
 pbdkit_api = 1
 
 
-class Weibull(pbdkit.Draws, pbdkit.BreaksAtStrain, pbdkit.FractureModel):
+class Weibull(Draws, BreaksAtStrain, FractureModel):
     """A bond breaks when its strain |r + d| / |r| - 1 exceeds a strength of its own.
 
     Strengths are drawn once, by the experiment's seed, so that a bond bears the strain ε with
@@ -40,37 +51,35 @@ class Weibull(pbdkit.Draws, pbdkit.BreaksAtStrain, pbdkit.FractureModel):
         """As `frame_bonds` says."""
         return self.frame_bonds
 
-    def constants(self, slot: pbdkit.Slot) -> dict[str, float]:
+    def constants(self, slot: Slot) -> dict[str, float]:
         """The rest length."""
-        return {"rest": pbdkit.length(slot.rest)}
+        return {"rest": length(slot.rest)}
 
-    def remembered(self) -> tuple[pbdkit.Remembered, ...]:
+    def remembered(self) -> tuple[Remembered, ...]:
         """The strength of each bond, which stays."""
-        return (
-            pbdkit.Remembered("strength", "strain at which the bond breaks", "1", changes=False),
-        )
+        return (Remembered("strength", "strain at which the bond breaks", "1", changes=False),)
 
-    def draw(self, owners: pbdkit.Bonds, generator: np.random.Generator) -> dict[str, NDArray[Any]]:
+    def draw(self, owners: Bonds, generator: np.random.Generator) -> dict[str, NDArray[Any]]:
         """scale · E^(1/modulus), E exponentially distributed with mean 1."""
         return {"strength": self.scale * generator.weibull(self.modulus, len(owners))}
 
     @staticmethod
-    def breaks(d: pbdkit.Vector, r: pbdkit.Vector, c: Any, p: Any) -> Any:
+    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
         """|r + d| > |r| (1 + strength)."""
-        return pbdkit.length(r + d) > c.rest + c.rest * c.strength
+        return length(r + d) > c.rest + c.rest * c.strength
 
     @staticmethod
-    def breaking_strain(r: pbdkit.Vector, c: Any, p: Any) -> Any:
+    def breaking_strain(r: Vector, c: Any, p: Any) -> Any:
         """The strength, for `pbdkit explain`."""
         return c.strength
 
     @staticmethod
-    def fictitious(u: pbdkit.Vector, r: pbdkit.Vector, p: Any) -> pbdkit.Vector:
+    def fictitious(u: Vector, r: Vector, p: Any) -> Vector:
         """The undeformed cell."""
         return 0.0 * r
 
 
-@pbdkit.hookimpl
-def pbdkit_components() -> list[type[pbdkit.Component]]:
+@hookimpl
+def pbdkit_components() -> list[type[Component]]:
     """What this distribution offers."""
     return [Weibull]

@@ -38,7 +38,7 @@ class OwnElastic(pbdkit.FollowerRule):
     type: Literal["own-elastic"] = "own-elastic"
     poisson_ratio: float = 0.3
 
-    def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> dict[str, float]:
+    def weights(self, slot: pbdkit.plugin.Slot, setting: pbdkit.plugin.Setting) -> dict[str, float]:
         nu = self.poisson_ratio
         x, y = np.sign(slot.rest.x), np.sign(slot.rest.y)
         if x and y:
@@ -50,7 +50,7 @@ class OwnElastic(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return (pbdkit.Vector(w.xx * d.x + w.xy * d.y, w.xy * d.x + w.yy * d.y),)
+        return (pbdkit.plugin.Vector(w.xx * d.x + w.xy * d.y, w.xy * d.x + w.yy * d.y),)
 
     @staticmethod
     def apply(total, here, p):

@@ -32,7 +32,7 @@ def shear(by):
 def source(name: str = "shear", target: str = "pbdkit_target:shear", does: str = "Shears.") -> str:
     return (
         "import pbdkit\n@pbdkit.hookimpl\ndef pbdkit_commands():\n"
-        f"    return [pbdkit.Command({name!r}, {target!r}, {does!r})]\n"
+        f"    return [pbdkit.plugin.Command({name!r}, {target!r}, {does!r})]\n"
     )
 
 
@@ -115,7 +115,7 @@ BROKEN = {
     ),
     "no command": (
         "import pbdkit\n@pbdkit.hookimpl\ndef pbdkit_commands():\n    return [3]\n",
-        "TypeError: 3 is no pbdkit.Command",
+        "TypeError: 3 is no pbdkit.plugin.Command",
     ),
     "no name": (source("Shear it"), "TypeError: 'Shear it' is no name for a command"),
     "no target": (source(target="pbdkit_target"), "TypeError: the target of the command 'shear'"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pbdkit import Experiment, Here, Vector, load
+from pbdkit import Experiment, load
 from pbdkit.components import pbdkit_components
 from pbdkit.components.elasticity import Elastic
 from pbdkit.components.fracture import NoFracture, StrainFracture, Threshold
@@ -24,7 +24,7 @@ from pbdkit.components.rules import (
 from pbdkit.lattice.cells import tiling_of
 from pbdkit.lattice.neighbourhood import build_neighbourhood
 from pbdkit.model.shipped import shipped_names
-from pbdkit.plugin import Setting
+from pbdkit.plugin import Here, Setting, Vector
 from pbdkit.plugin.units import is_needed
 
 REQUIRED = {

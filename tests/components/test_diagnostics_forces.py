@@ -247,7 +247,7 @@ def test_reactions_without_leaders_are_refused():
     assert str(caught.value) == "diagnostics.0: 'reaction' is of leader groups, and there is none"
 
 
-class Loose(pbdkit.Calibrated, pbdkit.FollowerRule):
+class Loose(pbdkit.plugin.Calibrated, pbdkit.FollowerRule):
     """A calibrated rule without weights, for neighbours that come and go."""
 
     type: Literal["loose"] = "loose"
@@ -279,7 +279,7 @@ def test_forces_of_neighbours_that_come_and_go_are_refused():
     )
 
 
-class Forceless(pbdkit.Calibrated, pbdkit.FollowerRule):
+class Forceless(pbdkit.plugin.Calibrated, pbdkit.FollowerRule):
     """A calibrated rule that does not say what its forces are."""
 
     type: Literal["forceless"] = "forceless"

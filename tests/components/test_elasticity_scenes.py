@@ -152,11 +152,11 @@ def test_cells_between_given_sites_are_whole():
     assert scene().cells.share.sum() == 5 * 4
 
 
-class Tiring(pbdkit.Remembers, StrainGradient):
+class Tiring(pbdkit.plugin.Remembers, StrainGradient):
     type: Literal["tiring"] = "tiring"
 
     def remembered(self):
-        return (pbdkit.Remembered("tiredness", "how tired it is", "1"),)
+        return (pbdkit.plugin.Remembered("tiredness", "how tired it is", "1"),)
 
 
 def test_a_rule_on_the_moves_of_another_remembers_nothing():

@@ -202,7 +202,7 @@ class Pushed(pbdkit.FollowerRule):
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / 4 + pbdkit.Vector(0.01, 0.0)
+        return total[0] / 4 + pbdkit.plugin.Vector(0.01, 0.0)
 
 
 def test_a_part_that_is_pushed_on_for_ever_is_refused_by_name():

@@ -7,10 +7,16 @@ from typing import Literal
 import numpy as np
 
 import pbdkit
-from pbdkit import Remembered
+from pbdkit.plugin import (
+    Remembered,
+    SharesParticles,
+    TurnsParticles,
+    Vector,
+    length,
+)
 
 
-class Vane(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.FollowerRule):
+class Vane(SharesParticles, TurnsParticles, pbdkit.FollowerRule):
     """Particles go to the mean of where their neighbours see them, and turn as these do: what the
     others would be without their fault."""
 
@@ -33,14 +39,14 @@ class Vane(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.FollowerRule):
     @staticmethod
     def remember(total, here, p):
         c, s = 2.0 * here.own.vane_cos + total[2], 2.0 * here.own.vane_sin + total[3]
-        size = 1e-6 + pbdkit.length(pbdkit.Vector(c, s))
+        size = 1e-6 + length(Vector(c, s))
         return c / size, s / size
 
 
 def off(d, r, there):
     """How far the neighbour stands from where it would, turned as it is."""
     c, s = there.vane_cos, there.vane_sin
-    return r + d - pbdkit.Vector(c * r.x - s * r.y, s * r.x + c * r.y)
+    return r + d - Vector(c * r.x - s * r.y, s * r.x + c * r.y)
 
 
 class Compass(Vane):
@@ -82,5 +88,5 @@ class Creeps(Vane):
 
     @staticmethod
     def apply(total, here, p):
-        creep = pbdkit.Vector(1e-9 * here.own.vane_cos, 1e-9 * here.own.vane_sin)
+        creep = Vector(1e-9 * here.own.vane_cos, 1e-9 * here.own.vane_sin)
         return 0.5 * total[0] / total[1] + creep

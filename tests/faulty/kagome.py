@@ -8,6 +8,11 @@ from typing import Literal
 from faulty.rules import Sound
 
 import pbdkit
+from pbdkit.plugin import (
+    BasisSite,
+    Cell,
+    Vector,
+)
 
 
 class Kagome(pbdkit.Lattice):
@@ -17,11 +22,11 @@ class Kagome(pbdkit.Lattice):
 
     def cell(self):
         half, height = 1.0, math.sqrt(3.0)
-        right = pbdkit.BasisSite(pbdkit.Vector(half, 0.0), (1, 0), (1, 0))
-        above = pbdkit.BasisSite(pbdkit.Vector(half / 2, height / 2), (0, 1), (0, 1))
-        return pbdkit.Cell(
-            (pbdkit.Vector(2 * half, 0.0), pbdkit.Vector(half, height)),
-            (pbdkit.BasisSite(), right, above),
+        right = BasisSite(Vector(half, 0.0), (1, 0), (1, 0))
+        above = BasisSite(Vector(half / 2, height / 2), (0, 1), (0, 1))
+        return Cell(
+            (Vector(2 * half, 0.0), Vector(half, height)),
+            (BasisSite(), right, above),
             period=(2, 2),
             primitive=((2, 0), (0, 2)),
         )

@@ -9,6 +9,17 @@ import numpy as np
 from pydantic import Field
 
 import pbdkit
+from pbdkit.plugin import (
+    LENGTH,
+    Anchors,
+    BasisSite,
+    Cell,
+    FrameMap,
+    Nearness,
+    Variable,
+    Vector,
+    squared_length,
+)
 
 
 class Twins(pbdkit.Lattice):
@@ -17,10 +28,10 @@ class Twins(pbdkit.Lattice):
     type: Literal["twins"] = "twins"
 
     def cell(self):
-        twin = pbdkit.BasisSite(pbdkit.Vector(0.0, 0.0), index=(0, 1), primitive=(0, 1))
-        return pbdkit.Cell(
-            (pbdkit.Vector(1.0, 0.0), pbdkit.Vector(0.0, 2.0)),
-            (pbdkit.BasisSite(), twin),
+        twin = BasisSite(Vector(0.0, 0.0), index=(0, 1), primitive=(0, 1))
+        return Cell(
+            (Vector(1.0, 0.0), Vector(0.0, 2.0)),
+            (BasisSite(), twin),
             period=(1, 2),
             primitive=((1, 0), (0, 2)),
         )
@@ -32,7 +43,7 @@ class Flat(pbdkit.Lattice):
     type: Literal["flat"] = "flat"
 
     def cell(self):
-        return pbdkit.Cell((pbdkit.Vector(1.0, 0.0), pbdkit.Vector(2.0, 0.0)))
+        return Cell((Vector(1.0, 0.0), Vector(2.0, 0.0)))
 
 
 class Rows(pbdkit.Lattice):
@@ -43,10 +54,10 @@ class Rows(pbdkit.Lattice):
     primitive: ClassVar[tuple] = ((1, 0), (0, 2))
 
     def cell(self):
-        second = pbdkit.BasisSite(pbdkit.Vector(self.across, 1.0), index=(0, 1), primitive=(0, 1))
-        return pbdkit.Cell(
-            (pbdkit.Vector(1.0, 0.0), pbdkit.Vector(0.0, 2.0)),
-            (pbdkit.BasisSite(), second),
+        second = BasisSite(Vector(self.across, 1.0), index=(0, 1), primitive=(0, 1))
+        return Cell(
+            (Vector(1.0, 0.0), Vector(0.0, 2.0)),
+            (BasisSite(), second),
             period=(1, 2),
             primitive=self.primitive,
         )
@@ -73,8 +84,8 @@ class Skips(pbdkit.Lattice):
     type: Literal["skips"] = "skips"
 
     def cell(self):
-        vectors = pbdkit.Vector(1.0, 0.0), pbdkit.Vector(0.0, 1.0)
-        return pbdkit.Cell(vectors, primitive=((2, 0), (0, 1)))
+        vectors = Vector(1.0, 0.0), Vector(0.0, 1.0)
+        return Cell(vectors, primitive=((2, 0), (0, 1)))
 
 
 class Rooted(pbdkit.Lattice):
@@ -84,7 +95,7 @@ class Rooted(pbdkit.Lattice):
 
     def cell(self):
         a = 1.0 + 1e-9 * abs(self.origin[0])
-        return pbdkit.Cell((pbdkit.Vector(a, 0.0), pbdkit.Vector(0.0, a)))
+        return Cell((Vector(a, 0.0), Vector(0.0, a)))
 
 
 class OneSided(pbdkit.NeighbourMetric):
@@ -100,7 +111,7 @@ class Approximate(pbdkit.NeighbourMetric):
     """Rest offsets to ten digits."""
 
     type: Literal["approximate"] = "approximate"
-    radius: Annotated[float, pbdkit.LENGTH] = Field(1.35, description="How far it sees.")
+    radius: Annotated[float, LENGTH] = Field(1.35, description="How far it sees.")
 
     def shells_around(self, cell, sublattice):
         shell = cell.offsets(sublattice, self.radius)
@@ -111,7 +122,7 @@ class Favours(pbdkit.NeighbourMetric):
     """The first sublattice sees farther within itself."""
 
     type: Literal["favours"] = "favours"
-    radius: Annotated[float, pbdkit.LENGTH] = Field(1.45, description="How far it sees.")
+    radius: Annotated[float, LENGTH] = Field(1.45, description="How far it sees.")
 
     def shells_around(self, cell, sublattice):
         near = cell.offsets(sublattice, self.radius)
@@ -130,7 +141,7 @@ class Contradicts(pbdkit.NeighbourMetric):
         return [cell.offsets(sublattice, 1.5)]
 
     def nearness(self):
-        return pbdkit.Nearness(2.1, (1.0, 1.0))
+        return Nearness(2.1, (1.0, 1.0))
 
 
 class Following(pbdkit.FramePolicy):
@@ -144,7 +155,7 @@ class Following(pbdkit.FramePolicy):
     def follow(self, frame):
         point, body = frame.nearest()
         points, first = np.unique(point, return_index=True)
-        return pbdkit.FrameMap(points, body[first], np.ones(len(points)))
+        return FrameMap(points, body[first], np.ones(len(points)))
 
 
 class Alternates(Following):
@@ -157,7 +168,7 @@ class Alternates(Following):
         points, first = np.unique(point, return_index=True)
         last = np.append(first[1:], len(point)) - 1
         chosen = np.where(np.arange(len(points)) % 2 == 0, first, last)
-        return pbdkit.FrameMap(points, body[chosen], np.ones(len(points)))
+        return FrameMap(points, body[chosen], np.ones(len(points)))
 
 
 class SaysItIsLocal(Following):
@@ -171,7 +182,7 @@ class SaysItIsLocal(Following):
     def follow(self, frame):
         first = frame.body_at(np.array([frame.low], np.int32))
         count = len(frame.site)
-        return pbdkit.FrameMap(np.arange(count), np.repeat(first, count), np.ones(count))
+        return FrameMap(np.arange(count), np.repeat(first, count), np.ones(count))
 
 
 class Shrinks(Following):
@@ -184,7 +195,7 @@ class Shrinks(Following):
         return replace(found, weight=0.9 * found.weight)
 
 
-class SaysItAnchors(pbdkit.Anchors, Following):
+class SaysItAnchors(Anchors, Following):
     """Says that it ties the body to its place, and does not."""
 
     type: Literal["says-it-anchors"] = "says-it-anchors"
@@ -207,11 +218,11 @@ class Strain(pbdkit.FractureModel):
     limit: float = Field(0.5, description="The strain at which bonds break.")
 
     def constants(self, slot):
-        return {"square": (1.0 + self.limit) ** 2 * pbdkit.squared_length(slot.rest)}
+        return {"square": (1.0 + self.limit) ** 2 * squared_length(slot.rest)}
 
     @staticmethod
     def breaks(d, r, c, p):
-        return pbdkit.squared_length(r + d) > c.square
+        return squared_length(r + d) > c.square
 
     @staticmethod
     def fictitious(u, r, p):
@@ -258,7 +269,7 @@ class Measures(Strain):
 
     @staticmethod
     def breaks(d, r, c, p):
-        return pbdkit.squared_length(r + d) - c.square
+        return squared_length(r + d) - c.square
 
 
 class Tupled(Strain):
@@ -277,7 +288,7 @@ class Extent(pbdkit.Diagnostic):
     type: Literal["extent"] = "extent"
 
     def variables(self):
-        return (pbdkit.Variable("extent", ("particle",), "displacement", "lattice unit"),)
+        return (Variable("extent", ("particle",), "displacement", "lattice unit"),)
 
     def measure(self, now):
         return (np.hypot(*now.displacement().T),)
@@ -289,7 +300,7 @@ class NoUnits(Extent):
     type: Literal["no-units"] = "no-units"
 
     def variables(self):
-        return (pbdkit.Variable("extent", ("particle",), "displacement", ""),)
+        return (Variable("extent", ("particle",), "displacement", ""),)
 
 
 class TakesOurName(Extent):
@@ -298,7 +309,7 @@ class TakesOurName(Extent):
     type: Literal["takes-our-name"] = "takes-our-name"
 
     def variables(self):
-        return (pbdkit.Variable("extent", ("site",), "displacement", "lattice unit"),)
+        return (Variable("extent", ("site",), "displacement", "lattice unit"),)
 
     def coordinates(self):
         return {"site": np.arange(3)}
@@ -322,7 +333,7 @@ class Truncates(Extent):
     type: Literal["truncates"] = "truncates"
 
     def variables(self):
-        return (pbdkit.Variable("extent", ("particle",), "displacement", "1", "i4"),)
+        return (Variable("extent", ("particle",), "displacement", "1", "i4"),)
 
 
 class FromFirstRow(Extent):

@@ -11,7 +11,19 @@ from faulty.rules import Sound
 from pydantic import Field, PrivateAttr
 
 import pbdkit
-from pbdkit import Remembered
+from pbdkit.plugin import (
+    LENGTH,
+    BreaksAtStrain,
+    Draws,
+    Remembered,
+    RenewsBonds,
+    RenewsParticles,
+    Softens,
+    Variable,
+    Vector,
+    length,
+    where,
+)
 
 STRENGTH = Remembered("strength", "strain at which the bond breaks", "1", 0.5, changes=False)
 WEAR = Remembered("wear", "how much the bond has softened", "1")
@@ -19,7 +31,11 @@ TIMES = Remembered("times", "steps in which it has softened", "1", dtype="i4")
 
 
 class Wearing(
-    pbdkit.Draws, pbdkit.RenewsBonds, pbdkit.Softens, pbdkit.BreaksAtStrain, pbdkit.FractureModel
+    Draws,
+    RenewsBonds,
+    Softens,
+    BreaksAtStrain,
+    pbdkit.FractureModel,
 ):
     """A bond of a strength of its own softens as it is strained, and counts how often: what the
     others would be without their fault."""
@@ -27,7 +43,7 @@ class Wearing(
     type: Literal["wearing"] = "wearing"
 
     def constants(self, slot):
-        return {"rest": pbdkit.length(slot.rest)}
+        return {"rest": length(slot.rest)}
 
     def remembered(self):
         return STRENGTH, WEAR, TIMES
@@ -37,9 +53,9 @@ class Wearing(
 
     @staticmethod
     def update(d, r, c, p):
-        strain = pbdkit.length(r + d) / c.rest - 1.0
+        strain = length(r + d) / c.rest - 1.0
         more = strain > c.wear
-        return pbdkit.where(more, strain, c.wear), pbdkit.where(more, c.times + 1, c.times)
+        return where(more, strain, c.wear), where(more, c.times + 1, c.times)
 
     @staticmethod
     def breaks(d, r, c, p):
@@ -55,7 +71,7 @@ class Wearing(
 
     @staticmethod
     def breaking_strain(r, c, p):
-        return pbdkit.where(c.wear > c.strength, c.wear, c.strength)
+        return where(c.wear > c.strength, c.wear, c.strength)
 
 
 class Hardens(Wearing):
@@ -222,8 +238,8 @@ class WearsTogether(Wearing):
 
     @staticmethod
     def update(d, r, c, p):
-        most = np.max(pbdkit.length(r + d) / c.rest - 1.0)
-        return pbdkit.where(most > c.wear, most + 0.0 * c.wear, c.wear), c.times
+        most = np.max(length(r + d) / c.rest - 1.0)
+        return where(most > c.wear, most + 0.0 * c.wear, c.wear), c.times
 
 
 class WearsInOrder(Wearing):
@@ -255,7 +271,7 @@ class WearsOneWay(Wearing):
 
     @staticmethod
     def update(d, r, c, p):
-        return pbdkit.where(d.x > c.wear, d.x, c.wear), c.times
+        return where(d.x > c.wear, d.x, c.wear), c.times
 
 
 class Misstates(Wearing):
@@ -275,14 +291,14 @@ class Sags(Wearing):
 
     @staticmethod
     def seen(d, lost, r, c, p):
-        return d + pbdkit.Vector(1e-9, 0.0)
+        return d + Vector(1e-9, 0.0)
 
 
-class Tired(pbdkit.RenewsParticles, Sound):
+class Tired(RenewsParticles, Sound):
     """Follows the less, the farther it has come: what the others would be without their fault."""
 
     type: Literal["tired"] = "tired"
-    stamina: Annotated[float, pbdkit.LENGTH] = Field(1.0, description="The way that halves moves.")
+    stamina: Annotated[float, LENGTH] = Field(1.0, description="The way that halves moves.")
 
     def remembered(self):
         return (Remembered("way", "way made in x", "lattice unit"),)
@@ -339,7 +355,7 @@ class SharesTheWay(Tired):
         return (np.mean(way + np.abs(total[0].x)) + 0.0 * way,)
 
 
-class DrawsAgain(pbdkit.Draws, Tired):
+class DrawsAgain(Draws, Tired):
     """Draws with the dice of Python."""
 
     type: Literal["draws-again"] = "draws-again"
@@ -358,7 +374,7 @@ class LastOnes(Extent):
 
     def variables(self):
         names = ("last_extent", "last_square")
-        return tuple(pbdkit.Variable(name, ("last",), name, "lattice unit") for name in names)
+        return tuple(Variable(name, ("last",), name, "lattice unit") for name in names)
 
     def measure(self, now):
         extent = super().measure(now)[0]

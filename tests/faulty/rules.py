@@ -9,6 +9,13 @@ import numpy as np
 from pydantic import ConfigDict, Field, PrivateAttr
 
 import pbdkit
+from pbdkit.plugin import (
+    Loadable,
+    Stiffness,
+    Vector,
+    length,
+    squared_length,
+)
 
 
 class Sound(pbdkit.FollowerRule):
@@ -34,7 +41,7 @@ class WritesInput(Sound):
     def gather(d, r, w, p):
         x, y = d
         x *= 2.0
-        return pbdkit.Vector(x, y), 1.0
+        return Vector(x, y), 1.0
 
 
 class CountsPlaces(Sound):
@@ -76,7 +83,7 @@ class LooksAround(Sound):
     @staticmethod
     def apply(total, here, p):
         x, y = total[0] / total[1]
-        return pbdkit.Vector(np.mean(x) + 0.0 * x, y)
+        return Vector(np.mean(x) + 0.0 * x, y)
 
 
 class NeedsArrays(Sound):
@@ -87,7 +94,7 @@ class NeedsArrays(Sound):
     @staticmethod
     def apply(total, here, p):
         x, y = total[0]
-        return pbdkit.Vector(x.clip(-1.0, 1.0), y)
+        return Vector(x.clip(-1.0, 1.0), y)
 
 
 SEEN: list[float] = []
@@ -102,7 +109,7 @@ class Remembers(Sound):
     def apply(total, here, p):
         x, y = total[0]
         SEEN.append(float(np.sum(x)))
-        return pbdkit.Vector(x + SEEN[-2 if len(SEEN) > 1 else -1], y)
+        return Vector(x + SEEN[-2 if len(SEEN) > 1 else -1], y)
 
 
 class Counts(Sound):
@@ -145,7 +152,7 @@ class Drifts(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[1] + pbdkit.Vector(1e-9, 0.0)
+        return total[0] / total[1] + Vector(1e-9, 0.0)
 
 
 class DriftsByRounding(Sound):
@@ -155,11 +162,11 @@ class DriftsByRounding(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d + pbdkit.Vector(0.1, 0.0), 1.0
+        return d + Vector(0.1, 0.0), 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] - pbdkit.Vector(0.1 * total[1], 0.0)
+        return total[0] - Vector(0.1 * total[1], 0.0)
 
 
 class Divides(Sound):
@@ -169,7 +176,7 @@ class Divides(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        share = 1.0 / pbdkit.length(r + d)
+        share = 1.0 / length(r + d)
         return share * d, share
 
 
@@ -181,7 +188,7 @@ class Square(Sound):
     @staticmethod
     def apply(total, here, p):
         x, y = total[0]
-        return pbdkit.Vector(np.stack([x, x]), y)
+        return Vector(np.stack([x, x]), y)
 
 
 class Varies(Sound):
@@ -202,7 +209,7 @@ class ClaimsLinear(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return (pbdkit.squared_length(d) / (r.x * r.x + r.y * r.y)) * d, 1.0
+        return (squared_length(d) / (r.x * r.x + r.y * r.y)) * d, 1.0
 
 
 class HoldsOn(Sound):
@@ -215,14 +222,14 @@ class HoldsOn(Sound):
         return -0.5 * here.u
 
 
-class Net(pbdkit.Loadable, Sound):
+class Net(Loadable, Sound):
     """Springs between neighbours, for small displacements: what the next would be without their
     fault."""
 
     type: Literal["net"] = "net"
 
     def elasticity(self):
-        return pbdkit.Stiffness(1.0, 1.0, 0.0, 0.5)
+        return Stiffness(1.0, 1.0, 0.0, 0.5)
 
     @staticmethod
     def gather(d, r, w, p):
@@ -239,7 +246,7 @@ class Net(pbdkit.Loadable, Sound):
 
 def pull_along(d, r):
     """The part of d along r."""
-    return ((d.x * r.x + d.y * r.y) / pbdkit.squared_length(r)) * r
+    return ((d.x * r.x + d.y * r.y) / squared_length(r)) * r
 
 
 class BearsTwice(Net):
@@ -295,7 +302,7 @@ class HasAScale(Sound):
     @staticmethod
     def apply(total, here, p):
         move = total[0] / total[1]
-        return move / (1.0 + pbdkit.length(move))
+        return move / (1.0 + length(move))
 
 
 class LeansRight(Sound):

@@ -139,7 +139,7 @@ class Loose(pbdkit.FramePolicy):
     def follow(self, frame):
         point, body = frame.nearest()
         kept = point < point[-1]
-        return pbdkit.FrameMap(point[kept], body[kept], np.ones(kept.sum()))
+        return pbdkit.plugin.FrameMap(point[kept], body[kept], np.ones(kept.sum()))
 
 
 def test_case_21_a_frame_point_that_follows_nobody_is_refused():

@@ -37,7 +37,7 @@ class CurrentY(pbdkit.FollowerRule):
     def apply(total, here, p):
         move = total[0] / total[1]
         above = here.X.y + here.u.y - p.middle
-        return pbdkit.Vector(move.x, move.y + p.K * (here.u.x + move.x) * above)
+        return pbdkit.plugin.Vector(move.x, move.y + p.K * (here.u.x + move.x) * above)
 
 
 def test_case_4_the_current_y_in_mixed_coordinates_diverges_and_is_known_to_beforehand():
@@ -77,7 +77,7 @@ class Periodic(pbdkit.FramePolicy):
     def follow(self, frame):
         low, high = np.array(frame.low), np.array(frame.high)
         body = frame.body_at(self.images(frame.site, low, high).astype(np.int32))
-        return pbdkit.FrameMap(np.arange(len(body)), body, np.ones(len(body)))
+        return pbdkit.plugin.FrameMap(np.arange(len(body)), body, np.ones(len(body)))
 
 
 class Even(Periodic):

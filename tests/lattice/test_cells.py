@@ -156,7 +156,7 @@ class Areas(pbdkit.Diagnostic):
     type: Literal["areas"] = "areas"
 
     def variables(self):
-        return (pbdkit.Variable("areas", (), "area", "1"),)
+        return (pbdkit.plugin.Variable("areas", (), "area", "1"),)
 
     def measure(self, now):
         def area(d, r):

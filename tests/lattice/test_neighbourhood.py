@@ -12,6 +12,11 @@ import pbdkit
 from pbdkit.components.lattices import CentredRectangular, Hexagonal, Oblique, Rectangular, Square
 from pbdkit.components.neighbours import Chebyshev, Coordination
 from pbdkit.lattice.neighbourhood import build_neighbourhood
+from pbdkit.plugin import (
+    BasisSite,
+    Cell,
+    Vector,
+)
 
 combinations = pytest.mark.parametrize(("lattice", "neighbours"), LATTICES_AND_NEIGHBOURS)
 spacing = st.floats(0.3, 3.0)
@@ -126,10 +131,10 @@ class OnTheCorner(pbdkit.Lattice):
     type: Literal["on-the-corner"] = "on-the-corner"
 
     def cell(self):
-        other = pbdkit.BasisSite(pbdkit.Vector(0.25, 0.0), index=(1, 0), primitive=(1, 0))
-        return pbdkit.Cell(
-            vectors=(pbdkit.Vector(1.0, 0.0), pbdkit.Vector(0.0, 1.0)),
-            sites=(pbdkit.BasisSite(), other),
+        other = BasisSite(Vector(0.25, 0.0), index=(1, 0), primitive=(1, 0))
+        return Cell(
+            vectors=(Vector(1.0, 0.0), Vector(0.0, 1.0)),
+            sites=(BasisSite(), other),
             period=(2, 1),
             primitive=((2, 0), (0, 1)),
         )

@@ -126,7 +126,7 @@ class Mute(pbdkit.FramePolicy):
 
     def follow(self, frame):
         point, body = frame.nearest()
-        return pbdkit.FrameMap(point, body, np.where(point == 2, 0.0, 1.0))
+        return pbdkit.plugin.FrameMap(point, body, np.where(point == 2, 0.0, 1.0))
 
 
 def test_a_frame_point_whose_weights_are_all_zero_copies_nobody():

@@ -246,7 +246,7 @@ class AheadBefore(pbdkit.Diagnostic):
 
     def variables(self):
         dims = ("particle", "axis")
-        return (pbdkit.Variable("ahead_before", dims, "Ahead, a step ago", "lattice unit"),)
+        return (pbdkit.plugin.Variable("ahead_before", dims, "Ahead, a step ago", "lattice unit"),)
 
     def measure(self, now):
         found = np.zeros_like(now.displacement())

@@ -25,7 +25,7 @@ class Given(pbdkit.Diagnostic):
     what: str
 
     def variables(self):
-        return (pbdkit.Variable("given", (), "zero", "1"),)
+        return (pbdkit.plugin.Variable("given", (), "zero", "1"),)
 
     def measure(self, now):
         arrays = {
@@ -67,7 +67,7 @@ class Centred(pbdkit.Diagnostic):
     type: Literal["centred"] = "centred"
 
     def variables(self):
-        return (pbdkit.Variable("farthest", (), "farthest particle", "lattice unit"),)
+        return (pbdkit.plugin.Variable("farthest", (), "farthest particle", "lattice unit"),)
 
     def measure(self, now):
         X = now.reference()
@@ -91,7 +91,7 @@ class Named(pbdkit.Diagnostic):
     at_end: ClassVar[bool] = True
 
     def variables(self):
-        return (pbdkit.Variable(self.variable, (self.dimension,), "zeros", "1"),)
+        return (pbdkit.plugin.Variable(self.variable, (self.dimension,), "zeros", "1"),)
 
     def coordinates(self):
         return {self.dimension: np.arange(3)}
@@ -132,7 +132,7 @@ class Coordination(pbdkit.Diagnostic):
     type: Literal["coordination-number"] = "coordination-number"
 
     def variables(self):
-        return (pbdkit.Variable("mean_neighbours", (), "mean number of neighbours", "1"),)
+        return (pbdkit.plugin.Variable("mean_neighbours", (), "mean number of neighbours", "1"),)
 
     def measure(self, now):
         return (now.sum_over_neighbours(lambda d, r: 1.0)[now.body].mean(),)
@@ -159,7 +159,7 @@ class Holed(pbdkit.Diagnostic):
     of_body: bool
 
     def variables(self):
-        return (pbdkit.Variable("holed", ("axis", "particle"), "holes", "1"),)
+        return (pbdkit.plugin.Variable("holed", ("axis", "particle"), "holes", "1"),)
 
     def measure(self, now):
         return (np.stack([np.where(now.body == self.of_body, np.nan, 0.0)] * 2),)

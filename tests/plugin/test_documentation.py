@@ -19,7 +19,7 @@ from interpreted_kernels import interpreting
 import pbdkit
 import pbdkit.testing
 from pbdkit.plugin import INTERFACES, Component
-from pbdkit.plugin.discovery import Hooks
+from pbdkit.plugin.hooks import Hooks
 from pbdkit.testing import PROPERTIES, examine, examples_of
 
 PAGES = Path(__file__).parents[2] / "docs" / "extending"
@@ -34,28 +34,28 @@ PAGE_OF = {
 }
 CAPABILITIES = {
     "FollowerRule": (
-        pbdkit.Calibrated,
-        pbdkit.Loadable,
-        pbdkit.TearsCells,
-        pbdkit.StoresEnergy,
-        pbdkit.Remembers,
-        pbdkit.Draws,
-        pbdkit.RenewsParticles,
-        pbdkit.SharesParticles,
-        pbdkit.TurnsParticles,
-        pbdkit.AppliesTwice,
+        pbdkit.plugin.Calibrated,
+        pbdkit.plugin.Loadable,
+        pbdkit.plugin.TearsCells,
+        pbdkit.plugin.StoresEnergy,
+        pbdkit.plugin.Remembers,
+        pbdkit.plugin.Draws,
+        pbdkit.plugin.RenewsParticles,
+        pbdkit.plugin.SharesParticles,
+        pbdkit.plugin.TurnsParticles,
+        pbdkit.plugin.AppliesTwice,
     ),
     "FractureModel": (
-        pbdkit.Remembers,
-        pbdkit.Draws,
-        pbdkit.RenewsBonds,
-        pbdkit.Softens,
-        pbdkit.SoftensCells,
-        pbdkit.StartsCracked,
-        pbdkit.BreaksAtStrain,
-        pbdkit.KnowsStiffness,
+        pbdkit.plugin.Remembers,
+        pbdkit.plugin.Draws,
+        pbdkit.plugin.RenewsBonds,
+        pbdkit.plugin.Softens,
+        pbdkit.plugin.SoftensCells,
+        pbdkit.plugin.StartsCracked,
+        pbdkit.plugin.BreaksAtStrain,
+        pbdkit.plugin.KnowsStiffness,
     ),
-    "FramePolicy": (pbdkit.Anchors,),
+    "FramePolicy": (pbdkit.plugin.Anchors,),
 }
 EVERY = pytest.mark.parametrize("interface", INTERFACES.values(), ids=lambda i: i.__name__)
 
@@ -91,7 +91,7 @@ def test_a_page_tells_every_method_and_declaration(interface):
 def test_a_page_tells_what_only_some_can_do(interface):
     text = text_of(interface)
     for capability in CAPABILITIES.get(interface.__name__, ()):
-        assert re.search(rf"`(pbdkit\.)?{capability.__name__}`", text)
+        assert re.search(rf"`(pbdkit\.plugin\.)?{capability.__name__}`", text)
         assert getattr(capability, "__abstractmethods__", set()) <= in_code(text)
 
 
@@ -111,7 +111,8 @@ def reports_on(interface, code, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     page = importlib.import_module(module)
     found = vars(page).values()
-    (component,) = (c for c in found if inspect.isclass(c) and issubclass(c, interface))
+    classes = (c for c in found if inspect.isclass(c) and c.__module__ == module)
+    (component,) = (c for c in classes if issubclass(c, interface))
     return [examine(example) for example in examples_of(component)]
 
 
@@ -129,7 +130,7 @@ def test_the_smallest_example_conforms(interface, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("interface", [pbdkit.FollowerRule, pbdkit.FractureModel])
 def test_the_example_that_remembers_conforms(interface, tmp_path, monkeypatch, interpreted):
-    (code,) = (block for block in blocks(text_of(interface)) if "pbdkit.Remembered(" in block)
+    (code,) = (block for block in blocks(text_of(interface)) if "Remembered(" in block)
     for report in reports_on(interface, code, tmp_path, monkeypatch):
         assert report.holds, str(report)
         assert "declares-what-it-remembers" in [outcome.property for outcome in report.ran]
@@ -156,23 +157,52 @@ def test_the_table_of_properties_is_whole():
         assert asked.asks.startswith(told)
 
 
-@pytest.mark.parametrize("name", [*pbdkit.__all__, *pbdkit.testing.__all__])
-def test_every_public_name_is_told(name):
-    assert name in in_code((PAGES / "api.md").read_text())
+PUBLIC = {module.__name__: {*module.__all__} for module in (pbdkit, pbdkit.plugin, pbdkit.testing)}
+IN_BOTH = PUBLIC["pbdkit"] & PUBLIC["pbdkit.plugin"]
+"""Names of `pbdkit.plugin` that `pbdkit` offers too."""
 
 
-def names_in_documentation():
-    """(module, name) of the tables of public names, of `pbdkit.NAME` on the pages for authors, and
-    of the directives of the reference."""
-    module, found = "", set()
+@pytest.mark.parametrize("module", PUBLIC)
+def test_the_tables_of_public_names_are_the_public_names(module):
+    told = [name for where, name in names_in_tables() if where == module]
+    assert len(told) == len({*told})
+    assert {*told} == PUBLIC[module] - (IN_BOTH if module == "pbdkit" else set())
+
+
+def test_the_reference_has_every_name_of_pbdkit():
+    reference = (PAGES.parent / "reference.md").read_text()
+    told = re.findall(r"^\.\. auto\w+:: (\w+)$", reference, re.M)
+    assert PUBLIC["pbdkit"] <= {*told}
+
+
+def test_authors_names_left_pbdkit_for_the_place_that_the_error_names():
+    for name in PUBLIC["pbdkit.plugin"] - IN_BOTH:
+        with pytest.raises(AttributeError, match=rf"from pbdkit.plugin import {name}`$"):
+            getattr(pbdkit, name)
+    with pytest.raises(AttributeError, match=r"from pbdkit\.plugin import Vector`$"):
+        _ = pbdkit.Components
+    with pytest.raises(AttributeError, match=r"module 'pbdkit' has no attribute 'nothing'$"):
+        _ = pbdkit.nothing
+
+
+def names_in_tables():
+    """(module, name) of the tables of public names."""
+    module, found = "", []
     for line in (PAGES / "api.md").read_text().splitlines():
         if header := re.match(r"\| of `([\w.]+)` \|", line):
             module = header[1]
         elif module and line.startswith("| `"):
-            found |= {(module, name) for name in re.findall(r"`(\w+)`", line.split("|")[1])}
+            found += [(module, name) for name in re.findall(r"`(\w+)`", line.split("|")[1])]
+    return found
+
+
+def names_in_documentation():
+    """(module, name) of the tables of public names, of `pbdkit.NAME` and `pbdkit.plugin.NAME` on
+    the pages for authors, and of the directives of the reference."""
+    module, found = "", {*names_in_tables()}
     for page in PAGES.glob("*.md"):
-        written = re.findall(r"\bpbdkit\.([A-Z]\w+)", page.read_text())
-        found |= {("pbdkit", name) for name in written}
+        written = re.findall(r"\b(pbdkit(?:\.plugin)?)\.([A-Z]\w+)", page.read_text())
+        found |= {*written}
     reference = PAGES.parent / "reference.md"
     for what, name in re.findall(r"^\.\. (\w+):: ([\w.]+)$", reference.read_text(), re.M):
         module = name if what == "currentmodule" else module
@@ -187,15 +217,13 @@ def test_documented_names_are_imported_from_where_the_documentation_says(module,
 
 
 def test_the_public_names_are_one_list():
-    """For Python, for type checkers, and of what authors exchange with pbdkit."""
-    tree = ast.parse(Path(pbdkit.__file__).read_text())
-    (block,) = (n for n in tree.body if isinstance(n, ast.If) and n.test.id == "TYPE_CHECKING")
-    imports = (n for n in block.body if isinstance(n, ast.ImportFrom) and n.module != "typing")
-    checked = {name.asname: node.module for node in imports for name in node.names}
-    assert checked == pbdkit._MODULE_OF
-    public = {name for name, module in checked.items() if module == "pbdkit.plugin"}
-    assert public == {*pbdkit.plugin.__all__} - {"INTERFACES", "LISTS"}
-    for name, module in checked.items():
+    """That of the stub, for type checkers and at run time."""
+    tree = ast.parse(Path(pbdkit.__file__).with_suffix(".pyi").read_text())
+    imports = (node for node in tree.body if isinstance(node, ast.ImportFrom))
+    stub = {name.asname: node.module for node in imports for name in node.names}
+    assert {*stub} | {"__version__"} == {*dir(pbdkit)}
+    assert {name for name, module in stub.items() if module != "pbdkit"} == {*pbdkit.__all__}
+    for name, module in stub.items():
         assert getattr(pbdkit, name) is getattr(importlib.import_module(module), name)
 
 

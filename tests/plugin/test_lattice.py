@@ -25,7 +25,7 @@ class Cubic(pbdkit.Lattice):
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def cell(self):
-        return pbdkit.Cell(tuple(map(pbdkit.SpaceVector, *np.eye(3).tolist())))
+        return pbdkit.plugin.Cell(tuple(map(pbdkit.plugin.SpaceVector, *np.eye(3).tolist())))
 
 
 class Brick(Body):

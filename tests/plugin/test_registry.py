@@ -121,7 +121,7 @@ class Still(pbdkit.FollowerRule):
 class Rightwards(pbdkit.NeighbourMetric):
     type: Literal["rightwards"] = "rightwards"
 
-    def shells_around(self, cell: pbdkit.Cell, sublattice: int) -> Sequence[Sequence[Any]]:
+    def shells_around(self, cell: pbdkit.plugin.Cell, sublattice: int) -> Sequence[Sequence[Any]]:
         return [[o for o in cell.offsets(sublattice, 1.0) if o.site > (0, 0)]]
 
 
@@ -131,19 +131,19 @@ class Loose(pbdkit.FramePolicy):
     def depth(self, reach: int) -> int:
         return reach
 
-    def follow(self, frame: pbdkit.FrameSites) -> pbdkit.FrameMap:
+    def follow(self, frame: pbdkit.plugin.FrameSites) -> pbdkit.plugin.FrameMap:
         point, body = frame.nearest()
         followed = point != 2
-        return pbdkit.FrameMap(point[followed], body[followed], np.ones(followed.sum()))
+        return pbdkit.plugin.FrameMap(point[followed], body[followed], np.ones(followed.sum()))
 
 
 class Misshapen(pbdkit.Diagnostic):
     type: Literal["misshapen"] = "misshapen"
 
-    def variables(self) -> tuple[pbdkit.Variable, ...]:
-        return (pbdkit.Variable("m", ("particle",), "too short by one", "1"),)
+    def variables(self) -> tuple[pbdkit.plugin.Variable, ...]:
+        return (pbdkit.plugin.Variable("m", ("particle",), "too short by one", "1"),)
 
-    def measure(self, now: pbdkit.Moment) -> tuple[Any, ...]:
+    def measure(self, now: pbdkit.plugin.Moment) -> tuple[Any, ...]:
         return (np.zeros(29),)
 
 

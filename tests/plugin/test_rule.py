@@ -36,7 +36,7 @@ class Membrane(pbdkit.FollowerRule):
         return total[0] / total[1]
 
 
-class Plate(pbdkit.AppliesTwice, Membrane):
+class Plate(pbdkit.plugin.AppliesTwice, Membrane):
     """u moves by -(1/2) (1 - P)² u."""
 
     type: Literal["plate"] = "plate"

@@ -428,7 +428,7 @@ class Leaning(pbdkit.FramePolicy):
         share = getattr(frame.rule, "K", 0.0) + getattr(frame.rule, "poisson_ratio", 0.0)
         body = np.stack([nearest, np.full(len(points), corner)], axis=1).ravel()
         weight = np.tile([1.0 - share, share], len(points))
-        return pbdkit.FrameMap(np.repeat(points, 2), body, weight)
+        return pbdkit.plugin.FrameMap(np.repeat(points, 2), body, weight)
 
 
 FOLLOWING = {

@@ -338,7 +338,7 @@ class Tough(pbdkit.FractureModel):
     energy: Annotated[float, FRACTURE_ENERGY] = 0.1
     can_break = False
 
-    def constants(self, slot: pbdkit.Slot) -> dict[str, float]:
+    def constants(self, slot: pbdkit.plugin.Slot) -> dict[str, float]:
         return {}
 
     @staticmethod

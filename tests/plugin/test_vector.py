@@ -33,12 +33,12 @@ OPERATIONS = {
     "scaled": (lambda a, b, s: s * a, lambda a, b, s: [s * x for x in a]),
     "quotient": (lambda a, b, s: a / s, lambda a, b, s: [x / s for x in a]),
     "choice": (
-        lambda a, b, s: pbdkit.where(s > 1.0, a, b),
+        lambda a, b, s: pbdkit.plugin.where(s > 1.0, a, b),
         lambda a, b, s: [x if s > 1.0 else y for x, y in zip(a, b, strict=True)],
     ),
-    "dot": (lambda a, b, s: pbdkit.dot(a, b), lambda a, b, s: [dotted(a, b)]),
-    "square": (lambda a, b, s: pbdkit.squared_length(a), lambda a, b, s: [dotted(a, a)]),
-    "length": (lambda a, b, s: pbdkit.length(a), lambda a, b, s: [math.sqrt(dotted(a, a))]),
+    "dot": (lambda a, b, s: pbdkit.plugin.dot(a, b), lambda a, b, s: [dotted(a, b)]),
+    "square": (lambda a, b, s: pbdkit.plugin.squared_length(a), lambda a, b, s: [dotted(a, a)]),
+    "length": (lambda a, b, s: pbdkit.plugin.length(a), lambda a, b, s: [math.sqrt(dotted(a, a))]),
     "formula": (
         lambda a, b, s: (1.0 - s) * a + s * b - (a + b) / s,
         lambda a, b, s: [((1.0 - s) * x + s * y) - (x + y) / s for x, y in zip(a, b, strict=True)],
@@ -105,9 +105,9 @@ def test_a_vector_stays_of_its_kind_and_has_as_many_components(space):
 def test_other_numbers_of_components_are_refused():
     with pytest.raises(ValueError, match="a vector has two or three components, not 4"):
         vector(range(4))
-    plane, space = pbdkit.Vector(1.0, 2.0), pbdkit.SpaceVector(1.0, 2.0, 3.0)
+    plane, space = pbdkit.plugin.Vector(1.0, 2.0), pbdkit.plugin.SpaceVector(1.0, 2.0, 3.0)
     for one, other in ((plane, space), (space, plane)):
         with pytest.raises(ValueError, match=r"argument 2 is (longer|shorter)"):
             one + other
         with pytest.raises(ValueError, match=r"argument 2 is (longer|shorter)"):
-            pbdkit.dot(one, other)
+            pbdkit.plugin.dot(one, other)

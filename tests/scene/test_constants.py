@@ -8,7 +8,7 @@ from property_cases import pull_right
 from remembering_parts import Tiring, Weakest
 
 import pbdkit
-from pbdkit import Remembered
+from pbdkit.plugin import Remembered
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 
@@ -40,22 +40,22 @@ class Plain(pbdkit.FractureModel):
         return 0.0 * r
 
 
-class Keeping(pbdkit.Remembers, Plain):
+class Keeping(pbdkit.plugin.Remembers, Plain):
     def remembered(self):
         return (Remembered("age", "age", "step"),)
 
 
-class Shortened(pbdkit.Draws, Keeping):
+class Shortened(pbdkit.plugin.Draws, Keeping):
     def draw(self, bonds, generator):
         return {"age": np.zeros(3)}
 
 
-class Infinite(pbdkit.Draws, Keeping):
+class Infinite(pbdkit.plugin.Draws, Keeping):
     def draw(self, bonds, generator):
         return {"age": np.full(len(bonds), np.inf)}
 
 
-class Misspelt(pbdkit.Draws, Keeping):
+class Misspelt(pbdkit.plugin.Draws, Keeping):
     def draw(self, bonds, generator):
         return {"agee": np.zeros(len(bonds))}
 
@@ -80,19 +80,19 @@ class Typed(Keeping):
         return (Remembered("age", "age", "step", dtype="f4"),)
 
 
-class Generous(pbdkit.RenewsBonds, Keeping):
+class Generous(pbdkit.plugin.RenewsBonds, Keeping):
     @staticmethod
     def update(d, r, c, p):
         return c.age + 1, c.age
 
 
-class Bare(pbdkit.RenewsBonds, Keeping):
+class Bare(pbdkit.plugin.RenewsBonds, Keeping):
     @staticmethod
     def update(d, r, c, p):
         return c.age + 1
 
 
-class Loose(pbdkit.Remembers, Plain):
+class Loose(pbdkit.plugin.Remembers, Plain):
     def remembered(self):
         return Remembered("age", "age", "step")
 
@@ -134,7 +134,7 @@ class Constant(Plain):
         return 1.0
 
 
-class Fractional(pbdkit.RenewsBonds, Keeping):
+class Fractional(pbdkit.plugin.RenewsBonds, Keeping):
     def remembered(self):
         return (Remembered("age", "age", "step", dtype="i4"),)
 
@@ -143,13 +143,13 @@ class Fractional(pbdkit.RenewsBonds, Keeping):
         return (c.age + 0.5,)
 
 
-class Exploding(pbdkit.RenewsBonds, Keeping):
+class Exploding(pbdkit.plugin.RenewsBonds, Keeping):
     @staticmethod
     def update(d, r, c, p):
         return ((c.age + 1.0) * 1e200,)
 
 
-class Writing(pbdkit.RenewsBonds, Keeping):
+class Writing(pbdkit.plugin.RenewsBonds, Keeping):
     @staticmethod
     def update(d, r, c, p):
         c.age[...] = 1.0
@@ -196,7 +196,7 @@ class Aged(pbdkit.Diagnostic):
     type: Literal["aged"] = "aged"
 
     def variables(self):
-        return (pbdkit.Variable("age", (), "oldest bond", "step"),)
+        return (pbdkit.plugin.Variable("age", (), "oldest bond", "step"),)
 
     def measure(self, now):
         return (now.remembered("age").max(),)
@@ -215,7 +215,7 @@ class Odd(pbdkit.Diagnostic):
     own_dimension = "odd"
 
     def variables(self):
-        one, other = (pbdkit.Variable(n, ("odd",), n, "1") for n in ("one", "other"))
+        one, other = (pbdkit.plugin.Variable(n, ("odd",), n, "1") for n in ("one", "other"))
         return one, other
 
     def measure(self, now):

@@ -9,7 +9,7 @@ import pytest
 import pbdkit
 
 
-class Placed(pbdkit.Draws, pbdkit.RenewsParticles, pbdkit.FollowerRule):
+class Placed(pbdkit.plugin.Draws, pbdkit.plugin.RenewsParticles, pbdkit.FollowerRule):
     """Stays, and remembers the places that it is told."""
 
     type: Literal["placed"] = "placed"
@@ -18,7 +18,7 @@ class Placed(pbdkit.Draws, pbdkit.RenewsParticles, pbdkit.FollowerRule):
     def remembered(self):
         names = ("drawn_x", "drawn_y", "told_x", "told_y", "centred_x", "centred_y")
         return tuple(
-            pbdkit.Remembered(name, name, "1", changes=not name.startswith("drawn"))
+            pbdkit.plugin.Remembered(name, name, "1", changes=not name.startswith("drawn"))
             for name in names
         )
 
@@ -38,7 +38,7 @@ class Placed(pbdkit.Draws, pbdkit.RenewsParticles, pbdkit.FollowerRule):
         return *here.X, *here.centred
 
 
-class Marked(pbdkit.Draws, pbdkit.FractureModel):
+class Marked(pbdkit.plugin.Draws, pbdkit.FractureModel):
     """Never breaks, and remembers the middle of each bond."""
 
     type: Literal["marked"] = "marked"
@@ -47,7 +47,7 @@ class Marked(pbdkit.Draws, pbdkit.FractureModel):
         return {}
 
     def remembered(self):
-        return tuple(pbdkit.Remembered(f"middle_{c}", c, "1", changes=False) for c in "xy")
+        return tuple(pbdkit.plugin.Remembered(f"middle_{c}", c, "1", changes=False) for c in "xy")
 
     def draw(self, bonds, generator):
         return {f"middle_{c}": bonds.midpoint[:, n] for n, c in enumerate("xy")}
@@ -105,7 +105,7 @@ class Soft(pbdkit.FollowerRule):
 
     @staticmethod
     def apply(total, here, p):
-        return pbdkit.where(here.X.x > 102.0, 0.5, 1.0) * total[0] / total[1]
+        return pbdkit.plugin.where(here.X.x > 102.0, 0.5, 1.0) * total[0] / total[1]
 
 
 @pytest.mark.parametrize("engine", ["numpy", "compiled"])

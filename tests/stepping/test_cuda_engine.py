@@ -112,7 +112,7 @@ class Various(pbdkit.FollowerRule):
     @staticmethod
     def gather(d, r, w, p):
         size = np.sqrt(np.abs(d.x) + np.maximum(d.y, 0.0)) + np.minimum(np.floor(d.x), 1.0)
-        return np.sign(size) * np.square(d.x), pbdkit.where(d.x > 0.0, d, 0.5 * d)
+        return np.sign(size) * np.square(d.x), pbdkit.plugin.where(d.x > 0.0, d, 0.5 * d)
 
     @staticmethod
     def apply(total, here, p):

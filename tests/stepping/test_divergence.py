@@ -65,7 +65,7 @@ class Poisoned(pbdkit.FollowerRule):
     @staticmethod
     def apply(total, here, p):
         x, y = total[0] / 4
-        return pbdkit.Vector(x + 0.0 * np.log(-4 * x - 1e-9), y)
+        return pbdkit.plugin.Vector(x + 0.0 * np.log(-4 * x - 1e-9), y)
 
 
 @pytest.mark.parametrize("every", [1, 5000])
@@ -165,7 +165,7 @@ class Vanishing(pbdkit.Diagnostic):
     type: Literal["vanishing"] = "vanishing"
 
     def variables(self):
-        return (pbdkit.Variable("vanishing", (), "a number at the start alone", "1"),)
+        return (pbdkit.plugin.Variable("vanishing", (), "a number at the start alone", "1"),)
 
     def measure(self, now):
         return (np.inf if now.step else 0.0,)

@@ -25,7 +25,7 @@ class DividesByZero(Plain):
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / pbdkit.length(total[0])
+        return total[0] / pbdkit.plugin.length(total[0])
 
 
 class TakesReference(Plain):
@@ -81,11 +81,15 @@ class HasWeights(Plain):
         return d * w.nearnes, 1.0
 
 
-class StartsAtVector(pbdkit.RenewsParticles, Plain):
+class StartsAtVector(pbdkit.plugin.RenewsParticles, Plain):
     type: Literal["starts-at-vector"] = "starts-at-vector"
 
     def remembered(self):
-        return (pbdkit.Remembered("way", "way", "lattice unit", initial=pbdkit.Vector(0.0, 0.0)),)
+        return (
+            pbdkit.plugin.Remembered(
+                "way", "way", "lattice unit", initial=pbdkit.plugin.Vector(0.0, 0.0)
+            ),
+        )
 
     @staticmethod
     def remember(total, here, p):
@@ -94,7 +98,7 @@ class StartsAtVector(pbdkit.RenewsParticles, Plain):
 
 class Measured(pbdkit.Diagnostic):
     def variables(self):
-        return (pbdkit.Variable("q", ("particle",), "q", "1"),)
+        return (pbdkit.plugin.Variable("q", ("particle",), "q", "1"),)
 
     def measure(self, now):
         return np.hypot(*now.displacement().T)
@@ -108,7 +112,7 @@ class Alone(Measured):
     type: Literal["alone"] = "alone"
 
     def variables(self):
-        return pbdkit.Variable("q", ("particle",), "q", "1")
+        return pbdkit.plugin.Variable("q", ("particle",), "q", "1")
 
 
 class Misspelt(Measured):
@@ -130,7 +134,7 @@ NO_NUMBER = "is none: make numbers of it in `parameters` or `weights`"
 TUPLE = ", not a tuple: write `(value,)`"
 MISTAKES = {
     DividesByZero: ("particle 25, found at step 1", "a displacement is NaN", "in divide (test_ru",
-                    "guard divisions and roots with `pbdkit.where`"),
+                    "guard divisions and roots with `pbdkit.plugin.where`"),
     TakesReference: ("test_rule_evaluation.py, line ", "`here.X` and `here.centred`", DECLARE),
     TakesReferenceWhole: ("test_rule_evaluation.py, line ", DECLARE),
     TakesOther: ("has no attribute 'part'", "; `p` holds share", "evaluation.py, line "),

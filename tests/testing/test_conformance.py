@@ -217,7 +217,7 @@ def test_after_a_fault_nothing_is_judged_that_means_nothing():
 
 
 def test_pbdkits_own_words_compile():
-    """A function that says `pbdkit.where` is compiled as one that imports it."""
+    """A function that says `pbdkit.plugin.where` is compiled as one that imports it."""
     report = examine(others.Strain())
     assert "is-the-same-compiled" in [outcome.property for outcome in report.ran]
 
@@ -311,7 +311,7 @@ def pbdkit_components():
 
 @pytest.mark.parametrize(("share", "code"), [("0.5", 0), ("1e-9 + 0.5", 1)])
 def test_one_line_is_enough_for_pytest(tmp_path, share, code):
-    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "pbdkit.Vector(1e-9, 0.0) +")
+    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "pbdkit.plugin.Vector(1e-9, 0.0) +")
     (tmp_path / "my_rules.py").write_text(source.replace("SHARE", share))
     (tmp_path / "test_mine.py").write_text(ONE_LINE)
     call = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "."]
@@ -326,7 +326,8 @@ def test_one_line_is_enough_for_pytest(tmp_path, share, code):
 def test_plugins_check_tries_a_distribution(install, call):
     install("pbdkit-good", SOURCE.replace("SHARE", "0.5"))
     install(
-        "pbdkit-bad", SOURCE.replace("SHARE *", "pbdkit.Vector(1e-9, 0.0) +").replace("mine", "bad")
+        "pbdkit-bad",
+        SOURCE.replace("SHARE *", "pbdkit.plugin.Vector(1e-9, 0.0) +").replace("mine", "bad"),
     )
     good = call("plugins", "check", "pbdkit_good")
     assert good.code == 0

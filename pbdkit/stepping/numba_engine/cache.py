@@ -35,14 +35,14 @@ from numba.core.registry import cpu_target
 from numba.extending import overload, register_jitable
 
 from pbdkit.plugin import CellStress, Here, Stiffness, Torn, dot, length, where
-from pbdkit.plugin.vector import KINDS, Components
+from pbdkit.plugin.vector import KINDS, Vector
 
 Function = Callable[..., Any]
 _ready: set[Function] = {where, dot}
 
 
 def _is_vector(kind: Any) -> bool:
-    return issubclass(getattr(kind, "instance_class", object), Components)
+    return issubclass(getattr(kind, "instance_class", object), Vector)
 
 
 def _written(kind: Any, arguments: str, component: str, whole: str = "Vector({})") -> Any:

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from pbdkit.plugin import (
     Component,
-    Components,
     FollowerRule,
     FractureModel,
     Here,
@@ -33,6 +32,7 @@ from pbdkit.plugin import (
     Softens,
     SoftensCells,
     TearsCells,
+    Vector,
 )
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.rule import shares_particles
@@ -480,7 +480,7 @@ def _parts(scene: Scene) -> tuple[int, ...]:
     refuses it: a kernel would take some of it for numbers."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     ones = np.ones(1, experiment.stepping.precision)
-    one: Components = vector([ones] * scene.axes)
+    one: Vector = vector([ones] * scene.axes)
     own = started(scene, particle_numbers(experiment), (1,))
     slot = scene.neighbourhood.slots[0][0]
     with np.errstate(all="ignore"):
@@ -497,4 +497,4 @@ def _parts(scene: Scene) -> tuple[int, ...]:
             for component in evaluator.move(total, here, one if scene.loads else None):
                 target(ones, component, ones, experiment.stepping)
             evaluator.renew_particles(total, here, own, None)
-    return tuple(len(part) if isinstance(part, Components) else 1 for part in total)
+    return tuple(len(part) if isinstance(part, Vector) else 1 for part in total)

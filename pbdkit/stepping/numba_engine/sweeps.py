@@ -483,7 +483,7 @@ def target_lines(
     ]
 
 
-def _shifted(plan: Plan, sign: str, by: Iterable[float]) -> str:
+def _shifted(plan: Plan, sign: str, by: Iterable[Any]) -> str:
     parts = (f"X{c} {sign} {plan.number(v)}" for c, v in zip(plan.axes, by, strict=True))
     return f"Vector({', '.join(parts)})"
 

@@ -1,6 +1,6 @@
 """Pantographic sheets for pbdkit: two families of fibres, joined where they cross by pivots."""
 
-import pbdkit
+from pbdkit.plugin import Component, hookimpl
 from pbdkit_pantograph.beams import PantographBeams
 from pbdkit_pantograph.fibres import Fibres
 from pbdkit_pantograph.springs import Pantograph
@@ -10,7 +10,7 @@ pbdkit_api = 1
 __all__ = ["Fibres", "Pantograph", "PantographBeams"]
 
 
-@pbdkit.hookimpl
-def pbdkit_components() -> list[type[pbdkit.Component]]:
+@hookimpl
+def pbdkit_components() -> list[type[Component]]:
     """What this distribution offers."""
     return [Fibres, Pantograph, PantographBeams]

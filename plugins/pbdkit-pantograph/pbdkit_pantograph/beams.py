@@ -7,6 +7,23 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 import pbdkit
+from pbdkit.plugin import (
+    AREA,
+    LENGTH,
+    FollowerRule,
+    Here,
+    Number,
+    Parameters,
+    Remembered,
+    Setting,
+    SharesParticles,
+    Slot,
+    TurnsParticles,
+    Vector,
+    dot,
+    length,
+    where,
+)
 from pbdkit_pantograph.fibres import families_of
 
 SHARE = 0.75
@@ -16,7 +33,7 @@ SLENDEREST = 1e-10
 the roundings of that along it."""
 
 
-class PantographBeams(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.FollowerRule):
+class PantographBeams(SharesParticles, TurnsParticles, FollowerRule):
     """Beams of Euler and Bernoulli from pivot to pivot, which remember how the two beams that cross
     there have turned.
 
@@ -35,21 +52,21 @@ class PantographBeams(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.Foll
     stretching: float = Field(
         1.0, gt=0.0, le=1e12, description="EA of a fibre: force over strain.", examples=[100.0]
     )
-    bending: Annotated[float, Field(gt=0.0, le=1e12), pbdkit.AREA] = Field(
+    bending: Annotated[float, Field(gt=0.0, le=1e12), AREA] = Field(
         0.01,
         description="EI of a fibre: moment over curvature, in the unit of `stretching` × length².",
         examples=[1.0],
     )
-    pivot: Annotated[float, Field(ge=0.0, le=1e12), pbdkit.LENGTH] = Field(
+    pivot: Annotated[float, Field(ge=0.0, le=1e12), LENGTH] = Field(
         0.0,
         description="Moment of a pivot over the angle between its fibres, in the unit of "
         "`stretching` × length; 0: they turn freely.",
         examples=[0.1],
     )
 
-    def parameters(self, setting: pbdkit.Setting) -> dict[str, float]:
+    def parameters(self, setting: Setting) -> dict[str, float]:
         """Raises ExperimentError for fibres that are too slender for the numbers of a computer."""
-        least = max(pbdkit.length(slot.rest) for slots in setting.slots for slot in slots[:1])
+        least = max(length(slot.rest) for slots in setting.slots for slot in slots[:1])
         if self.bending < SLENDEREST * self.stretching * least**2:
             raise pbdkit.ExperimentError(
                 f"bending is less than {SLENDEREST:g} of stretching · link²; take stiffer fibres, "
@@ -57,27 +74,27 @@ class PantographBeams(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.Foll
             )
         return self.numeric_parameters()
 
-    def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> dict[str, float]:
+    def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """`one` and `other`: whether the neighbour is next along that family; the rest length."""
         around = setting.slots[slot.source]
         families = families_of([s.rest for s in around])
-        along = [min(pbdkit.length(slot.rest - e), pbdkit.length(slot.rest + e)) for e in families]
-        rest = float(pbdkit.length(slot.rest))
+        along = [min(length(slot.rest - e), length(slot.rest + e)) for e in families]
+        rest = float(length(slot.rest))
         one, other = (float(apart < 1e-6 * rest) for apart in along)
         return {"one": one, "other": other, "rest": rest}
 
-    def remembered(self) -> tuple[pbdkit.Remembered, ...]:
+    def remembered(self) -> tuple[Remembered, ...]:
         """Both rotations, and for those who record: the force of the beams and the energy."""
         rotations = [
-            pbdkit.Remembered(f"{which}_{part}", f"{what} of the {which} fibre's rotation", "1", at)
+            Remembered(f"{which}_{part}", f"{what} of the {which} fibre's rotation", "1", at)
             for which in ("first", "second")
             for part, what, at in (("cos", "cosine", 1.0), ("sin", "sine", 0.0))
         ]
         force = [
-            pbdkit.Remembered(f"force_{c}", f"force of the beams on the pivot along {c}", "force")
+            Remembered(f"force_{c}", f"force of the beams on the pivot along {c}", "force")
             for c in "xy"
         ]
-        energy = pbdkit.Remembered("energy", "energy of the pivot and half its links", "energy")
+        energy = Remembered("energy", "energy of the pivot and half its links", "energy")
         return (*rotations, *force, energy)
 
     def rotations(self) -> tuple[tuple[str, str], ...]:
@@ -91,20 +108,20 @@ class PantographBeams(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.Foll
         """Force; stiffness xx, xy, yy; by family the moment, and the stiffness that goes with it;
         half the energy."""
         v, is_beam = r + d, w.one + w.other
-        span = pbdkit.length(v)
-        safe = pbdkit.where(span > 0.0, span, 1.0)
+        span = length(v)
+        safe = where(span > 0.0, span, 1.0)
         t = _lag(_rotated(r, w, own), v, w.rest * span)
         t_there = _lag(_rotated(r, w, there), v, w.rest * span)
         # |v|² - |r|² = d·(r + v): small elongations keep all their digits.
-        elongation = pbdkit.dot(d, r + v) / (span + w.rest)
+        elongation = dot(d, r + v) / (span + w.rest)
         stretching, bending = is_beam * p.stretching / w.rest, is_beam * p.bending / w.rest
         slope, slope_there = 1.0 + t * t / 4.0, 1.0 + t_there * t_there / 4.0
         moment = 2.0 * bending * (2.0 * t + t_there) * slope
         moment_there = 2.0 * bending * (2.0 * t_there + t) * slope_there
         pull, shear = stretching * elongation, (moment + moment_there) / safe
         along = v / safe
-        across = pbdkit.Vector(-along.y, along.x)
-        tension = pbdkit.where(pull > 0.0, pull, 0.0 * pull) / safe
+        across = Vector(-along.y, along.x)
+        tension = where(pull > 0.0, pull, 0.0 * pull) / safe
         # Least multiples of a link's own stiffnesses that bound it, rotations of both ends and all.
         stiff = 21.0 * bending * slope * slope_there / (safe * safe) + tension
         turning = 7.0 * bending * slope * slope
@@ -119,21 +136,21 @@ class PantographBeams(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.Foll
         )  # fmt: skip
 
     @staticmethod
-    def apply(total: Any, here: pbdkit.Here, p: Any) -> Any:
+    def apply(total: tuple[Any, ...], here: Here, p: Parameters) -> Vector:
         """Stiffness⁻¹ · force, less a quarter; no move where there is no beam."""
         force, xx, xy, yy = total[0], total[1], total[2], total[3]
         area = xx * yy - xy * xy
-        safe = pbdkit.where(area > 0.0, area, 1.0)
+        safe = where(area > 0.0, area, 1.0)
         x, y = yy * force.x - xy * force.y, xx * force.y - xy * force.x
-        return SHARE * pbdkit.Vector(x / safe, y / safe)
+        return SHARE * Vector(x / safe, y / safe)
 
     @staticmethod
-    def remember(total: Any, here: pbdkit.Here, p: Any) -> tuple[Any, ...]:
+    def remember(total: tuple[Any, ...], here: Here, p: Parameters) -> tuple[Number, ...]:
         """Rotations that balance the moments of beams and pivot; force and energy as they are."""
         own, force = here.own, total[0]
         sine = own.first_sin * own.second_cos - own.first_cos * own.second_sin
         cosine = own.first_cos * own.second_cos + own.first_sin * own.second_sin
-        t = 2.0 * sine / pbdkit.where(cosine > -1.0, 1.0 + cosine, 1.0)
+        t = 2.0 * sine / where(cosine > -1.0, 1.0 + cosine, 1.0)
         slope = 1.0 + t * t / 4.0
         twist, spring = p.pivot * t * slope, p.pivot * slope * slope
         one, other = _stiffness(total[6], total[7]), _stiffness(total[7], total[6])
@@ -151,24 +168,24 @@ def _rotated(r: Any, w: Any, own: Any) -> Any:
     """Q r: the direction in which a beam leaves a pivot."""
     c = w.one * own.first_cos + w.other * own.second_cos
     s = w.one * own.first_sin + w.other * own.second_sin
-    return pbdkit.Vector(c * r.x - s * r.y, s * r.x + c * r.y)
+    return Vector(c * r.x - s * r.y, s * r.x + c * r.y)
 
 
 def _lag(e: Any, v: Any, lengths: Any) -> Any:
     """2 tan(φ/2) of the angle φ from e to v, `lengths` the product of theirs."""
-    cosine = lengths + pbdkit.dot(e, v)
-    return 2.0 * (e.x * v.y - e.y * v.x) / pbdkit.where(cosine > 0.0, cosine, 1.0)
+    cosine = lengths + dot(e, v)
+    return 2.0 * (e.x * v.y - e.y * v.x) / where(cosine > 0.0, cosine, 1.0)
 
 
 def _stiffness(turning: Any, others: Any) -> Any:
     """That of one rotation; where no beam holds it, that of the other one, or any."""
-    held = pbdkit.where(turning > 0.0, turning, others) / SHARE
-    return pbdkit.where(held > 0.0, held, 1.0)
+    held = where(turning > 0.0, turning, others) / SHARE
+    return where(held > 0.0, held, 1.0)
 
 
 def _turned(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
     """The rotation (c, s) turned by 2 atan(angle/2), of length 1."""
     q = angle / 2.0
     x, y = (1.0 - q * q) * c - 2.0 * q * s, (1.0 - q * q) * s + 2.0 * q * c
-    size = pbdkit.length(pbdkit.Vector(x, y))
+    size = length(Vector(x, y))
     return x / size, y / size

@@ -7,15 +7,16 @@ from collections.abc import Iterable
 from typing import Literal, TypeVar
 
 import pbdkit
+from pbdkit.plugin import Cell, NeighbourMetric, Offset, Slot, Vector, length
 
 ALONG, NEXT, ACROSS = "along", "next", "across"
 Role = tuple[str, int]
 """What a neighbour is to a pivot: along a fibre, next but one along it, or across a cell; and in
 which of the four directions: 0 and 1 are the two ends of the first family, 2 and 3 of the other."""
-Step = TypeVar("Step", pbdkit.Offset, pbdkit.Slot)
+Step = TypeVar("Step", Offset, Slot)
 
 
-class Fibres(pbdkit.NeighbourMetric):
+class Fibres(NeighbourMetric):
     """Shell 1: the next pivots along two families of fibres. Shell 2: the next but one. Shell 3:
     those across the cells between.
 
@@ -26,7 +27,7 @@ class Fibres(pbdkit.NeighbourMetric):
 
     type: Literal["fibres"] = "fibres"
 
-    def shells_around(self, cell: pbdkit.Cell, sublattice: int) -> list[list[pbdkit.Offset]]:
+    def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
         """Four neighbours a shell. Raises ExperimentError where the lattice lacks one of them."""
         radius = 4 * max(math.hypot(*vector) for vector in cell.vectors)
         roles = roles_of(cell.offsets(sublattice, radius))
@@ -50,7 +51,7 @@ def roles_of(steps: Iterable[Step]) -> list[tuple[Step, Role]]:
     return [(_found(known, rest), role) for role, rest in rests.items()]
 
 
-def families_of(rests: list[pbdkit.Components]) -> tuple[pbdkit.Components, pbdkit.Components]:
+def families_of(rests: list[Vector[float]]) -> tuple[Vector[float], Vector[float]]:
     """The two shortest that are not in line, of equal ones those of the smallest angle to x."""
     shortest = min(math.hypot(*rest) for rest in rests)
     flat = 1e-6 * shortest
@@ -61,9 +62,9 @@ def families_of(rests: list[pbdkit.Components]) -> tuple[pbdkit.Components, pbdk
     return one, other
 
 
-def _found(steps: list[Step], rest: pbdkit.Components) -> Step:
+def _found(steps: list[Step], rest: Vector[float]) -> Step:
     for step in steps:
-        if pbdkit.length(step.rest - rest) < 1e-6 * pbdkit.length(rest):
+        if length(step.rest - rest) < 1e-6 * length(rest):
             return step
     raise pbdkit.ExperimentError(
         f"fibres need a neighbour at ({rest.x:.4g}, {rest.y:.4g}): take a lattice of one site, "

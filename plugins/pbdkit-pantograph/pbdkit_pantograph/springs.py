@@ -6,11 +6,21 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-import pbdkit
+from pbdkit.plugin import (
+    FollowerRule,
+    Here,
+    Parameters,
+    Setting,
+    Slot,
+    Vector,
+    dot,
+    length,
+    where,
+)
 from pbdkit_pantograph.fibres import ACROSS, ALONG, NEXT, roles_of
 
 
-class Pantograph(pbdkit.FollowerRule):
+class Pantograph(FollowerRule):
     """A pivot is two points that coincide, one on each fibre; it moves to the average of the places
     that the two fibres propose.
 
@@ -42,7 +52,7 @@ class Pantograph(pbdkit.FollowerRule):
         examples=[0.01],
     )
 
-    def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> dict[str, float]:
+    def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """Stiffness and rest length of the spring, and 1 for the one of the eight points along the
         fibres that it is: `next0` to `next3`, and `after0` to `after3` behind them."""
         roles = {s.rest: role for s, role in roles_of(setting.slots[slot.source])}
@@ -50,20 +60,20 @@ class Pantograph(pbdkit.FollowerRule):
         stiffness = {ALONG: 1.0, ACROSS: self.shear}.get(what, 0.0)
         return {
             "stiffness": stiffness,
-            "rest": pbdkit.length(slot.rest),
+            "rest": length(slot.rest),
             **{f"next{n}": float((ALONG, n) == (what, direction)) for n in range(4)},
             **{f"after{n}": float((NEXT, n) == (what, direction)) for n in range(4)},
         }
 
     @staticmethod
-    def gather(d: pbdkit.Vector, r: pbdkit.Vector, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
         """(k e n, k) of the spring, e = |r + d| - |r|; then d and presence at each of the eight
         points along the fibres."""
         v = r + d
-        distance = pbdkit.length(v)
+        distance = length(v)
         # |v|² - |r|² = d·(r + v): small elongations keep all their digits.
-        elongation = pbdkit.dot(d, r + v) / (distance + w.rest)
-        pull = w.stiffness * elongation / pbdkit.where(distance > 0.0, distance, 1.0)
+        elongation = dot(d, r + v) / (distance + w.rest)
+        pull = w.stiffness * elongation / where(distance > 0.0, distance, 1.0)
         return (
             pull * v, w.stiffness,
             w.next0 * d, w.next0, w.next1 * d, w.next1,
@@ -73,14 +83,15 @@ class Pantograph(pbdkit.FollowerRule):
         )  # fmt: skip
 
     @staticmethod
-    def apply(total: Any, here: pbdkit.Here, p: Any) -> Any:
+    def apply(total: tuple[Any, ...], here: Here, p: Parameters) -> Vector:
         """Σ forces / Σ stiffness; no move where there is neither."""
         pull, stiffness = total[0], total[1]
         one, one_stiffness = _bent(total[2:6], total[10:14])
         other, other_stiffness = _bent(total[6:10], total[14:18])
         stiffness = stiffness + p.bending * (one_stiffness + other_stiffness)
         force = pull + p.bending * (one + other)
-        return force / pbdkit.where(stiffness > 0.0, stiffness, 1.0)
+        move: Vector = force / where(stiffness > 0.0, stiffness, 1.0)
+        return move
 
 
 def _bent(next_points: Any, after: Any) -> tuple[Any, Any]:

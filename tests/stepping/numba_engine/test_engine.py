@@ -359,7 +359,7 @@ class Reads(Halfway):
             return SHARE * x
 
         d, n = total
-        return pbdkit.Vector(halved(inner(FACTORS[0] * d.x)) / (n + WHOLE), s * d.y / n)
+        return pbdkit.plugin.Vector(halved(inner(FACTORS[0] * d.x)) / (n + WHOLE), s * d.y / n)
 
 
 @pytest.mark.parametrize(
