@@ -1,5 +1,6 @@
 # The public names of pbdkit, and where each comes from; __init__.py reads them here.
 
+from pbdkit import errors as errors
 from pbdkit import plugin as plugin
 from pbdkit import testing as testing
 from pbdkit.api import (
@@ -70,6 +71,7 @@ from pbdkit.plugin import (
 from pbdkit.plugin import (
     hookimpl as hookimpl,
 )
+from pbdkit.simulation import Simulation as Simulation
 from pbdkit.sweeps.combine import concat as concat
 from pbdkit.web.report import report as report
 from pbdkit.web.widget import live as live

@@ -1,39 +1,36 @@
-"""What Python users call: from a file, a dict or an object to an experiment and its dataset."""
+"""The verbs of pbdkit for Python users: from a file, a dict or an object to an experiment, its
+dataset, and what is known of both."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, warn_caller
+from pbdkit.errors import DivergedError, ExperimentError, ReproducibilityWarning, warn_caller
 from pbdkit.io.layout import carried
 from pbdkit.io.layout import experiment_of as experiment_of
 from pbdkit.io.sinks import MemorySink, Sink
 from pbdkit.model.experiment import Experiment
-from pbdkit.model.loading import load_experiment
-from pbdkit.model.reading import OF_PROGRAM, Settings, Source, with_settings
-from pbdkit.plugin import Component
-from pbdkit.plugin.registry import GIVEN, Registry
+from pbdkit.model.loading import as_experiment, but_got, load_experiment
+from pbdkit.plugin.registry import GIVEN
 from pbdkit.progress import Watch, progress_bar
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import FAILED, Run, RunReport, record
+from pbdkit.simulation import FAILED, RunReport, Simulation, record
 from pbdkit.stability.forecast import refuse_too_much_output
 from pbdkit.stability.relaxation import tuned
 
 if TYPE_CHECKING:
     import xarray
+    from distributed import Client
 
     from pbdkit.fitting.result import Fitted
     from pbdkit.fitting.strength import FittedStrength
     from pbdkit.identification.report import Identity
+    from pbdkit.model.loading import ComponentClasses, ExperimentLike
+    from pbdkit.model.reading import Settings
     from pbdkit.stability.analysis import Analysis
-
-ComponentClasses = Iterable[type[Component]]
-Given = Experiment | Mapping[str, Any] | str | Path
-"""An experiment, or the dict, the file or the name of a shipped one of which it is made."""
 
 
 def load(
@@ -57,20 +54,29 @@ def load(
     allow_outside : bool
         Whether files that the experiment names, of fields and motions, may lie outside its folder.
 
+    Returns
+    -------
+    Experiment
+        Validated as a whole.
+
     Raises
     ------
     ExperimentError, PluginError
         Where the file or a setting is wrong, or a plugin is missing or broken.
+
+    Examples
+    --------
+    >>> experiment = pbdkit.load("paper/a", settings={"steps": 20})
     """
     if not isinstance(name, str | Path):
         raise ExperimentError(
-            f"load: expected a file or the name of a shipped experiment, {_but_got(name)}"
+            f"load: expected a file or the name of a shipped experiment, {but_got(name)}"
         )
     return load_experiment(str(name), settings, components, allow_outside=allow_outside)
 
 
 def run(
-    experiment: Given,
+    experiment: ExperimentLike,
     *,
     components: ComponentClasses = (),
     settings: Settings = (),
@@ -95,6 +101,11 @@ def run(
     progress : bool
         Show how far the run is.
 
+    Returns
+    -------
+    xarray.Dataset
+        What the experiment records, with everything that makes it again in its attributes.
+
     Raises
     ------
     ExperimentError, PluginError
@@ -107,10 +118,15 @@ def run(
 
     Warns
     -----
-    PbdkitWarning
+    SceneWarning, StabilityWarning, AccuracyWarning
         As `pbdkit run` does, of what is doubtful in the scene or can diverge (but for what takes
         an analysis: `analyse(experiment).warnings()`), and of a last state
-        that is inside out.
+        that is inside out. They are classes of `pbdkit.errors`, under PbdkitWarning.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", progress=False)
+    >>> ds.position.sel(time=400, particle=67)
     """
     found = as_experiment(experiment, components, settings)
     return _run(found, progress, None if output is None else Path(output), force)
@@ -123,7 +139,7 @@ def _run(
         return _run_into(output, experiment, progress, force)
     memory, scene = MemorySink(), build_scene(experiment)
     refuse_too_much_output(scene)
-    report = _recorded(scene, lambda run: memory, progress)
+    report = _recorded(scene, lambda simulation: memory, progress)
     return _finished(report, memory.dataset())
 
 
@@ -135,15 +151,15 @@ def _run_into(output: Path, experiment: Experiment, progress: bool, force: bool)
     refuse_taken(output, force=force)
     scene = build_scene(experiment)
     file = NetcdfSink(output, force, experiment.record.compression)
-    report = _recorded(scene, lambda run: run.sink(file), progress)
+    report = _recorded(scene, lambda simulation: simulation.sink(file), progress)
     return _finished(report, open(file.written))
 
 
-def _recorded(scene: Scene, sink_of: Callable[[Run], Sink], progress: bool) -> RunReport:
+def _recorded(scene: Scene, sink_of: Callable[[Simulation], Sink], progress: bool) -> RunReport:
     with progress_bar(progress) as show:
-        run = Run(scene, watch=Watch(show=show))
-        _warn(run.warnings)
-        return record(run, sink_of(run))
+        simulation = Simulation.of_scene(scene, watch=Watch(show=show))
+        _warn(simulation.warnings)
+        return record(simulation, sink_of(simulation))
 
 
 def _finished(report: RunReport, dataset: xarray.Dataset) -> xarray.Dataset:
@@ -159,23 +175,62 @@ def _warn(texts: Iterable[str]) -> None:
 
 
 def analyse(
-    experiment: Given, *, components: ComponentClasses = (), settings: Settings = ()
+    experiment: ExperimentLike, *, components: ComponentClasses = (), settings: Settings = ()
 ) -> Analysis:
-    """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
-    and the step operator as a sparse matrix (``.operator``)."""
+    """Return what is known of a run before its first step.
+
+    Parameters
+    ----------
+    experiment, components, settings
+        As in `run`.
+
+    Returns
+    -------
+    Analysis
+        Stability, eigenvalues, steps to a tolerance, and the step operator as a sparse matrix
+        (``.operator``); ``print`` shows a summary.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Where the experiment is wrong, or a plugin is missing or broken.
+
+    Examples
+    --------
+    >>> pbdkit.analyse("paper/a").spectral_radius
+    """
     from pbdkit.stability.analysis import Analysis
 
     return Analysis(tuned(build_scene(as_experiment(experiment, components, settings))))
 
 
 def identify(
-    experiment: Given, *, components: ComponentClasses = (), settings: Settings = ()
+    experiment: ExperimentLike, *, components: ComponentClasses = (), settings: Settings = ()
 ) -> Identity:
-    """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
-    elastic body, with its constants, from the rule's answer to plane waves.
+    """Return what the experiment's rule is physically, on its lattice and neighbours: diffusion or
+    an elastic body, with its constants, from the rule's answer to plane waves.
 
     Where its numbers differ from place to place it is that of the first of
     ``experiment.materials()``, which are experiments of one material each, by name.
+
+    Parameters
+    ----------
+    experiment, components, settings
+        As in `run`.
+
+    Returns
+    -------
+    Identity
+        The kind of continuum and its constants; ``print`` shows a summary.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Where the experiment is wrong, or a plugin is missing or broken.
+
+    Examples
+    --------
+    >>> print(pbdkit.identify("material/bar"))
     """
     from pbdkit.identification.probe import identified
 
@@ -186,9 +241,29 @@ def identify(
 def rerun(
     dataset: xarray.Dataset, *, components: ComponentClasses = (), progress: bool = True
 ) -> xarray.Dataset:
-    """The same run again, bit for bit, from the experiment that the dataset carries.
+    """Run the experiment that a dataset carries again, bit for bit.
 
-    Warns, with pbdkit.PbdkitWarning, where other versions made the dataset than are installed.
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result of a run.
+    components, progress
+        As in `run`.
+
+    Returns
+    -------
+    xarray.Dataset
+        The new result.
+
+    Raises
+    ------
+    ExperimentError, PluginError, DivergedError
+        As `run` does, and for a dataset without an experiment.
+
+    Warns
+    -----
+    ReproducibilityWarning
+        Where other versions made the dataset than are installed.
     """
     experiment = experiment_of(dataset, components)
     _warn_of_versions(dataset, experiment)
@@ -198,13 +273,33 @@ def rerun(
 def resume(
     output: str | Path, *, steps: int | None = None, anyway: bool = False, progress: bool = True
 ) -> xarray.Dataset:
-    """Goes on with the unfinished run that was to write `output`, or continues a finished one to
-    so many `steps`, and returns the dataset in the file: that of the uninterrupted run, bit for
-    bit.
+    """Go on with the unfinished run that was to write a file, or continue a finished one.
 
-    Raises ExperimentError where there is nothing to go on with, where another process writes it
-    and, unless `anyway`, where the experiment, pbdkit or a plugin changed since; StorageError for a
-    damaged store or disk; DivergedError, as `run` does, with no dataset: the file holds it.
+    Parameters
+    ----------
+    output : str or path
+        The file.
+    steps : int, optional
+        The number of steps to which a finished run is continued.
+    anyway : bool
+        Go on also where the experiment, pbdkit or a plugin changed since.
+    progress : bool
+        Show how far the run is.
+
+    Returns
+    -------
+    xarray.Dataset
+        The dataset in the file: that of the uninterrupted run, bit for bit.
+
+    Raises
+    ------
+    ExperimentError
+        Where there is nothing to go on with, another process writes the file, or something changed
+        since.
+    StorageError
+        For a damaged store or disk.
+    DivergedError
+        As `run` does, with no dataset: the file holds it.
     """
     from pbdkit.io.open import open
     from pbdkit.restart import resumption
@@ -230,11 +325,12 @@ def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
         if name != GIVEN and before != now:
             whose = f"{name} {before}" if before else f"an unknown version of {name}"
             text = f"made by {whose}, run again by {now}: the result may differ"
-            warnings.warn(text, PbdkitWarning, stacklevel=3)
+            warn_caller(text, ReproducibilityWarning)
 
 
 def sweep(
-    experiment: Given,
+    experiment: ExperimentLike,
+    *,
     vary: Mapping[str, Any] | None = None,
     together: Mapping[str, Any] | None = None,
     replicates: int = 1,
@@ -242,21 +338,59 @@ def sweep(
     names: Mapping[str, str] | None = None,
     folder: str | Path | None = None,
     workers: int | None = None,
-    client: Any = None,
+    client: Client | None = None,
     progress: bool = True,
 ) -> xarray.Dataset:
-    """Runs an experiment over the product of the values in `vary`, the lists in `together`, and
-    replicates with seeds of their own; returns one dataset with the parameters as dimensions.
+    """Run an experiment over the product of some values, and return one dataset.
 
-    The arguments are those of a sweep file, and so is what `pbdkit sweep` would write. `folder`
-    keeps what is finished: the same call again runs the rest. `workers` are processes of this
-    machine, as many as it has processors if None, this process alone if 1; `client` takes a dask
-    cluster instead. A member that fails is NaN in the dataset, which says why in `message`; warns
-    of it with pbdkit.PbdkitWarning. Raises ExperimentError and PluginError before anything runs.
+    Parameters
+    ----------
+    experiment : Experiment, mapping, str or path
+        As in `run`.
+    vary : mapping
+        Lists of values by the path of the parameter, of which the product is run.
+    together : mapping
+        Lists of one length, which are varied at once.
+    replicates : int
+        Runs of each member, with seeds of their own.
+    keep : mapping
+        The ``variables`` and ``times`` to keep; by default everything.
+    names : mapping
+        Names of the new dimensions by path.
+    folder : str or path, optional
+        Keeps what is finished: the same call again runs the rest.
+    workers : int, optional
+        Processes of this machine: by default as many as it has processors; 1 is this one alone.
+    client : dask.distributed.Client, optional
+        A cluster in place of processes of this machine.
+    progress : bool
+        Show how many members have been run.
+
+    Returns
+    -------
+    xarray.Dataset
+        What `pbdkit sweep` would write, with the parameters as dimensions. A member that failed is
+        NaN, and its ``message`` says why.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Before anything runs.
+
+    Warns
+    -----
+    SweepWarning
+        Of members without values.
+    StorageWarning
+        Of damaged members in the folder, which run again.
+
+    Examples
+    --------
+    >>> pbdkit.sweep("paper/d1", vary={"solver.relaxation": [0.5, 1.0]})
     """
     from pbdkit.sweeps.execute import called
 
-    given = as_experiment(experiment, ())
+    given = as_experiment(experiment)
     parts = {"vary": vary or {}, "together": together or {}, "keep": keep or {}}
     parts["names"] = names or {}
     return called(given, parts | {"replicates": replicates}, folder, workers, client, progress)
@@ -265,20 +399,45 @@ def sweep(
 def fit(
     description: Mapping[str, Any] | str | Path,
     *,
-    experiment: Given | None = None,
+    experiment: ExperimentLike | None = None,
+    measured: xarray.Dataset | None = None,
     components: ComponentClasses = (),
 ) -> Fitted:
-    """Parameters of an experiment from what was measured, with their uncertainty.
+    """Fit parameters of an experiment to what was measured.
 
-    `description` is a fit file, the name of a shipped one, or a dict of the same; `experiment`
-    takes the place of its own. Raises ExperimentError and PluginError, and DivergedError where no
-    fit is found.
+    Parameters
+    ----------
+    description : mapping, str or path
+        A fit file, the name of a shipped one, or a dict of the same.
+    experiment : Experiment, mapping, str or path, optional
+        Takes the place of that in the description.
+    measured : xarray.Dataset, optional
+        Takes the place of the file of the measurement: a variable for each of its ``columns``, all
+        of one size, as x, y, ux and uy of a field.
+    components : iterable of classes
+        As in `load`.
+
+    Returns
+    -------
+    Fitted
+        The values with their errors and correlations; ``print`` shows a summary.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Where the description, the experiment or the measurement is wrong.
+    DivergedError
+        Where no fit is found.
+
+    Examples
+    --------
+    >>> print(pbdkit.fit("plate-with-hole"))
     """
     from pbdkit.equilibrium.certificate import UnconvergedError
     from pbdkit.fitting.fit import fit_experiment
     from pbdkit.fitting.specification import described_fit
 
-    asked, source = described_fit(description, given=experiment is not None)
+    asked, source = described_fit(description, given=experiment is not None, measured=measured)
     found = as_experiment(experiment, components) if experiment is not None else None
     try:
         return fit_experiment(asked, found or Experiment.build(source, components), components)
@@ -289,15 +448,31 @@ def fit(
 def fit_strength(
     description: Mapping[str, Any] | str | Path,
     *,
-    experiment: Given | None = None,
+    experiment: ExperimentLike | None = None,
     components: ComponentClasses = (),
 ) -> FittedStrength:
-    """The strength of bonds and its scatter from the peaks of repeated tests, with their
-    uncertainty.
+    """Fit the strength of bonds and its scatter to the peaks of repeated tests.
 
-    `description` is a strength fit file, the name of a shipped one, or a dict of the same;
-    `experiment` takes the place of its own. Raises ExperimentError and PluginError, and
-    DivergedError where a specimen finds no equilibrium.
+    Parameters
+    ----------
+    description : mapping, str or path
+        A strength fit file, the name of a shipped one, or a dict of the same.
+    experiment : Experiment, mapping, str or path, optional
+        Takes the place of that in the description.
+    components : iterable of classes
+        As in `load`.
+
+    Returns
+    -------
+    FittedStrength
+        The values with their intervals; ``print`` shows a summary.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Where the description, the experiment or the measurement is wrong.
+    DivergedError
+        Where a specimen finds no equilibrium.
     """
     from pbdkit.equilibrium.certificate import UnconvergedError
     from pbdkit.fitting.strength import described_strength_fit, fit_strength_of
@@ -308,43 +483,3 @@ def fit_strength(
         return fit_strength_of(asked, found or Experiment.build(source, components))
     except UnconvergedError as error:
         raise DivergedError(str(error)) from None
-
-
-def as_experiment(
-    given: Given, components: ComponentClasses, settings: Settings = ()
-) -> Experiment:
-    """Return the experiment that is given in one of these ways, with the settings."""
-    if isinstance(given, Experiment):
-        Registry(components)  # what is handed over is checked, needed or not
-        given.refuse_unvalidated()
-        return given.with_settings(settings) if settings else given
-    if isinstance(given, str | Path):
-        return load(given, components=components, settings=settings)
-    if _is_dataset(given) or not isinstance(given, Mapping):
-        raise ExperimentError(f"expected an experiment, {_but_got(given)}")
-    source = Source(data=dict(given), beside=OF_PROGRAM)
-    source = with_settings(source, settings, Experiment.defaults())
-    return Experiment.build(source, components)
-
-
-def _is_dataset(given: Any) -> bool:
-    return hasattr(given, "data_vars")
-
-
-def _but_got(given: Any) -> str:
-    """Return what was given in place of an experiment, and what takes or makes it."""
-    if _is_dataset(given):
-        return (
-            "got a dataset, which is a result: `pbdkit.rerun(ds)` runs its experiment again, and "
-            "`ds.pbd.experiment()` returns it"
-        )
-    if isinstance(given, Experiment | Mapping):
-        return f"got {_kind(given)}, which needs no loading: `pbdkit.run` takes it as it is"
-    return (
-        f"got {_kind(given)}; give a file, the name of a shipped experiment as 'paper/a', a dict "
-        "of its parts, or a pbdkit.Experiment"
-    )
-
-
-def _kind(given: Any) -> str:
-    return "a class" if isinstance(given, type) else f"an object of type {type(given).__name__}"

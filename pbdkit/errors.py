@@ -12,6 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 if TYPE_CHECKING:
     import xarray
 
+__all__ = [
+    "AccuracyWarning", "DivergedError", "ExperimentError", "PbdkitError", "PbdkitWarning",
+    "PluginError", "ReproducibilityWarning", "RetirementWarning", "SceneWarning",
+    "StabilityWarning", "StorageError", "StorageWarning", "SweepWarning",
+]  # fmt: skip
+
 LONGEST = 3900
 """So many characters a message has at most."""
 MOST_LINES = 20
@@ -101,15 +107,74 @@ class WriteError(StorageError):
 
 
 class PbdkitWarning(UserWarning):
-    """A run, or its result, deserves a doubt; the text says which, and the remedy."""
+    """The base class of all warnings; the text names the place and the remedy.
+
+    Each subject has a class of its own, so that it can be silenced alone:
+    ``warnings.filterwarnings("ignore", category=pbdkit.errors.StabilityWarning)``.
+    """
 
 
-def warn_caller(text: str) -> None:
-    """Issue a PbdkitWarning at the line outside pbdkit that made the call."""
+class SceneWarning(PbdkitWarning):
+    """A part of the experiment has no effect, or is probably not what was meant."""
+
+
+class StabilityWarning(PbdkitWarning):
+    """Steps can diverge: the relaxation is too large, or a mass too small."""
+
+
+class AccuracyWarning(PbdkitWarning):
+    """Results may be less accurate than their digits: edges that are not free of stress, cells that
+    lock or have turned over."""
+
+
+class ReproducibilityWarning(PbdkitWarning):
+    """A run is repeated by other versions than those that made the dataset."""
+
+
+class StorageWarning(PbdkitWarning):
+    """A file carries no seal, or a part of it was damaged and is computed anew."""
+
+
+class SweepWarning(PbdkitWarning):
+    """Members of a sweep have no values."""
+
+
+class RetirementWarning(PbdkitWarning):
+    """A name of an earlier version is read as its successor until version 1.0."""
+
+
+class WarningText(str):
+    """The text of a warning, and the class with which it is issued in Python."""
+
+    category: type[PbdkitWarning]
+
+    def __new__(cls, text: str, category: type[PbdkitWarning] = SceneWarning) -> WarningText:
+        """Return the text with its class."""
+        self = super().__new__(cls, text)
+        self.category = category
+        return self
+
+
+def of_category(category: type[PbdkitWarning], texts: Iterable[str]) -> list[str]:
+    """Return the texts of warnings with the class with which they are issued."""
+    return [WarningText(text, category) for text in texts]
+
+
+def warn_caller(text: str, category: type[PbdkitWarning] | None = None) -> None:
+    """Issue a warning at the line outside pbdkit that made the call.
+
+    Parameters
+    ----------
+    text : str
+        What is doubtful, and the remedy.
+    category : class, optional
+        The class of the warning; by default that of a WarningText, and else SceneWarning.
+    """
     level, frame = 1, sys._getframe()
     while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] == "pbdkit":
         level, frame = level + 1, frame.f_back
-    warnings.warn(text, PbdkitWarning, stacklevel=level)
+    category = category or getattr(text, "category", SceneWarning)
+    warnings.warn(str(text), category, stacklevel=level)
 
 
 def dotted(where: Sequence[Any]) -> str:

@@ -29,7 +29,7 @@ from pbdkit.model.shipped import read_experiment
 from pbdkit.plugin.discovery import refuse_retired
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.simulation import Driver, Execution, Run, RunReport, record
+from pbdkit.simulation import Driver, Execution, RunReport, Simulation, record
 from pbdkit.stability.relaxation import with_solver
 
 
@@ -240,7 +240,7 @@ SAME_WEIGHT = 1e-6
 class Resumption:
     """A run that is ready to be gone on with: ``record()`` does it."""
 
-    run: Run
+    run: Simulation
     sink: NetcdfSink
     recorder: Recorder
 

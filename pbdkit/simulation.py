@@ -12,32 +12,39 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from pbdkit.communicator import SERIAL, Communicator
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import DivergedError, ExperimentError, warn_caller
 from pbdkit.io.checkpoint import Checkpoint
-from pbdkit.io.recorder import Recorder, RunOutcome
+from pbdkit.io.recorder import Recorder, RunOutcome, Snapshots
 from pbdkit.io.sinks import KeepingSink, MemorySink, OverlappingSink, Sink
 from pbdkit.linear.stencil import Bound, wave_bound
+from pbdkit.model.loading import as_experiment
 from pbdkit.model.solver import Equilibrium, Solver, Stepping
 from pbdkit.plugin.discovery import worded
 from pbdkit.progress import StoppedError, Watch
-from pbdkit.scene.scene import Scene
+from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stability.forecast import outlook, prediction, quick_warnings
 from pbdkit.stability.relaxation import tuned
 from pbdkit.stepping.divergence import EVERY, Guard
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.state import State, initial_state
+from pbdkit.stepping.state import State, initial_state, unmoved_state
 
 if TYPE_CHECKING:
+    import xarray
+
     from pbdkit.equilibrium.certificate import Certificate, Pace, Settling
     from pbdkit.equilibrium.solve import Way
     from pbdkit.model.experiment import Experiment
+    from pbdkit.model.loading import ComponentClasses, ExperimentLike
+    from pbdkit.model.reading import Settings
 
+
+__all__ = ["Recording", "Simulation"]
 
 States = Generator[State, None, RunOutcome]
 
@@ -61,6 +68,11 @@ class Driver(ABC):
         self.within: float | None = None
         """The moment within a step of which the state just given out is an equilibrium to be
         recorded; None elsewhere."""
+        self.pause = -1
+        """A step at which to give out the state whatever is recorded."""
+        self.certificate: Certificate | None = None
+        """The bound on the distance of the last state from equilibrium, of an equilibrium that was
+        found."""
         self.rejection: FloatingPointError | None = None
         """Why whoever looked at the last state could not use it; its next move is up to the
         driver."""
@@ -73,6 +85,10 @@ class Driver(ABC):
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """All that decides how it goes on from a state just given out."""
+
+    def restart(self, state: State) -> None:
+        """Go on from another state of the same step in place of that just given out."""
+        self.state = state
 
     @abstractmethod
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
@@ -133,6 +149,11 @@ class SteppingDriver(Driver):
             raise experiment.located(ExperimentError(text, ("solver", "settle")))
         settling.pace, settling.obstacle = pace, obstacle
 
+    def restart(self, state: State) -> None:
+        """Go on from another state; the guard looks back to it."""
+        super().restart(state)
+        self.guard = replace(self.guard, good_step=state.step, kept=state.copy())
+
     def states(self) -> States:
         """A run that diverges gives out the last good state at its end, where that is later than
         what was recorded."""
@@ -166,6 +187,7 @@ class SteppingDriver(Driver):
         experiment, state = self.scene.experiment, self.state
         stops = [experiment.next_wanted(state.step), self.guard.next_look]
         stops += [self.settling.pace.next_look] if self.settling else []
+        stops += [self.pause] if self.pause > state.step else []
         reached = min(*stops, state.step + self._patience)
         planned = experiment.record.keeps(reached, reached + 1)  # by longer runs, too
         notes = reached == self.guard.next_look or planned
@@ -258,7 +280,7 @@ class EquilibriumDriver(Driver):
         state = self.state
         yield state
         try:
-            certificate = yield from self._on_the_way(state)
+            self.certificate = certificate = yield from self._on_the_way(state)
             outcome = RunOutcome("complete", str(certificate), state.step, certificate.as_dict())
         except UnconvergedError as error:
             found = error.certificate
@@ -324,39 +346,277 @@ LARGEST = 50_000
 """Of larger bodies nothing is measured ahead of the run."""
 
 
-class Run:
-    """One run of a scene, gone through once: ``for state in Run(scene): ...``.
+class Simulation:
+    """One simulation of an experiment, stepped by hand or to its end.
 
-    A state comes at every step of which the experiment records something, the first and the last
-    included, and at some between. It is valid, and may be changed, until the next is asked for:
-    ``state.copy()`` keeps it. `watch` is told how far the run is and says whether to stop; `start`
-    is the state to go on from, which the run takes over. Raises ExperimentError, with its place in
-    the file, and PluginError.
+    The numbers are those of `pbdkit.run`, bit for bit, however many steps are made in a call. A
+    warning is issued for what is doubtful in the scene, as `pbdkit.run` does.
+
+    Parameters
+    ----------
+    experiment : Experiment, mapping, str or path
+        As `pbdkit.run` takes it.
+    components, settings
+        As in `pbdkit.load`.
+    start : Simulation, optional
+        The simulation from whose state this one starts, at the step that it has reached: the body
+        must have the same particles and bonds. By default the initial state of the experiment.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Where the experiment is wrong, a plugin is missing or broken, or the start is the state of
+        another body.
+
+    Examples
+    --------
+    >>> simulation = pbdkit.Simulation("paper/a")
+    >>> with simulation.record("first-steps.nc"):
+    ...     simulation.step(50)
+    >>> simulation.state.position.sel(particle=67)
+    >>> simulation.equilibrate()
     """
 
-    processes = 1
-    """That share it."""
+    processes: int = 1
+    """The number of processes that share it."""
 
     def __init__(
-        self, scene: Scene, *, start: State | None = None, watch: Watch | None = None
+        self,
+        experiment: ExperimentLike,
+        *,
+        components: ComponentClasses = (),
+        settings: Settings = (),
+        start: Simulation | None = None,
     ) -> None:
+        scene = build_scene(as_experiment(experiment, components, settings))
+        state = None
+        if start is not None:
+            state = start.driver.state.copy()
+            if not state.fits(unmoved_state(scene, scene.raster.shape[1:])):
+                raise ExperimentError(
+                    "start: its state is that of another body: the particles, bonds, leader "
+                    "groups and precision must be the same"
+                )
+            if state.step > scene.experiment.steps:
+                raise ExperimentError(
+                    f"start: step {state.step} is reached, and the experiment has "
+                    f"{scene.experiment.steps} steps"
+                )
+        self._begin(scene, state, Watch())
+        for text in self.warnings:
+            warn_caller(text)
+
+    @classmethod
+    def of_scene(
+        cls, scene: Scene, *, start: State | None = None, watch: Watch | None = None
+    ) -> Simulation:
+        """Return the simulation of a scene, without warnings.
+
+        Parameters
+        ----------
+        scene : Scene
+            The experiment on its lattice.
+        start : State, optional
+            The state to go on from, which the simulation takes over.
+        watch : Watch, optional
+            Shows progress and says whether to stop.
+        """
+        simulation = cls.__new__(cls)
+        simulation._begin(scene, start, watch or Watch())
+        return simulation
+
+    def _begin(self, scene: Scene, start: State | None, watch: Watch) -> None:
         chosen = scene.experiment.stepping.open_parameters
         self.scene = scene = tuned(scene)
-        self.outcome: RunOutcome | None = None
-        """How the run ended; None until it has."""
         with _located(scene):
             make = DRIVERS[type(scene.experiment.solver)]
-            self.driver = make(scene, start or initial_state(scene), watch or Watch())
+            self.driver = make(scene, start or initial_state(scene), watch)
         self.driver.chosen = chosen
 
+    outcome: RunOutcome | None = None
+    """How the simulation ended; None until it has."""
+
     def __iter__(self) -> Iterator[State]:
+        """Yield the states to the end, once: of every step of which something is recorded, the
+        first and the last included, and of some between. Each is valid, and may be changed, until
+        the next: ``state.copy()`` keeps it."""
         with _located(self.scene):
             self.outcome = yield from self.driver.states()
 
+    def step(self, n: int = 1) -> None:
+        """Make steps.
+
+        Parameters
+        ----------
+        n : int
+            The number of steps. A run that has settled ends earlier, as `outcome` then says.
+
+        Raises
+        ------
+        ExperimentError
+            Where the experiment has fewer steps left, or its solver makes none.
+        DivergedError
+            Where a displacement leaves the finite numbers.
+        """
+        steps, time = self.experiment.steps, self.time
+        if not self.experiment.solver.makes_steps:
+            raise ExperimentError(
+                "solver: an equilibrium is found without steps: call run() or equilibrate(), or "
+                "take solver: {type: stepping}"
+            )
+        if type(n) is not int or n < 0:
+            raise ExperimentError(f"step: expected a number of steps from 0, got {n!r}")
+        if self.outcome:
+            raise ExperimentError(f"step: the simulation has ended: {self.outcome.stop_reason}")
+        if time + n > steps:
+            raise ExperimentError(
+                f"step: step {time} of {steps} is reached, and {n} more are asked for; "
+                f"settings={{'steps': {time + n}}} makes the experiment longer"
+            )
+        self.driver.pause = time + n
+        self._go(lambda: self.time >= time + n)
+
+    def run(self) -> None:
+        """Go on to the end of the experiment, as `pbdkit.run` does.
+
+        Raises
+        ------
+        DivergedError
+            Where a displacement leaves the finite numbers, there is no equilibrium, or the body
+            comes apart on the way to one.
+        """
+        self._go(lambda: False)
+
+    def equilibrate(self) -> Certificate:
+        """Move the body to equilibrium, with leaders, loads and numbers as they are now.
+
+        Bonds that are too long in equilibrium break. The time stays as it is, and steps go on from
+        there. With ``solver: equilibrium`` the load is followed to the last step, as in `run`.
+
+        Returns
+        -------
+        Certificate
+            The bound on the distance from equilibrium; ``print`` shows it.
+
+        Raises
+        ------
+        DivergedError
+            Where no equilibrium is found.
+        ExperimentError
+            Where there is none.
+        """
+        from pbdkit.equilibrium.certificate import UnconvergedError
+        from pbdkit.equilibrium.solve import settle_at_step
+
+        if not self.experiment.solver.makes_steps:
+            self.run()
+            assert self.driver.certificate is not None
+            return self.driver.certificate
+        state = self.driver.state.copy()
+        try:
+            with _located(self.scene):
+                certificate = settle_at_step(self.scene, state)
+        except UnconvergedError as error:
+            raise DivergedError(f"{error}: {error.certificate}") from None
+        self.driver.restart(state)
+        return certificate
+
+    def record(self, path: str | Path | None = None, *, force: bool = False) -> Recording:
+        """Record from the present state on what the experiment asks for under `record`.
+
+        The present state is recorded in any case, and so is the last one. Recording ends with the
+        block, or by `Recording.close`, and where the simulation ends.
+
+        Parameters
+        ----------
+        path : str or path, optional
+            The file to write, as `pbdkit.run` does; by default the dataset is kept in memory.
+        force : bool
+            Replace an existing file.
+
+        Returns
+        -------
+        Recording
+            A context manager, whose `dataset` is there when it has ended.
+
+        Raises
+        ------
+        ExperimentError
+            Where the file exists, or the simulation has ended.
+        StorageError
+            Where the file cannot be written.
+        """
+        if self.outcome:
+            raise ExperimentError(f"record: the simulation has ended: {self.outcome.stop_reason}")
+        if path is None:
+            memory = MemorySink()
+            recording = Recording(self, memory, dataset_of=memory.dataset)
+        else:
+            from pbdkit.io.netcdf import NetcdfSink
+            from pbdkit.io.open import open
+            from pbdkit.io.save import refuse_taken
+
+            refuse_taken(Path(path), force=force)
+            file = NetcdfSink(Path(path), force, self.experiment.record.compression)
+            recording = Recording(self, self.sink(file), dataset_of=lambda: open(file.written))
+        self._start()
+        self._recordings.append(recording)
+        return recording
+
+    _recordings: list[Recording]
+    _states: Iterator[State] | None = None
+
+    def _start(self) -> None:
+        """Let the driver give out the present state, which recordings then take."""
+        if self._states is None:
+            self._states, self._recordings = iter(self), []
+            next(self._states)
+
+    def _go(self, is_reached: Callable[[], bool]) -> None:
+        """Go on until a time is reached, or the end; recordings take each state as it is left."""
+        self._start()
+        assert self._states is not None
+        while not self.outcome and not is_reached():
+            try:
+                for recording in self._recordings:
+                    recording.take(self.driver.state)
+                next(self._states, None)
+            except BaseException:
+                time, ending, self._recordings = self.time, self._recordings, []
+                self.outcome = RunOutcome("interrupted", f"by an error after step {time}", time)
+                for recording in ending:
+                    recording.abandon()
+                raise
+        if self.outcome:
+            ending, self._recordings = self._recordings, []
+            for recording in ending:
+                recording.finish(self.outcome)
+            if self.outcome.status in FAILED:
+                raise DivergedError(self.outcome.stop_reason)
+
     @property
-    def state(self) -> State:
-        """Where the run stands; of one that diverged, what it came to."""
-        return self.driver.state
+    def experiment(self) -> Experiment:
+        """The experiment, with numbers in place of `auto`."""
+        return self.scene.experiment
+
+    @property
+    def time(self) -> int:
+        """The number of steps that are made."""
+        return self.driver.state.step
+
+    @property
+    def state(self) -> xarray.Dataset:
+        """The present state: `position`, `u` and `kind` of every particle, what rule and fracture
+        model remember, and `broken_step` of every bond where bonds can break.
+
+        The names, coordinates and units are those of a run's dataset at one time. The values are
+        read-only, and later steps do not change them.
+        """
+        return self._snapshots.dataset(self.driver.state)
+
+    @cached_property
+    def _snapshots(self) -> Snapshots:
+        return Snapshots(self.scene)
 
     @property
     def choice(self) -> Choice:
@@ -369,11 +629,11 @@ class Run:
         return self.scene.raster.count
 
     def recorder(self, sink: Sink) -> Recorder:
-        """What takes from its states what the dataset holds."""
+        """Return what takes from its states what the dataset holds."""
         return Recorder(self.scene, sink)
 
     def sink(self, file: KeepingSink) -> KeepingSink:
-        """What writes into a file beside the run."""
+        """Return a sink that writes into a file beside the simulation."""
         return OverlappingSink(file)
 
     @cached_property
@@ -383,16 +643,17 @@ class Run:
 
     @cached_property
     def waves(self) -> Bound | None:
-        """What plane waves say of its stability."""
+        """The bound on its stability from plane waves."""
         return wave_bound(self.scene)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What is to be said before the first step: of the scene, and of stability."""
+        """The warnings before the first step: of the scene, and of stability."""
         return quick_warnings(self.scene, self.waves)
 
     def outlook(self) -> list[str]:
-        """What else `check` warns of, where the body is so small that it is known at once."""
+        """Return what else `check` warns of, where the body is so small that it is known at
+        once."""
         wave_warns = bool(self.waves) and "solver.relaxation" in " ".join(self.warnings)
         found = outlook(self.scene)
         return [w for w in found if not (wave_warns and w.startswith("solver.relaxation"))]
@@ -436,48 +697,136 @@ def peak_memory() -> int:
     return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> RunReport:
-    """Takes a run to its end, and what the experiment records of it into the sink. A `recorder` of
-    the sink that has begun goes on with what it took before. A run that is asked to stop is left
-    where it stands, where the sink can keep that."""
-    begun, scene, first = time.perf_counter(), run.scene, run.state.step
-    keeping = sink if isinstance(sink, KeepingSink) else None
+class Recording:
+    """What a simulation records of its states, as its experiment asks for under `record`.
 
-    def report(outcome: RunOutcome, warnings: tuple[str, ...] = ()) -> RunReport:
-        wall_s = time.perf_counter() - begun
-        return RunReport(outcome, run.particles, wall_s, run.choice, warnings, first, run.processes)
+    Made by `Simulation.record`, and a context manager: recording ends with the block.
+    """
 
+    def __init__(
+        self,
+        simulation: Simulation,
+        sink: Sink,
+        recorder: Recorder | None = None,
+        dataset_of: Callable[[], xarray.Dataset] | None = None,
+    ) -> None:
+        self._simulation, self._sink, self._dataset_of = simulation, sink, dataset_of
+        self._keeping = sink if isinstance(sink, KeepingSink) else None
+        self._begun, self._first = time.perf_counter(), simulation.time
+        self._has_ended = False
+        try:
+            if recorder is None:
+                recorder = simulation.recorder(sink)
+                with _located(simulation.scene):
+                    recorder.begin()
+        except BaseException:
+            self.abandon()
+            raise
+        self._recorder = recorder
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End recording with the present state. A run that has not come to its end is then recorded
+        with the status "interrupted".
+
+        Raises
+        ------
+        StorageError
+            Where the file cannot be written.
+        """
+        simulation, time = self._simulation, self._simulation.time
+        if self._has_ended:
+            return
+        if time >= simulation.experiment.steps:
+            with suppress(DivergedError):  # the dataset says it
+                simulation.run()
+            return
+        simulation._recordings.remove(self)
+        try:
+            self._recorder.observe(simulation.driver.state, last=True)
+            self.finish(RunOutcome("interrupted", f"stopped after step {time}", time))
+        except BaseException:
+            self.abandon()
+            raise
+
+    @property
+    def dataset(self) -> xarray.Dataset:
+        """The dataset that was recorded.
+
+        Raises
+        ------
+        ExperimentError
+            Where recording has not ended.
+        """
+        if not self._has_ended or self._dataset_of is None:
+            raise ExperimentError("record: has not ended: leave the block, or call close()")
+        return self._dataset_of()
+
+    def take(self, state: State) -> None:
+        """Record what is wanted of a state, and keep where the simulation stands, if it is due. A
+        state that cannot be recorded is for the driver to deal with."""
+        simulation, driver = self._simulation, self._simulation.driver
+        try:
+            with _located(simulation.scene):
+                self._recorder.observe(state, last=driver.ending, within=driver.within)
+        except FloatingPointError as error:
+            driver.rejection = error
+            return
+        # At its end there is nothing to go on to: what follows from the last state is its end.
+        ends = driver.ending or driver.is_over or state.step >= simulation.experiment.steps
+        if self._keeping and not ends and self._keeping.due():
+            rate = (state.step - self._first) / (time.perf_counter() - self._begun)
+            self._keeping.keep(checkpoint_of(driver, self._recorder, rate))
+
+    def suspend(self, outcome: RunOutcome) -> RunReport:
+        """Leave the run where it stands, to be gone on with."""
+        assert self._keeping
+        self._keeping.suspend(checkpoint_of(self._simulation.driver, self._recorder))
+        return self._report(outcome)
+
+    def finish(self, outcome: RunOutcome) -> RunReport:
+        """Record what is known at the end."""
+        simulation, driver = self._simulation, self._simulation.driver
+        if self._keeping:
+            self._keeping.note_end(checkpoint_of(driver, self._recorder))
+        with _located(simulation.scene):
+            self._recorder.finish(driver.state, outcome, simulation.prediction)
+        self._has_ended = True
+        return self._report(outcome, self._recorder.warnings)
+
+    def abandon(self) -> None:
+        """Give up what was recorded; what was kept stays."""
+        self._has_ended, self._dataset_of = True, None
+        self._sink.abandon()
+
+    def _report(self, outcome: RunOutcome, warnings: tuple[str, ...] = ()) -> RunReport:
+        simulation, wall_s = self._simulation, time.perf_counter() - self._begun
+        cost = simulation.particles, wall_s, simulation.choice
+        return RunReport(outcome, *cost, warnings, self._first, simulation.processes)
+
+
+def record(simulation: Simulation, sink: Sink, *, recorder: Recorder | None = None) -> RunReport:
+    """Take a simulation to its end, and what the experiment records of it into the sink.
+
+    A `recorder` of the sink that has begun goes on with what it took before. A simulation that is
+    asked to stop is left where it stands, where the sink can keep that.
+    """
+    recording = Recording(simulation, sink, recorder)
     try:
-        if recorder is None:
-            recorder = run.recorder(sink)
-            with _located(scene):
-                recorder.begin()
-        for state in run:
-            if keeping and run.driver.stopped:
-                keeping.suspend(checkpoint_of(run.driver, recorder))
-                return report(run.driver.stopped)
-            try:
-                with _located(scene):
-                    within = run.driver.within
-                    recorder.observe(state, last=run.driver.ending, within=within)
-            except FloatingPointError as error:
-                run.driver.rejection = error
-                continue
-            # At its end there is nothing to go on to: what follows from the last state is its end.
-            ends = run.driver.ending or run.driver.is_over
-            ends = ends or state.step >= scene.experiment.steps
-            if keeping and not ends and keeping.due():
-                rate = (state.step - first) / (time.perf_counter() - begun)
-                keeping.keep(checkpoint_of(run.driver, recorder, rate))
-        assert run.outcome is not None
-        if keeping:
-            keeping.note_end(checkpoint_of(run.driver, recorder))
-        with _located(scene):
-            recorder.finish(run.state, run.outcome, run.prediction)
+        for state in simulation:
+            if isinstance(sink, KeepingSink) and simulation.driver.stopped:
+                return recording.suspend(simulation.driver.stopped)
+            recording.take(state)
+        assert simulation.outcome is not None
+        return recording.finish(simulation.outcome)
     except BaseException:
         sink.abandon()
         raise
-    return report(run.outcome, recorder.warnings)
 
 
 def rehearse(scene: Scene) -> None:
@@ -508,20 +857,16 @@ class Execution:
 
     def scene(self, experiment: Experiment) -> Scene:
         """Return what this process needs of an experiment's scene."""
-        from pbdkit.scene.scene import build_scene
-
         return build_scene(experiment)
 
     def tuned(self, scene: Scene) -> Scene:
         """Return the scene with numbers in place of `auto`."""
-        from pbdkit.stability.relaxation import tuned
-
         return tuned(scene)
 
     def by_root(self, work: Callable[[], int]) -> int:
         """Return what the root alone comes to."""
         return work()
 
-    def run(self, scene: Scene, watch: Watch) -> Run:
+    def run(self, scene: Scene, watch: Watch) -> Simulation:
         """Return the run of a scene."""
-        return Run(scene, watch=watch)
+        return Simulation.of_scene(scene, watch=watch)

@@ -20,7 +20,7 @@ import pbdkit
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.plugin import StoresEnergy
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import Run
+from pbdkit.simulation import Simulation
 from pbdkit.testing import mechanics as laws
 
 Tree = dict[str, Any]
@@ -192,10 +192,10 @@ def work_of(scene: Scene, moment: StateMoment) -> float:
 
 def last_moment(experiment: Tree) -> tuple[Scene, StateMoment]:
     """The scene, and where its run ends."""
-    course = Run(build_scene(pbdkit.Experiment(**experiment)))
+    course = Simulation.of_scene(build_scene(pbdkit.Experiment(**experiment)))
     for _ in course:
         pass
-    return course.scene, StateMoment(course.state.copy(), Tables(course.scene))
+    return course.scene, StateMoment(course.driver.state.copy(), Tables(course.scene))
 
 
 def _modulus(experiment: Tree) -> float:

@@ -88,7 +88,9 @@ def test_rules_are_evaluated_in_one_place():
 def test_functions_stay_short(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef):
-            assert node.end_lineno - node.lineno < 60, node.name
+            # A docstring with its sections is not counted.
+            first = node.body[ast.get_docstring(node) is not None :][:1] or [node]
+            assert node.end_lineno - first[0].lineno < 60, node.name
 
 
 def test_every_folder_has_its_place_in_the_order():

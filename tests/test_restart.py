@@ -22,7 +22,7 @@ from pbdkit.io.sinks import MemorySink, OverlappingSink
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 Call = Callable[..., Any]
 OUT = Path("tensile.nc")
@@ -86,7 +86,7 @@ def run_in_parts(given: dict[str, Any], path: Path, looks: Iterator[int]) -> int
     """Stops the run after so many looks, and so on; how often it was gone on with."""
     scene = scene_of(given)
     sink = OverlappingSink(NetcdfSink(path, False, scene.experiment.record.compression))
-    report = record(Run(scene, watch=stopping_after(next(looks))), sink)
+    report = record(Simulation.of_scene(scene, watch=stopping_after(next(looks))), sink)
     for resumed in count():
         if report.outcome.status != "interrupted":
             return resumed
@@ -122,7 +122,7 @@ def test_a_run_in_parts_is_the_whole_run(
 ) -> None:
     given = tensile | RUNS[change]
     whole, parts = tmp_path / "whole.nc", tmp_path / "parts.nc"
-    record(Run(scene_of(given)), NetcdfSink(whole))
+    record(Simulation.of_scene(scene_of(given)), NetcdfSink(whole))
     random = np.random.default_rng(len(change))
     looks = (int(random.integers(0, 2 + n)) for n in count())
     assert run_in_parts(given, parts, looks) > 0
@@ -135,7 +135,7 @@ def test_a_run_in_parts_is_the_whole_run(
 def test_any_run_in_parts_is_the_whole_run(tmp_path_factory: Any, given: dict[str, Any]) -> None:
     folder = tmp_path_factory.mktemp("parts")
     try:
-        record(Run(scene_of(given)), NetcdfSink(folder / "whole.nc"))
+        record(Simulation.of_scene(scene_of(given)), NetcdfSink(folder / "whole.nc"))
     except pbdkit.ExperimentError:  # leaders that contradict each other, perhaps on the way
         assume(False)
     run_in_parts(given, folder / "parts.nc", iter([1, 2, 3, 10**9]))
@@ -151,7 +151,7 @@ def test_a_run_is_gone_on_with_from_any_commit(
     monkeypatch.setattr(netcdf_sink, "EVERY_S", 0.0)
     monkeypatch.setattr(netcdf_sink, "SHARE", 0)
     whole, live = tmp_path / "whole.nc", tmp_path / "live"
-    record(Run(scene_of(given)), NetcdfSink(whole))
+    record(Simulation.of_scene(scene_of(given)), NetcdfSink(whole))
     live.mkdir()
     sink = NetcdfSink(live / "out.nc", first_s=0.0)
     keep = sink.keep
@@ -161,7 +161,7 @@ def test_a_run_is_gone_on_with_from_any_commit(
         shutil.copytree(live, tmp_path / f"kill-{standing.facts['step']}")
 
     monkeypatch.setattr(sink, "keep", keep_and_copy)
-    record(Run(scene_of(given)), sink)
+    record(Simulation.of_scene(scene_of(given)), sink)
     killed = sorted(tmp_path.glob("kill-*"))
     assert len(killed) == given["steps"]
     for folder in killed:
@@ -180,7 +180,7 @@ def stopped(call: Call, tensile: dict[str, Any]) -> dict[str, Any]:
     sink = NetcdfSink(OUT, origin={"experiment": "e.json", "settings": []})
     given = tensile | {"steps": 40}
     Path("e.json").write_text(json.dumps(given))
-    report = record(Run(scene_of(given), watch=stopping_after(20)), sink)
+    report = record(Simulation.of_scene(scene_of(given), watch=stopping_after(20)), sink)
     assert (report.outcome.status, OUT.exists()) == ("interrupted", False)
     return given
 
@@ -244,8 +244,8 @@ def test_a_finished_run_is_continued_to_the_longer_one(
     given = tensile | RUNS[change]
     given |= {"steps": given.get("steps", 10) + 17}
     whole, shorter = tmp_path / "whole.nc", tmp_path / "shorter.nc"
-    record(Run(scene_of(given)), NetcdfSink(whole))
-    record(Run(scene_of(given | {"steps": 10})), NetcdfSink(shorter))
+    record(Simulation.of_scene(scene_of(given)), NetcdfSink(whole))
+    record(Simulation.of_scene(scene_of(given | {"steps": 10})), NetcdfSink(shorter))
     with pbdkit.resume(shorter, steps=given["steps"], progress=False) as ds:
         assert ds.time[-1] > 10
     assert_same(whole, shorter)
@@ -336,12 +336,12 @@ LATER: dict[str, dict[str, Any]] = {
 def test_a_run_that_settles_is_continued_to_the_longer_one(later: str, tmp_path: Path) -> None:
     """Whether or not the shorter run has settled, what is to happen after it still does."""
     given, whole = BLOCK | LATER[later] | {"steps": 400}, tmp_path / "whole.nc"
-    outcome = record(Run(scene_of(given)), NetcdfSink(whole)).outcome
+    outcome = record(Simulation.of_scene(scene_of(given)), NetcdfSink(whole)).outcome
     assert outcome.status == "settled"
     assert outcome.steps > (8 if later in ("nothing", "a rule that is not linear") else 129)
     for shorter in (7, 60):
         part = tmp_path / f"part-{shorter}.nc"
-        record(Run(scene_of(given | {"steps": shorter})), NetcdfSink(part))
+        record(Simulation.of_scene(scene_of(given | {"steps": shorter})), NetcdfSink(part))
         found = resumption(part, Watch(), steps=400)
         assert found is not None
         found.record()
@@ -352,8 +352,11 @@ def test_a_run_that_settles_is_continued_to_the_longer_one(later: str, tmp_path:
 def test_an_interrupted_run_goes_on_to_more_steps(later: str, tmp_path: Path) -> None:
     given = BLOCK | LATER[later] | {"record": {"every": 1}}
     whole, part = tmp_path / "whole.nc", tmp_path / "part.nc"
-    record(Run(scene_of(given | {"steps": 900})), NetcdfSink(whole))
-    record(Run(scene_of(given | {"steps": 80}), watch=stopping_after(40)), NetcdfSink(part))
+    record(Simulation.of_scene(scene_of(given | {"steps": 900})), NetcdfSink(whole))
+    record(
+        Simulation.of_scene(scene_of(given | {"steps": 80}), watch=stopping_after(40)),
+        NetcdfSink(part),
+    )
     found = resumption(part, Watch(), steps=900)
     assert found is not None
     assert found.record().first > 5
@@ -362,13 +365,15 @@ def test_an_interrupted_run_goes_on_to_more_steps(later: str, tmp_path: Path) ->
 
 def test_a_run_that_is_stopped_at_its_last_look_settles_all_the_same(tmp_path: Path) -> None:
     given = BLOCK | {"record": {"every": 1}, "steps": 400}
-    steps = record(Run(scene_of(given)), MemorySink()).outcome.steps
+    steps = record(Simulation.of_scene(scene_of(given)), MemorySink()).outcome.steps
     given, whole = given | {"steps": steps}, tmp_path / "whole.nc"
-    record(Run(scene_of(given)), NetcdfSink(whole))
+    record(Simulation.of_scene(scene_of(given)), NetcdfSink(whole))
     stops = []
     for looks in count(steps + 2):
         part = tmp_path / f"part-{looks}.nc"
-        report = record(Run(scene_of(given), watch=stopping_after(looks)), NetcdfSink(part))
+        report = record(
+            Simulation.of_scene(scene_of(given), watch=stopping_after(looks)), NetcdfSink(part)
+        )
         if report.outcome.status != "interrupted":
             break
         stops.append(report.outcome.steps)
@@ -383,7 +388,10 @@ def test_a_run_that_is_stopped_at_its_last_look_settles_all_the_same(tmp_path: P
 def test_an_interrupted_run_is_not_taken_for_a_shorter_one(tmp_path: Path) -> None:
     """One of 100 steps would have settled before the load that the longer one waits for."""
     given, part = BLOCK | LATER["a load"] | {"record": {"every": 1}}, tmp_path / "part.nc"
-    record(Run(scene_of(given | {"steps": 900}), watch=stopping_after(40)), NetcdfSink(part))
+    record(
+        Simulation.of_scene(scene_of(given | {"steps": 900}), watch=stopping_after(40)),
+        NetcdfSink(part),
+    )
     with pytest.raises(pbdkit.ExperimentError, match="of 100 steps looks from step 1 on whether"):
         resumption(part, Watch(), steps=100)
     found = resumption(part, Watch())
@@ -395,7 +403,7 @@ def test_the_search_for_an_equilibrium_does_not_become_another_one(
     tensile: dict[str, Any], tmp_path: Path
 ) -> None:
     given, part = tensile | RUNS["equilibrium, fracture"], tmp_path / "part.nc"
-    record(Run(scene_of(given), watch=stopping_after(9)), NetcdfSink(part))
+    record(Simulation.of_scene(scene_of(given), watch=stopping_after(9)), NetcdfSink(part))
     steps = given["steps"]
     with pytest.raises(pbdkit.ExperimentError, match="the way there depends on `steps`"):
         resumption(part, Watch(), steps=steps + 5)
@@ -407,15 +415,15 @@ def test_weights_that_were_chosen_are_those_of_the_longer_run(tmp_path: Path) ->
     solver = {"type": "stepping", "relaxation": "auto", "memory": "auto"}
     given = BLOCK | {"solver": solver}
     whole, part = tmp_path / "whole.nc", tmp_path / "part.nc"
-    record(Run(scene_of(given | {"steps": 60})), NetcdfSink(whole))
-    record(Run(scene_of(given | {"steps": 9})), NetcdfSink(part))
+    record(Simulation.of_scene(scene_of(given | {"steps": 60})), NetcdfSink(whole))
+    record(Simulation.of_scene(scene_of(given | {"steps": 9})), NetcdfSink(part))
     for steps in (30, 60):  # what was chosen is known of a run that was itself continued
         found = resumption(part, Watch(), steps=steps)
         assert found is not None
         found.record()
     assert_same(whole, part)
     given |= {"leaders": [BLOCK["leaders"][0], BLOCK["leaders"][1] | {"until": 20}]}
-    record(Run(scene_of(given | {"steps": 9})), NetcdfSink(part, True))
+    record(Simulation.of_scene(scene_of(given | {"steps": 9})), NetcdfSink(part, True))
     with pytest.raises(
         pbdkit.ExperimentError, match=r": the steps were .* relaxation 1\.5782, .* takes 1\.8"
     ):
@@ -424,7 +432,10 @@ def test_weights_that_were_chosen_are_those_of_the_longer_run(tmp_path: Path) ->
     assert found is not None
     assert found.record().outcome.status == "complete"
     given |= {"steps": 15, "record": {"every": 1}}
-    record(Run(scene_of(given), watch=stopping_after(5)), NetcdfSink(tmp_path / "left.nc"))
+    record(
+        Simulation.of_scene(scene_of(given), watch=stopping_after(5)),
+        NetcdfSink(tmp_path / "left.nc"),
+    )
     with pytest.raises(pbdkit.ExperimentError, match=r": the steps were .* takes 1\.8"):
         resumption(tmp_path / "left.nc", Watch(), steps=60)
     found = resumption(tmp_path / "left.nc", Watch())
@@ -441,8 +452,8 @@ def test_a_distance_that_is_infinite_can_be_gone_on_with(tmp_path: Path) -> None
         "steps": 60,
     }
     whole, part = tmp_path / "whole.nc", tmp_path / "part.nc"
-    record(Run(scene_of(given | {"steps": 90})), NetcdfSink(whole))
-    run = Run(scene_of(given))
+    record(Simulation.of_scene(scene_of(given | {"steps": 90})), NetcdfSink(whole))
+    run = Simulation.of_scene(scene_of(given))
     record(run, NetcdfSink(part))
     assert run.driver.state_dict()["pace"].bounded[1] == np.inf
     found = resumption(part, Watch(), steps=90)
@@ -455,9 +466,12 @@ def test_what_cannot_be_continued_is_refused(
     tensile: dict[str, Any], call: Call, tmp_path: Path
 ) -> None:
     for status, change in (("diverged", "diverges"), ("an equilibrium", "equilibrium")):
-        record(Run(scene_of(tensile | RUNS[change])), NetcdfSink(tmp_path / "out.nc", True))
+        record(
+            Simulation.of_scene(scene_of(tensile | RUNS[change])),
+            NetcdfSink(tmp_path / "out.nc", True),
+        )
         refused = call("resume", str(tmp_path / "out.nc"), "--steps", "5000")
         assert (refused.code, status in refused.err) == (2, True), refused.err
-    record(Run(scene_of(tensile)), NetcdfSink(tmp_path / "short.nc"))
+    record(Simulation.of_scene(scene_of(tensile)), NetcdfSink(tmp_path / "short.nc"))
     refused = call("resume", str(tmp_path / "short.nc"), "--steps", "3")
     assert "steps are done; --steps takes a larger number" in refused.err

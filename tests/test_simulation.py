@@ -18,7 +18,7 @@ from pbdkit.io.sinks import MemorySink
 from pbdkit.model.solver import Equilibrium, Solver
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import DRIVERS, Run, SteppingDriver, record
+from pbdkit.simulation import DRIVERS, Simulation, SteppingDriver, record
 from pbdkit.stepping.divergence import Guard
 from pbdkit.stepping.state import State
 
@@ -56,7 +56,7 @@ def test_the_states_of_a_run_are_those_that_are_recorded(
     tensile: dict[str, Any], solver: dict[str, Any]
 ) -> None:
     given = tensile | {"solver": solver, "steps": 500, "record": {"every": 7}}
-    run = Run(scene_of(given))
+    run = Simulation.of_scene(scene_of(given))
     assert run.outcome is None
     places = {state.step: run.scene.raster.table(state.u).copy() for state in run}
     assert run.outcome is not None
@@ -72,7 +72,7 @@ def test_the_states_of_a_run_are_those_that_are_recorded(
 
 def test_a_run_can_be_watched_between_its_records_and_changed(tensile: dict[str, Any]) -> None:
     given = tensile | {"leaders": tensile["leaders"][:1], "record": {"at": [0]}}
-    run = Run(scene_of(given, diagnostics=[{"type": "track", "numbers": [13]}]))
+    run = Simulation.of_scene(scene_of(given, diagnostics=[{"type": "track", "numbers": [13]}]))
     steps, moved = [], 0.0
     for state in run:
         steps.append(state.step)
@@ -88,30 +88,34 @@ def test_a_run_can_be_watched_between_its_records_and_changed(tensile: dict[str,
 def test_a_run_goes_on_from_a_state(tensile: dict[str, Any], solver: str) -> None:
     given = tensile | {"solver": SOLVERS[solver], "steps": 60}
     kept: State | None = None
-    whole = Run(scene_of(given))
+    whole = Simulation.of_scene(scene_of(given))
     for state in whole:
         if state.step == 23:
             kept = state.copy()
-    rest = Run(scene_of(given), start=kept)
+    rest = Simulation.of_scene(scene_of(given), start=kept)
     assert [state.step for state in rest] == list(range(23, 61))
-    assert np.array_equal(rest.state.u, whole.state.u)
+    assert np.array_equal(rest.driver.state.u, whole.driver.state.u)
     assert rest.outcome == whole.outcome
 
 
-def test_all_that_decides_when_a_run_settles_is_data(tensile: dict[str, Any]) -> None:
+def test_all_that_decides_when_a_run_settles_is_data(
+    tensile: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A run that is left, and gone on with from its state, guard and pace, ends where it would
     have."""
+    # Calls are not cut short where the machine is busy.
+    monkeypatch.setattr("pbdkit.simulation.LONGEST_CALL_S", 1e6)
     given = tensile | {"solver": SOLVERS["settle"], "steps": 5000, "record": {"at": [0]}}
-    whole, left = Run(scene_of(given)), Run(scene_of(given))
+    whole, left = Simulation.of_scene(scene_of(given)), Simulation.of_scene(scene_of(given))
     steps = [state.step for state in whole]
     middle = steps[len(steps) // 2]
     for state in left:
         if state.step == middle:
             break
-    driver, state = left.driver, left.state.copy()
+    driver, state = left.driver, left.driver.state.copy()
     assert isinstance(driver, SteppingDriver)
     assert driver.settling is not None
-    rest = Run(scene_of(given), start=state)
+    rest = Simulation.of_scene(scene_of(given), start=state)
     assert isinstance(rest.driver, SteppingDriver)
     assert rest.driver.settling is not None
     rest.driver.guard = Guard(**vars(copy.deepcopy(driver.guard)))
@@ -127,7 +131,7 @@ def test_who_watches_a_run_can_stop_it(tensile: dict[str, Any], solver: str) -> 
     given = tensile | {"solver": SOLVERS[solver], "record": {"at": [0]}, "steps": 10**6}
     told: list[str] = []
     watch = Watch(lambda: len(told) > 2, lambda what, share: told.append(what))
-    sink, run = MemorySink(), Run(scene_of(given), watch=watch)
+    sink, run = MemorySink(), Simulation.of_scene(scene_of(given), watch=watch)
     report = record(run, sink)
     assert report.outcome.status == "interrupted"
     assert told[0] == {"stepping": "step 0 of 1000000", "equilibrium": "assembling"}[solver]
@@ -168,7 +172,7 @@ def test_numbers_leave_all_bounds_in_silence(tensile: dict[str, Any], relaxation
 
 def test_why_an_engine_was_taken_is_true_of_a_large_body(tensile: dict[str, Any]) -> None:
     body = {"type": "grid", "columns": 300, "rows": 300}
-    run = Run(scene_of(tensile, body=body, steps=1))
+    run = Simulation.of_scene(scene_of(tensile, body=body, steps=1))
     assert run.choice.engine == "numpy"
     assert "small" not in run.choice.reason
     assert run.choice.reason.endswith("s in all: compiling would take longer")
@@ -211,3 +215,179 @@ def test_a_damaged_attribute_is_said_to_be_one(
     ds.attrs[name] = value
     with pytest.raises(pbdkit.StorageError, match=f"attribute '{name}' is damaged"):
         pbdkit.rerun(ds, progress=False)
+
+
+STEPPED = {
+    "numpy": {"type": "stepping", "engine": "numpy", "memory": 0.5},
+    "compiled": {"type": "stepping", "engine": "compiled"},
+    "settle": {"type": "stepping", "settle": {"tolerance": 1e-4}},
+}
+TRACK = {"type": "track", "numbers": [13]}
+
+
+def same_values(one: Any, other: Any) -> None:
+    """Of two datasets, every variable but when and how they ended."""
+    assert {*one.variables} == {*other.variables}
+    for name, variable in one.variables.items():
+        np.testing.assert_array_equal(variable, other.variables[name])
+
+
+@pytest.mark.parametrize("solver", STEPPED.values(), ids=STEPPED)
+def test_steps_by_hand_are_those_of_a_run(tensile: dict[str, Any], solver: dict[str, Any]) -> None:
+    given = tensile | {"solver": solver, "steps": 500, "diagnostics": [TRACK]}
+    whole = pbdkit.run(given, progress=False)
+    simulation = pbdkit.Simulation(given)
+    with simulation.record() as recording:
+        for n in (0, 1, 2, 57, 340):
+            simulation.step(n)
+            if simulation.outcome is None:
+                now = whole.sel(time=simulation.time)
+                np.testing.assert_array_equal(simulation.state.position, now.position)
+        simulation.run()
+    same_values(recording.dataset, whole)
+    assert recording.dataset.status == whole.status == simulation.outcome.status
+    assert simulation.time == whole.time[-1]
+
+
+def test_a_state_is_labelled_as_a_run_is_and_stays_as_it_is(tensile: dict[str, Any]) -> None:
+    given = tensile | {"steps": 20, "fracture": {"type": "threshold", "thresholds": [1.02]}}
+    given |= {"diagnostics": [{"type": "displacement"}]}
+    whole, simulation = pbdkit.run(given, progress=False), pbdkit.Simulation(given)
+    simulation.step(12)
+    state, then = simulation.state, whole.sel(time=12)
+    before = state.position.copy()
+    simulation.step(8)
+    np.testing.assert_array_equal(state.position, before)
+    assert not state.u.values.flags.writeable
+    for name in ("position", "kind", "u", *state.coords):
+        assert then[name].dims == state[name].dims
+        np.testing.assert_array_equal(then[name], state[name])
+        assert then[name].attrs.keys() == state[name].attrs.keys()
+    broke = np.where(whole.broken_step <= 12, whole.broken_step, -1)
+    np.testing.assert_array_equal(state.broken_step, broke)
+    assert (state.broken_step >= 0).any()
+    assert state.pbd.experiment() == pbdkit.Experiment(**given)
+
+
+def test_recording_in_the_middle_begins_and_ends_with_the_state_at_hand(
+    tensile: dict[str, Any], tmp_path: Path
+) -> None:
+    given = tensile | {"steps": 40, "record": {"every": 5}}
+    whole, simulation = pbdkit.run(given, progress=False), pbdkit.Simulation(given)
+    simulation.step(12)
+    with simulation.record(tmp_path / "part.nc") as recording:
+        simulation.step(11)
+        with pytest.raises(pbdkit.ExperimentError, match="record: has not ended"):
+            _ = recording.dataset
+    simulation.step(1)
+    with pbdkit.open(tmp_path / "part.nc") as part:
+        assert part.time.values.tolist() == [12, 15, 20, 23]
+        assert (part.status, part.stop_reason) == ("interrupted", "stopped after step 23")
+        at = part.position.sel(time=[15, 20])
+        np.testing.assert_array_equal(at, whole.position.sel(time=[15, 20]))
+    with pytest.raises(pbdkit.ExperimentError, match=r"part\.nc.* exists"):
+        simulation.record(tmp_path / "part.nc")
+    with pbdkit.resume(tmp_path / "part.nc", steps=40, progress=False) as longer:
+        np.testing.assert_array_equal(longer.position[-1], whole.position[-1])
+
+
+def test_a_simulation_that_is_recorded_to_its_end_is_complete(
+    tensile: dict[str, Any], tmp_path: Path
+) -> None:
+    given = tensile | {"steps": 30}
+    simulation = pbdkit.Simulation(given)
+    with simulation.record(tmp_path / "out.nc"), simulation.record() as other:
+        simulation.step(30)
+    with pbdkit.open(tmp_path / "out.nc") as ds:
+        assert ds.status == "complete"
+        same_values(ds, pbdkit.run(given, progress=False))
+        same_values(ds, other.dataset)
+    for refused in (simulation.step, simulation.record):
+        with pytest.raises(pbdkit.ExperimentError, match="has ended: all steps done"):
+            refused()
+
+
+def test_an_equilibrium_on_the_way_is_recorded_and_gone_on_from(tensile: dict[str, Any]) -> None:
+    simulation = pbdkit.Simulation(tensile | {"steps": 40})
+    with simulation.record() as recording:
+        simulation.step(20)
+        certificate = simulation.equilibrate()
+        rest = simulation.state
+        simulation.step(1)
+    straight = tensile | {"steps": 20, "solver": {"type": "equilibrium"}}
+    expected = pbdkit.run(straight, progress=False).position[-1]
+    np.testing.assert_allclose(rest.position, expected, rtol=0, atol=1e-9)
+    assert certificate.share < 1e-8
+    assert simulation.time == 21
+    ds = recording.dataset
+    assert ds.time.values.tolist() == list(range(22))
+    np.testing.assert_array_equal(ds.position.sel(time=20), rest.position)
+    # Leaders rest from step 10 on: what is at rest stays.
+    np.testing.assert_allclose(ds.position[-1], rest.position, rtol=0, atol=1e-12)
+
+
+def test_the_equilibrium_of_the_solver_is_that_of_a_run(tensile: dict[str, Any]) -> None:
+    given = tensile | {"solver": {"type": "equilibrium"}}
+    simulation = pbdkit.Simulation(given)
+    with pytest.raises(pbdkit.ExperimentError, match=r"solver: .* call run\(\) or equilibrate\(\)"):
+        simulation.step()
+    assert str(simulation.equilibrate()).startswith("within ")
+    whole = pbdkit.run(given, progress=False)
+    np.testing.assert_array_equal(simulation.state.position, whole.position[-1])
+
+
+def test_a_simulation_starts_from_the_state_of_another(tensile: dict[str, Any]) -> None:
+    given = tensile | {"steps": 40}
+    whole, first = pbdkit.run(given, progress=False), pbdkit.Simulation(given)
+    first.step(15)
+    second = pbdkit.Simulation(given, start=first)
+    third = pbdkit.Simulation(given, settings={"solver.relaxation": 0.5}, start=first)
+    first.run()
+    for simulation in (second, third):
+        assert simulation.time == 15
+        simulation.run()
+    np.testing.assert_array_equal(second.state.position, whole.position[-1])
+    assert not np.array_equal(third.state.position, whole.position[-1])
+    wider = given | {"body": {"type": "grid", "columns": 11, "rows": 10}}
+    with pytest.raises(pbdkit.ExperimentError, match="start: its state is that of another body"):
+        pbdkit.Simulation(wider, start=first)
+    with pytest.raises(pbdkit.ExperimentError, match="start: step 40 is reached"):
+        pbdkit.Simulation(given | {"steps": 20}, start=first)
+
+
+def test_steps_that_the_experiment_does_not_have_are_refused(tensile: dict[str, Any]) -> None:
+    simulation = pbdkit.Simulation(tensile | {"steps": 30})
+    simulation.step(10)
+    with pytest.raises(pbdkit.ExperimentError, match=r"step 10 of 30 .* settings={'steps': 35}"):
+        simulation.step(25)
+    for n in (-1, 1.0, True):
+        with pytest.raises(pbdkit.ExperimentError, match="step: expected a number of steps"):
+            simulation.step(n)
+    assert simulation.time == 10
+
+
+def test_a_simulation_that_diverges_says_so_and_its_recording_is_kept(
+    tensile: dict[str, Any],
+) -> None:
+    given = tensile | {"steps": 4000, "solver": {"type": "stepping", "relaxation": 2.5}}
+    with pytest.warns(pbdkit.errors.StabilityWarning, match="can diverge"):
+        simulation = pbdkit.Simulation(given)
+    with pytest.raises(pbdkit.DivergedError, match="left all bounds"), simulation.record() as kept:
+        simulation.step(4000)
+    assert kept.dataset.status == "diverged"
+    assert simulation.outcome.status == "diverged"
+
+
+def test_an_error_in_the_block_leaves_what_was_recorded(tensile: dict[str, Any]) -> None:
+    simulation = pbdkit.Simulation(tensile | {"steps": 30})
+
+    def fail() -> None:
+        with simulation.record() as recording:
+            kept.append(recording)
+            simulation.step(3)
+            raise KeyError
+
+    kept: list[Any] = []
+    with pytest.raises(KeyError):
+        fail()
+    assert kept[0].dataset.time.values.tolist() == [0, 1, 2, 3]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pbdkit.io.netcdf import NetcdfSink
     from pbdkit.io.recorder import RunOutcome
     from pbdkit.progress import Watch
-    from pbdkit.simulation import Execution, Run, RunReport
+    from pbdkit.simulation import Execution, RunReport, Simulation
 
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
@@ -232,7 +232,7 @@ def _warn(texts: Iterable[str], quiet: bool) -> None:
 
 
 def _tell(
-    run: Run, report: RunReport, file: NetcdfSink, path: Path, quiet: bool, as_json: bool
+    run: Simulation, report: RunReport, file: NetcdfSink, path: Path, quiet: bool, as_json: bool
 ) -> None:
     """What there is to say of a run that ended."""
     _warn(report.warnings, quiet)

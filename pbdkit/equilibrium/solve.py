@@ -215,6 +215,17 @@ def settle(
             return certificate
 
 
+def settle_at_step(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
+    """Move a state, in place, to equilibrium with leaders, loads and numbers as they are at its
+    step; bonds that are too long there break.
+
+    Raises ExperimentError where there is no equilibrium, and UnconvergedError.
+    """
+    finder = finder_of(scene, initial_state(scene), watch)
+    step = state.step
+    return _settle_bonds_at(scene, state, finder, step, step, MOST_SETTLINGS, step)
+
+
 def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
     """The equilibrium of a scene as a state of its own."""
     state = initial_state(scene)

@@ -53,7 +53,7 @@ from pbdkit.plugin import Lattice
 from pbdkit.plugin.frame import Indices
 from pbdkit.scene.leaders import Leading
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import FAILED, Run
+from pbdkit.simulation import FAILED, Simulation
 from pbdkit.stepping.state import Floats, State, initial_state
 
 STRAIGHT = 1e-6
@@ -513,13 +513,13 @@ class RunObservation(Observation):
         asked = experiment.model_copy(
             update={"record": mine.record, "diagnostics": mine.diagnostics}
         )
-        run = Run(scene_like(self.scene, asked))
+        run = Simulation.of_scene(scene_like(self.scene, asked))
         found = self._read(run)
-        broken = run.state.broken_step
+        broken = run.driver.state.broken_step
         when = np.zeros(0) if broken is None else np.asarray(broken, float)
-        return found, when, run.state.step
+        return found, when, run.driver.state.step
 
-    def _recorded(self, run: Run) -> Iterator[tuple[float, State]]:
+    def _recorded(self, run: Simulation) -> Iterator[tuple[float, State]]:
         """The states that a run records and the moment of each, in steps, and that at which it
         ends. Raises UnconvergedError where it ends without a result."""
         last = -1.0
@@ -535,7 +535,7 @@ class RunObservation(Observation):
             raise UnconvergedError(reason)
 
     @abstractmethod
-    def _read(self, run: Run) -> Floats:
+    def _read(self, run: Simulation) -> Floats:
         """What a run predicts of the numbers that were measured."""
 
 
@@ -603,7 +603,7 @@ class CurveObservation(RunObservation):
     def _within_the_run(self) -> CurveObservation:
         """Without the rows to which the run does not come. Raises ExperimentError where none is
         left, and for times beyond the run."""
-        come, _ = self.curve(Run(self.scene))
+        come, _ = self.curve(Simulation.of_scene(self.scene))
         inside = (self.along >= come.min()) & (self.along <= come.max())
         what = "times" if self.at_times else "displacements of the group"
         ends = f"the run's {what} go from {come.min():g} to {come.max():g}"
@@ -630,7 +630,7 @@ class CurveObservation(RunObservation):
         """Of some of them."""
         return replace(super().part(chosen), along=self.along[chosen])
 
-    def _read(self, run: Run) -> Floats:
+    def _read(self, run: Simulation) -> Floats:
         come, force = self.curve(run)
         beyond = SLACK * (come.max() - come.min())
         if self.along.min() < come.min() - beyond or self.along.max() > come.max() + beyond:
@@ -640,7 +640,7 @@ class CurveObservation(RunObservation):
             )
         return np.interp(self.along, come, force)
 
-    def curve(self, run: Run) -> tuple[Floats, Floats]:
+    def curve(self, run: Simulation) -> tuple[Floats, Floats]:
         """At each recorded moment, until the group stops or turns, the place (step,) and the force
         over Young's modulus and thickness (step,). After a run has settled its force stays."""
         tables, places, forces = Tables(run.scene), [], []
@@ -866,15 +866,15 @@ class TracksObservation(RunObservation):
             interpolation=self.interpolation.part(chosen),
         )
 
-    def _read(self, run: Run) -> Floats:
+    def _read(self, run: Simulation) -> Floats:
         found, left = np.zeros((len(self.along), 2)), np.ones(len(self.along))
         for moment, state in self._recorded(run):
             share = np.maximum(0.0, 1.0 - np.abs(self.along - moment))
             self._add(found, share, state, run)
             left -= share
         # A run that has settled stays where it is.
-        after = self.along > run.state.step
-        self._add(found, np.where(after, left, 0.0), run.state, run)
+        after = self.along > run.driver.state.step
+        self._add(found, np.where(after, left, 0.0), run.driver.state, run)
         if (missing := ~after & (left > ON_STEP)).any():
             raise ExperimentError(
                 f"the run gives no state at time {self.along[missing][0]:g}; leave that time out",
@@ -882,7 +882,7 @@ class TracksObservation(RunObservation):
             )
         return np.asarray(found.T.ravel())
 
-    def _add(self, found: Floats, share: Floats, state: State, run: Run) -> None:
+    def _add(self, found: Floats, share: Floats, state: State, run: Simulation) -> None:
         """Adds a share of a state, by row, to the displacements that were found."""
         if (rows := np.flatnonzero(share)).size:
             part = self.interpolation.part(rows)

@@ -5,10 +5,10 @@ displacements, tracks in time, curves).
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -41,6 +41,9 @@ from pbdkit.model.validation import closed_part, report
 from pbdkit.plugin.component import Component, Strict
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import Floats
+
+if TYPE_CHECKING:
+    import xarray
 
 GUESS = 1.0
 """The noise where none is given, until residuals tell it."""
@@ -82,7 +85,13 @@ class MeasuredColumns(Component):
 
     @model_validator(mode="after")
     def _read(self, info: ValidationInfo) -> Self:
-        object.__setattr__(self, "_rows", np.array(read_columns(self.file, info, self.columns)))
+        table = (info.context or {}).get(self.file)
+        rows = (
+            read_columns(self.file, info, self.columns)
+            if table is None
+            else _rows_of(table, self.columns)
+        )
+        object.__setattr__(self, "_rows", np.array(rows))
         return self
 
     @property
@@ -99,6 +108,26 @@ class MeasuredColumns(Component):
     def observation(self, experiment: Experiment, modes: int) -> Observation:
         """Of an experiment, with so many modes along measured boundaries. Raises
         ExperimentError."""
+
+
+DATASET = "(dataset)"
+"""The `file` of a measurement that is handed over in Python."""
+
+
+def _rows_of(table: xarray.Dataset, columns: Sequence[str]) -> Floats:
+    """The rows of a dataset with these variables. Raises ValueError."""
+    for name in columns:
+        if name not in table:
+            hint = did_you_mean(name, map(str, table))
+            raise ValueError(f"the dataset has no variable '{name}'{hint}")
+    values = [np.asarray(table[name], float).ravel() for name in columns]
+    if len({len(value) for value in values}) > 1:
+        sizes = ", ".join(f"{n} {len(v)}" for n, v in zip(columns, values, strict=True))
+        raise ValueError(f"the variables of the dataset need one size: {sizes}")
+    rows = np.stack(values, axis=1)
+    if not len(rows) or not np.isfinite(rows).all():
+        raise ValueError("the variables of the dataset need finite numbers, one at least")
+    return rows
 
 
 class Distortion(Strict):
@@ -337,10 +366,14 @@ class Fit(Strict):
 
 
 def described_fit(
-    description: Mapping[str, Any] | str | Path, *, given: bool
+    description: Mapping[str, Any] | str | Path,
+    *,
+    given: bool,
+    measured: xarray.Dataset | None = None,
 ) -> tuple[Fit, Source]:
-    """The fit in a file, of a shipped name or in a dict, and the source of its experiment; none is
-    looked for where one is `given`. Raises ExperimentError."""
+    """Return the fit in a file, of a shipped name or in a dict, and the source of its experiment;
+    none is looked for where one is `given`. A dataset that was `measured` takes the place of the
+    file of the measurement. Raises ExperimentError."""
     if isinstance(description, Mapping):
         path, source = Path("fit"), Source("fit", dict(description), {}, OF_PROGRAM)
     else:
@@ -354,11 +387,24 @@ def described_fit(
         source = Source(
             source.name, {"experiment": "", **source.data}, source.places, source.beside
         )
+    context: dict[str, Any] = {"beside": source.beside}
+    if measured is not None:
+        source, context[DATASET] = _with_dataset(source), measured
     try:
-        fit = Fit.model_validate(source.data, context={"beside": source.beside})
+        fit = Fit.model_validate(source.data, context=context)
     except ValidationError as error:
         raise report(error, source) from None
     return fit, source if given else base_source(path, fit.experiment, source)
+
+
+def _with_dataset(source: Source) -> Source:
+    """The description with a dataset in place of the file of its measurement."""
+    data = dict(source.data) if isinstance(source.data, Mapping) else {}
+    file = data.get("measured") or {}
+    if not isinstance(file, Mapping):
+        raise ExperimentError("measured: a dataset takes the place of one measurement, not several")
+    data["measured"] = {**file, "file": DATASET}
+    return Source(source.name, data, source.places, source.beside)
 
 
 def shipped_fits() -> list[str]:

@@ -4,7 +4,6 @@ of other kinds that names the command that reads them.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 from pbdkit.errors import (
     ExperimentError,
     PbdkitError,
-    PbdkitWarning,
     StorageError,
+    StorageWarning,
     WriteError,
     one_line,
+    warn_caller,
 )
 from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout
 from pbdkit.io.members import SWEEP, choices, member
@@ -102,7 +102,7 @@ def open(path: str | Path) -> xarray.Dataset:
     file, where it is not as it was written, where it cannot be read as netCDF, where pbdkit did not
     make it, where variables are missing, or where a newer pbdkit made it than this one can read. A
     change that is met later, as values are read, raises StorageError too. Warns, with
-    pbdkit.PbdkitWarning, of a file without a seal, which is first read once in another process.
+    StorageWarning, of a file without a seal, which is first read once in another process.
     """
     if not isinstance(path, str | Path):
         raise ExperimentError(
@@ -148,7 +148,7 @@ def _opened(file: Path) -> xarray.Dataset:
     if not sealed:
         try_reading(file)
         dataset = opened_unsealed(file)
-        warnings.warn(f"{file}: {UNSEALED}", PbdkitWarning, stacklevel=3)
+        warn_caller(f"{file}: {UNSEALED}", StorageWarning)
         return dataset
     import xarray
 

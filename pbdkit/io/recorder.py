@@ -11,24 +11,29 @@ from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
 from itertools import chain, compress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pbdkit.errors import PluginError
+from pbdkit.components.diagnostics import Displacement
+from pbdkit.errors import AccuracyWarning, PluginError, WarningText
 from pbdkit.io import layout
 from pbdkit.io.checkpoint import RecordedSteps
-from pbdkit.io.layout import Column, Values, When
+from pbdkit.io.layout import Column, Values, When, diagnostic_column
 from pbdkit.io.physical import Physical, Twins
-from pbdkit.io.sinks import Sink
+from pbdkit.io.sinks import MemorySink, Sink
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import FRAME
+from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import Diagnostic, Moment, RenewsBonds, RenewsParticles, Variable
 from pbdkit.plugin.component import as_values
 from pbdkit.plugin.discovery import blaming
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
+
+if TYPE_CHECKING:
+    import xarray
 
 
 class RecordedVariables:
@@ -217,10 +222,10 @@ class Recorder:
         count = self._scene.experiment.record_count
         planned = {"time": count, "step": max(count, self._scene.experiment.steps + 1)}
         self.sink.begin(self._columns, self._measured.sizes, planned)
-        for values in map(self._twins.beside, self._known()) if history is None else history:
+        for values in map(self._twins.beside, self.known()) if history is None else history:
             self.sink.put(values)
 
-    def _known(self) -> Iterator[Values]:
+    def known(self) -> Iterator[Values]:
         """What is known before the first step; made one after the other, and not all at once."""
         raster, scene = self._scene.raster, self._scene
         numbers = raster.before + np.arange(1, raster.count + 1)
@@ -271,7 +276,8 @@ class Recorder:
         values: Values = {}
         experiment, now = self._scene.experiment, state.step if within is None else within
         late = last and now > self.seen.recorded
-        planned = within is not None or experiment.records(state.step)
+        # The first state is always recorded, of a run that does not begin with step 0 too.
+        planned = within is not None or experiment.records(state.step) or self.seen.recorded < 0
         recorded = late or (not last and planned)
         if recorded:
             position = moment.position()
@@ -301,7 +307,7 @@ class Recorder:
             known = int(recorded) if diverged else state.step
             moment = StateMoment(state, self._tables, known)
         if not diverged and (warning := self._inside_out(state)):
-            self.warnings = (warning,)
+            self.warnings = (WarningText(warning, AccuracyWarning),)
         if self._scene.has_fracture:
             steps, strains = moment.broken_step(), moment.broken_strain()
             self.sink.put({"broken_step": steps, "broken_strain": strains})
@@ -313,19 +319,64 @@ class Recorder:
         return StateMoment(state, self._tables).cells.inside_out()
 
     def _attributes(self, outcome: RunOutcome, prediction: dict[str, Any]) -> dict[str, str]:
-        experiment = self._scene.experiment
         return {
-            "Conventions": layout.CONVENTIONS,
-            "schema_version": layout.SCHEMA_VERSION,
-            "title": experiment.name,
-            "pbdkit_version": version("pbdkit"),
-            "experiment": experiment.model_dump_json(by_alias=True),
-            "plugins": json.dumps(experiment.distributions()),
+            **provenance_of(self._scene.experiment),
             "prediction": json.dumps(prediction),
             "status": outcome.status,
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         } | ({"certificate": json.dumps(outcome.certificate)} if outcome.certificate else {})
+
+
+def provenance_of(experiment: Experiment) -> dict[str, str]:
+    """Return the attributes that say what a dataset was made of, and by which versions."""
+    return {
+        "Conventions": layout.CONVENTIONS,
+        "schema_version": layout.SCHEMA_VERSION,
+        "title": experiment.name,
+        "pbdkit_version": version("pbdkit"),
+        "experiment": experiment.model_dump_json(by_alias=True),
+        "plugins": json.dumps(experiment.distributions()),
+    }
+
+
+class Snapshots:
+    """Labelled states of a scene, as a dataset of its run has them at one time."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._tables = scene, Tables(scene)
+        self._measured = RecordedVariables(scene)
+        self._columns = {column.name: column for column in columns_of(scene)}
+        shown = diagnostic_column(Displacement().variables()[0], Displacement)
+        self._columns.setdefault(shown.name, shown)
+        known = Recorder(scene, MemorySink()).known()
+        labels = {name: value for values in known for name, value in values.items()}
+        dims = {"particle", "axis", "index", "bond", "end"}
+        self._labels = {
+            name: self._variable(name, value)
+            for name, value in labels.items()
+            if {*self._columns[name].dims} <= dims
+        }
+        self._attributes = provenance_of(scene.experiment)
+
+    def dataset(self, state: State) -> xarray.Dataset:
+        """Return a state with its labels; its values are copies that cannot be written to."""
+        import xarray
+
+        moment = StateMoment(state, self._tables)
+        values: Values = {"position": moment.position(), "u": moment.displacement()}
+        values |= {"kind": moment.kind(), **self._measured.remembered(moment, first=True)}
+        if self._scene.has_fracture:
+            values["broken_step"] = moment.broken_step()
+        variables = {name: self._variable(name, value) for name, value in values.items()}
+        time = {"time": ((), state.step, self._columns["time"].attributes)}
+        return xarray.Dataset(variables, {**self._labels, **time}, self._attributes)
+
+    def _variable(self, name: str, value: Any) -> Any:
+        column, values = self._columns[name], np.array(value)
+        values.flags.writeable = False
+        dims = tuple(dim for dim in column.dims if dim not in layout.TIMES)
+        return dims, values, column.attributes
 
 
 def columns_of(scene: Scene) -> list[Column]:

@@ -26,7 +26,7 @@ from pydantic import (
     model_validator,
 )
 
-from pbdkit.errors import ExperimentError, PluginError, warn_caller
+from pbdkit.errors import ExperimentError, PluginError, RetirementWarning, warn_caller
 from pbdkit.model.bodies import BODIES, AnyBody, Body, Box
 from pbdkit.model.boundary_conditions import AnyInitial, Cut, LeaderGroup, Load, Obstacle
 from pbdkit.model.motions import Newton
@@ -278,7 +278,7 @@ def announce(retired: Iterable[Retired], source: Source, fields: Mapping[str, An
             error = ExperimentError(source.message(where, text), where)
             error.located = True
             raise error
-        warn_caller(source.message((one.field, "type"), one.advice))
+        warn_caller(source.message((one.field, "type"), one.advice), RetirementWarning)
 
 
 def _numbered(fields: Mapping[str, Any]) -> Iterator[tuple[str | int, ...]]:

@@ -47,7 +47,7 @@ from pbdkit.plugin.discovery import blaming
 from pbdkit.progress import Watch
 from pbdkit.scene.memory_estimate import TooLargeError
 from pbdkit.scene.scene import Ground, Scene, build_scene
-from pbdkit.simulation import Driver, Execution, Run
+from pbdkit.simulation import Driver, Execution, Simulation
 from pbdkit.stability.forecast import prediction, quick_warnings
 from pbdkit.stability.relaxation import tuned, with_solver
 from pbdkit.stepping.state import State
@@ -349,7 +349,7 @@ DRIVERS: dict[type[Solver], Callable[[Division, Scene, Watch], Driver]] = {
 """What carries it out on one of them."""
 
 
-class DistributedRun(Run):
+class DistributedSimulation(Simulation):
     """One run that several processes share: each has its part of the scene. What it gives out are
     states of the part. Raises what any run does, in all processes."""
 
@@ -423,6 +423,6 @@ class DistributedExecution(Execution):
         """Return what the root alone comes to; the other processes sleep meanwhile."""
         return self.communicator.by_root(work)
 
-    def run(self, scene: Scene, watch: Watch) -> Run:
+    def run(self, scene: Scene, watch: Watch) -> Simulation:
         """Return the run of this process's part."""
-        return DistributedRun(self.communicator, scene, watch)
+        return DistributedSimulation(self.communicator, scene, watch)

@@ -56,11 +56,11 @@ from pbdkit.plugin.hooks import GROUP, Command, hookimpl
 from pbdkit.plugin.lattice import (
     BasisSite,
     Cell,
+    CellPolygon,
     Lattice,
     Nearness,
     NeighbourMetric,
     Offset,
-    Polygon,
     Slot,
     Tiling,
 )
@@ -115,14 +115,14 @@ BUILTIN = GROUP
 
 __all__ = [
     "AREA", "ENERGY", "FORCE", "FRACTURE_ENERGY", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
-    "BasisSite", "BondHistory", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellStress",
-    "CellValues", "Command", "Component", "Condition", "Constants", "Diagnostic", "Drawn", "Draws",
-    "FollowerRule", "ForceValues", "FractureModel", "FrameMap", "FramePolicy", "FrameSites",
-    "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows", "Loadable", "MixesCells",
-    "Moment", "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair", "Parameters",
-    "ParticleOperation", "Particles", "Polygon", "Quantity", "Remembered", "Remembers", "RenewsBonds",
-    "RenewsParticles", "Segment", "Setting", "SharesParticles", "Slot", "Softens", "SoftensCells",
-    "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells", "Tiling", "Torn",
-    "TouchingRows", "TurnsParticles", "Variable", "Vector", "Weights", "dot", "hookimpl",
-    "length", "squared_length", "where",
+    "BasisSite", "BondHistory", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellPolygon",
+    "CellStress", "CellValues", "Command", "Component", "Condition", "Constants", "Diagnostic",
+    "Drawn", "Draws", "FollowerRule", "ForceValues", "FractureModel", "FrameMap", "FramePolicy",
+    "FrameSites", "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows", "Loadable",
+    "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair",
+    "Parameters", "ParticleOperation", "Particles", "Quantity", "Remembered", "Remembers",
+    "RenewsBonds", "RenewsParticles", "Segment", "Setting", "SharesParticles", "Slot", "Softens",
+    "SoftensCells", "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells",
+    "Tiling", "Torn", "TouchingRows", "TurnsParticles", "Variable", "Vector", "Weights", "dot",
+    "hookimpl", "length", "squared_length", "where",
 ]  # fmt: skip

@@ -10,7 +10,6 @@ from pbdkit.errors import ExperimentError, PluginError, did_you_mean, one_line
 from pbdkit.plugin import BUILTIN, Component
 from pbdkit.plugin.discovery import (
     ALL,
-    COMMAND_GROUP,
     DISABLE,
     Offer,
     Plugin,
@@ -23,6 +22,7 @@ from pbdkit.plugin.discovery import (
     load_builtin,
     loaded,
 )
+from pbdkit.plugin.hooks import COMMAND_GROUP
 
 GIVEN = "components"
 """How classes that were handed over in Python appear among the plugins."""

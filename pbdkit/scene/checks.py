@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.errors import AccuracyWarning, WarningText
 from pbdkit.lattice.fill import has_narrow_slot
 from pbdkit.lattice.neighbourhood import Neighbourhood, body_box, flatness
 from pbdkit.lattice.raster import FOLLOWER, LeftOut, Raster, cells_of_sites, positions
@@ -65,10 +66,13 @@ def doubts_of(
         )
     if not frame.edges_are_free and material_of(rule) is not None:
         doubts.append(
-            f"frame: under '{frame.type}' edges are not free of stress, and with the calibrated "
-            f"rule '{rule.type}' the result does not converge to elasticity, however fine the "
-            "lattice (copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever); "
-            "take {type: natural}"
+            WarningText(
+                f"frame: under '{frame.type}' edges are not free of stress, and with the "
+                f"calibrated rule '{rule.type}' the result does not converge to elasticity, "
+                "however fine the lattice (copying frames err by 6.7 % on a bar in tension, "
+                "14.5 % on a cantilever); take {type: natural}",
+                AccuracyWarning,
+            )
         )
     return doubts
 
@@ -102,11 +106,12 @@ def locking(experiment: Experiment, raster: Raster) -> Iterator[str]:
     across = max(1.0, min((high - low) / side for low, high, side in ends))
     error = LOCKING * float(c.shear / values[0]) / across
     if error > NOTICED:
-        yield (
+        yield WarningText(
             f"rule: '{rule.type}' hardly stretches along the diagonals of the lattice with these "
             f"ratios, so that cells lock: with {across:.3g} of them across the body it may be too "
             f"stiff by some {100 * error:.2g} %; turn the body onto the lattice, so that the stiff "
-            "directions of the material lie along its axes, or refine it"
+            "directions of the material lie along its axes, or refine it",
+            AccuracyWarning,
         )
 
 

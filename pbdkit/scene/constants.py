@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.errors import AccuracyWarning, ExperimentError, PluginError, of_category
 from pbdkit.lattice.cells import patches
 from pbdkit.lattice.fill import rounding_of
 from pbdkit.lattice.neighbourhood import Neighbourhood, bonds_in, plane_block
@@ -123,14 +123,17 @@ def check_diagnostics(
 
 def _doubts(experiment: Experiment, raster: Raster) -> list[str]:
     has_frame = raster.communicator.any((raster.table_kind == FRAME).any())
-    return [
-        f"diagnostics.{n}: '{diagnostic.type}' counts what frame points pull at leaders, which at "
-        "the corners of held edges is no force of the body (the reaction of a clamped cantilever "
-        "with 10 cells over its height is 8 times that of the body under 'mean', and 1.6 % off "
-        "under 'natural'); take frame: {type: natural}"
-        for n, diagnostic in enumerate(experiment.diagnostics)
-        if has_frame and "forces" in diagnostic.needs
-    ]
+    return of_category(
+        AccuracyWarning,
+        (
+            f"diagnostics.{n}: '{diagnostic.type}' counts what frame points pull at leaders, which "
+            "at the corners of held edges is no force of the body (the reaction of a clamped "
+            "cantilever with 10 cells over its height is 8 times that of the body under 'mean', "
+            "and 1.6 % off under 'natural'); take frame: {type: natural}"
+            for n, diagnostic in enumerate(experiment.diagnostics)
+            if has_frame and "forces" in diagnostic.needs
+        ),
+    )
 
 
 def _refuse_without_material(diagnostic: Diagnostic, experiment: Experiment) -> None:

@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pbdkit.errors import ExperimentError, PbdkitError
+from pbdkit.errors import (
+    ExperimentError,
+    PbdkitError,
+    StabilityWarning,
+    WarningText,
+    of_category,
+)
 from pbdkit.lattice.neighbourhood import count_bonds
 from pbdkit.lattice.raster import FOLLOWER, Floats, Mask
 from pbdkit.linear.spectrum import NEUTRAL
@@ -231,7 +237,7 @@ def _doubts(scene: Scene) -> list[str]:
     for n, load in enumerate(scene.experiment.loads):
         if load.from_ > scene.experiment.steps:
             warnings.append(f"loads.{n}: begins to act after the run's last step")
-    warnings += too_light(scene)
+    warnings += of_category(StabilityWarning, too_light(scene))
     for n, barrier in enumerate(scene.barriers):
         if barrier.group.from_ > scene.experiment.steps:
             warnings.append(f"obstacles.{n}: begins after the run's last step")
@@ -254,7 +260,8 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
         return []
     remedy = f"; it is stable below {stable:.4g}" if stable else NO_REMEDY
     grows = f"can diverge, some waves grow by {bound.radius:.4g} a step"
-    return [f"solver.relaxation: {solver.relaxation:g} {grows}{remedy}"]
+    text = f"solver.relaxation: {solver.relaxation:g} {grows}{remedy}"
+    return [WarningText(text, StabilityWarning)]
 
 
 def refuse_unheld_loads(scene: Scene) -> None:

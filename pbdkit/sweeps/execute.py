@@ -12,7 +12,6 @@ import sys
 import tempfile
 import threading
 import time
-import warnings
 from abc import ABC, abstractmethod
 from asyncio import CancelledError
 from collections import deque
@@ -32,7 +31,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xxhash
 
-from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError, did_you_mean
+from pbdkit.errors import (
+    ExperimentError,
+    PbdkitError,
+    StorageError,
+    StorageWarning,
+    SweepWarning,
+    did_you_mean,
+    warn_caller,
+)
 from pbdkit.io.layout import CONVENTIONS, SCHEMA_VERSION, Column
 from pbdkit.io.open import open as open_result
 from pbdkit.io.recorder import Recorder
@@ -594,11 +601,11 @@ def called(
         with progress_bar(progress) as show:
             summary = carry_out(asked, kept, crew, lambda: False, show)
         for text in summary.faults:
-            warnings.warn(text, PbdkitWarning, stacklevel=4)
+            warn_caller(text, StorageWarning)
         if failures := summary.failures:
             member, status, message = failures[0]
             text = f"{len(failures)} of {len(summary.members)} members have no values, as {status}"
-            warnings.warn(f"{text}: {member.words}: {message}", PbdkitWarning, stacklevel=4)
+            warn_caller(f"{text}: {member.words}: {message}", SweepWarning)
         assert summary.path is not None  # nobody stops it but by an exception
         dataset = open_result(summary.path)
         if folder is None:

@@ -27,7 +27,7 @@ from pbdkit.plugin import Component
 from pbdkit.plugin.discovery import worded
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 from pbdkit.sweeps.specification import Job
 
 LENGTH = 8
@@ -181,7 +181,7 @@ def run_member(
 
 def _ran(experiment: Experiment, sink: KeptSink, stopping: Callable[[], bool]) -> tuple[str, str]:
     """Status and message of the run."""
-    run = Run(build_scene(experiment), watch=Watch(stopping))
+    run = Simulation.of_scene(build_scene(experiment), watch=Watch(stopping))
     said = run.warnings
     report = record(run, sink)
     status, reason = report.outcome.status, report.outcome.stop_reason

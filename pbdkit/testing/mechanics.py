@@ -31,7 +31,7 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import vector
 from pbdkit.restart import restore
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import Run, checkpoint_of, record
+from pbdkit.simulation import Simulation, checkpoint_of, record
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
@@ -154,7 +154,7 @@ def resumed(scene: Scene, again: Scene, step: int, start: State | None = None) -
     """The dataset of a run that is stopped at a step, kept as the run store keeps it, and gone on
     with in a scene made anew."""
     sink = MemorySink()
-    left, recorder = Run(scene, start=start), Recorder(scene, sink)
+    left, recorder = Simulation.of_scene(scene, start=start), Recorder(scene, sink)
     recorder.begin()
     for state in left:
         recorder.observe(state)
@@ -162,7 +162,7 @@ def resumed(scene: Scene, again: Scene, step: int, start: State | None = None) -
             break
     kept = checkpoint_of(left.driver, recorder)
     facts = json.loads(json.dumps(kept.facts))
-    rest, recorder = Run(again), Recorder(again, sink)
+    rest, recorder = Simulation.of_scene(again), Recorder(again, sink)
     checkpoint = Checkpoint(kept.about, facts, kept.copied().arrays)
     restore(rest.driver, recorder, checkpoint, SERIAL)
     record(rest, sink, recorder=recorder)

@@ -27,7 +27,7 @@ from pbdkit.plugin import (
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.leaders import rotations_of
 from pbdkit.scene.scene import Scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 from pbdkit.stepping.engine_choice import obstacle
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.rule_evaluation import Evaluator, summed
@@ -224,7 +224,7 @@ def _refuse_other_records(scene: Scene, again: Scene) -> None:
     """Raises PropertyError where a run that is stopped, kept as the run store keeps it, and gone on
     with in a scene made anew records something else than one that was never interrupted."""
     whole, start = MemorySink(), state_with(scene, displacements(scene, 5, share=0.4))
-    record(Run(scene, start=start.copy()), whole)
+    record(Simulation.of_scene(scene, start=start.copy()), whole)
     datasets = resumed(scene, again, STEPS - 1, start), whole.dataset()
     found, needed = ({str(n): v for n, v in ds.variables.items()} for ds in datasets)
     for name in differing(needed, found):

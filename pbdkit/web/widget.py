@@ -1,23 +1,21 @@
-"""The same view in a notebook: messages of a widget in place of a socket.
-
-What Python users call.
-"""
+"""The live view in a notebook: messages of a widget in place of a socket."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import anywidget
 
-from pbdkit.api import Given, as_experiment
 from pbdkit.errors import ExperimentError, refuse_without
-from pbdkit.plugin import Component
+from pbdkit.model.loading import as_experiment
 from pbdkit.web.commands import command_of
 from pbdkit.web.page import script, source
 from pbdkit.web.server import Conductor, Viewer
 from pbdkit.web.session import Message, Session
+
+if TYPE_CHECKING:
+    from pbdkit.model.loading import ComponentClasses, ExperimentLike
 
 
 class _Cells(Viewer):
@@ -66,16 +64,32 @@ class LiveWidget(anywidget.AnyWidget):
 
 
 def live(
-    experiment: Given,
+    experiment: ExperimentLike,
     *,
-    components: Iterable[type[Component]] = (),
+    components: ComponentClasses = (),
     output: str | Path | None = None,
 ) -> LiveWidget:
-    """A widget for a notebook: the body of an experiment answers to the mouse.
+    """Return a widget for a notebook, in which the body of an experiment answers to the mouse.
 
-    What is done to it can be saved as an experiment, at `output` or as NAME-live.yaml, that repeats
-    it bit for bit. ``widget.close()`` ends it. Raises ExperimentError where anywidget is missing,
-    and for an experiment of which there is no scene; PluginError.
+    Parameters
+    ----------
+    experiment : Experiment, mapping, str or path
+        As `pbdkit.run` takes it.
+    components : iterable of classes
+        As in `pbdkit.load`.
+    output : str or path, optional
+        Where what is done to the body can be saved as an experiment that repeats it bit for bit; by
+        default NAME-live.yaml.
+
+    Returns
+    -------
+    LiveWidget
+        Shown by the notebook; ``close()`` ends it.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Where anywidget is missing, or the experiment is wrong.
     """
     refuse_without("anywidget", "live", "live needs anywidget")
 

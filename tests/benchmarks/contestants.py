@@ -25,7 +25,7 @@ from peers import python_with
 import pbdkit
 from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import Run
+from pbdkit.simulation import Simulation
 from pbdkit.stepping.state import State
 
 HERE = Path(__file__).parent
@@ -101,12 +101,12 @@ def stiffen(scene: Scene, cells: int) -> None:
 
 
 def settled(scene: Scene) -> State:
-    run = Run(scene)
+    run = Simulation.of_scene(scene)
     for _ in run:
         pass
     assert run.outcome
     assert run.outcome.status == "settled", run.outcome.stop_reason
-    return run.state
+    return run.driver.state
 
 
 def error_of(problem: Problem, cells: int, scene: Scene, state: State) -> float:

@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from sheets import Running, moving, scene_of
 
 from pbdkit.io.netcdf import NetcdfSink
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 from pbdkit.stepping.numpy_engine import Stepper
 
 NEIGHBOURS = {
@@ -94,7 +94,7 @@ def _run(size: int, parts: dict[str, Any], turns: int = 7) -> tuple[float, int]:
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(turns):
             sink = NetcdfSink(Path(folder) / "out.nc", replace=True)
-            report = record(Run(scene), sink)
+            report = record(Simulation.of_scene(scene), sink)
             found = min(found, report.wall_s)
             assert report.outcome.status == "complete"
     return found, scene.raster.count

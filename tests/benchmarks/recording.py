@@ -13,7 +13,7 @@ from sheets import Running, moving, scene_of
 
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.io.sinks import OverlappingSink
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 
 def recording(size: int, steps: int, every: int) -> tuple[Ratio, str]:
@@ -27,7 +27,7 @@ def recording(size: int, steps: int, every: int) -> tuple[Ratio, str]:
 
         def with_pbdkit():
             path.unlink(missing_ok=True)
-            record(Run(scene), OverlappingSink(NetcdfSink(path, replace=True)))
+            record(Simulation.of_scene(scene), OverlappingSink(NetcdfSink(path, replace=True)))
 
         with_pbdkit()
         snapshot = np.zeros(path.stat().st_size // (steps // every + 1), np.uint8)

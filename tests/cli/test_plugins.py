@@ -18,7 +18,7 @@ from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.plugin.registry import Registry
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 Install = Callable[..., None]
 Call = Callable[..., Any]
@@ -60,7 +60,7 @@ CHEAP = [name for name in EVERY_COMMAND if name not in DEAR]
 def healthy(install: Install, call: Call) -> None:
     """The plugin, and an unfinished run of left.nc."""
     install("zz-healthy", rule("zz-healthy"), "2.1")
-    run = Run(build_scene(pbdkit.load("e.json")), watch=Watch(lambda: True))
+    run = Simulation.of_scene(build_scene(pbdkit.load("e.json")), watch=Watch(lambda: True))
     record(run, NetcdfSink(Path("left.nc")))
 
 

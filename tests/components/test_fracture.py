@@ -184,10 +184,12 @@ def test_an_onset_beyond_failure_is_refused():
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
 def test_the_crack_path_is_the_broken_bonds_in_order(lattice, tmp_path):
     from pbdkit.io.netcdf import NetcdfSink
-    from pbdkit.simulation import Run, record
+    from pbdkit.simulation import Simulation, record
 
     given = bar(9, pulled(0.1), STRAIN, lattice={"type": lattice, "a": 1.0}, **SHEET)
-    record(Run(build_scene(pbdkit.Experiment(**given))), NetcdfSink(tmp_path / "o.nc"))
+    record(
+        Simulation.of_scene(build_scene(pbdkit.Experiment(**given))), NetcdfSink(tmp_path / "o.nc")
+    )
     with pbdkit.open(tmp_path / "o.nc") as ds:
         rows, steps = ds.crack_bond.values - 1, ds.crack_step.values
         assert sorted(rows) == np.flatnonzero(ds.broken_step >= 0).tolist()

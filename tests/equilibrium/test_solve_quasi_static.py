@@ -14,7 +14,7 @@ from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 VELOCITY, STEPS = 0.02, 30
 HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
@@ -249,7 +249,7 @@ def test_a_quasi_static_test_in_parts_is_the_whole(increments, tmp_path):
         looks = count()
         return Watch(lambda: next(looks) > 12)
 
-    report = record(Run(scene, watch=watch()), NetcdfSink(path))
+    report = record(Simulation.of_scene(scene, watch=watch()), NetcdfSink(path))
     resumed = 0
     while report.outcome.status == "interrupted":
         report, resumed = resumption(path, watch()).record(), resumed + 1

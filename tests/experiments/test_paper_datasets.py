@@ -12,7 +12,7 @@ from paper_cases import FOLLOWER, FRAME, LEADER, TORN, every_case, moved, run
 import pbdkit
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 BASE = {
     "time": (("time",), "int64"),
@@ -123,7 +123,7 @@ def test_a_rerun_from_the_dataset_alone_is_the_same_bit_for_bit(case):
 def test_the_file_is_identical_to_the_dataset_in_memory(case, tmp_path):
     shorter = [] if case == "a" else ["steps=30"]
     path, experiment = tmp_path / "out.nc", pbdkit.load(f"paper/{case}", settings=shorter)
-    record(Run(build_scene(experiment)), NetcdfSink(path))
+    record(Simulation.of_scene(build_scene(experiment)), NetcdfSink(path))
     assert [p.name for p in tmp_path.iterdir()] == ["out.nc"]
     with xarray.open_dataset(path) as opened:
         in_memory = run(case, *shorter)

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import pbdkit
 
 
-class Kicks(pbdkit.ParticleOperation):
+class Kicks(pbdkit.plugin.ParticleOperation):
     """Declares that it rests, and moves particles at rest."""
 
     type: Literal["kicks"] = "kicks"
@@ -15,10 +15,10 @@ class Kicks(pbdkit.ParticleOperation):
 
     @staticmethod
     def displacement(u, new, p):
-        return pbdkit.Vector(new.x + 1e-3, new.y)
+        return pbdkit.plugin.Vector(new.x + 1e-3, new.y)
 
 
-class Pins(pbdkit.ParticleOperation):
+class Pins(pbdkit.plugin.ParticleOperation):
     """Declares that it rests, and holds every particle where it is."""
 
     type: Literal["pins"] = "pins"

@@ -13,7 +13,7 @@ from pbdkit.fitting.fit import problem_of
 from pbdkit.fitting.observations import TracksObservation
 from pbdkit.fitting.specification import described_fit
 from pbdkit.plotting.fit import draw_fit
-from pbdkit.simulation import Run
+from pbdkit.simulation import Simulation
 
 WIDTH, HEIGHT, STEPS = 8.0, 4.0, 16
 MODULUS, THICKNESS, NOISE = 1000.0, 2.0, 1e-4
@@ -301,7 +301,7 @@ def test_curves_have_the_equilibria_within_steps(tmp_path):
         fracture={"type": "strain", "failure": 0.5}, record={"increments": True},
     )  # fmt: skip
     (observation,) = posed(made, given).observations
-    places, forces = observation.curve(Run(observation.scene))
+    places, forces = observation.curve(Simulation.of_scene(observation.scene))
     np.testing.assert_allclose(places, np.linspace(0.0, 0.01 * WIDTH, 21), atol=1e-9)
     np.testing.assert_allclose(forces, HEIGHT * places / WIDTH, rtol=1e-6, atol=1e-9)
 

@@ -15,7 +15,7 @@ from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.lattice.raster import FRAME
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 OLD = Path(__file__).parents[1] / "data" / "version-1.nc.gz"
 HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
@@ -222,7 +222,7 @@ def test_a_run_that_is_not_finished_shows_the_same_layout(tmp_path, monkeypatch)
                                            fracture={"type": "threshold", "thresholds": [1.4]},
                                            diagnostics=[{"type": "crack-path"}]))  # fmt: skip
     output, looks = tmp_path / "out.nc", iter(range(100))
-    run = Run(build_scene(given), watch=Watch(lambda: next(looks) >= 5))
+    run = Simulation.of_scene(build_scene(given), watch=Watch(lambda: next(looks) >= 5))
     assert record(run, NetcdfSink(output)).outcome.status == "interrupted"
     whole = pbdkit.run(given, progress=False)
     with pbdkit.open(output) as left:

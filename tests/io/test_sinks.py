@@ -12,7 +12,7 @@ from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.io.sinks import LARGE_BYTES, MOST_WAITING, KeepingSink, OverlappingSink
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 LARGE = np.zeros(LARGE_BYTES // 8)
 
@@ -129,8 +129,8 @@ def test_a_large_run_is_the_same_written_beside_or_not(tmp_path):
     )
     scene = build_scene(experiment)
     plain, beside = tmp_path / "plain.nc", tmp_path / "beside.nc"
-    record(Run(scene), NetcdfSink(plain))
-    record(Run(scene), OverlappingSink(NetcdfSink(beside)))
+    record(Simulation.of_scene(scene), NetcdfSink(plain))
+    record(Simulation.of_scene(scene), OverlappingSink(NetcdfSink(beside)))
     with pbdkit.open(plain) as one, pbdkit.open(beside) as other:
         for name in one.variables:
             np.testing.assert_array_equal(one[name], other[name])
@@ -147,7 +147,7 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
         return False
 
     with pytest.raises(pbdkit.StorageError, match="appeared while this was going on"):
-        record(Run(scene, watch=Watch(appear)), sink)
+        record(Simulation.of_scene(scene, watch=Watch(appear)), sink)
     assert path.read_text() == "somebody else's"
     (kept,) = (p for p in tmp_path.iterdir() if p != path)
     with pbdkit.open(kept) as ds:
@@ -172,7 +172,7 @@ def test_compression_changes_the_file_and_not_the_values(tmp_path):
         experiment = pbdkit.load("start", settings=settings)
         path = tmp_path / f"{compression}.nc"
         sink = NetcdfSink(path, compression=experiment.record.compression)
-        record(Run(build_scene(experiment)), sink)
+        record(Simulation.of_scene(build_scene(experiment)), sink)
         sizes[compression] = path.stat().st_size
     assert sizes["zlib"] < 0.3 * sizes["none"]
     with pbdkit.open(tmp_path / "none.nc") as one, pbdkit.open(tmp_path / "zlib.nc") as other:
@@ -183,7 +183,9 @@ def test_compression_changes_the_file_and_not_the_values(tmp_path):
 def test_chunks_serve_a_history_and_a_snapshot(tmp_path, columns, along_time):
     settings = [f"body.columns={columns}", f"body.rows={columns}", "steps=30"]
     path = tmp_path / "out.nc"
-    record(Run(build_scene(pbdkit.load("start", settings=settings))), NetcdfSink(path))
+    record(
+        Simulation.of_scene(build_scene(pbdkit.load("start", settings=settings))), NetcdfSink(path)
+    )
     with pbdkit.open(path) as ds:
         chunks = ds.position.encoding["chunksizes"]
         assert np.prod(chunks) * 8 <= 1.01 * 2**20

@@ -27,7 +27,7 @@ from pbdkit.plugin.registry import Registry
 from pbdkit.plugin.schedule import Course
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run
+from pbdkit.simulation import Simulation
 from pbdkit.stability.analysis import Analysis
 from pbdkit.stability.forecast import forecast
 from pbdkit.stepping.engine_choice import choose, what_kernels_lack
@@ -516,7 +516,7 @@ def test_turns_of_a_live_session_move_the_frame_too(tmp_path):
     session.advance(5)
     session.turn("rule.poisson_ratio", 0.4)
     session.advance(5)
-    run = Run(build_scene(pbdkit.load(session.save().path, components=[Leaning])))
+    run = Simulation.of_scene(build_scene(pbdkit.load(session.save().path, components=[Leaning])))
     for state in run:
         last = state.u.copy()
     np.testing.assert_array_equal(session.state.u, last)

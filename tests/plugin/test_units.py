@@ -28,7 +28,7 @@ from pbdkit.plugin.units import (
     Units,
 )
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 UNITS = {"length": "0.25 mm", "youngs_modulus": "206 GPa", "thickness": "3.05 mm"}
 BAR: dict[str, Any] = {
@@ -155,7 +155,7 @@ def test_a_file_is_continued_to_the_bit(tmp_path: Any) -> None:
             tmp_path / f"{steps}.nc",
             build_scene(pbdkit.Experiment(**STEPPED, steps=steps)),
         )
-        record(Run(scene), NetcdfSink(path))
+        record(Simulation.of_scene(scene), NetcdfSink(path))
         return path
 
     with pbdkit.resume(made(2), steps=4, progress=False) as ds, pbdkit.open(made(4)) as whole:

@@ -23,7 +23,7 @@ from pbdkit.plugin import Component
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.restart import restore
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, RunReport, record
+from pbdkit.simulation import RunReport, Simulation, record
 
 Components = Iterable[type[Component]]
 MOST_STOPS = 4
@@ -60,7 +60,7 @@ def begun(parts: dict[str, Any], output: Path, own: Components, watch: Watch) ->
     """A run from its start."""
     experiment = Experiment.build(Source("trial", parts), own)
     sink = NetcdfSink(output, compression=compression_of(experiment))
-    return record(Run(build_scene(experiment), watch=watch), OverlappingSink(sink))
+    return record(Simulation.of_scene(build_scene(experiment), watch=watch), OverlappingSink(sink))
 
 
 def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any]) -> RunReport:
@@ -71,7 +71,10 @@ def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any])
         experiment = Experiment.build(Source("stored", parts), own)
         scene, checkpoint = build_scene(experiment), left.checkpoint()
         sink = NetcdfSink(output)
-        run, recorder = Run(scene, watch=watch), Recorder(scene, OverlappingSink(sink))
+        run, recorder = (
+            Simulation.of_scene(scene, watch=watch),
+            Recorder(scene, OverlappingSink(sink)),
+        )
         restore(run.driver, recorder, checkpoint, SERIAL)
         sink.go_on(left, checkpoint, columns_of(scene), compression_of(experiment))
     except BaseException:

@@ -24,7 +24,7 @@ from sheets import Running, moving, scene_of
 from pbdkit.io.netcdf import FIRST_S, NetcdfSink
 from pbdkit.io.run_store import store_of
 from pbdkit.io.sinks import OverlappingSink
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 
 NEVER = 1e9
 Work = Callable[[], object]
@@ -55,7 +55,7 @@ def recording(parts: dict[str, Any], path: Path, first_s: float = FIRST_S) -> Wo
 
     def work() -> None:
         path.unlink(missing_ok=True)
-        record(Run(scene), OverlappingSink(NetcdfSink(path, first_s=first_s)))
+        record(Simulation.of_scene(scene), OverlappingSink(NetcdfSink(path, first_s=first_s)))
 
     return work
 

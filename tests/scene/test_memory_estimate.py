@@ -11,7 +11,7 @@ import pytest
 import pbdkit
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 from pbdkit.stability.forecast import forecast
 
 MIB = 2**20
@@ -32,7 +32,7 @@ def test_memory_and_output_are_what_check_says(change, tmp_path):
     path = tmp_path / "out.nc"
 
     tracemalloc.start()
-    record(Run(build_scene(scene.experiment)), NetcdfSink(path))
+    record(Simulation.of_scene(build_scene(scene.experiment)), NetcdfSink(path))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
 
@@ -46,7 +46,7 @@ def test_small_files_are_as_large_as_check_says(change, tmp_path):
     settings = ["body.columns=40", "body.rows=30", "steps=60", "record.every=1", "diagnostics=[]"]
     scene = build_scene(pbdkit.load("start", settings=[*settings, *CHANGES[change]]))
     path = tmp_path / "out.nc"
-    record(Run(scene), NetcdfSink(path))
+    record(Simulation.of_scene(scene), NetcdfSink(path))
     assert path.stat().st_size / MIB == pytest.approx(forecast(scene).output_mib, rel=0.05)
 
 
@@ -62,14 +62,14 @@ import json, sys
 from pathlib import Path
 from pbdkit.api import load
 from pbdkit.io.netcdf import NetcdfSink
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 from pbdkit.scene.scene import build_scene
 from pbdkit.scene.memory_estimate import sizes_of
 
 def run(side):
     size = [f"body.columns={side}", f"body.rows={side}"]
     scene = build_scene(load("paper/a", settings=[*sys.argv[3:], *size]))
-    record(Run(scene), NetcdfSink(Path(sys.argv[1]), replace=True))
+    record(Simulation.of_scene(scene), NetcdfSink(Path(sys.argv[1]), replace=True))
     status = Path("/proc/self/status").read_text()
     return scene, 1024 * int(status.split("VmHWM:")[1].split()[0])
 
@@ -106,12 +106,12 @@ import json, sys
 from pathlib import Path
 from pbdkit.api import load
 from pbdkit.io.netcdf import NetcdfSink
-from pbdkit.simulation import Run, peak_memory, record
+from pbdkit.simulation import Simulation, peak_memory, record
 from pbdkit.scene.scene import build_scene
 from pbdkit.scene.memory_estimate import sizes_of
 
 scene = build_scene(load("paper/a", settings=sys.argv[2:]))
-record(Run(scene), NetcdfSink(Path(sys.argv[1]), replace=True))
+record(Simulation.of_scene(scene), NetcdfSink(Path(sys.argv[1]), replace=True))
 peak = peak_memory()
 said = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count).memory
 modules = [name for name, of in sys.modules.items() if getattr(of, "__spec__", None)]

@@ -6,7 +6,7 @@ from property_cases import BOTH_ENDS_HELD, advanced, body_sites, scene_of
 
 from pbdkit.components.neighbours import Chebyshev, Coordination
 from pbdkit.lattice.neighbourhood import build_neighbourhood
-from pbdkit.simulation import Run
+from pbdkit.simulation import Simulation
 from pbdkit.stability.forecast import forecast
 
 SQUARE = {"type": "square", "a": 1.0}
@@ -127,4 +127,6 @@ def test_an_equilibrium_that_smaller_steps_reach_is_not_warned_of():
     ]
     assert len(warned[0]) == 1
     assert warned[1] == []
-    assert not any("diverge" in w for w in Run(scene_of(**parts, solver=straight)).warnings)
+    assert not any(
+        "diverge" in w for w in Simulation.of_scene(scene_of(**parts, solver=straight)).warnings
+    )

@@ -9,7 +9,7 @@ import pbdkit
 from pbdkit.io.sinks import MemorySink
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 from pbdkit.stepping import divergence as guard
 from pbdkit.stepping.divergence import EVERY, Guard
 from pbdkit.stepping.state import initial_state
@@ -156,7 +156,7 @@ def test_who_stops_the_run_while_the_last_good_state_is_looked_for_keeps_what_wa
     sink = MemorySink()
     scene = build_scene(pbdkit.Experiment(**given))
     # Two calls of a hundred steps at most blow up; from the third on somebody wants to stop.
-    report = record(Run(scene, watch=Watch(lambda: next(calls) >= 2)), sink)
+    report = record(Simulation.of_scene(scene, watch=Watch(lambda: next(calls) >= 2)), sink)
     assert report.outcome.status == "diverged"
     assert sink.dataset().time.values.tolist() == [0]
 

@@ -25,7 +25,7 @@ import pbdkit
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run
+from pbdkit.simulation import Simulation
 from pbdkit.web import script as saving
 from pbdkit.web import session as history
 from pbdkit.web import session as stage
@@ -52,10 +52,10 @@ def do(session, **command):
 
 
 def run_of(path):
-    run = Run(build_scene(pbdkit.load(path)))
+    run = Simulation.of_scene(build_scene(pbdkit.load(path)))
     for _ in run:
         pass
-    return run.state
+    return run.driver.state
 
 
 def assert_same(a, b):
