@@ -1,10 +1,16 @@
 """Imports follow the data: experiment, scene, stepping, results, command line."""
 
 import ast
+import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+
+import pbdkit
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.numba_engine import engine
+from pbdkit.stepping.program import ORDER as ORDER_OF_A_STEP
 
 PACKAGE = Path(__file__).parent.parent / "pbdkit"
 ORDER = [
@@ -96,3 +102,36 @@ def test_functions_stay_short(path):
 def test_every_folder_has_its_place_in_the_order():
     folders = {p.name for p in PACKAGE.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
     assert folders <= set(ORDER)
+
+
+PAGE = (PACKAGE.parent / "ARCHITECTURE.md").read_text()
+
+
+def test_the_page_names_every_package_and_no_file_that_is_missing():
+    table = PAGE.split("## The way of the data")[0]
+    names = {word.strip("/") for word in re.findall(r"`([\w/]+)`", table)}
+    assert {*ORDER} <= names
+    paths = re.findall(r"`([a-z_]+/[\w/]*\.py)`", PAGE)
+    files = re.findall(r"`([a-z_]+\.py)`", PAGE)
+    folders = [PACKAGE, PACKAGE / "stepping", PACKAGE.parent, PACKAGE.parent / "tests"]
+    assert len(paths) > 3
+    assert not [path for path in paths if not any((f / path).exists() for f in folders)]
+    assert not [name for name in files if not any((f / name).exists() for f in folders)]
+
+
+def test_the_page_lists_the_operations_in_the_order_of_a_step():
+    section = PAGE.split("## The operations of a step")[1].split("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| `")]
+    names = [name for row in rows for name in re.findall(r"`(\w+)`", row.split("|")[1])]
+    ranks = [[kind.__name__ for kind in ORDER_OF_A_STEP].index(name) for name in names]
+    assert sorted(ranks) == [*range(len(ORDER_OF_A_STEP))]
+
+
+def test_the_kernel_on_the_page_is_the_one_that_is_generated(monkeypatch):
+    sources = []
+    monkeypatch.setattr(engine, "load_blamed", lambda levels, source, given: sources.append(source))
+    engine.CompiledStepper(build_scene(pbdkit.load("paper/a")))
+    lines = sources[0].splitlines()
+    for line in PAGE.split("```python\n")[1].split("```")[0].splitlines():
+        assert line in lines, line
+        del lines[: lines.index(line) + 1]

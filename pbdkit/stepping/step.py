@@ -1,4 +1,4 @@
-"""A step is a list of operations, one for each feature of a scene (ARCHITECTURE.md, "One step").
+"""A step is a list of operations, one for each feature of a scene (listed in ARCHITECTURE.md).
 
 An engine interprets the list and knows no feature by name: numpy applies one operation after the
 other, a kernel is written by letting each of them emit its lines. The order stands once, in
