@@ -1,24 +1,13 @@
-"""Kernels for a GPU, written from the same elementwise functions and in the same words.
+"""The GPU engine (numba-cuda): kernels that make many steps a launch, and the state on the device.
 
-Writes what one thread of a GPU does with places of the rasters and of bonds: the same lines that
-rows are swept with, on flat arrays.
-
+A thread moves one particle after the other with the lines that rows are swept with, on flat arrays.
 Every place has a group: 0 where nobody follows, then a number for each sublattice and kind of row
-whose particles have all their neighbours (`rows.py`), then one for each sublattice where something
-may be missing (`slot_loop.py`).
+whose particles have all their neighbours, then one for each sublattice where something may be
+missing. Between operations of a step all threads wait for each other: what one writes, none reads
+before the next.
 
-The arrays that kernels for a GPU are given, by name: planes flat, tables as they are.
-
-Writes the source of a scene's kernel for a GPU: many steps a launch.
-
-The order within a step is that of `stepping/numpy_engine.py`. Between its parts all threads wait
-for each other, at places that are few: what a part writes, none reads before the next.
-
-What a scene comes to on a GPU: the source of its kernel, and the arrays that it begins with.
-
-Kernels compiled for a GPU, by numba-cuda (written against 0.30; see `_uncontracted`).
-
-The GPU engine: the state stays on the device, and is fetched at the end of a call.
+The state stays on the device and is fetched at the end of a call. Kernels are kept from contracting
+products and sums (written against numba-cuda 0.30; see `_uncontracted`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""What stands in the way of the GPU engine, told without loading what it needs.
-
-Which engine steps a scene, on how many threads, and why.
+"""The choice of the engine that steps a scene, on how many threads, and why; and what stands in
+the way of the others, found without loading them.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""What a particle does in a step, given its neighbours: told once, for every room that asks.
+"""Evaluation of rule and fracture model: what a particle does in a step, given its neighbours.
 
-Stepping, analysis, identity, diagnostics of a material and the conformance suite evaluate rule and
-fracture model here and nowhere else; kernels are generated from the same functions and tested
-against this.
-
-Particles of a scene with what is around them, as the evaluator is asked about them.
+Stepping, analysis, identification, diagnostics of a material and the conformance suite evaluate
+rule and fracture model here and nowhere else; kernels are generated from the same functions and
+tested against this.
 """
 
 from __future__ import annotations

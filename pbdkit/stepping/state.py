@@ -1,6 +1,5 @@
-"""Breaking the bonds that cross a crack or a cut (docs/fracture.md).
-
-What a run remembers from one step to the next. This, and nothing else, is a checkpoint.
+"""The state of a run: what it remembers from one step to the next. This, and nothing else, is a
+checkpoint.
 """
 
 from __future__ import annotations

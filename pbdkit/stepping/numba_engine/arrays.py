@@ -1,6 +1,5 @@
-"""The arrays that kernels are given, by name: what stays the same for a scene, and lost bonds.
-
-Which stretches of which rows have all their neighbours and whole cells, and which have not.
+"""The arrays that kernels are given, by name: what stays the same for a scene, lost bonds, and
+which stretches of which rows have all their neighbours and whole cells.
 """
 
 from __future__ import annotations

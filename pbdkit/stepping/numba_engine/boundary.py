@@ -1,13 +1,6 @@
-"""Writes how frame points follow the body.
+"""The arrays of leaders and obstacles that kernels are given, for one step or for several.
 
-Writes what a kernel does with leaders, and the arrays that it is given of them.
-
-Where some are guided, those that lead along an axis are listed for each axis by itself.
-
-Writes the pass that keeps particles out of obstacles, after the sweeps; where particles may be
-guided, after the leaders too.
-
-Rows whose particles reach no obstacle's box, as far as their displacements go, are passed over.
+Where some particles are guided, those that lead along an axis are listed for each axis by itself.
 """
 
 from __future__ import annotations

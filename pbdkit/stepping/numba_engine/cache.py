@@ -1,10 +1,9 @@
-"""Elementwise functions made ready for numba, and the key that tells when they have changed.
+"""The cache of kernels: a folder for each, under a key of everything that it was made of.
 
-Loads kernels, kept in a cache folder under a key of everything that they were made of.
-
-A kernel has a folder of its own with its source, what numba keeps beside it, and the digests of
-both. What does not agree with its digests is never loaded but made anew; where nothing can be kept,
-or others could write there, a kernel is made in memory.
+The folder has the source, what numba keeps beside it, and the digests of both. What does not agree
+with its digests is never loaded but made anew; where nothing can be kept, or others could write
+there, a kernel is made in memory. Elementwise functions are made ready for numba here, and their
+source is part of the key.
 """
 
 from __future__ import annotations

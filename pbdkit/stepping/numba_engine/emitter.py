@@ -1,4 +1,5 @@
-"""Writes the source of a scene's kernel: the sweeps that move particles, and the loop over steps.
+"""The source of a scene's kernel: the sweeps that move particles, and the loop over steps, in
+which each operation of a step emits its lines.
 
 Row by row the shortest code is run that serves: rest offsets and steps to neighbours are literals
 where all neighbours are there. What varies from run to run (the rule's parameters, thresholds,

@@ -1,6 +1,4 @@
-"""Followers whose neighbours are found anew at every step: a compiled sweep over their list.
-
-How far the leaders' motion can have reached: nothing beyond is touched.
+"""The compiled engine: whole intervals of steps in one call, on what the motion has reached.
 
 At rest a rule moves nothing, exactly; so a step can only move particles that bear a load or adjoin
 one that has moved. Where that is plain from the scene nothing has moved before the leaders do;
@@ -9,7 +7,7 @@ the box around what has moved, and around leaders that are not at home, grows by
 and by as many as rules work on each other's moves. Where something is remembered that changes,
 everything is looked at in every step.
 
-The compiled engine: whole intervals of steps in one call, on what the motion has reached.
+Where neighbours are found anew at every step, the kernel is a sweep over their list.
 """
 
 from __future__ import annotations

@@ -1,10 +1,5 @@
-"""A rule of a scene, as its kernel sees it.
-
-What a scene's kernel has to hold, and the lines it is written in.
-
-The arrays of passes of several steps: their sizes, and who stands in which rows and columns.
-
-The rules of a scene as the levels of its kernel, tried out on single numbers first.
+"""The plan of a kernel: the rules of a scene as its levels, what the kernel has to hold, the words
+that its lines are written in, and the sizes of passes of several steps.
 """
 
 from __future__ import annotations

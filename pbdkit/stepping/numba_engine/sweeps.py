@@ -1,23 +1,18 @@
-"""Writes how kernels find the damage of the cells around a particle, and which particles have any.
+"""The lines of the sweeps that move particles, and of the pass that judges bonds.
 
-Few particles have any. A plane of marks records which: the sweep moves all others as if no bond
-could break, and then computes the marked ones in short chunks. A mark stays, and is set too early
-rather than too late: without damage both ways give the same numbers.
+Rows of particles that have all their neighbours are written slot by slot: rest offsets, steps and
+weights are literals, so that what cancels at rest folds away. All other particles are moved in a
+loop over their slots: neighbours may be missing, cells cut, and there may be thousands of slots.
+That is done particle after particle, since what is not like the middle of a body are its edges;
+where there are too many slots to write out it is everything, and all particles of a row take in one
+slot after the other.
 
-Writes what every kind of row does alike: the words of a neighbour, and a particle's target.
+Few particles have damaged cells around them. A plane of marks records which: the sweep moves all
+others as if no bond could break, and then computes the marked ones in short chunks. A mark stays,
+and is set too early rather than too late: without damage both ways give the same numbers.
 
-Writes what looks at bonds where they are kept: the pass that renews and breaks them before the
-sweeps, and what notes those that a sweep has broken.
-
-Writes what is done in a row of particles that have all their neighbours, slot by slot: rest
-offsets, steps and weights are literals, so that what cancels at rest folds away.
-
-Writes what is done with any particles, in a loop over their slots: neighbours may be missing,
-cells cut, and there may be thousands of slots.
-
-Mostly particle after particle, since what is not like the middle of a body are its edges. Where
-there are too many slots to write out it is everything, and all particles of a row take in one slot
-after the other.
+Bonds that remember what changes are renewed and broken in a pass before the sweep, where they are
+kept; others by the sweep, which notes what it has broken.
 """
 
 from __future__ import annotations
