@@ -1,4 +1,4 @@
-"""What can go wrong, named: every error that pbdkit raises on purpose derives from PbdkitError."""
+"""Exceptions and warnings. Every error that pbdkit raises on purpose derives from PbdkitError."""
 
 from __future__ import annotations
 
@@ -18,25 +18,35 @@ __all__ = [
     "StabilityWarning", "StorageError", "StorageWarning", "SweepWarning",
 ]  # fmt: skip
 
-LONGEST = 3900
-"""So many characters a message has at most."""
-MOST_LINES = 20
-MOST_NAMES = 8
-"""So many names that begin with a word are suggested for it."""
+MAX_CHARACTERS = 3900
+"""Largest number of characters of a message."""
+MAX_LINES = 20
+"""Largest number of lines of a message."""
+MAX_SUGGESTIONS = 8
+"""Largest number of names with the same beginning that are suggested."""
 
 
 class PbdkitError(Exception):
-    """The common ancestor; its text is one message for the user, with place and remedy. Whatever it
-    repeats of the input is made fit to be shown.
+    """Base class of all errors of pbdkit.
 
-    `where` is the path of the faulty field in the experiment, for instance
-    ``("leaders", 1, "select")``; it is empty when no single field is to blame. `exit_status` is
-    that of the program which ends with it.
+    Parameters
+    ----------
+    message
+        Text for the user: place, fault, expectation and remedy. Unprintable characters are escaped.
+    where
+        Path of the faulty field in the experiment, for instance ``("leaders", 1, "select")``; empty
+        if there is no single field.
+
+    Attributes
+    ----------
+    exit_status
+        Exit status of the program.
+    is_reported
+        Whether another process has already reported the error.
     """
 
     exit_status: ClassVar[int] = 1
-    told: bool = False
-    """Whether the user knows of it already, from another process."""
+    is_reported: bool = False
 
     def __init__(self, message: str, where: Sequence[str | int] = ()) -> None:
         super().__init__(printable(message))
@@ -44,46 +54,62 @@ class PbdkitError(Exception):
 
 
 def printable(text: str) -> str:
-    """The text as a terminal may show it: what does not print is escaped, and of long lines the
-    beginning, with the place, and the end, with the remedy, are kept."""
-    lines = text.split("\n")[:MOST_LINES]
-    longest = min(1000, LONGEST // len(lines))
-    return "\n".join(_cut(_escaped(_cut(line, longest)), longest) for line in lines)
+    """Return the text as a terminal can show it.
+
+    Unprintable characters are escaped. Of long lines the beginning, with the place, and the end,
+    with the remedy, are kept.
+    """
+    lines = text.split("\n")[:MAX_LINES]
+    limit = min(1000, MAX_CHARACTERS // len(lines))
+    return "\n".join(_cut(_escaped(_cut(line, limit)), limit) for line in lines)
 
 
-def _cut(line: str, longest: int) -> str:
-    half = longest // 2
-    return line if len(line) <= longest else f"{line[:half]} ... {line[6 - half :]}"
+def _cut(line: str, limit: int) -> str:
+    half = limit // 2
+    return line if len(line) <= limit else f"{line[:half]} ... {line[6 - half :]}"
 
 
 def _escaped(line: str) -> str:
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    return "".join(
+        character if character.isprintable() else ascii(character)[1:-1] for character in line
+    )
 
 
 class ExperimentError(PbdkitError):
-    """The experiment or the call is wrong."""
+    """An experiment or a call is invalid.
+
+    Attributes
+    ----------
+    located
+        Whether the message begins with the place in the experiment's file.
+    """
 
     exit_status = 2
     located: bool = False
-    """Whether the message already begins with the place in the experiment's file."""
 
 
 class NotSharedError(ExperimentError):
-    """Several processes cannot share it: one can run it."""
+    """Several processes cannot share the run; one process can run it."""
 
 
 class PluginError(PbdkitError):
-    """A distribution that the experiment names is missing or broken, or a component of it fails;
-    `where` is then the path of the field that asks for it, where one does."""
+    """A distribution that the experiment needs is missing or broken, or a component fails.
+
+    `where` is the path of the field that refers to it, if there is one.
+    """
 
     exit_status = 3
 
 
 class DivergedError(PbdkitError):
-    """A run left all bounds, did not converge to an equilibrium, or came apart on the way to one.
+    """A run diverged, did not converge to an equilibrium, or separated into parts on the way to
+    one.
 
-    `dataset` holds what was recorded before, status "diverged", "unconverged" or "separated"; it is
-    None where the run was writing to a file, which then holds the same.
+    Attributes
+    ----------
+    dataset
+        The records until then, with status "diverged", "unconverged" or "separated"; None if the
+        run was writing to a file, which holds the same.
     """
 
     exit_status = 4
@@ -94,24 +120,21 @@ class DivergedError(PbdkitError):
 
 
 class StorageError(PbdkitError):
-    """A result could not be written or read; nothing that existed before was touched."""
+    """A result could not be written or read. Existing files are unchanged."""
 
     exit_status = 6
 
 
 class WriteError(StorageError):
-    """A file could not be written: the earlier one of its name, and all that was read, are sound.
+    """A file could not be written. An earlier file of this name is unchanged.
 
-    The message begins with the place, and nothing that reads another file meanwhile changes it.
+    The message begins with the place, and is not changed by code that reads another file meanwhile.
     """
 
 
 class PbdkitWarning(UserWarning):
-    """The base class of all warnings; the text names the place and the remedy.
-
-    Each subject has a class of its own, so that it can be silenced alone:
-    ``warnings.filterwarnings("ignore", category=pbdkit.errors.StabilityWarning)``.
-    """
+    """A run or its result may not be what was intended; the text gives the reason and the
+    remedy."""
 
 
 class SceneWarning(PbdkitWarning):
@@ -178,22 +201,26 @@ def warn_caller(text: str, category: type[PbdkitWarning] | None = None) -> None:
 
 
 def dotted(where: Sequence[Any]) -> str:
-    """The path of a field as users write it: ``leaders.1.select``."""
+    """Return the path of a field as users write it: ``leaders.1.select``."""
     return ".".join(str(part) for part in where)
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return ``; did you mean 'x'?`` with the known names that begin with the word, or else with
-    the nearest one; an empty string where no known name is near."""
-    by_lower, lower = {k.lower(): k for k in known}, name[:80].lower()
-    near = [k for k in by_lower if k.startswith((f"{lower}_", f"{lower}-"))] if lower else []
-    if not 0 < len(near) <= MOST_NAMES or lower in by_lower:
-        near = difflib.get_close_matches(lower, by_lower, n=1, cutoff=0.5)
-    names = [f"'{by_lower[k]}'" for k in near]
+def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+    """Return ``; did you mean 'x'?`` with similar names, or an empty string.
+
+    Names that begin with the word are suggested, else the nearest one.
+    """
+    by_lower, lower = {key.lower(): key for key in candidates}, name[:80].lower()
+    similar = (
+        [key for key in by_lower if key.startswith((f"{lower}_", f"{lower}-"))] if lower else []
+    )
+    if not 0 < len(similar) <= MAX_SUGGESTIONS or lower in by_lower:
+        similar = difflib.get_close_matches(lower, by_lower, n=1, cutoff=0.5)
+    names = [f"'{by_lower[key]}'" for key in similar]
     if not names:
         return ""
-    before = f"{', '.join(names[:-1])} or " if len(names) > 1 else ""
-    return f"; did you mean {before}{names[-1]}?"
+    first = f"{', '.join(names[:-1])} or " if len(names) > 1 else ""
+    return f"; did you mean {first}{names[-1]}?"
 
 
 LONGEST_LINE = 400

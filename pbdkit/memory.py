@@ -1,4 +1,4 @@
-"""The memory that this process may use: of the machine, of a container, under a limit."""
+"""Memory available to this process: of the machine, of a container, under a limit."""
 
 from __future__ import annotations
 
@@ -8,23 +8,35 @@ from contextlib import suppress
 from pathlib import Path
 
 LIBRARIES = 2**30
-"""Bytes of address space for the libraries that are loaded (measured: 560 MiB with a kernel
-compiled anew). Some of them end the process, or never end, where they get none."""
+"""Address space in bytes for the libraries that are loaded (560 MiB were measured with a kernel
+compiled anew). Some of them crash or hang with less."""
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
+"""File with the memory limit of a container."""
 
 
 def machine_memory(processes: int = 1) -> int:
-    """Bytes for a scene, where so many processes share the machine; what cannot be asked is taken
-    as 16 GiB."""
-    found = [min(_of_all(), default=16 * 2**30) // processes]
+    """Return the memory in bytes for a scene.
+
+    Parameters
+    ----------
+    processes
+        Number of processes that share the machine.
+
+    Notes
+    -----
+    16 GiB are assumed if the system does not report its memory.
+    """
+    limits = [min(_system_limits(), default=16 * 2**30) // processes]
     if (limit := address_limit()) is not None:
-        found.append(max(0, limit - LIBRARIES))
-    return min(found)
+        limits.append(max(0, limit - LIBRARIES))
+    return min(limits)
 
 
 def refuse_little_memory() -> None:
-    """Raises MemoryError where the limit on address space leaves too little for the libraries;
-    where it is enough they take one thread, as each maps some more."""
+    """Raise MemoryError if the limit on address space is too small for the libraries.
+
+    If there is a limit, libraries use one thread, since each thread takes address space.
+    """
     limit = address_limit()
     if limit is None:
         return
@@ -37,17 +49,17 @@ def refuse_little_memory() -> None:
 
 
 def address_limit() -> int | None:
-    """Bytes of address space that the process may map; None where there is no limit."""
+    """Return the limit on address space in bytes; None if there is none."""
     try:
         from resource import RLIM_INFINITY, RLIMIT_AS, getrlimit
-    except ImportError:  # not on every system
+    except ImportError:  # Windows has no resource module
         return None
     limit, _ = getrlimit(RLIMIT_AS)
     return None if limit == RLIM_INFINITY else limit
 
 
-def _of_all() -> Iterator[int]:
+def _system_limits() -> Iterator[int]:
     with suppress(AttributeError, OSError, ValueError):
         yield os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with suppress(OSError, ValueError):  # "max": no bound
+    with suppress(OSError, ValueError):  # "max" means no limit
         yield int(CONTAINER.read_text())

@@ -1,4 +1,4 @@
-"""What whoever waits for a run is told, and whether they want it to stop: a bar, or a line."""
+"""Progress reporting and cancellation: a bar on a terminal, or a line in a notebook."""
 
 from __future__ import annotations
 
@@ -7,66 +7,98 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-PATIENCE_S = 1.0
-"""What is over by then shows no bar."""
-REFRESH_S, LINE_S = 0.1, 0.5
-"""So often a bar, and a line in a notebook, is drawn anew."""
+DELAY_S = 1.0
+"""Delay in seconds before the bar appears."""
+REFRESH_S = 0.1
+"""Interval in seconds between updates of a bar."""
+
+LINE_S = 0.5
+"""Interval in seconds between updates of a line in a notebook."""
 
 
 class StoppedError(Exception):
-    """The run, or the search for an equilibrium, was asked to stop."""
+    """A run, or the search for an equilibrium, was cancelled."""
 
 
 class Watch:
-    """Tells `show` what is being done and which share of it is, and asks `stopping` whether to go
-    on. `load` names the increment of load, where there are several."""
+    """Report the progress of a task, and cancel it on request.
+
+    Parameters
+    ----------
+    stopping
+        Function that returns whether the task is to be cancelled.
+    show
+        Function that shows the description of a task and the fraction that is done.
+
+    Attributes
+    ----------
+    load
+        Name of the load increment, if there are several; it precedes the description.
+    """
 
     def __init__(
         self,
         stopping: Callable[[], bool] = lambda: False,
-        show: Callable[[str, float], None] = lambda what, share: None,
+        show: Callable[[str, float], None] = lambda task, fraction: None,
     ) -> None:
-        self.load, self._what = "", ""
+        self.load, self._task = "", ""
         self.stopping, self.show = stopping, show
 
-    def begin(self, what: str) -> None:
-        """Something else is done from now on. Raises StoppedError."""
-        self.look(0.0, what)
+    def begin(self, task: str) -> None:
+        """Start another task; raise StoppedError if it is cancelled."""
+        self.look(0.0, task)
 
-    def look(self, share: float, what: str = "") -> None:
-        """So much is done, of `what` or of what was begun last. Raises StoppedError."""
-        self._what = what or self._what
+    def look(self, fraction: float, what: str = "") -> None:
+        """Report the fraction that is done of a task, by default of the last one.
+
+        Raises
+        ------
+        StoppedError
+            If the task is cancelled.
+        """
+        self._task = what or self._task
         if self.stopping():
             raise StoppedError
-        self.show(self.load + self._what, min(1.0, max(0.0, share)))
+        self.show(self.load + self._task, min(1.0, max(0.0, fraction)))
 
 
 @contextmanager
 def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
-    """Yields a function to be told what is done, and which share of it. Once a second has passed it
-    draws a bar on stderr; in a notebook, where bars need more than is installed, it writes a line
-    that changes. Both are gone at the end."""
-    drawn: _Bar | _Line | None = None
-    due = time.perf_counter() + PATIENCE_S
+    """Show progress from the first second on, until the block ends.
 
-    def show(what: str, done: float) -> None:
-        nonlocal drawn, due
+    A bar is drawn on stderr. In a notebook, where bars need further packages, a line is updated.
+
+    Parameters
+    ----------
+    wanted
+        Whether anything is shown.
+
+    Yields
+    ------
+    callable
+        Function of the description of a task and the fraction that is done.
+    """
+    display: _Bar | _Line | None = None
+    due = time.perf_counter() + DELAY_S
+
+    def show(task: str, fraction: float) -> None:
+        nonlocal display, due
         if not wanted or time.perf_counter() < due:
             return
-        if drawn is None:
-            drawn = _Line() if in_notebook() else _Bar()
-        due = time.perf_counter() + (LINE_S if isinstance(drawn, _Line) else REFRESH_S)
-        drawn.show(what, done)
+        if display is None:
+            display = _Line() if in_notebook() else _Bar()
+        due = time.perf_counter() + (LINE_S if isinstance(display, _Line) else REFRESH_S)
+        display.show(task, fraction)
 
     try:
         yield show
     finally:
-        if drawn is not None:
-            drawn.stop()
+        if display is not None:
+            display.stop()
 
 
 class _Bar:
-    """A bar of rich on a terminal."""
+    """A progress bar of rich on a terminal."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -76,27 +108,25 @@ class _Bar:
         self._bar.start()
         self._bar.add_task("", total=1)
 
-    def show(self, what: str, done: float) -> None:
-        """Draws it anew."""
-        self._bar.update(self._bar.task_ids[0], description=what, completed=done)
+    def show(self, task: str, fraction: float) -> None:
+        self._bar.update(self._bar.task_ids[0], description=task, completed=fraction)
 
     def stop(self) -> None:
-        """Takes it away."""
         self._bar.stop()
 
 
 class _Line:
-    """One line of text on stdout, which each writing replaces."""
+    """A line of text on stdout that is overwritten."""
 
     def __init__(self) -> None:
-        self._begun, self._length = time.perf_counter() - PATIENCE_S, 0
+        self._start, self._length = time.perf_counter() - DELAY_S, 0
 
-    def show(self, what: str, done: float) -> None:
-        """Writes what is done, its share, and how long it has taken."""
-        self._write(f"{what} {done:.0%} after {time.perf_counter() - self._begun:.0f} s")
+    def show(self, task: str, fraction: float) -> None:
+        """Write the task, its fraction and the time it has taken."""
+        self._write(f"{task} {fraction:.0%} after {time.perf_counter() - self._start:.0f} s")
 
     def stop(self) -> None:
-        """Leaves an empty line."""
+        """Clear the line."""
         self._write("")
 
     def _write(self, text: str) -> None:
@@ -106,6 +136,6 @@ class _Line:
 
 
 def in_notebook() -> bool:
-    """Whether a kernel runs this, whose output goes to a page."""
+    """Return whether the code runs in a kernel of a notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel")

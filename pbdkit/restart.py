@@ -1,6 +1,5 @@
 """Resume a run: from the checkpoint of an unfinished run, or from the end of a finished one that is
-to be continued.
-"""
+to be continued."""
 
 from __future__ import annotations
 
@@ -58,27 +57,35 @@ def restore(
     driver.load_state_dict(parts)
 
 
-ENDED = ("complete", "settled", "interrupted")
-"""The status of results that can be continued."""
+CONTINUABLE = ("complete", "settled", "interrupted")
+"""Status of results that can be continued."""
 BLOCK_BYTES = 2**22
-"""Of a result that is continued so much is read at once, or one row if that is more."""
+"""Number of bytes of a result that are read together, at least one row."""
 
 
-def asked(
-    left: UnfinishedRun, output: Path, steps: int | None, anyway: bool
+def unfinished_source(
+    unfinished: UnfinishedRun, output: Path, steps: int | None, anyway: bool
 ) -> tuple[Source | None, dict[str, Any]]:
-    """The experiment of an unfinished run, None where all of it is done, and where it came from."""
-    about, origin = left.about, left.about.get("origin")
+    """Return the experiment of an unfinished run, and where it came from.
+
+    The experiment is None if all steps are done.
+
+    Raises
+    ------
+    ExperimentError
+        If the experiment or a version changed, unless `anyway`.
+    """
+    about, origin = unfinished.about, unfinished.about.get("origin")
     if not isinstance(origin, dict):
-        raise StorageError("what is noted under 'origin' is damaged")
-    if "finished" in left.facts:
+        raise StorageError("the checkpoint is damaged: 'origin' is no mapping")
+    if "finished" in unfinished.facts:
         return None, origin
-    source = _source(about, f"{output}, unfinished", steps, left.facts.get("step"))
+    source = _source(about, f"{output}, unfinished", steps, unfinished.facts.get("step"))
     experiment = Experiment.build(source)
     if steps not in (None, about.get("steps")) and not experiment.solver.makes_steps:
         raise ExperimentError(
-            f"{output}: an equilibrium is looked for, and the way there depends on `steps`: resume "
-            f"it without --steps, or run it anew with --set steps={steps}"
+            f"{output}: an equilibrium depends on `steps` along its load path: resume it without "
+            f"--steps, or run it again with --set steps={steps}"
         )
     if not anyway:
         _refuse_versions(output, about, experiment)
@@ -87,60 +94,75 @@ def asked(
 
 
 def chosen_parameters(facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """The parameters of the solver that the run has chosen itself."""
-    found = facts.get("chosen", [])
-    if not isinstance(found, list) or not {*found} <= {"relaxation", "memory"}:
-        raise StorageError("what is noted under 'chosen' is damaged")
-    return tuple(found)
+    """Return the parameters of the solver that the run has chosen itself."""
+    names = facts.get("chosen", [])
+    if not isinstance(names, list) or not {*names} <= {"relaxation", "memory"}:
+        raise StorageError("the checkpoint is damaged: 'chosen' is no list of solver parameters")
+    return tuple(names)
 
 
 def longer(
-    dataset: Any, output: Path, steps: int, anyway: bool, kept: ExitStack | None = None
+    dataset: Any, output: Path, steps: int, anyway: bool, stack: ExitStack | None = None
 ) -> tuple[Source, Checkpoint]:
-    """The experiment of a result, of more steps, and where it stands; its arrays stay in the file
-    until `kept` is closed, where that is given. Raises ExperimentError where it is to be run anew.
+    """Return the experiment of a result with more steps, and its final state.
+
+    Parameters
+    ----------
+    stack
+        Stack on which the file of the arrays stays open; without it they are read.
+
+    Raises
+    ------
+    ExperimentError
+        If the result cannot be continued.
     """
     about = dataset.attrs
-    if about.get("status") not in ENDED:
-        raise ExperimentError(f"is {about.get('status')}: there is nothing to continue")
-    if (made_as := about.get("schema_version")) != SCHEMA_VERSION:
+    if about.get("status") not in CONTINUABLE:
+        raise ExperimentError(f"has status {about.get('status')}, and cannot be continued")
+    if (result_version := about.get("schema_version")) != SCHEMA_VERSION:
         raise ExperimentError(
-            f"is of schema_version {made_as}, and what is recorded now is laid out as "
-            f"{SCHEMA_VERSION}; run it anew with --set steps={steps}"
+            f"has schema_version {result_version}, and this pbdkit writes {SCHEMA_VERSION}; run it "
+            f"again with --set steps={steps}"
         )
-    checkpoint = _final_state(output, kept)
+    checkpoint = _final_state(output, stack)
     source = _source(about, str(output), steps, checkpoint.facts.get("step"))
     experiment = Experiment.build(source)
     if not experiment.solver.makes_steps:
         raise ExperimentError(
-            "is an equilibrium, which is found and not continued; run it anew with "
-            f"--set steps={steps}"
+            f"is an equilibrium, which cannot be continued; run it again with --set steps={steps}"
         )
     if not anyway:
-        made = {"pbdkit": about.get("pbdkit_version"), "plugins": _map(about, "plugins")}
-        _refuse_versions(output, made, experiment)
+        versions = {"pbdkit": about.get("pbdkit_version"), "plugins": _map(about, "plugins")}
+        _refuse_versions(output, versions, experiment)
     return source, checkpoint
 
 
 def history(
     dataset: Any, columns: list[Column], experiment: Experiment, *, pieced: bool = False
 ) -> Iterator[Values]:
-    """What was recorded and would be by the longer run, entry by entry; large ones `pieced` on
-    request."""
+    """Yield the records of a result that the longer run shares.
+
+    Parameters
+    ----------
+    pieced
+        Whether large arrays are read in pieces.
+    """
     for column in columns:
         if column.when is When.START:
             yield {column.name: _entry(dataset[column.name], pieced)}
     for dim in ("time", "step"):
-        along = [column.name for column in columns if column.grows and column.dims[0] == dim]
-        steps = dataset[dim].values.tolist() if along else []
-        for step, values in zip(steps, _rows(dataset, along, dim, pieced), strict=False):
+        names = [column.name for column in columns if column.grows and column.dims[0] == dim]
+        steps = dataset[dim].values.tolist() if names else []
+        for step, values in zip(steps, _rows(dataset, names, dim, pieced), strict=False):
             if dim == "step" or experiment.records(step):
                 yield values
 
 
 def _rows(dataset: Any, names: list[str], dim: str, pieced: bool) -> Iterator[Values]:
-    """Row by row along a dimension. They are read in blocks: to read anything takes far longer than
-    to read one row of a small body."""
+    """Yield row by row along a dimension.
+
+    They are read in blocks, which is much faster than reading rows of small bodies separately.
+    """
     count = dataset.sizes.get(dim, 0)
     size = sum(dataset[name].nbytes for name in names)
     block = max(1, BLOCK_BYTES * count // max(1, size))
@@ -148,21 +170,21 @@ def _rows(dataset: Any, names: list[str], dim: str, pieced: bool) -> Iterator[Va
         if pieced and block == 1:
             yield {name: _entry(dataset[name][start], pieced) for name in names}
             continue
-        read = {name: dataset[name][start : start + block].values for name in names}
+        content = {name: dataset[name][start : start + block].values for name in names}
         for n in range(min(block, count - start)):
-            yield {name: values[n] for name, values in read.items()}
+            yield {name: values[n] for name, values in content.items()}
 
 
 def _entry(variable: Any, pieced: bool) -> Any:
-    """All that a variable holds."""
+    """Return all values of a variable, in pieces if it is large."""
     if not pieced or variable.dtype.kind not in "fiub" or variable.nbytes <= BLOCK_BYTES:
         return variable.values
-    count, some = len(variable), max(1, BLOCK_BYTES * len(variable) // variable.nbytes)
-    pieces = (variable[at : at + some].values for at in range(0, count, some))
+    count, rows = len(variable), max(1, BLOCK_BYTES * len(variable) // variable.nbytes)
+    pieces = (variable[start : start + rows].values for start in range(0, count, rows))
     return PiecedArray(variable.shape, variable.dtype, pieces)
 
 
-def _final_state(output: Path, kept: ExitStack | None) -> Checkpoint:
+def _final_state(output: Path, stack: ExitStack | None) -> Checkpoint:
     content = opened(output)
     with ExitStack() as closing:
         closing.callback(content.close)
@@ -170,82 +192,103 @@ def _final_state(output: Path, kept: ExitStack | None) -> Checkpoint:
             group = content.groups[FINAL_STATE]
             facts, arrays = json.loads(group.attrs["facts"]), dict(group.variables)
         except KeyError:
-            raise StorageError("holds no final state: an older pbdkit made it") from None
-        if kept is None:
+            raise StorageError(
+                "contains no final state: it was written by an older pbdkit"
+            ) from None
+        if stack is None:
             arrays = {name: variable[...] for name, variable in arrays.items()}
         else:
-            kept.push(closing.pop_all())
+            stack.push(closing.pop_all())
         return Checkpoint({}, facts, arrays)
 
 
 def _source(about: Mapping[str, Any], name: str, steps: int | None, done: Any) -> Source:
     parts = _map(about, "experiment")
-    refuse_retired(parts, f"{name}: going on")
+    refuse_retired(parts, f"{name}: resuming")
     if steps is not None:
         if isinstance(done, int) and steps <= done:
-            raise ExperimentError(f"{name}: {done} steps are done; --steps takes a larger number")
+            raise ExperimentError(f"{name}: {done} steps are done; --steps must be larger")
         parts["steps"] = steps
     return Source(name, parts)
 
 
 def _map(about: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """What is noted there as JSON."""
+    """Parse the JSON mapping under a key."""
     try:
-        found = json.loads(about.get(key, ""))
+        mapping = json.loads(about.get(key, ""))
     except (ValueError, TypeError, RecursionError):
-        found = None
-    if not isinstance(found, dict):
-        raise StorageError(f"what is noted under '{key}' is damaged")
-    return found
+        mapping = None
+    if not isinstance(mapping, dict):
+        raise StorageError(f"'{key}' is damaged: it is no JSON mapping")
+    return mapping
 
 
-def _refuse_versions(output: Path, made: Mapping[str, Any], experiment: Experiment) -> None:
-    here = experiment.distributions() | {"pbdkit": version("pbdkit")}
-    before = {**made.get("plugins", {}), "pbdkit": made.get("pbdkit")}
-    for name, now in here.items():
-        if before.get(name) != now:
+def _refuse_versions(output: Path, versions: Mapping[str, Any], experiment: Experiment) -> None:
+    installed = experiment.distributions() | {"pbdkit": version("pbdkit")}
+    previous = {**versions.get("plugins", {}), "pbdkit": versions.get("pbdkit")}
+    for name, current in installed.items():
+        if previous.get(name) != current:
             raise ExperimentError(
-                f"{output}: was begun with {name} {before.get(name)}, and {now} is installed: the "
-                "steps to come may differ; --anyway goes on with it"
+                f"{output}: was started with {name} {previous.get(name)}, and {current} is "
+                "installed: further steps may differ; --anyway resumes it"
             )
 
 
 def _refuse_changed_file(output: Path, about: Mapping[str, Any], origin: Any) -> None:
-    """Where the run came from a file that says something else now."""
+    """Raise ExperimentError if the experiment file of the run has changed."""
     file, settings = origin.get("experiment"), origin.get("settings", [])
     if not isinstance(file, str) or not Path(file).is_file():
         return
     try:
-        source = read_experiment(file, allow_outside=True)  # only compared
+        source = read_experiment(file, allow_outside=True)  # it is compared, not run
         source = with_settings(source, settings, Experiment.defaults())
-        now = json.loads(Experiment.build(source).model_dump_json(by_alias=True))
+        current = json.loads(Experiment.build(source).model_dump_json(by_alias=True))
     except PbdkitError:
-        now = None
-    begun = _map(about, "experiment")
-    if now is not None:  # what the run has chosen itself is no change
-        chosen = begun.get("solver", {})
-        now["solver"] = {k: chosen.get(k) if v == "auto" else v for k, v in now["solver"].items()}
-    if now != begun:
+        current = None
+    original = _map(about, "experiment")
+    if current is not None:  # numbers that the run chose for `auto` are no change
+        chosen = original.get("solver", {})
+        current["solver"] = {
+            key: chosen.get(key) if value == "auto" else value
+            for key, value in current["solver"].items()
+        }
+    if current != original:
         raise ExperimentError(
-            f"{output}: {file} has changed since the run began, which goes on as it was then; "
-            "--anyway does so"
+            f"{output}: {file} has changed since the run started; --anyway resumes the run with "
+            "the original experiment"
         )
 
 
-SAME_WEIGHT = 1e-6
-"""Relaxation and memory chosen on other machines differ by less."""
+WEIGHT_TOLERANCE = 1e-6
+"""Tolerance for relaxation and memory that were chosen on different machines."""
 
 
 @dataclass(frozen=True)
 class Resumption:
-    """A run that is ready to be gone on with: ``record()`` does it."""
+    """A run that is ready to be resumed.
+
+    Parameters
+    ----------
+    run
+        The run, with its state restored.
+    sink
+        File of the result.
+    recorder
+        Recorder of the remaining steps.
+    """
 
     run: Simulation
     sink: NetcdfSink
     recorder: Recorder
 
     def record(self) -> RunReport:
-        """To its end. Raises what any run does."""
+        """Run the remaining steps, and return a report of the run.
+
+        Raises
+        ------
+        PbdkitError
+            As any run does.
+        """
         return record(self.run, self.recorder.sink, recorder=self.recorder)
 
 
@@ -257,12 +300,33 @@ def resumption(
     anyway: bool = False,
     execution: Execution | None = None,
 ) -> Resumption | None:
-    """The unfinished run of an output, or its result to be continued to so many steps; None where
-    all was done but to give the result its name, which it has now. With the `execution`
-    of several processes they share what is left, however many have begun it.
+    """Prepare to resume the unfinished run of an output, or to continue its result.
 
-    Raises ExperimentError where there is nothing to go on with, and, unless told to go on `anyway`,
-    where the experiment, pbdkit or a plugin changed since; StorageError for what is damaged.
+    Parameters
+    ----------
+    output
+        Path of the result.
+    watch
+        Progress and cancellation.
+    steps
+        Step to which a finished result is continued.
+    anyway
+        Whether changes of the experiment or of versions are ignored.
+    processes
+        Processes that share the run, however many started it.
+
+    Returns
+    -------
+    Resumption or None
+        None if all steps were done; the result then has its final name.
+
+    Raises
+    ------
+    ExperimentError
+        If there is nothing to resume, or if the experiment, pbdkit or a plugin changed, unless
+        `anyway`.
+    StorageError
+        If the checkpoint is damaged.
     """
     execution = execution or Execution()
     with execution.communicator.raise_together():
@@ -273,13 +337,14 @@ def resumption(
 
 
 def _is_unfinished(output: Path, steps: int | None) -> bool:
-    """Whether a run of it is; else there is a result that can be continued to more steps."""
+    """Return whether there is an unfinished run of an output; else there is a result to
+    continue."""
     refuse_store(output)
     if is_unfinished(output):
         return True
     refuse_other_file(output)
     if not output.exists():
-        raise ExperimentError(f"{output}: there is no unfinished run of it, and no result")
+        raise ExperimentError(f"{output}: there is neither an unfinished run nor a result")
     if steps is None:
         raise ExperimentError(f"{output}: is finished; --steps N continues it to step N")
     make_room(output)
@@ -287,35 +352,35 @@ def _is_unfinished(output: Path, steps: int | None) -> bool:
 
 
 @contextmanager
-def _damage_named(output: Path) -> Iterator[None]:
-    """What was kept in other forms than a run keeps is damage, not a bug."""
+def _report_damage(output: Path) -> Iterator[None]:
+    """Report a malformed checkpoint as StorageError."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise StorageError(f"{output}: what was kept of it is damaged: {error}") from error
+        raise StorageError(f"{output}: the checkpoint is damaged: {error}") from error
 
 
 def _unfinished(
     output: Path, watch: Watch, steps: int | None, anyway: bool, execution: Execution
 ) -> Resumption | None:
     communicator = execution.communicator
-    left: UnfinishedRun | None = None
+    unfinished: UnfinishedRun | None = None
     checkpoint, source, origin = None, None, dict[str, Any]()
     chosen, is_same = tuple[str, ...](), True
     try:
         with communicator.raise_together():
             if communicator.is_root:
-                left = UnfinishedRun.open(output, writing=True, anyway=anyway)
-                source, origin = asked(left, output, steps, anyway)
-                chosen = chosen_parameters(left.facts)
-                is_same = steps in (None, left.about.get("steps"))
+                unfinished = UnfinishedRun.open(output, writing=True, anyway=anyway)
+                source, origin = unfinished_source(unfinished, output, steps, anyway)
+                chosen = chosen_parameters(unfinished.facts)
+                is_same = steps in (None, unfinished.about.get("steps"))
         source, origin, chosen, is_same = communicator.bcast((source, origin, chosen, is_same))
         sink = NetcdfSink(output, replace=origin.get("replace") is True, origin=origin)
-        with communicator.raise_together(), _damage_named(output):
-            if left and source is None:
-                sink.conclude(left)
-            elif left:
-                checkpoint = left.checkpoint(on_disk=communicator.size > 1)
+        with communicator.raise_together(), _report_damage(output):
+            if unfinished and source is None:
+                sink.conclude(unfinished)
+            elif unfinished:
+                checkpoint = unfinished.checkpoint(on_disk=communicator.size > 1)
         if source is None:
             return None
         experiment = Experiment.build(source)
@@ -325,15 +390,15 @@ def _unfinished(
         run = execution.run(scene, watch)
         run.driver.chosen = chosen
         recorder = run.recorder(run.sink(sink))
-        with _damage_named(output):
+        with _report_damage(output):
             restore(run.driver, recorder, checkpoint, communicator)
-        with communicator.raise_together(), _damage_named(output):
-            if left and checkpoint:
+        with communicator.raise_together(), _report_damage(output):
+            if unfinished and checkpoint:
                 columns = columns_of(run.scene)
-                sink.go_on(left, checkpoint, columns, experiment.record.compression)
+                sink.go_on(unfinished, checkpoint, columns, experiment.record.compression)
     except BaseException:
-        if left:
-            left.close()
+        if unfinished:
+            unfinished.close()
         raise
     return Resumption(run, sink, recorder)
 
@@ -341,15 +406,15 @@ def _unfinished(
 def _continued(
     output: Path, watch: Watch, steps: int, anyway: bool, execution: Execution
 ) -> Resumption:
-    """The result stays as it is until the longer one takes its place."""
+    """Continue a result, which is replaced only by the complete longer one."""
     communicator = execution.communicator
-    with ExitStack() as open_until_read:
+    with ExitStack() as stack:
         source, checkpoint, dataset, chosen = None, None, None, tuple[str, ...]()
         with communicator.raise_together():
             if communicator.is_root:
-                dataset = open_until_read.enter_context(reading(output))
-                kept = open_until_read if communicator.size > 1 else None
-                source, checkpoint = longer(dataset, output, steps, anyway, kept)
+                dataset = stack.enter_context(reading(output))
+                stack_of_arrays = stack if communicator.size > 1 else None
+                source, checkpoint = longer(dataset, output, steps, anyway, stack_of_arrays)
                 chosen = chosen_parameters(checkpoint.facts)
         source, chosen = communicator.bcast((source, chosen))
         experiment = Experiment.build(source)
@@ -361,12 +426,14 @@ def _continued(
         sink = NetcdfSink(output, True, experiment.record.compression)
         recorder, recorded = run.recorder(run.sink(sink)), None
         try:
-            before: Iterable[Values] = ()
+            records: Iterable[Values] = ()
             if dataset is not None:
                 columns, pieced = columns_of(run.scene), communicator.size > 1
-                before = history(dataset, columns, experiment, pieced=pieced)
-                recorded = [t for t in dataset["time"].values.tolist() if experiment.records(t)][-1]
-            recorder.begin(before)
+                records = history(dataset, columns, experiment, pieced=pieced)
+                recorded = [
+                    time for time in dataset["time"].values.tolist() if experiment.records(time)
+                ][-1]
+            recorder.begin(records)
             restore(run.driver, recorder, checkpoint, communicator, recorded)
         except BaseException:
             recorder.sink.abandon()
@@ -377,17 +444,22 @@ def _continued(
 def _refuse_other_weights(
     place: str, scene: Scene, chosen: tuple[str, ...], execution: Execution
 ) -> None:
-    """Raises ExperimentError where a run of the scene, which has another number of steps, would
-    choose other numbers in place of `auto`; they follow from the roles of the last step."""
-    before = scene.experiment.stepping
-    auto = before.model_copy(update={f"asked_{name}": "auto" for name in chosen})
-    now = execution.tuned(with_solver(scene, auto)).experiment.stepping if chosen else before
+    """Raise ExperimentError if a run with another number of steps would choose other numbers for
+    `auto`.
+
+    They depend on the roles of the last step.
+    """
+    stepping = scene.experiment.stepping
+    auto = stepping.model_copy(update={f"asked_{name}": "auto" for name in chosen})
+    new_stepping = (
+        execution.tuned(with_solver(scene, auto)).experiment.stepping if chosen else stepping
+    )
     for name in chosen:
-        old, new = getattr(before, name), getattr(now, name)
-        if not math.isclose(old, new, rel_tol=SAME_WEIGHT, abs_tol=SAME_WEIGHT):
+        old, new = getattr(stepping, name), getattr(new_stepping, name)
+        if not math.isclose(old, new, rel_tol=WEIGHT_TOLERANCE, abs_tol=WEIGHT_TOLERANCE):
             raise ExperimentError(
                 f"{place}the steps were made with {name} {old:.6g}, chosen for the roles of the "
                 f"shorter run's last step, and a run of {scene.experiment.steps} steps takes "
-                f"{new:.6g}; run it anew with --set steps={scene.experiment.steps}, or --anyway "
-                "goes on with the former"
+                f"{new:.6g}; run it again with --set steps={scene.experiment.steps}, or use "
+                "--anyway to continue with the former"
             )

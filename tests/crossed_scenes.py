@@ -92,7 +92,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (
         ("memory auto",),
         ("rule number in time", "fracture number in time"),
-        "'auto' needs numbers that stay, and some change in time",
+        "'auto' needs constant parameters, and some depend on time",
     ),
     (("memory auto",), (ANEW,), "'auto' needs a spectrum, and neighbours that are found anew"),
     (UNCALIBRATED, ("loads", "body force"), r"loads: the rule '[a-z-]+' .* knows no forces"),

@@ -203,7 +203,7 @@ def test_an_unfinished_run_is_looked_at(stopped: dict[str, Any], call: Call) -> 
 def test_a_run_beside_an_unfinished_one_is_refused(stopped: dict[str, Any], call: Call) -> None:
     refused = call("run", "e.json")
     assert refused.code == 2
-    assert "`pbdkit resume tensile.nc` goes on with it" in refused.err
+    assert "`pbdkit resume tensile.nc` continues it" in refused.err
     assert call("run", "e.json", "--force").code == 0
     assert sorted(path.name for path in Path().iterdir()) == ["e.json", "tensile.nc"]
 
@@ -215,7 +215,7 @@ def test_python_goes_on_with_it(stopped: dict[str, Any]) -> None:
             np.testing.assert_array_equal(ds[name], whole[name])
     with pytest.raises(pbdkit.ExperimentError, match=r"is finished; --steps N continues it"):
         pbdkit.resume(OUT)
-    with pytest.raises(pbdkit.ExperimentError, match="no unfinished run of it, and no result"):
+    with pytest.raises(pbdkit.ExperimentError, match="neither an unfinished run nor a result"):
         pbdkit.resume("none.nc")
 
 
@@ -224,7 +224,7 @@ def test_what_changed_since_is_refused(
 ) -> None:
     Path("e.json").write_text(json.dumps(stopped | {"seed": 7}))
     refused = call("resume", str(OUT))
-    assert (refused.code, "e.json has changed since the run began" in refused.err) == (2, True)
+    assert (refused.code, "e.json has changed since the run started" in refused.err) == (2, True)
     Path("e.json").write_text(json.dumps(stopped))
     with monkeypatch.context() as other:
         other.setattr("pbdkit.restart.version", lambda name: "99.0")
@@ -384,7 +384,7 @@ def test_a_run_that_is_stopped_at_its_last_look_settles_all_the_same(tmp_path: P
     assert stops[-1] == steps
 
 
-@pytest.mark.filterwarnings("ignore:.* begins to act after the last step")
+@pytest.mark.filterwarnings("ignore:.* starts after the last step")
 def test_an_interrupted_run_is_not_taken_for_a_shorter_one(tmp_path: Path) -> None:
     """One of 100 steps would have settled before the load that the longer one waits for."""
     given, part = BLOCK | LATER["a load"] | {"record": {"every": 1}}, tmp_path / "part.nc"
@@ -405,7 +405,7 @@ def test_the_search_for_an_equilibrium_does_not_become_another_one(
     given, part = tensile | RUNS["equilibrium, fracture"], tmp_path / "part.nc"
     record(Simulation.of_scene(scene_of(given), watch=stopping_after(9)), NetcdfSink(part))
     steps = given["steps"]
-    with pytest.raises(pbdkit.ExperimentError, match="the way there depends on `steps`"):
+    with pytest.raises(pbdkit.ExperimentError, match="depends on `steps` along its load path"):
         resumption(part, Watch(), steps=steps + 5)
     assert resumption(part, Watch(), steps=steps) is not None
 
@@ -474,4 +474,4 @@ def test_what_cannot_be_continued_is_refused(
         assert (refused.code, status in refused.err) == (2, True), refused.err
     record(Simulation.of_scene(scene_of(tensile)), NetcdfSink(tmp_path / "short.nc"))
     refused = call("resume", str(tmp_path / "short.nc"), "--steps", "3")
-    assert "steps are done; --steps takes a larger number" in refused.err
+    assert "steps are done; --steps must be larger" in refused.err

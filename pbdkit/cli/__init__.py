@@ -129,7 +129,7 @@ def _warn_once() -> Callable[..., None]:
 
 def _report(error: BaseException) -> int:
     if isinstance(error, errors.PbdkitError):
-        return error.exit_status if error.told else _failed(str(error), error.exit_status)
+        return error.exit_status if error.is_reported else _failed(str(error), error.exit_status)
     if _of_memory(error):
         told = f"out of memory: {error}" if str(error) else "out of memory"
         return _failed(f"{told}; `pbdkit check` estimates what an experiment needs", 6)

@@ -1,4 +1,5 @@
-"""``pbdkit check`` and ``identify``: what an experiment will do, and what a rule is physically."""
+"""Commands ``pbdkit check`` and ``pbdkit identify``: forecast of an experiment, identity of a
+rule."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
 
 Row = tuple[str, str]
-SHOWN = 3
-"""So many groups are named in a line; --verbose names all."""
+MAX_LISTED = 3
+"""Number of groups that are listed in a line without --verbose."""
 
 
 @click.command()
@@ -34,13 +35,13 @@ SHOWN = 3
 @verbose_option
 @json_option
 def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bool) -> None:
-    """Say what will happen, without running it: who is held and who leads, whether it is stable,
-    in how many steps it settles, what it takes in time and memory."""
+    """Forecast a run without running it: supports and leaders, stability, steps to convergence,
+    time and memory."""
     from pbdkit.cli.options import waiting
     from pbdkit.errors import PbdkitWarning
     from pbdkit.model.loading import load_experiment
 
-    with warnings.catch_warnings(record=True) as of_loading:
+    with warnings.catch_warnings(record=True) as loading_warnings:
         warnings.simplefilter("always", PbdkitWarning)
         loaded = load_experiment(experiment, settings)
     from pbdkit.scene.scene import build_scene
@@ -52,82 +53,100 @@ def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bo
         scene = tuned(build_scene(loaded))
         rehearse(scene)
         refuse_unheld_loads(scene)
-        found = forecast(scene)
-    found = replace(found, warnings=[*(str(w.message) for w in of_loading), *found.warnings])
+        predicted = forecast(scene)
+    predicted = replace(
+        predicted, warnings=[*(str(w.message) for w in loading_warnings), *predicted.warnings]
+    )
     if as_json:
-        click.echo(json.dumps(found.as_dict()))
+        click.echo(json.dumps(predicted.as_dict()))
         return
     click.echo(f"{loaded.name}: valid")
-    rows = [*_who(scene, found, SHOWN if not verbose else None), *_what(loaded, scene, found)]
-    for title, text in [*rows, *_more(scene, found)] if verbose else rows:
+    rows = [
+        *_boundary_rows(scene, predicted, MAX_LISTED if not verbose else None),
+        *_run_rows(loaded, scene, predicted),
+    ]
+    for title, text in [*rows, *_detail_rows(scene, predicted)] if verbose else rows:
         click.echo(f"  {title:<10} {text}")
-    for warning in dict.fromkeys(found.warnings):
+    for warning in dict.fromkeys(predicted.warnings):
         click.echo(f"warning: {warning}")
 
 
-def _who(scene: Scene, found: Forecast, most: int | None) -> Iterator[Row]:
-    """The body, and who is held, led and loaded; of groups the first `most`."""
-    if found.size_mm:
-        yield "size", f"{' × '.join(f'{side:.6g}' for side in found.size_mm)} mm"
+def _boundary_rows(scene: Scene, predicted: Forecast, limit: int | None) -> Iterator[Row]:
+    """Yield rows about the body, supports, leaders and loads; groups are listed up to `limit`."""
+    if predicted.size_mm:
+        yield "size", f"{' × '.join(f'{side:.6g}' for side in predicted.size_mm)} mm"
     raster = scene.raster
     sides = np.ptp(raster.reference(raster.body_rows), axis=0)
     count, extent = len(raster.body_rows), " × ".join(f"{side:.6g}" for side in sides)
-    frame = f", and {found.particles - count} of the frame" * (found.particles > count)
+    frame = f", and {predicted.particles - count} of the frame" * (predicted.particles > count)
     yield "body", f"{count} particles over {extent} lattice units{frame}"
-    groups = [(f"leaders.{n}", len(one.rows), one.group) for n, one in enumerate(scene.leading)]
-    held = [one for one in groups if one[2].motion.type == "hold"]
-    yield from _listed("supports", (f"{_words(*one)}{_when(one[2])}" for one in held), most)
-    moving = (f"{_words(*one)} {_motion(one[2])}" for one in groups if one not in held)
-    yield from _listed("leaders", moving, most)
-    each = scene.loads.each if scene.loads else ()
+    groups = [(f"leaders.{n}", len(item.rows), item.group) for n, item in enumerate(scene.leading)]
+    supports = [item for item in groups if item[2].motion.type == "hold"]
+    yield from _row_of(
+        "supports", (f"{_describe(*item)}{_duration(item[2])}" for item in supports), limit
+    )
+    moving = (f"{_describe(*item)} {_motion(item[2])}" for item in groups if item not in supports)
+    yield from _row_of("leaders", moving, limit)
+    resolved_loads = scene.loads.each if scene.loads else ()
     units = scene.experiment.units
-    loads = ((f"loads.{n}", len(one.rows), one.load) for n, one in enumerate(each))
-    yield from _listed("loads", (f"{_words(*one)} {_force(one[2], units)}" for one in loads), most)
+    loads = ((f"loads.{n}", len(item.rows), item.load) for n, item in enumerate(resolved_loads))
+    yield from _row_of(
+        "loads", (f"{_describe(*item)} {_force(item[2], units)}" for item in loads), limit
+    )
     obstacles = enumerate(barrier.group for barrier in scene.barriers)
-    yield from _listed("obstacles", (f"obstacles.{n} {_motion(one)}" for n, one in obstacles), most)
-    yield from _listed("regions", _in_regions(scene), most)
+    yield from _row_of(
+        "obstacles", (f"obstacles.{n} {_motion(item)}" for n, item in obstacles), limit
+    )
+    yield from _row_of("regions", _in_regions(scene), limit)
 
 
-def _what(loaded: Experiment, scene: Scene, found: Forecast) -> Iterator[Row]:
-    """What will happen, and what it takes."""
+def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator[Row]:
+    """Yield rows about the course of the run and its cost."""
     if loaded.stepping.is_open:
-        why = "the rule is not linear or bonds can break"
-        near = "" if found.exact else f", of the step linearised at rest: {why}"
-        yield "chosen", f"relaxation {found.relaxation:.6g}, memory {found.memory:.6g}{near}"
+        reason = "the rule is not linear or bonds can break"
+        remark = "" if predicted.exact else f", of the step linearised at rest: {reason}"
+        yield (
+            "chosen",
+            f"relaxation {predicted.relaxation:.6g}, memory {predicted.memory:.6g}{remark}",
+        )
     if loaded.solver.makes_steps:
-        yield from _stability(found)
-        yield from _settling(scene, found)
-        if found.period is not None:
-            shrinks = f"shrinking by a factor of {found.decay:.4g} a step"
-            yield "oscillates", f"slowest period {found.period:.4g} steps, {shrinks}"
+        yield from _stability(predicted)
+        yield from _convergence(scene, predicted)
+        if predicted.period is not None:
+            shrinks = f"shrinking by a factor of {predicted.decay:.4g} a step"
+            yield "oscillates", f"slowest period {predicted.period:.4g} steps, {shrinks}"
     else:
         count = loaded.record_count - 1
-        each = f" of each of {count} recorded steps" if count > 1 else ""
-        yield "solver", f"goes straight to the equilibrium{each}, to where steps would lead"
+        equilibria = f" of each of {count} recorded steps" if count > 1 else ""
+        yield "solver", f"goes straight to the equilibrium{equilibria}, to where steps would lead"
         from pbdkit.equilibrium.solve import changes
 
-        if settled := changes(scene, loaded.steps):
-            listed = ", ".join(map(str, settled[:SHOWN]))
-            more = f" and {len(settled) - SHOWN} more" if len(settled) > SHOWN else ""
-            steps = "step" if len(settled) == 1 else "steps"
-            yield "settles", f"before roles or loads change, after {steps} {listed}{more}"
-    time = "" if found.seconds is None else f"{_seconds(found.seconds)} of stepping, "
-    memory = f"{found.memory_mib:.3g} MiB of memory, {found.output_mib:.3g} MiB of output"
+        if steps_of_changes := changes(scene, loaded.steps):
+            listed = ", ".join(map(str, steps_of_changes[:MAX_LISTED]))
+            rest = (
+                f" and {len(steps_of_changes) - MAX_LISTED} more"
+                if len(steps_of_changes) > MAX_LISTED
+                else ""
+            )
+            steps = "step" if len(steps_of_changes) == 1 else "steps"
+            yield "settles", f"before roles or loads change, after {steps} {listed}{rest}"
+    time = "" if predicted.seconds is None else f"{_seconds(predicted.seconds)} of stepping, "
+    memory = f"{predicted.memory_mib:.3g} MiB of memory, {predicted.output_mib:.3g} MiB of output"
     yield "takes", f"{time}{memory} (estimates)"
 
 
-def _listed(title: str, each: Iterable[str], most: int | None) -> Iterator[Row]:
-    """A line of groups."""
-    listed = [*each]
-    more = len(listed) - (most or len(listed))
-    if listed:
-        yield title, "; ".join([*listed[:most], *([f"and {more} more"] if more > 0 else [])])
+def _row_of(title: str, groups: Iterable[str], limit: int | None) -> Iterator[Row]:
+    """Yield a row that lists groups, if there are any."""
+    texts = [*groups]
+    rest = len(texts) - (limit or len(texts))
+    if texts:
+        yield title, "; ".join([*texts[:limit], *([f"and {rest} more"] if rest > 0 else [])])
 
 
-def _words(name: str, count: int, group: LeaderGroup | Load) -> str:
-    ((how, which),) = group.select.model_dump().items()
-    where = f" ({how} {which})" if isinstance(which, str) else ""
-    return f"{name}, {_particles(count)}{where}"
+def _describe(name: str, count: int, group: LeaderGroup | Load) -> str:
+    ((kind, value),) = group.select.model_dump().items()
+    place = f" ({kind} {value})" if isinstance(value, str) else ""
+    return f"{name}, {_particles(count)}{place}"
 
 
 def _particles(count: int) -> str:
@@ -135,30 +154,30 @@ def _particles(count: int) -> str:
 
 
 def _motion(group: Driven) -> str:
-    return f"by {group.motion.type}{_when(group)}"
+    return f"by {group.motion.type}{_duration(group)}"
 
 
-def _when(group: Driven) -> str:
-    """Along which axes, and in which steps, if not along all and always."""
+def _duration(group: Driven) -> str:
+    """Return axes and steps of a group, if not all."""
     axes, until = "".join(getattr(group, "axes", None) or ()), group.until
     begins = f" from step {group.from_}" * (group.from_ > 1)
     return f" along {axes}" * bool(axes) + begins + f" until step {until}" * (until is not None)
 
 
 def _force(load: Load, units: Units | None) -> str:
-    """As an experiment writes it: in N or kN, and N/mm², where it has the units for that."""
-    force, counted = load.force_at(max(load.from_, 1)), ""
+    """Format a load in the units of the experiment: N or kN, and N/mm²."""
+    force, unit = load.force_at(max(load.from_, 1)), ""
     quantity = FORCE if load.force else BODY_FORCE
     if units and not units.lacks(quantity):
-        force, counted = force * units.scale(quantity), f" {quantity.unit}".replace("^2", "²")
+        force, unit = force * units.scale(quantity), f" {quantity.unit}".replace("^2", "²")
         if load.force and np.abs(force).max() >= 1e3:
-            force, counted = force / 1e3, f" k{FORCE.unit}"
-    listed = ", ".join(f"{one:.6g}" for one in force.tolist())
-    return f"{'force' if load.force else 'body force'} [{listed}]{counted}"
+            force, unit = force / 1e3, f" k{FORCE.unit}"
+    components = ", ".join(f"{component:.6g}" for component in force.tolist())
+    return f"{'force' if load.force else 'body force'} [{components}]{unit}"
 
 
 def _in_regions(scene: Scene) -> Iterator[str]:
-    """How many particles of the body lie in each region."""
+    """Yield the number of particles of the body in each region."""
     from pbdkit.scene.constants import signed_distance
 
     raster = scene.raster
@@ -168,28 +187,40 @@ def _in_regions(scene: Scene) -> Iterator[str]:
         yield f"{name}, {_particles(int(inside.sum()))}"
 
 
-def _stability(found: Forecast) -> Iterator[Row]:
-    if found.spectral_radius is None:
+def _stability(predicted: Forecast) -> Iterator[Row]:
+    if predicted.spectral_radius is None:
         yield "stable", "not known beforehand"
         return
-    verdict = "yes" if found.stable else "NO, some modes grow"
-    near = ", linearised at the start" * (not found.exact) + ", estimated" * found.estimated
-    bound = found.largest_stable_relaxation
-    below = f"; stable with relaxations below {bound:.6g}" if bound else ""
-    yield "stable", f"{verdict} (spectral radius {found.spectral_radius:.6g}{near}){below}"
+    verdict = "yes" if predicted.stable else "NO, some modes grow"
+    remark = (
+        ", linearised at the start" * (not predicted.exact) + ", estimated" * predicted.estimated
+    )
+    bound = predicted.largest_stable_relaxation
+    range_text = f"; stable with relaxations below {bound:.6g}" if bound else ""
+    yield (
+        "stable",
+        f"{verdict} (spectral radius {predicted.spectral_radius:.6g}{remark}){range_text}",
+    )
 
 
-def _settling(scene: Scene, found: Forecast) -> Iterator[Row]:
-    steps = {t: n for t in ("1e-3", "1e-6") if (n := found.steps_to.get(t)) is not None}
-    if not (steps and found.stable):
+def _convergence(scene: Scene, predicted: Forecast) -> Iterator[Row]:
+    steps = {
+        tolerance: needed
+        for tolerance in ("1e-3", "1e-6")
+        if (needed := predicted.steps_to.get(tolerance)) is not None
+    }
+    if not (steps and predicted.stable):
         return
-    told, asked = ", ".join(f"to {t} in {n}" for t, n in steps.items()), scene.experiment.steps
-    reached = [t for t, n in steps.items() if n <= asked]
-    verdict = f"the {asked} asked for reach {reached[-1] if reached else 'neither'}"
+    text, count = (
+        ", ".join(f"to {tolerance} in {needed}" for tolerance, needed in steps.items()),
+        scene.experiment.steps,
+    )
+    tolerances = [tolerance for tolerance, needed in steps.items() if needed <= count]
+    verdict = f"the {count} asked for reach {tolerances[-1] if tolerances else 'neither'}"
     if scene.experiment.stepping.settle is not None:
-        verdict = f"the run ends when it has settled, after {asked} at the latest"
+        verdict = f"the run ends when it has settled, after {count} at the latest"
     whole = "" if scene.experiment.fracture.type == "none" else ", as long as no bond breaks"
-    yield "settles", f"{told} steps{whole}; {verdict}"
+    yield "settles", f"{text} steps{whole}; {verdict}"
 
 
 def _seconds(seconds: float) -> str:
@@ -200,32 +231,40 @@ def _seconds(seconds: float) -> str:
     return f"about {seconds / 60:.0f} min" if seconds < 6000.0 else f"about {seconds / 3600:.3g} h"
 
 
-def _more(scene: Scene, found: Forecast) -> Iterator[Row]:
-    """The rest of what is known."""
+def _detail_rows(scene: Scene, predicted: Forecast) -> Iterator[Row]:
+    """Yield the rows that --verbose adds."""
     from pbdkit.plugin import RenewsParticles
 
     experiment = scene.experiment
     records = experiment.record_count
     yield "records", f"{records} states in {experiment.steps} steps, that of time 0 included"
-    yield "particles", f"{found.particles}, of which {found.followers} follow in step 1"
-    yield "bonds", f"{found.bonds}"
-    yield "weights", f"relaxation {found.relaxation:.6g}, memory {found.memory:.6g}"
-    if found.spectral_radius is not None:
-        near = "exact" if found.exact else "linearised at the start"
+    yield "particles", f"{predicted.particles}, of which {predicted.followers} follow in step 1"
+    yield "bonds", f"{predicted.bonds}"
+    yield "weights", f"relaxation {predicted.relaxation:.6g}, memory {predicted.memory:.6g}"
+    if predicted.spectral_radius is not None:
+        remark = "exact" if predicted.exact else "linearised at the start"
         if isinstance(experiment.rule, RenewsParticles):
-            near += ", what particles remember held as it is there"
-        near += ", estimated: the steps to 1 %" if found.estimated else ""
-        least = found.smallest_eigenvalue
-        ends = "" if least is None else f"; smallest eigenvalue of the rule's own step {least:.9g}"
-        yield "spectrum", f"radius {found.spectral_radius:.9g}, {near}{ends}"
-        told = ", ".join(f"{t} in {n}" for t, n in found.steps_to.items() if n is not None)
-        yield from [("steps", f"settle to {told}")] if told else []
-    if found.lag is not None:
-        size, counted = in_lengths(experiment.units)
-        end = found.lag_reached
+            remark += ", what particles remember held as it is there"
+        remark += ", estimated: the steps to 1 %" if predicted.estimated else ""
+        smallest = predicted.smallest_eigenvalue
+        ends = (
+            ""
+            if smallest is None
+            else f"; smallest eigenvalue of the rule's own step {smallest:.9g}"
+        )
+        yield "spectrum", f"radius {predicted.spectral_radius:.9g}, {remark}{ends}"
+        text = ", ".join(
+            f"{tolerance} in {needed}"
+            for tolerance, needed in predicted.steps_to.items()
+            if needed is not None
+        )
+        yield from [("steps", f"settle to {text}")] if text else []
+    if predicted.lag is not None:
+        size, unit = in_lengths(experiment.units)
+        end = predicted.lag_reached
         reached = "" if end is None else f", {size * end:.4g} when they end"
-        told = f"{size * found.lag:.4g} {counted} behind equilibrium if the leaders' fastest steps"
-        yield "lag", f"{told} went on{reached}"
+        text = f"{size * predicted.lag:.4g} {unit} behind equilibrium if the leaders' fastest steps"
+        yield "lag", f"{text} went on{reached}"
 
 
 @click.command()
@@ -234,35 +273,41 @@ def _more(scene: Scene, found: Forecast) -> Iterator[Row]:
 @verbose_option
 @json_option
 def identify(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bool) -> None:
-    """Say what the experiment's rule is physically, on its lattice and neighbours: diffusion or an
-    elastic body, and with which constants."""
+    """Identify the rule of an experiment: diffusion or an elastic body, with its constants."""
     from pbdkit.api import identify, load
     from pbdkit.cli.options import waiting
 
     materials = load(experiment, settings=settings).materials()
     with waiting("identifying", silent=as_json):
-        every = {name: identify(one) for name, one in materials.items()}
+        identities = {name: identify(material) for name, material in materials.items()}
     if as_json:
-        alone = every.get("")
-        told = alone.as_dict() if alone else {name: f.as_dict() for name, f in every.items()}
-        click.echo(json.dumps(told))
+        identity = identities.get("")
+        content = (
+            identity.as_dict()
+            if identity
+            else {name: value.as_dict() for name, value in identities.items()}
+        )
+        click.echo(json.dumps(content))
         return
-    alike: dict[str, list[str]] = {}
-    for name, found in every.items():
-        alike.setdefault(json.dumps(found.as_dict()), []).append(name)
-    for names in alike.values():
-        _show(every[names[0]], ", ".join(filter(None, names)), verbose)
-    for note in dict.fromkeys(note for found in every.values() for note in found.notes):
-        names = [name for name, found in every.items() if note in found.notes]
-        of = f" ({', '.join(names)})" if len(names) < len(every) else ""
-        click.echo(f"note{of}: {note}")
+    groups: dict[str, list[str]] = {}
+    for name, result in identities.items():
+        groups.setdefault(json.dumps(result.as_dict()), []).append(name)
+    for names in groups.values():
+        _show(identities[names[0]], ", ".join(filter(None, names)), verbose)
+    for note in dict.fromkeys(note for result in identities.values() for note in result.notes):
+        names = [name for name, result in identities.items() if note in result.notes]
+        remark = f" ({', '.join(names)})" if len(names) < len(identities) else ""
+        click.echo(f"note{remark}: {note}")
 
 
-def _show(found: Identity, materials: str, verbose: bool) -> None:
-    """The table of one material, or of several that are the same."""
+def _show(identity: Identity, materials: str, verbose: bool) -> None:
+    """Print the table of one material, or of several with the same identity."""
     from pbdkit.cli.options import show_table
     from pbdkit.identification.report import table
 
-    where = f" ({materials})" if materials else ""
-    click.echo(f"{found.name}: {found.rule}{where}, {found.lattice} lattice, {found.neighbours}")
-    show_table(table(found, whole=verbose))
+    remark = f" ({materials})" if materials else ""
+    click.echo(
+        f"{identity.name}: {identity.rule}{remark}, {identity.lattice} lattice, "
+        f"{identity.neighbours}"
+    )
+    show_table(table(identity, whole=verbose))

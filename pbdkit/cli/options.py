@@ -1,6 +1,5 @@
-"""Arguments and options that several commands share, output paths that are checked before the work,
-tables, and progress at a terminal.
-"""
+"""Arguments and options shared by commands, checks of output paths, tables, and progress on a
+terminal."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from pbdkit.errors import ExperimentError, StorageError, refuse_no_matplotlib
-from pbdkit.progress import PATIENCE_S
+from pbdkit.progress import DELAY_S
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -35,27 +34,28 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def completed_by(name: str) -> Completer:
-    """The completer of that name in `completion`, which is imported when a shell asks."""
+    """Return the completer of a name in `completion`, which is imported only when a shell needs
+    it."""
 
     def complete(
-        context: click.Context, parameter: click.Parameter, begun: str
+        context: click.Context, parameter: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
         completer: Completer = getattr(import_module("pbdkit.cli.completion"), name)
-        return completer(context, parameter, begun)
+        return completer(context, parameter, incomplete)
 
     return complete
 
 
 def result_argument(name: str, metavar: str = "OUT.nc", **more: Any) -> Callable[[F], F]:
-    """The argument of that name: a result, or several."""
-    completed = completed_by("results")
-    return click.argument(name, metavar=metavar, type=PATH, shell_complete=completed, **more)
+    """Return a click argument for one result or several."""
+    complete = completed_by("results")
+    return click.argument(name, metavar=metavar, type=PATH, shell_complete=complete, **more)
 
 
 color_option = click.option(
     "--color",
     metavar="VARIABLE",
-    help="Colour by a variable, e.g. pe1, u, u_x; a wrong one lists all.",
+    help="Variable that gives the colours, e.g. pe1, u, u_x; an unknown name lists all.",
     shell_complete=completed_by("variables"),
 )
 times_option = click.option(
@@ -63,7 +63,7 @@ times_option = click.option(
     "times",
     type=float,
     multiple=True,
-    help="Draw this recorded step, else the last; again for a panel more.",
+    help="Recorded step to draw, default the last; repeat it for further panels.",
     shell_complete=completed_by("times"),
 )
 set_option = click.option(
@@ -72,18 +72,18 @@ set_option = click.option(
     multiple=True,
     metavar="PATH=VALUE",
     shell_complete=completed_by("settings"),
-    help="Change a value, e.g. rule.K=-0.002 or leaders.1.until=20.",
+    help="Change a value of the experiment, e.g. rule.K=-0.002 or leaders.1.until=20.",
 )
 
 
 def _choice(
-    context: click.Context, option: click.Parameter, given: tuple[str, ...]
+    context: click.Context, option: click.Parameter, texts: tuple[str, ...]
 ) -> dict[str, str]:
-    """The values by name. Raises click.BadParameter."""
-    for text in given:
+    """Return the values by name; raise click.BadParameter for text without a value."""
+    for text in texts:
         if not all(text.partition("=")):
             raise click.BadParameter(f"'{text}': expected NAME=VALUE, for instance steel=3")
-    return dict(text.split("=", 1) for text in given)
+    return dict(text.split("=", 1) for text in texts)
 
 
 at_option = click.option(
@@ -91,26 +91,29 @@ at_option = click.option(
     multiple=True,
     metavar="NAME=VALUE",
     callback=_choice,
-    help="Of a sweep, the member with this parameter; again for one more.",
+    help="Select the member of a sweep by a parameter; repeat it for further parameters.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-verbose_option = click.option("--verbose", is_flag=True, help="Say all that is known.")
+verbose_option = click.option("--verbose", is_flag=True, help="Print all details.")
 
 
 def _setting(module: str, name: str) -> Callable[[click.Context, click.Parameter, bool], None]:
-    """Return the callback of a flag that sets the environment variable of that name in a module to
-    "*", for this call and the processes that it starts."""
+    """Return the callback of a flag that sets an environment variable to "*".
 
-    def set_variable(context: click.Context, option: click.Parameter, given: bool) -> None:
-        if not given:
+    The variable is set for this call and the processes that it starts. Its name is the constant
+    `name` of a module.
+    """
+
+    def set_variable(context: click.Context, option: click.Parameter, flag: bool) -> None:
+        if not flag:
             return
         variable = getattr(import_module(module), name)
-        before = os.environ.get(variable)
+        previous = os.environ.get(variable)
         os.environ[variable] = "*"
 
         def restore() -> None:
             os.environ.pop(variable, None)
-            os.environ.update({} if before is None else {variable: before})
+            os.environ.update({} if previous is None else {variable: previous})
 
         context.call_on_close(restore)
 
@@ -123,12 +126,12 @@ outside_option = click.option(
     is_eager=True,
     expose_value=False,
     callback=_setting("pbdkit.model.reading", "ALLOW_OUTSIDE"),
-    help="Read files that lie outside the folder of the file that names them.",
+    help="Read files outside the folder of the file that names them.",
 )
 
 
 def experiment_argument(command: F) -> F:
-    """Add the argument of that name, and the option which of the files that it names are read."""
+    """Add the argument EXPERIMENT, and the option that permits files elsewhere."""
     argument = click.argument(
         "experiment", metavar="EXPERIMENT", shell_complete=completed_by("experiments")
     )
@@ -141,12 +144,12 @@ NO_PLUGINS = click.Option(
     is_eager=True,
     expose_value=False,
     callback=_setting("pbdkit.plugin.discovery", "DISABLE"),
-    help="Load no plugin, as if only pbdkit itself were installed.",
+    help="Load no plugins, as if pbdkit alone were installed.",
 )
 
 
 def with_no_plugins(command: C) -> C:
-    """The command, and those in it, with the option --no-plugins."""
+    """Return the command, and its subcommands, with the option --no-plugins."""
     if NO_PLUGINS not in command.params:
         command.params.append(NO_PLUGINS)
     for inner in getattr(command, "commands", {}).values():
@@ -155,42 +158,65 @@ def with_no_plugins(command: C) -> C:
 
 
 FORMATS = (".png", ".svg", ".pdf")
+"""File name extensions of pictures."""
 UNLIMITED = 10_000
+"""Width of tables that are not printed on a terminal."""
 
 
 @contextmanager
-def refusals_as(what: str) -> Iterator[None]:
-    """What the system refuses in the block becomes a StorageError that begins with `what`."""
+def refusals_as(subject: str) -> Iterator[None]:
+    """Raise a StorageError that begins with `subject` for each OSError in the block."""
     try:
         yield
     except OSError as error:
-        raise StorageError(f"{what}: {error.strerror}") from None
+        raise StorageError(f"{subject}: {error.strerror}") from None
 
 
 @contextmanager
 def folder_kept() -> Iterator[None]:
-    """Goes back to the current folder: a plugin may change it when it is imported. Raises
-    StorageError where there is none."""
+    """Return to the current folder after the block: plugins may change it when they are imported.
+
+    Raises
+    ------
+    StorageError
+        If there is no current folder.
+    """
     with refusals_as("the current folder"):
-        here = Path.cwd()
-    with chdir(here):
+        folder = Path.cwd()
+    with chdir(folder):
         yield
 
 
 def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:
-    """Raises ExperimentError where nothing is to be written there: a name that is no UTF-8, a
-    folder, a file without `force`, and, forced or not, what is no plain file, and the experiment
-    under this or another name. Raises StorageError where the system does not tell."""
+    """Check that a file may be written at a path.
+
+    Parameters
+    ----------
+    force
+        Whether an existing file may be replaced.
+    experiment
+        Experiment file, which is never replaced.
+
+    Raises
+    ------
+    ExperimentError
+        If the name is not UTF-8, if the path is a folder or no regular file, if it is the
+        experiment under any name, or if a file exists and `force` is not set.
+    StorageError
+        If the file system returns an error.
+    """
     from pbdkit.io.atomic_file import kind_of
 
-    try:  # in the bytes that the system has, whatever the locale makes of them
+    try:  # in the bytes of the file system, whatever the locale
         os.fsencode(path.absolute()).decode()
     except UnicodeDecodeError:
         shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
-        raise ExperimentError(f"{shown}: is no UTF-8; name another file with -o") from None
+        raise ExperimentError(
+            f"{shown}: the name is not UTF-8; name another file with -o"
+        ) from None
     with refusals_as(f"{str(path)[:80]}..."):
-        kind, there = kind_of(path), os.path.lexists(path)
-    if not there:
+        kind, exists = kind_of(path), os.path.lexists(path)
+    if not exists:
         return
     if kind == "a folder":
         raise ExperimentError(f"{path}: is a folder; name a file with -o")
@@ -205,23 +231,25 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
 
 
 def refuse_unfinished(path: Path, *, force: bool) -> None:
-    """Raises ExperimentError beside an unfinished run, which `force` discards, unless another
-    process is writing it."""
+    """Raise ExperimentError beside an unfinished run, unless `force` discards it.
+
+    A run that another process is writing is never discarded.
+    """
     from pbdkit.io.run_store import make_room
 
     if not make_room(path, discard=force):
         raise ExperimentError(
-            f"{path}: an unfinished run of it is here; `pbdkit resume {path}` goes on with it, "
+            f"{path}: there is an unfinished run; `pbdkit resume {path}` continues it, "
             "--force discards it, -o names another file"
         )
 
 
 def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
-    """What is to be said where the output may not fit on its disk."""
+    """Warn if the output may not fit on its disk."""
     from pbdkit.scene.memory_estimate import MIB, sizes_of
 
     output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total).output
-    with suppress(OSError):  # no such folder: said when the file is opened
+    with suppress(OSError):  # a missing folder is reported when the file is opened
         if output > (free := shutil.disk_usage(path.parent).free):
             yield (
                 f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
@@ -231,53 +259,63 @@ def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
 
 
 def show_table(table: Table) -> None:
-    """Prints it; a line a row where it goes to a file or another program."""
+    """Print a table; one line for each row if the output is no terminal."""
     from rich.console import Console
 
     width = None if sys.stdout.isatty() else UNLIMITED
     Console(width=width, highlight=False).print(table)
 
 
-def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
-    """ExperimentError or StorageError where a picture or another file cannot be written there."""
+def refuse_unwritable(picture: Path | None, *files: Path | None) -> None:
+    """Raise ExperimentError or StorageError if a picture or another file cannot be written."""
     if picture and picture.suffix not in FORMATS:
         raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
     if picture:
         refuse_no_matplotlib()
-    for path in (picture, *others):
+    for path in (picture, *files):
         if path and path.is_dir():
             raise ExperimentError(f"{path}: is a folder; name a file")
         if path and not path.parent.is_dir():
             raise StorageError(f"{path}: there is no folder {path.parent}")
 
 
-def save(picture: Path, drawn: Figure, *, replace: bool, quiet: bool = False) -> None:
-    """Writes a figure and says so, unless quiet; WriteError where the system refuses."""
+def save(picture: Path, figure: Figure, *, replace: bool, quiet: bool = False) -> None:
+    """Write a figure, and print its path unless `quiet`.
+
+    Raises
+    ------
+    WriteError
+        If the file system returns an error.
+    """
     from pbdkit.io.atomic_file import write
 
     content = io.BytesIO()
-    drawn.savefig(content, format=picture.suffix.removeprefix("."))
+    figure.savefig(content, format=picture.suffix.removeprefix("."))
     write(picture, content.getvalue(), replace=replace)
     if not quiet:
         click.echo(f"{picture} written")
 
 
 @contextmanager
-def waiting(what: str, *, silent: bool = False) -> Iterator[Callable[[str], None]]:
-    """Says on stderr what is being done, and for how long already, once a second has passed; at its
-    end the line goes. Nothing where nobody looks: `silent`, or stderr is no terminal.
+def waiting(task: str, *, silent: bool = False) -> Iterator[Callable[[str], None]]:
+    """Show a task and its duration on stderr after a second, until the block ends.
 
-    Yields a function to be told what is done from then on.
+    Nothing is shown if `silent`, or if stderr is no terminal.
+
+    Yields
+    ------
+    callable
+        Function that replaces the description of the task.
     """
     if silent or not sys.stderr.isatty():
-        yield lambda what: None
+        yield lambda task: None
         return
-    line = _line(what)
-    timer = threading.Timer(PATIENCE_S, line.start)
+    line = _line(task)
+    timer = threading.Timer(DELAY_S, line.start)
     timer.daemon = True
     timer.start()
     try:
-        yield lambda what: line.update(line.task_ids[0], description=what)
+        yield lambda task: line.update(line.task_ids[0], description=task)
     finally:
         timer.cancel()
         timer.join()
@@ -285,11 +323,11 @@ def waiting(what: str, *, silent: bool = False) -> Iterator[Callable[[str], None
             line.stop()
 
 
-def _line(what: str) -> Any:
+def _line(task: str) -> Any:
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
     line = Progress(*columns, console=Console(file=sys.stderr), transient=True)
-    line.add_task(what, total=None)
+    line.add_task(task, total=None)
     return line

@@ -1,4 +1,4 @@
-"""``pbdkit plot``, ``animate`` and ``curve``: a result as a picture, a movie and lines."""
+"""Commands ``pbdkit plot``, ``animate`` and ``curve``: pictures, movies and curves of results."""
 
 from __future__ import annotations
 
@@ -32,12 +32,14 @@ LOOK = [
         "--field/--dots",
         "filled",
         default=None,
-        help="Fill the body with the variable, or a dot a particle; by default what is legible.",
+        help="Draw a filled field, or a dot for each particle; by default what is legible.",
     ),
-    click.option("--contours", is_flag=True, help="Fill in steps at round levels."),
-    click.option("--bonds/--no-bonds", default=None, help="Draw bonds; by default if legible."),
-    click.option("--broken", is_flag=True, help="Draw broken bonds too, dashed."),
-    click.option("--outline", is_flag=True, help="Draw the outline at rest."),
+    click.option("--contours", is_flag=True, help="Draw filled contours at round levels."),
+    click.option(
+        "--bonds/--no-bonds", default=None, help="Draw bonds; by default if they are legible."
+    ),
+    click.option("--broken", is_flag=True, help="Draw broken bonds, dashed."),
+    click.option("--outline", is_flag=True, help="Draw the outline of the body at rest."),
     click.option(
         "--range",
         "limits",
@@ -45,9 +47,9 @@ LOOK = [
         type=float,
         metavar="LOW HIGH",
         default=None,
-        help="The values of the first and the last colour.",
+        help="Limits of the colour scale.",
     ),
-    click.option("--map", "cmap", metavar="NAME", help="A colour map of matplotlib, e.g. magma."),
+    click.option("--map", "cmap", metavar="NAME", help="Colour map of matplotlib, e.g. magma."),
     click.option(
         "--size",
         "figsize",
@@ -55,9 +57,10 @@ LOOK = [
         type=float,
         metavar="WIDTH HEIGHT",
         default=None,
-        help="In inches.",
+        help="Size of the figure in inches.",
     ),
 ]
+"""Options that pictures and movies have in common."""
 force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
 
 
@@ -82,8 +85,10 @@ def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @set_option
 @outside_option
 @look_options
-@click.option("--numbers", is_flag=True, help="Write the particles' numbers where there is room.")
-@click.option("--dpi", type=int, default=200, show_default=True, help="Pixels an inch.")
+@click.option("--numbers", is_flag=True, help="Write the numbers of particles if there is room.")
+@click.option(
+    "--dpi", type=int, default=200, show_default=True, help="Resolution in pixels per inch."
+)
 @force_option
 def plot(
     file: Path,
@@ -94,10 +99,10 @@ def plot(
     force: bool,
     **look: Any,
 ) -> None:
-    """Draw configurations of a result: kinds, or a variable as dots, bonds or a field.
+    """Draw configurations of a result: kinds of particles, or a variable as dots, bonds or a field.
 
-    Of an experiment, draw the set-up before it runs, to NAME-setup.png: the body, supports, motions
-    and loads.
+    For an experiment, draw the set-up before it runs, to NAME-setup.png: the body, supports,
+    motions and loads.
     """
     from pbdkit.cli.options import refuse_output, refuse_unwritable, save
     from pbdkit.errors import ExperimentError
@@ -118,7 +123,7 @@ def plot(
     with reading(file, at=at) as dataset:
         time = times if len(times) > 1 else times[0] if times else None
         axes = draw(dataset, time=time, **look)
-        from pbdkit.plotting.style import figure_of  # needs matplotlib, which is there by now
+        from pbdkit.plotting.style import figure_of  # needs matplotlib, which was checked above
 
         save(path, figure_of(axes[0] if isinstance(axes, list) else axes), replace=force)
 
@@ -126,27 +131,35 @@ def plot(
 def _plot_set_up(
     name: str, output: Path | None, settings: tuple[str, ...], *, force: bool, look: dict[str, Any]
 ) -> None:
-    """Draw an experiment before it runs. Raises ExperimentError for options of results."""
+    """Draw an experiment before it runs; raise ExperimentError for options of results."""
     from pbdkit.api import load
     from pbdkit.cli.options import refuse_output, refuse_unwritable, save
     from pbdkit.errors import ExperimentError
     from pbdkit.plotting.configuration import plot_experiment
 
     figsize, dpi = look.pop("figsize"), look.pop("dpi")
-    words = {"filled": "field", "times": "time", "vmin": "range", "vmax": "range", "cmap": "map"}
-    if asked := [
-        words.get(k, k) for k, value in look.items() if value not in (None, False, (), {})
+    option_names = {
+        "filled": "field",
+        "times": "time",
+        "vmin": "range",
+        "vmax": "range",
+        "cmap": "map",
+    }
+    if options := [
+        option_names.get(key, key)
+        for key, value in look.items()
+        if value not in (None, False, (), {})
     ]:
         raise ExperimentError(
-            f"--{asked[0]}: is for results; {name} is an experiment, of which the set-up is drawn; "
-            f"`pbdkit run {name}` makes a result of it"
+            f"--{options[0]}: applies to results; {name} is an experiment, whose set-up is drawn; "
+            f"`pbdkit run {name}` computes a result"
         )
     experiment = load(name, settings=settings)
     path = output or Path(f"{experiment.name.replace('/', '-')}-setup.png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
     axes = plot_experiment(experiment, figsize=figsize, dpi=dpi)
-    from pbdkit.plotting.style import figure_of  # needs matplotlib, which is there by now
+    from pbdkit.plotting.style import figure_of  # needs matplotlib, which was checked above
 
     save(path, figure_of(axes), replace=force)
 
@@ -156,14 +169,22 @@ def _plot_set_up(
 @click.option("-o", "--output", type=PATH, help="MP4 or GIF; default OUT.mp4.")
 @at_option
 @look_options
-@click.option("--fps", type=float, default=25.0, show_default=True, help="Steps a second.")
 @click.option(
-    "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Only each N-th step."
+    "--fps", type=float, default=25.0, show_default=True, help="Recorded steps per second."
 )
-@click.option("--dpi", type=int, default=120, show_default=True, help="Pixels an inch.")
+@click.option(
+    "--every",
+    type=click.IntRange(min=1),
+    default=1,
+    metavar="N",
+    help="Draw every N-th recorded step only.",
+)
+@click.option(
+    "--dpi", type=int, default=120, show_default=True, help="Resolution in pixels per inch."
+)
 @force_option
 def animate(file: Path, output: Path | None, at: dict[str, str], force: bool, **look: Any) -> None:
-    """Make a movie of a result: every recorded step, with the same colours all along."""
+    """Make a movie of a result: every recorded step, with one colour scale."""
     from pbdkit.cli.options import refuse_output, refuse_unwritable
     from pbdkit.io.open import reading, refuse_other_file
     from pbdkit.plotting.movie import animate as write
@@ -181,33 +202,47 @@ def animate(file: Path, output: Path | None, at: dict[str, str], force: bool, **
 
 
 CURVES = ("stress-strain", "load-displacement", "energies")
+"""Kinds of curves."""
 CRACKS: dict[str, Any] = {"crack": "map", "crack-length": "length", "broken-bonds": "bonds"}
+"""Kinds of pictures of cracks, with their names in `pbdkit.plotting.crack`."""
 HISTORY = "history"
+"""Kind of histories."""
 
 
 @click.command()
 @result_argument("file")
 @click.argument("kind", required=False, type=click.Choice([*CURVES, HISTORY, *CRACKS]))
 @click.option("-o", "--output", type=PATH, help="PNG, SVG or PDF.")
-@click.option("--y", metavar="VARIABLE", help="Draw this, e.g. reaction_x or pe1.")
-@click.option("--x", metavar="VARIABLE", help="Over this; the time if it is not said.")
+@click.option("--y", metavar="VARIABLE", help="Variable to draw, e.g. reaction_x or pe1.")
+@click.option("--x", metavar="VARIABLE", help="Variable of the abscissa; default the time.")
 @click.option(
     "--particle",
     "particles",
     type=int,
     multiple=True,
-    help="Its history; again for one more.",
+    help="Number of a particle with a history; repeat it for further particles.",
 )
-@click.option("--bond", nargs=2, type=int, metavar="A B", help="The history of a bond.")
+@click.option(
+    "--bond",
+    nargs=2,
+    type=int,
+    metavar="A B",
+    help="Numbers of the two particles of a bond with a history.",
+)
 @click.option("--group", type=int, help="Forces of this leader group.")
 @click.option("--load", type=int, help="Forces of this load.")
 @click.option("--obstacle", type=int, help="Forces of this obstacle.")
 @at_option
 @click.option("--force", is_flag=True, help="Replace an existing picture.")
 def curve(
-    file: Path, kind: str | None, output: Path | None, at: dict[str, str], force: bool, **asked: Any
+    file: Path,
+    kind: str | None,
+    output: Path | None,
+    at: dict[str, str],
+    force: bool,
+    **options: Any,
 ) -> None:
-    """Draw what changes in the course of a result: a curve, histories, the crack.
+    """Draw quantities of a result over time: a curve, histories, the crack.
 
     \b
     stress-strain      nominal stress over nominal strain
@@ -218,47 +253,45 @@ def curve(
     crack-length       the length of the longest crack over the steps
     broken-bonds       their number over the steps
 
-    Without KIND the first that the result has. --y alone draws that variable over the steps, and
-    with --particle or --bond its history there. Results of sweeps have a line a member.
+    KIND is by default the first that the result has. --y alone draws that variable over the steps,
+    and with --particle or --bond its history there. Results of sweeps have a line for each member.
     """
     from pbdkit.cli.options import refuse_output, refuse_unwritable, save
     from pbdkit.io.open import reading, refuse_other_file
 
     refuse_other_file(file)
-    path = output or file.with_name(f"{file.stem}-{_named(kind, asked)}.png")
+    path = output or file.with_name(f"{file.stem}-{_default_name(kind, options)}.png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
     with reading(file, sweeps=True, at=at) as dataset:
-        from pbdkit.plotting.style import figure_of  # needs matplotlib, which is there by now
+        from pbdkit.plotting.style import figure_of  # needs matplotlib, which was checked above
 
-        save(path, figure_of(_drawn(dataset, kind, **asked)), replace=force)
-
-
-def _named(kind: str | None, asked: dict[str, Any]) -> str:
-    """What the picture is called where nobody says."""
-    if kind in (None, HISTORY) and (asked["particles"] or asked["bond"]):
-        return f"{HISTORY}-{asked['y']}" if asked["y"] else HISTORY
-    return kind or asked["y"] or "curve"
+        save(path, figure_of(_draw(dataset, kind, **options)), replace=force)
 
 
-def _drawn(
+def _default_name(kind: str | None, options: dict[str, Any]) -> str:
+    """Return the default name of the picture."""
+    if kind in (None, HISTORY) and (options["particles"] or options["bond"]):
+        return f"{HISTORY}-{options['y']}" if options["y"] else HISTORY
+    return kind or options["y"] or "curve"
+
+
+def _draw(
     dataset: xarray.Dataset,
     kind: Any,
     x: str | None,
     y: str | None,
     particles: tuple[int, ...],
     bond: tuple[int, int] | None,
-    **chosen: Any,
+    **forces: Any,
 ) -> Axes:
     from pbdkit.plotting.crack import crack
     from pbdkit.plotting.curves import curve, history
 
     if x is not None and y is None:
-        raise ExperimentError(
-            f"--x {x}: no variable is given to be drawn over it; add --y VARIABLE"
-        )
+        raise ExperimentError(f"--x {x}: there is no variable to draw over it; add --y VARIABLE")
     if kind in CRACKS:
         return crack(dataset, kind=CRACKS[kind])
     if kind == HISTORY or (kind is None and (particles or bond)):
         return history(dataset, y, particle=particles or None, bond=bond)
-    return curve(dataset, x, y, kind=kind, **chosen)
+    return curve(dataset, x, y, kind=kind, **forces)

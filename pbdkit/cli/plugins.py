@@ -1,6 +1,5 @@
-"""``pbdkit plugins``: list and check installed plugins, and create a new plugin project from
-templates.
-"""
+"""Commands ``pbdkit plugins``: list and check installed plugins, and create a plugin project from
+templates."""
 
 from __future__ import annotations
 
@@ -36,13 +35,13 @@ INTERFACE_NAMES = (
     "FollowerRule", "Lattice", "NeighbourMetric", "FramePolicy", "FractureModel",
     "ParticleOperation", "Diagnostic",
 )  # fmt: skip
-"""The open interfaces by name, here so that `--help` imports none of them."""
+"""Names of the open interfaces, listed here so that `--help` imports none of them."""
 
 
 @click.group(invoke_without_command=True)
 @click.pass_context
 def plugins(context: click.Context) -> None:
-    """What is installed, and in which state."""
+    """List, check and create plugins."""
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
 
@@ -50,7 +49,7 @@ def plugins(context: click.Context) -> None:
 @plugins.command("list")
 @json_option
 def list_(as_json: bool) -> None:
-    """A row for each component and one for each plugin."""
+    """List components and plugins, and their states."""
     from pbdkit.plugin.registry import Registry
 
     registry = Registry()
@@ -70,7 +69,7 @@ def list_(as_json: bool) -> None:
     for column in rows[0]:
         table.add_column(column, overflow="fold", no_wrap=column not in ("reason", "type"))
     for row in rows:
-        table.add_row(*map(Text, row.values()))  # no markup: [x] is what it says
+        table.add_row(*map(Text, row.values()))  # as Text, so that [x] is no markup
     show_table(table)
 
 
@@ -81,14 +80,14 @@ def list_(as_json: bool) -> None:
     type=click.Choice(INTERFACE_NAMES),
     default=INTERFACE_NAMES[0],
     show_default=True,
-    help="What the plugin adds.",
+    help="Interface of the component.",
 )
 @click.option(
     "--dir",
     "parent",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     default=".",
-    help="Where the project's folder is made; here by default.",
+    help="Folder in which the project is created; default the current one.",
 )
 def new(name: str, interface: str, parent: Path) -> None:
     """Write a plugin project NAME, e.g. pbdkit-my-rule, that installs and runs as it stands."""
@@ -96,43 +95,43 @@ def new(name: str, interface: str, parent: Path) -> None:
     project = project_of(name, interface)
     folder = project.write(parent)
     click.echo(
-        f"{folder}: the {interface} '{project.type}' stands in {project.module}.py; next:\n"
+        f"{folder}: the {interface} '{project.type}' is in {project.module}.py; next:\n"
         f"  pip install -e {folder if folder.is_absolute() else f'./{folder}'}\n"
         f"  pbdkit run {folder / 'example.yaml'}"
     )
 
 
-@plugins.command(short_help="Try every property on each component of a plugin.")
+@plugins.command(short_help="Check the components of plugins for conformance.")
 @click.argument("distributions", metavar="[DISTRIBUTION]...", nargs=-1)
-@click.option("--verbose", is_flag=True, help="Show every property, held, failed and skipped.")
+@click.option("--verbose", is_flag=True, help="Show every property: passed, failed and skipped.")
 @json_option
 @click.pass_context
 def check(
     context: click.Context, distributions: tuple[str, ...], verbose: bool, as_json: bool
 ) -> None:
-    """Tries every property of its interface on each component of a distribution.
+    """Check the components of a distribution against the properties of their interface.
 
-    Without a name those of all plugins are tried. `pbdkit` is the distribution of the built-in
-    components. Exits 3 where something fails, or a plugin does not load.
+    Components of all plugins are checked by default. `pbdkit` is the distribution of the built-in
+    components. The exit status is 3 if a property fails, or if a plugin does not load.
     """
     from pbdkit.testing import examine_all
 
-    rows, holds = [], True
-    for plugin in _asked_for(distributions):
+    rows, success = [], True
+    for plugin in _selected_plugins(distributions):
         if plugin.fault:
-            holds = False
+            success = False
             click.echo(f"{plugin} is {plugin.fault}", err=True)
         for report in examine_all(plugin.components):
-            holds = holds and report.holds
+            success = success and report.holds
             rows.append({"distribution": plugin.distribution} | asdict(report))
             if not as_json:
-                click.echo(report if verbose else _told(report))
+                click.echo(report if verbose else _summary(report))
     if as_json:
-        click.echo(json.dumps({"holds": holds, "reports": rows}))
-    elif holds:
-        tried = "1 example" if len(rows) == 1 else f"{len(rows)} examples"
-        click.echo(f"all properties hold for {tried} of its components")
-    context.exit(0 if holds else 3)
+        click.echo(json.dumps({"holds": success, "reports": rows}))
+    elif success:
+        examples = "1 example" if len(rows) == 1 else f"{len(rows)} examples"
+        click.echo(f"all properties hold for {examples} of its components")
+    context.exit(0 if success else 3)
 
 
 def _rows(plugin: Plugin) -> list[dict[str, str]]:
@@ -152,39 +151,45 @@ def _rows(plugin: Plugin) -> list[dict[str, str]]:
     ]
 
 
-def _asked_for(distributions: tuple[str, ...]) -> list[Plugin]:
-    """The plugins of these distributions, or all but the built-in one.
+def _selected_plugins(distributions: tuple[str, ...]) -> list[Plugin]:
+    """Return the plugins of distributions, or all except the built-in one.
 
-    Raises PluginError for a name that is not installed, and where there is no plugin at all.
+    Raises
+    ------
+    PluginError
+        For a distribution that is not installed, or if there is no plugin.
     """
     from pbdkit.errors import PluginError, did_you_mean
     from pbdkit.plugin import BUILTIN
     from pbdkit.plugin.discovery import canonical
     from pbdkit.plugin.registry import Registry
 
-    known: dict[str, list[Plugin]] = {}
+    by_distribution: dict[str, list[Plugin]] = {}
     for plugin in Registry().plugins:
-        known.setdefault(canonical(plugin.distribution), []).append(plugin)
-    asked = distributions or [name for name in known if name != BUILTIN]
-    if not asked:
+        by_distribution.setdefault(canonical(plugin.distribution), []).append(plugin)
+    names = distributions or [name for name in by_distribution if name != BUILTIN]
+    if not names:
         raise PluginError(
-            "no plugin is installed; `pbdkit plugins check pbdkit` tries what is built in"
+            "no plugin is installed; `pbdkit plugins check pbdkit` checks the built-in components"
         )
-    for name in asked:
-        if canonical(name) not in known:
-            hint = did_you_mean(name, [own[0].distribution for own in known.values()])
-            raise PluginError(f"'{name}' is not installed, or is no plugin{hint}")
-    return [plugin for name in asked for plugin in known[canonical(name)]]
+    for name in names:
+        if canonical(name) not in by_distribution:
+            hint = did_you_mean(
+                name, [members[0].distribution for members in by_distribution.values()]
+            )
+            raise PluginError(f"'{name}' is not installed, or is not a plugin{hint}")
+    return [plugin for name in names for plugin in by_distribution[canonical(name)]]
 
 
-def _told(report: Report) -> str:
+def _summary(report: Report) -> str:
     faults = [f"  failed  {outcome.property}: {outcome.reason}" for outcome in report.failed]
     return "\n".join([report.summary(), *faults])
 
 
 PREFIX = f"{BUILTIN}-"
-TAKEN = {*keyword.kwlist, "Literal", "Field"}
-"""What a class in the module cannot be called."""
+"""Beginning of the names of plugins."""
+RESERVED_NAMES = {*keyword.kwlist, "Literal", "Field"}
+"""Names that a class in the module cannot have."""
 DEFAULT_PARTS = {
     "lattice": "{type: square, a: 1.0}",
     "neighbours": "{type: coordination, shells: 1}",
@@ -194,7 +199,7 @@ DEFAULT_PARTS = {
     "operations": "[]",
     "diagnostics": "[{type: displacement}]",
 }
-"""The parts of the example experiment, but for the one that the plugin offers."""
+"""Parts of the example experiment, apart from the one of the plugin."""
 TEMPLATES = {
     "pyproject.toml": "pyproject.toml",
     "README.md": "README.md",
@@ -205,12 +210,28 @@ TEMPLATES = {
     "tests/test_example.py": "test_example.py",
     "tests/test_conformance.py": "test_conformance.py",
 }
+"""Template of each file of a project."""
 
 
 @dataclass(frozen=True)
 class Project:
-    """``pbdkit-my-rule``: the module ``pbdkit_my_rule``, the type ``my-rule``, the class
-    ``MyRule``, with a component of that interface."""
+    """A plugin project: names, and the interface of its component.
+
+    Parameters
+    ----------
+    distribution
+        For instance ``pbdkit-my-rule``.
+    module
+        ``pbdkit_my_rule``.
+    type
+        ``my-rule``.
+    class_name
+        ``MyRule``.
+    interface
+        Name of the interface.
+    field
+        Key of experiment files for such components.
+    """
 
     distribution: str
     module: str
@@ -220,61 +241,73 @@ class Project:
     field: str
 
     def files(self) -> dict[str, str]:
-        """The text of each file, by its place in the project's folder."""
-        own = f"{{type: {self.type}}}"
-        own = f"[{own}]" if self.field in LISTS else own
-        parts = DEFAULT_PARTS | {self.field: own}
-        known = {
+        """Return the text of each file by its path in the project's folder."""
+        part = f"{{type: {self.type}}}"
+        part_text = f"[{part}]" if self.field in LISTS else part
+        parts = DEFAULT_PARTS | {self.field: part_text}
+        substitutions = {
             **vars(self),
             "variable": self.type.replace("-", "_"),
-            "own": own,
+            "own": part_text,
             "pbdkit_version": ".".join(__version__.split(".")[:2]),
             "parts": "\n".join(f"{name}: {part}" for name, part in parts.items()),
         }
         folder = files("pbdkit.cli").joinpath("templates")
         texts = {}
         for file, template in TEMPLATES.items():
-            text = folder.joinpath(template.format(**known) + ".txt").read_text("utf-8")
-            texts[file.format(**known)] = Template(text).substitute(known)
+            text = folder.joinpath(template.format(**substitutions) + ".txt").read_text("utf-8")
+            texts[file.format(**substitutions)] = Template(text).substitute(substitutions)
         return texts
 
     def write(self, parent: Path) -> Path:
-        """Writes it into a new folder of `parent`, named as the distribution, and returns that.
+        """Write the project into a new folder of `parent`, and return that folder.
 
-        Raises ExperimentError where there is something of that name, StorageError where it cannot
-        be written; then nothing of it stays.
+        Raises
+        ------
+        ExperimentError
+            If there is something of that name.
+        StorageError
+            If it cannot be written; then nothing of it remains.
         """
         folder = parent / self.distribution
         texts = self.files()
         if os.path.lexists(folder):
             raise ExperimentError(
-                f"{folder}: exists and is left as it is; take another name or --dir"
+                f"{folder}: exists and is not changed; choose another name or --dir"
             )
         write_folder(folder, texts)
         return folder
 
 
 def project_of(name: str, interface: str) -> Project:
-    """The project of that name with a component of that interface.
+    """Return the project for a distribution name and an interface.
 
-    Raises ExperimentError where a name in it cannot be had.
+    Raises
+    ------
+    ExperimentError
+        If the name, or one derived from it, is invalid or in use.
     """
     if not re.fullmatch(r"[A-Za-z]([A-Za-z0-9._-]*[A-Za-z0-9])?", name):
         raise ExperimentError(
-            f"'{name}' is no name for a distribution: it begins with a letter, ends with a letter "
-            "or digit, and holds letters, digits, '.', '_' and '-', as pbdkit-my-rule does"
+            f"'{name}' is not a valid distribution name: it starts with a letter, ends with a "
+            "letter or digit, and contains letters, digits, '.', '_' and '-', for instance "
+            "pbdkit-my-rule"
         )
     distribution = canonical(name)
     kind = distribution.removeprefix(PREFIX)
     class_name = "".join(word.capitalize() for word in kind.split("-"))
-    module, instead = distribution.replace("-", "_"), f"; try {PREFIX}my-{kind}"
-    if not class_name.isidentifier() or class_name in TAKEN:
-        raise ExperimentError(f"'{name}' makes no name for a class{instead}")
-    taken = {*keyword.kwlist, *sys.stdlib_module_names}
-    spec = None if module in taken else find_spec(module)
-    if module in taken or (spec and spec.origin):  # a mere folder has no origin
-        raise ExperimentError(f"there is a module {module} already{instead}")
-    field, own = next((field, i) for field, i in INTERFACES.items() if i.__name__ == interface)
-    if [kind] in Registry().spellings(own, installed=False).values():
-        raise ExperimentError(f"'{kind}' is a built-in {interface}{instead}")
+    module, remedy = distribution.replace("-", "_"), f"; try {PREFIX}my-{kind}"
+    if not class_name.isidentifier() or class_name in RESERVED_NAMES:
+        raise ExperimentError(f"'{name}' gives no valid name for a class{remedy}")
+    reserved = {*keyword.kwlist, *sys.stdlib_module_names}
+    spec = None if module in reserved else find_spec(module)
+    if module in reserved or (spec and spec.origin):  # a folder without __init__ has no origin
+        raise ExperimentError(f"there is already a module {module}{remedy}")
+    field, base = next(
+        (field, interface_class)
+        for field, interface_class in INTERFACES.items()
+        if interface_class.__name__ == interface
+    )
+    if [kind] in Registry().spellings(base, installed=False).values():
+        raise ExperimentError(f"'{kind}' is a built-in {interface}{remedy}")
     return Project(distribution, module, kind, class_name, interface, field)

@@ -1,6 +1,5 @@
-"""``pbdkit explain``, ``status``, ``verify`` and ``export``: inspect a result or an unfinished run,
-and write it in another format.
-"""
+"""Commands ``pbdkit explain``, ``status``, ``verify`` and ``export``: inspect and convert
+results."""
 
 from __future__ import annotations
 
@@ -22,27 +21,27 @@ if TYPE_CHECKING:
     from pbdkit.scene.scene import Scene
 
 
-SHOWN = 20
-"""So many broken bonds are listed in words; --json has all."""
+MAX_LISTED = 20
+"""Number of broken bonds that are listed as text; --json lists all."""
 
 
 @click.command()
 @result_argument("files", "FILE...", nargs=-1, required=True)
 def verify(files: tuple[Path, ...]) -> int:
-    """Recompute the digests of results and say, a line a file, which are as they were written."""
+    """Recompute the checksums of results, and report for each file whether it is unchanged."""
     from pbdkit.cli.options import waiting
 
     faults = []
     for file in files:
         with waiting(f"reading {file}"):
-            fault = _verified(file)
-        click.echo(fault or f"{file}: is as it was written")
+            fault = _fault_of(file)
+        click.echo(fault or f"{file}: unchanged since it was written")
         faults += [fault] if fault else []
     return 6 if faults else 0
 
 
-def _verified(file: Path) -> str:
-    """What a file's line says against it, if anything."""
+def _fault_of(file: Path) -> str:
+    """Return the fault of a result, or an empty string."""
     from pbdkit.cli.options import refusals_as
     from pbdkit.errors import StorageError
     from pbdkit.io.open import UNSEALED, other_file, refuse_no_file
@@ -51,8 +50,8 @@ def _verified(file: Path) -> str:
 
     fault = ""
     try:
-        if told := other_file(file):
-            raise StorageError(f"{file}: {told}")
+        if description := other_file(file):
+            raise StorageError(f"{file}: {description}")
         refuse_no_file(file)
         with refusals_as(str(file)), SealedFile(file) as content:
             content.check()
@@ -67,7 +66,7 @@ def _verified(file: Path) -> str:
 
 
 def _refuse_elsewhere(file: Path) -> None:
-    """Raises StorageError where the bytes are what was sealed, and refer to others elsewhere."""
+    """Raise StorageError if the bytes are those that were sealed, but refer to other files."""
     from pbdkit.errors import StorageError, one_line
     from pbdkit.io.seal import opened
 
@@ -75,7 +74,7 @@ def _refuse_elsewhere(file: Path) -> None:
         opened(file).close()
     except StorageError:
         raise
-    except Exception as error:  # whatever the libraries make of it
+    except Exception as error:  # h5py raises errors of many types
         raise StorageError(f"{file}: cannot be read as netCDF-4: {one_line(str(error))}") from None
 
 
@@ -83,27 +82,27 @@ def _refuse_elsewhere(file: Path) -> None:
 @result_argument("output")
 @json_option
 def status(output: Path, as_json: bool) -> None:
-    """Say of an unfinished run how far it is, at which rate, and when it will end."""
+    """Report the progress of an unfinished run: step, rate and remaining time."""
     from pbdkit.errors import ExperimentError
     from pbdkit.io.open import refuse_other_file, refuse_store
     from pbdkit.io.run_store import status_of
 
     refuse_store(output)
-    found = status_of(output)
-    if found is None:
+    facts = status_of(output)
+    if facts is None:
         refuse_other_file(output)
-        what = "is finished" if output.exists() else "there is no such run"
-        raise ExperimentError(f"{output}: {what}; runs of less than a second leave no trace")
+        state = "is finished" if output.exists() else "there is no such run"
+        raise ExperimentError(f"{output}: {state}; runs of less than a second have no status")
     if as_json:
-        click.echo(json.dumps(found))
+        click.echo(json.dumps(facts))
         return
-    click.echo(f"{output}: step {found['step']} of {found['steps']}, {found['state']}")
-    if found["rate"]:
-        click.echo(f"rate: {found['rate']:.3g} steps a second")
-    if found["state"] == "running" and found["left_s"] is not None:
-        click.echo(f"time left: about {_duration(found['left_s'])}")
-    elif found["state"] != "running":
-        click.echo(f"`pbdkit resume {output}` goes on with it")
+    click.echo(f"{output}: step {facts['step']} of {facts['steps']}, {facts['state']}")
+    if facts["rate"]:
+        click.echo(f"rate: {facts['rate']:.3g} steps a second")
+    if facts["state"] == "running" and facts["left_s"] is not None:
+        click.echo(f"time left: about {_duration(facts['left_s'])}")
+    elif facts["state"] != "running":
+        click.echo(f"`pbdkit resume {output}` continues it")
 
 
 def _duration(seconds: float) -> str:
@@ -113,12 +112,16 @@ def _duration(seconds: float) -> str:
 
 @click.command()
 @result_argument("file")
-@click.option("--bond", nargs=2, type=int, metavar="A B", help="The bond between two numbers.")
+@click.option(
+    "--bond", nargs=2, type=int, metavar="A B", help="Numbers of the two particles of a bond."
+)
 @at_option
 @json_option
 def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_json: bool) -> None:
-    """Say which bonds broke, when, how far strained and in which order; or, of one bond, how far it
-    is, or was, from breaking, and what happened around it."""
+    """Explain fracture: which bonds broke, when, at which strain and in which order.
+
+    For one bond, report its distance from breaking, or its break, and what happened around it.
+    """
     from pbdkit.cli.options import waiting
     from pbdkit.io.explain import Explained
     from pbdkit.io.layout import scene_of
@@ -126,13 +129,13 @@ def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_jso
 
     with waiting(f"reading {file}", silent=as_json), reading(file, at=at) as dataset:
         explained = Explained(dataset, scene_of(dataset, "explain"))
-        found = _of_one(explained, *bond) if bond else _of_all(explained)
-        words = _bond_in_words(found) if bond else _run_in_words(found)
-        said = json.dumps(found, default=asdict) if as_json else "\n".join(words)
-    click.echo(said)
+        facts = _bond_facts(explained, *bond) if bond else _run_facts(explained)
+        lines = _bond_in_words(facts) if bond else _run_in_words(facts)
+        text = json.dumps(facts, default=asdict) if as_json else "\n".join(lines)
+    click.echo(text)
 
 
-def _of_all(explained: Explained) -> dict[str, Any]:
+def _run_facts(explained: Explained) -> dict[str, Any]:
     steps = explained.steps
     return {
         "fracture": explained.model.type,
@@ -145,7 +148,7 @@ def _of_all(explained: Explained) -> dict[str, Any]:
     }
 
 
-def _of_one(explained: Explained, a: int, b: int) -> dict[str, Any]:
+def _bond_facts(explained: Explained, a: int, b: int) -> dict[str, Any]:
     import numpy as np
 
     row = explained.row(a, b)
@@ -161,62 +164,69 @@ def _of_one(explained: Explained, a: int, b: int) -> dict[str, Any]:
     }
 
 
-def _run_in_words(found: dict[str, Any]) -> Iterator[str]:
-    broken, model = found["broken"], found["fracture"]
-    also = {"cut": found["cut"], "broken from the start": found["broken_from_the_start"]}
-    more = "".join(f", {count} {how}" for how, count in also.items() if count)
-    yield f"fracture {model}: {broken} of {found['bonds']} bonds broke{more}"
-    rows = [s for s in found["in_order"] if s.state == "broken"]
+def _run_in_words(facts: dict[str, Any]) -> Iterator[str]:
+    broken, model = facts["broken"], facts["fracture"]
+    further = {"cut": facts["cut"], "broken from the start": facts["broken_from_the_start"]}
+    rest = "".join(f", {count} {kind}" for kind, count in further.items() if count)
+    yield f"fracture {model}: {broken} of {facts['bonds']} bonds broke{rest}"
+    rows = [standing for standing in facts["in_order"] if standing.state == "broken"]
     if rows:
         yield f"first in step {rows[0].step}, last in step {rows[-1].step}"
         yield "order  step  bond           strain       breaks above"
-    for s in rows[:SHOWN]:
-        strain, limit = _number(s.strain_at_break), _number(s.breaks_above)
-        yield f"{s.order:>5}  {s.step:>4}  {_name(s):<13}  {strain:<11}  {limit}"
-    if rows and all(s.breaks_above is None for s in rows):
-        does = "a model does by `breaking_strain`"
-        yield f"{model} does not say above which strain a bond breaks: {does}"
-    if len(rows) > SHOWN:
-        yield f"and {len(rows) - SHOWN} more: --json lists all"
-    if found["nearest"]:
-        yield f"nearest to breaking: {_name(found['nearest'])}: {_standing(found['nearest'])}"
+    for standing in rows[:MAX_LISTED]:
+        strain, limit = _number(standing.strain_at_break), _number(standing.breaks_above)
+        position = f"{standing.order:>5}  {standing.step:>4}  {_name(standing):<13}"
+        yield f"{position}  {strain:<11}  {limit}"
+    if rows and all(standing.breaks_above is None for standing in rows):
+        remedy = "models declare it by `breaking_strain`"
+        yield f"{model} has no strain above which a bond breaks: {remedy}"
+    if len(rows) > MAX_LISTED:
+        yield f"and {len(rows) - MAX_LISTED} more: --json lists all"
+    if facts["nearest"]:
+        yield f"nearest to breaking: {_name(facts['nearest'])}: {_standing(facts['nearest'])}"
 
 
-def _bond_in_words(found: dict[str, Any]) -> Iterator[str]:
-    s: BondStatus = found["bond"]
+def _bond_in_words(facts: dict[str, Any]) -> Iterator[str]:
+    s: BondStatus = facts["bond"]
     yield f"bond {_name(s)}: shell {s.shell}, rest length {s.rest_length:.6g}"
     if s.state == "broken":
         strain = _number(s.strain_at_break, "an unknown strain")
-        order = f"number {s.order} of the {found['broken_in_all']} broken"
+        order = f"number {s.order} of the {facts['broken_in_all']} broken"
         yield f"broke in step {s.step} at strain {strain}, {order}"
         if s.breaks_above is not None:
-            yield f"fracture {found['fracture']} breaks it above {s.breaks_above:.6g}"
+            yield f"fracture {facts['fracture']} breaks it above {s.breaks_above:.6g}"
     elif s.state == "cut":
         yield f"cut at the beginning of step {s.step}"
     else:
         yield _standing(s)
     if s.state == "intact":
-        most = found["most_strained"]
-        yield f"longest of the recorded steps in step {most['step']}: strain {most['strain']:.6g}"
-    yield from (f"{name} {value:.6g}" for name, value in found["remembered"].items())
-    yield from _around_in_words(found["around"], s.step)
+        step, strain = facts["most_strained"]["step"], facts["most_strained"]["strain"]
+        yield f"largest strain of the recorded steps in step {step}: {strain:.6g}"
+    yield from (f"{name} {value:.6g}" for name, value in facts["remembered"].items())
+    yield from _around_in_words(facts["around"], s.step)
 
 
 def _around_in_words(around: list[BondStatus], step: int | None) -> Iterator[str]:
-    """The other bonds at its ends: what broke before it, with it and after it."""
-    broken = [s for s in around if s.step is not None]
+    """Describe the other bonds at its ends: those that broke before it, with it and after it."""
+    broken = [standing for standing in around if standing.step is not None]
     groups = {"broken around it": broken}
     if step is not None:
-        when: dict[str, Any] = {"broken around it before": lt, "in the same step": eq, "after": gt}
+        relations: dict[str, Any] = {
+            "broken around it before": lt,
+            "in the same step": eq,
+            "after": gt,
+        }
         groups = {
-            title: [s for s in broken if is_so(s.step, step)] for title, is_so in when.items()
+            title: [standing for standing in broken if relation(standing.step, step)]
+            for title, relation in relations.items()
         }
     for title, group in groups.items():
-        yield f"{title}: {', '.join(f'{_name(s)} (step {s.step})' for s in group) or 'none'}"
-    whole = [s for s in around if s.step is None]
-    most = max(whole, key=lambda s: s.strain, default=None)
-    strained = f", the most strained {_name(most)}: {_standing(most)}" if most else ""
-    yield f"not broken around it: {len(whole)}{strained}"
+        bonds = ", ".join(f"{_name(standing)} (step {standing.step})" for standing in group)
+        yield f"{title}: {bonds or 'none'}"
+    unbroken = [standing for standing in around if standing.step is None]
+    maximum = max(unbroken, key=lambda standing: standing.strain, default=None)
+    remark = f", the most strained {_name(maximum)}: {_standing(maximum)}" if maximum else ""
+    yield f"not broken around it: {len(unbroken)}{remark}"
 
 
 def _name(s: BondStatus) -> str:
@@ -224,7 +234,7 @@ def _name(s: BondStatus) -> str:
 
 
 def _standing(s: BondStatus) -> str:
-    """An unbroken bond in a few words."""
+    """Describe an unbroken bond in a few words."""
     words = f"{s.state}, strain {s.strain:.6g} in step {s.at_step}"
     if s.breaks_above is not None and s.share is not None:
         words += f", breaks above {s.breaks_above:.6g} ({s.share:.3g} of the way)"
@@ -236,18 +246,19 @@ def _number(value: float | None, unknown: str = "not known") -> str:
 
 
 SUFFIX = ".vtkhdf"
+"""File name extension of VTKHDF files."""
 
 
 @click.command()
 @result_argument("file")
-@click.option("-o", "--output", type=PATH, help="A .vtkhdf file; beside OUT.nc if not said.")
+@click.option("-o", "--output", type=PATH, help="A .vtkhdf file; default OUT.vtkhdf.")
 @at_option
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> None:
-    """Write a result as VTKHDF, which ParaView opens: every recorded step with all variables.
+    """Write a result as VTKHDF for ParaView: every recorded step with all variables.
 
-    Particles are vertices, bonds lines, and the cells of the lattice triangles and quads; the cell
-    array `part` tells them apart (0, 1, 2), and `broken` those that are torn.
+    Particles are vertices, bonds lines, and the cells of the lattice triangles and quads. The cell
+    array `part` distinguishes them (0, 1, 2), and `broken` marks torn cells.
     """
     from pbdkit.cli.options import refuse_output
     from pbdkit.errors import ExperimentError, StorageError
@@ -257,7 +268,9 @@ def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> 
     refuse_other_file(file)
     path = output or file.with_suffix(SUFFIX)
     if path.suffix != SUFFIX:
-        raise ExperimentError(f"{path}: ends in {SUFFIX}, so that ParaView knows what it is")
+        raise ExperimentError(
+            f"{path}: must end in {SUFFIX}, by which ParaView recognises the format"
+        )
     refuse_output(path, force=force)
     if not path.parent.is_dir():
         raise StorageError(f"{path}: there is no folder {path.parent}")
@@ -267,12 +280,15 @@ def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> 
 
 
 def _scene_of(dataset: xarray.Dataset) -> Scene | None:
-    """The scene that the cells are those of; without it, which is told, there are no cells."""
+    """Return the scene of the cells; without it, warn that there are no cells."""
     from pbdkit.errors import PbdkitError
     from pbdkit.io.layout import scene_of
 
     try:
         return scene_of(dataset, "a grid of cells")
     except PbdkitError as error:
-        click.echo(f"warning: without cells, as its experiment is not there: {error}", err=True)
+        click.echo(
+            f"warning: written without cells, since the experiment is not available: {error}",
+            err=True,
+        )
         return None

@@ -1,6 +1,5 @@
-"""``pbdkit run`` and ``resume``, which a signal ends between two steps, so that everything kept is
-complete.
-"""
+"""Commands ``pbdkit run`` and ``pbdkit resume``. A signal ends a run between two steps, so that all
+records are complete."""
 
 from __future__ import annotations
 
@@ -26,32 +25,32 @@ if TYPE_CHECKING:
     from pbdkit.simulation import Execution, RunReport, Simulation
 
 
-NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
-"""Ctrl-C, what ends a process, a terminal that closes, and the warning that batch systems send; a
-system may lack some."""
+SIGNAL_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+"""Signals that end a run: Ctrl-C, termination, a closed terminal, and the warning of batch systems.
+Some do not exist on every system."""
 
 
 class Stop:
-    """Whether, and by which signal, the process was asked to stop."""
+    """Request to stop the process, by a signal; calling it returns whether there was one."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
 
     def __call__(self) -> bool:
-        """Whether it was."""
+        """Return whether the process was asked to stop."""
         return self.signal is not None
 
     @property
     def exit_status(self) -> int:
-        """130 for Ctrl-C, else 128 and the number of the signal."""
+        """Return 130 for Ctrl-C, else 128 plus the number of the signal."""
         return 128 + (self.signal or signal.SIGINT)
 
 
 @contextmanager
-def asked_to_stop() -> Iterator[Stop]:
-    """Yields what tells whether the process has been asked to stop.
+def stop_on_signals() -> Iterator[Stop]:
+    """Record signals in the block instead of ending the process; a second Ctrl-C ends it at once.
 
-    A second Ctrl-C stops at once. Outside the main thread signals are not ours to handle.
+    Outside the main thread signals cannot be handled.
     """
     stop = Stop()
 
@@ -60,21 +59,28 @@ def asked_to_stop() -> Iterator[Stop]:
             raise KeyboardInterrupt
         stop.signal = signal.Signals(number)
 
-    ours = threading.current_thread() is threading.main_thread()
-    found = [getattr(signal, name) for name in NAMES if hasattr(signal, name)] if ours else []
-    # Who starts it with `nohup` wants it to survive the terminal.
-    hears = {n: n.name != "SIGHUP" or signal.getsignal(n) is not signal.SIG_IGN for n in found}
-    numbers = [number for number in found if hears[number]]
-    before = {number: signal.signal(number, note) for number in numbers}
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    signals = (
+        [getattr(signal, name) for name in SIGNAL_NAMES if hasattr(signal, name)]
+        if is_main_thread
+        else []
+    )
+    # A process started with `nohup` must survive the terminal.
+    is_handled = {
+        number: number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN
+        for number in signals
+    }
+    numbers = [number for number in signals if is_handled[number]]
+    previous = {number: signal.signal(number, note) for number in numbers}
     try:
         yield stop
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-ENDED = ("complete", "settled")
-"""How runs end that came to what was asked for."""
+SUCCESSFUL = ("complete", "settled")
+"""Status of runs that ended as intended."""
 
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
@@ -83,7 +89,9 @@ quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but err
 @experiment_argument
 @click.option("-o", "--output", type=PATH, help="The file to write.")
 @set_option
-@click.option("--force", is_flag=True, help="Replace an existing output by a whole result.")
+@click.option(
+    "--force", is_flag=True, help="Replace an existing output once the result is complete."
+)
 @quiet_option
 @json_option
 def run(
@@ -108,27 +116,27 @@ def run(
                 path = output or Path(loaded.name.replace("/", "-") + ".nc")
             if execution.communicator.is_root:
                 refuse_output(path, force=force, experiment=Path(experiment))
-        given = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment
-        origin = {"experiment": given, "settings": list(settings)}
+        origin_path = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment
+        origin = {"experiment": origin_path, "settings": list(settings)}
         quiet = quiet or not execution.communicator.is_root
 
-        def run_by(chosen: Execution, again: bool) -> int:
+        def run_by(chosen: Execution, is_repeated: bool) -> int:
             from pbdkit.io.netcdf import NetcdfSink
             from pbdkit.simulation import record
 
             scene = chosen.scene(loaded)
             with chosen.communicator.raise_together():
                 if chosen.communicator.is_root:
-                    refuse_unfinished(path, force=force or again)
+                    refuse_unfinished(path, force=force or is_repeated)
             file = NetcdfSink(path, force, loaded.record.compression, origin=origin)
             _warn(disk_warnings(path, scene), quiet)
-            with _watched(path, quiet or as_json, file) as (stop, watch):
-                one = chosen.run(scene, watch)
-                del scene  # of which each of several processes goes on with its part alone
-                _warn([*one.warnings, *([] if quiet else one.outlook())], quiet)
-                report = record(one, one.sink(file))
+            with _progress(path, quiet or as_json, file) as (stop, watch):
+                simulation = chosen.run(scene, watch)
+                del scene  # each of several processes keeps its part alone
+                _warn([*simulation.warnings, *([] if quiet else simulation.outlook())], quiet)
+                report = record(simulation, simulation.sink(file))
             if chosen.communicator.is_root:
-                _tell(one, report, file, path, quiet, as_json)
+                _report_end(simulation, report, file, path, quiet, as_json)
             return _exit_status(report.outcome, stop)
 
         return _shared(execution, quiet, run_by)
@@ -140,69 +148,69 @@ def run(
 @click.option(
     "--anyway",
     is_flag=True,
-    help="Also where the experiment or a version changed, or where the last commits are lost.",
+    help="Resume although the experiment or a version changed, or the last commits are lost.",
 )
 @quiet_option
 @json_option
 def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: bool) -> int:
-    """Go on with an interrupted run that was to write OUT.nc, to the same result bit for bit."""
+    """Continue an interrupted run that was to write OUT.nc; the result is the same bit for bit."""
     from pbdkit.mpi.launch import launched
     from pbdkit.restart import resumption
 
     with launched() as execution:
         quiet = quiet or not execution.communicator.is_root
 
-        def resume_by(chosen: Execution, _: bool) -> int:
-            with _watched(output, quiet or as_json) as (stop, watch):
-                found = resumption(output, watch, steps=steps, anyway=anyway, execution=chosen)
-                if found is None:
+        def resume_by(chosen: Execution, is_repeated: bool) -> int:
+            with _progress(output, quiet or as_json) as (stop, watch):
+                resumed = resumption(output, watch, steps=steps, anyway=anyway, execution=chosen)
+                if resumed is None:
                     if not quiet:
-                        click.echo(f"{output}: was finished, and is whole")
+                        click.echo(f"{output}: is finished and complete")
                     return 0
-                _warn(found.run.warnings, quiet)
-                with _told_what_is_kept(output, found.sink):
-                    report = found.record()
+                _warn(resumed.run.warnings, quiet)
+                with _advice_on_failure(output, resumed.sink):
+                    report = resumed.record()
             if chosen.communicator.is_root:
-                _tell(found.run, report, found.sink, output, quiet, as_json)
+                _report_end(resumed.run, report, resumed.sink, output, quiet, as_json)
             return _exit_status(report.outcome, stop)
 
         return _shared(execution, quiet, resume_by)
 
 
 def _shared(execution: Execution, quiet: bool, work: Callable[[Execution, bool], int]) -> int:
-    """Done by all processes together; where they cannot share it, again by the first of them."""
+    """Let all processes work together; if they cannot share the work, let the first do it alone."""
     try:
         return work(execution, False)
     except NotSharedError as error:
-        told = str(error).replace("; run it in one process", "; the first of them runs it alone")
-        _warn([told], quiet)
+        text = str(error).replace("; run it in one process", "; the first of them runs it alone")
+        _warn([text], quiet)
     from pbdkit.simulation import Execution
 
-    # A signal that all of them get must not end those who wait.
-    with nullcontext() if execution.communicator.is_root else asked_to_stop():
+    # A signal that is sent to all processes must not end those that wait.
+    with nullcontext() if execution.communicator.is_root else stop_on_signals():
         return execution.by_root(lambda: work(Execution(), True))
 
 
 @contextmanager
-def _watched(
+def _progress(
     path: Path, silent: bool, file: NetcdfSink | None = None
 ) -> Iterator[tuple[Stop, Watch]]:
-    """Progress on a terminal, and signals heard."""
+    """Show progress on a terminal, and handle signals."""
     from pbdkit.progress import Watch, progress_bar
 
-    drawn = not silent and sys.stderr.isatty()
-    with asked_to_stop() as stop, progress_bar(drawn) as show:
+    is_drawn = not silent and sys.stderr.isatty()
+    with stop_on_signals() as stop, progress_bar(is_drawn) as show:
         watch = Watch(stop, show)
         if file is None:
             yield stop, watch
             return
-        with _told_what_is_kept(path, file):
+        with _advice_on_failure(path, file):
             yield stop, watch
 
 
 @contextmanager
-def _told_what_is_kept(path: Path, file: NetcdfSink) -> Iterator[None]:
-    """Where a run fails that was kept, how to go on with it."""
+def _advice_on_failure(path: Path, file: NetcdfSink) -> Iterator[None]:
+    """Print how to resume a run that fails with records on disk."""
     try:
         yield
     except NotSharedError:
@@ -210,20 +218,19 @@ def _told_what_is_kept(path: Path, file: NetcdfSink) -> Iterator[None]:
     except ExperimentError:
         if file.kept:
             click.echo(
-                f"what was recorded until then is kept, and `pbdkit plot {path}` draws it; to "
-                "resume would be refused in the same way: change the experiment, and run it with "
-                "--force",
+                f"the records until then are kept, and `pbdkit plot {path}` draws them; resuming "
+                "would fail in the same way: change the experiment, and run it with --force",
                 err=True,
             )
         raise
     except BaseException:
         if file.kept:
-            click.echo(_how_to_go_on(path), err=True)
+            click.echo(_resume_advice(path), err=True)
         raise
 
 
-def _how_to_go_on(path: Path) -> str:
-    return f"`pbdkit resume {path}` goes on from what was kept"
+def _resume_advice(path: Path) -> str:
+    return f"`pbdkit resume {path}` continues it"
 
 
 def _warn(texts: Iterable[str], quiet: bool) -> None:
@@ -231,36 +238,40 @@ def _warn(texts: Iterable[str], quiet: bool) -> None:
         click.echo(f"warning: {text}", err=True)
 
 
-def _tell(
+def _report_end(
     run: Simulation, report: RunReport, file: NetcdfSink, path: Path, quiet: bool, as_json: bool
 ) -> None:
-    """What there is to say of a run that ended."""
+    """Print the outcome of a run."""
     _warn(report.warnings, quiet)
     outcome = report.outcome
     if as_json:
         click.echo(json.dumps(_figures(report, file.written)))
-    elif not quiet and outcome.status in ENDED:
-        _say(report, file.written, settling=run.scene.experiment.stepping.settle is not None)
-    what = f"pbdkit: {outcome.status}: {outcome.stop_reason}"
+    elif not quiet and outcome.status in SUCCESSFUL:
+        _print_summary(
+            report, file.written, settling=run.scene.experiment.stepping.settle is not None
+        )
+    outcome_text = f"pbdkit: {outcome.status}: {outcome.stop_reason}"
     if outcome.status == "interrupted":
-        click.echo(f"{what}; {_how_to_go_on(path)}", err=True)
-    elif outcome.status not in ENDED:
-        left = "" if file.written == path else f"; {path} is left as it was"
-        click.echo(f"{what}; what was recorded until then is in {file.written}{left}", err=True)
+        click.echo(f"{outcome_text}; {_resume_advice(path)}", err=True)
+    elif outcome.status not in SUCCESSFUL:
+        remark = "" if file.written == path else f"; {path} is unchanged"
+        click.echo(
+            f"{outcome_text}; the records until then are in {file.written}{remark}", err=True
+        )
 
 
 def _exit_status(outcome: RunOutcome, stop: Stop) -> int:
-    """Of the program, in all processes."""
-    if outcome.status in ENDED:
+    """Return the exit status of the program, the same in all processes."""
+    if outcome.status in SUCCESSFUL:
         return 0
     return stop.exit_status if outcome.status == "interrupted" else 4
 
 
-def _say(report: RunReport, path: Path, *, settling: bool) -> None:
+def _print_summary(report: RunReport, path: Path, *, settling: bool) -> None:
     outcome = report.outcome
-    made = f"{outcome.steps - report.first} of {outcome.steps}" if report.first else outcome.steps
-    steps = "step" if made == 1 else "steps"
-    size = f"{report.particles} particles, {made} {steps} in {report.wall_s:.2g} s"
+    count = f"{outcome.steps - report.first} of {outcome.steps}" if report.first else outcome.steps
+    steps = "step" if count == 1 else "steps"
+    size = f"{report.particles} particles, {count} {steps} in {report.wall_s:.2g} s"
     size += f" on {report.processes} processes" if report.processes > 1 else ""
     click.echo(f"{outcome.status}: {size}, written to {path}")
     if outcome.certificate:

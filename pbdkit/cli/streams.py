@@ -1,4 +1,4 @@
-"""Standard output and error, for as long as the program runs."""
+"""Standard output and error while the program runs."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ from pbdkit.errors import PbdkitError, WriteError
 
 
 class NoReaderError(PbdkitError):
-    """Standard output goes to a program that has had enough of it, as `head` has: no fault."""
+    """The reader of standard output has closed it, as `head` does. This is no error of the
+    program."""
 
-    exit_status, told = 0, True
+    exit_status, is_reported = 0, True
 
 
 @contextmanager
 def standard_streams() -> Iterator[None]:
-    """In the block a write to standard output that fails is a WriteError, or a NoReaderError, and
-    one to standard error is dropped, so that the exit status stays what it is.
+    """Handle failures of standard output and error in the block, so that the exit status remains
+    meaningful.
 
-    Descriptors that are closed are taken, so that no other file gets their numbers, in which other
-    programs and libraries would write. Streams that somebody has put in the place of Python's stay.
+    A failed write to standard output raises WriteError, or NoReaderError if the reader has closed
+    it. A failed write to standard error is ignored. Closed descriptors are occupied, so that no
+    other file gets their numbers, to which other programs and libraries write. Streams that replace
+    those of Python are kept.
     """
     if os.name != "posix":
         yield
@@ -35,7 +38,7 @@ def standard_streams() -> Iterator[None]:
             os.fstat(number)
         except OSError:
             os.set_inheritable(os.open(os.devnull, os.O_RDONLY), True)
-    before = sys.stdout, sys.stderr
+    previous = sys.stdout, sys.stderr
     if sys.stdout is sys.__stdout__:
         sys.stdout = _stream(sys.stdout, _Output)
     if sys.stderr is sys.__stderr__:
@@ -45,11 +48,11 @@ def standard_streams() -> Iterator[None]:
     finally:
         with suppress(Exception):
             sys.stdout.flush()
-        sys.stdout, sys.stderr = before
+        sys.stdout, sys.stderr = previous
 
 
 def _stream(standard: TextIO | None, kind: type[io.FileIO]) -> TextIO:
-    """Like one of Python's streams; where that is closed each write fails."""
+    """Return a stream like one of Python's; if that is closed, each write fails."""
     if standard is None:
         raw = kind(os.open(os.devnull, os.O_RDONLY), "w")
         return io.TextIOWrapper(io.BufferedWriter(raw))
@@ -62,12 +65,12 @@ def _stream(standard: TextIO | None, kind: type[io.FileIO]) -> TextIO:
 
 
 class _Output(io.FileIO):
-    """Raises its first fault; what comes after it is dropped."""
+    """Raise the first failure of a write, and ignore further writes."""
 
     _failed = False
 
     def write(self, data: Any) -> int:
-        """As in any file."""
+        """Write data, or raise NoReaderError or WriteError at the first failure."""
         if self._failed:
             return len(data)
         try:
@@ -75,16 +78,16 @@ class _Output(io.FileIO):
         except OSError as error:
             self._failed = True
             if isinstance(error, BrokenPipeError):
-                raise NoReaderError("nobody reads standard output") from None
+                raise NoReaderError("standard output has no reader") from None
             reason = "is closed" if error.errno == errno.EBADF else error.strerror
             raise WriteError(f"standard output: {reason}") from None
 
 
 class _Errors(io.FileIO):
-    """Drops what cannot be written."""
+    """Ignore failures of writes."""
 
     def write(self, data: Any) -> int:
-        """As in any file."""
+        """Write data, or ignore it if that fails."""
         try:
             return super().write(data)
         except OSError:

@@ -1,6 +1,5 @@
-"""``pbdkit sweep`` and ``fit``, and what there is to start from: ``experiments``, ``init`` and
-``schema``.
-"""
+"""Commands ``pbdkit sweep`` and ``fit``, and those to start from: ``experiments``, ``init`` and
+``schema``."""
 
 from __future__ import annotations
 
@@ -24,53 +23,60 @@ if TYPE_CHECKING:
 
 PATH = click.Path(path_type=Path)
 CONNECT_S = 10.0
-SHOWN = 20
-"""So many failures are shown; `message` in the dataset has all."""
+"""Timeout for the connection to a cluster in seconds."""
+MAX_LISTED = 20
+"""Number of failures that are listed; `message` in the dataset has all."""
 
 
 @click.command()
 @click.argument("file", metavar="SWEEP", type=PATH)
-@click.option("-o", "--output", "folder", type=PATH, help="The folder to keep the members in.")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes; else one a processor.")
-@click.option("--dask", "address", metavar="ADDRESS", help="Run on a dask cluster instead.")
+@click.option("-o", "--output", "folder", type=PATH, help="Folder of the results of members.")
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Number of processes; default one for each processor.",
+)
+@click.option(
+    "--dask", "address", metavar="ADDRESS", help="Run on the dask cluster at this address."
+)
 @outside_option
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 def sweep(
     file: Path, folder: Path | None, workers: int | None, address: str | None, quiet: bool
 ) -> int:
-    """Run an experiment over many parameters; a second call runs what is left."""
-    from pbdkit.cli.run import asked_to_stop
+    """Run an experiment for many parameter values; a second call runs the remaining members."""
+    from pbdkit.cli.run import stop_on_signals
     from pbdkit.progress import progress_bar
     from pbdkit.sweeps.execute import carry_out, crew_of
-    from pbdkit.sweeps.specification import Asked, read_sweep
+    from pbdkit.sweeps.specification import SweepPlan, read_sweep
 
     specified, base, source = read_sweep(file)
-    asked, kept = Asked(specified, base, source), folder or Path(file.stem)
-    _refuse_folder(kept)
+    plan, path = SweepPlan(specified, base, source), folder or Path(file.stem)
+    _refuse_folder(path)
     with (
         _client(address) as client,
-        asked_to_stop() as stopping,
+        stop_on_signals() as stopping,
         progress_bar(not quiet and sys.stderr.isatty()) as show,
     ):
-        summary = carry_out(asked, kept, crew_of(workers, client), stopping, show)
+        summary = carry_out(plan, path, crew_of(workers, client), stopping, show)
     for fault in summary.faults:
         click.echo(f"warning: {fault}", err=True)
-    return _told(summary, kept, stopping, quiet)
+    return _report_end(summary, path, stopping, quiet)
 
 
 def _refuse_folder(folder: Path) -> None:
-    """Raises ExperimentError where something else than a folder has the name."""
+    """Raise ExperimentError if the path exists and is no folder."""
     from pbdkit.cli.options import refusals_as
     from pbdkit.errors import ExperimentError
 
     with refusals_as(str(folder)[:80]):
         if folder.exists() and not folder.is_dir():
-            raise ExperimentError(f"{folder}: is no folder; name one with -o")
+            raise ExperimentError(f"{folder}: is not a folder; name one with -o")
 
 
 @contextmanager
 def _client(address: str | None) -> Iterator[Any]:
-    """The cluster at that address, if there is to be one. Raises ExperimentError."""
+    """Yield the client of the cluster at an address, or None without one; raise ExperimentError."""
     from pbdkit.errors import ExperimentError
 
     if address is None:
@@ -83,29 +89,29 @@ def _client(address: str | None) -> Iterator[Any]:
     except ImportError:
         what = "--dask needs dask.distributed: pip install 'pbdkit[sweep]'"
         raise ExperimentError(what) from None
-    # Its notes on lost connections, with tracebacks, would stand between those of the program.
+    # Its log messages about lost connections, with tracebacks, would hide those of the program.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         client = connect(address, timeout=CONNECT_S)
     except (OSError, ValueError, ImportError) as error:
-        raise ExperimentError(f"--dask {address}: no scheduler answers: {error}") from None
+        raise ExperimentError(f"--dask {address}: no scheduler responds: {error}") from None
     with client:
         yield client
 
 
-def _told(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
-    """Says how it went; the exit status."""
+def _report_end(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
+    """Print the outcome of the sweep, and return the exit status."""
     count, missing = len(summary.members), len(summary.members) - len(summary.ends)
     failures = summary.failures
     if summary.path is None:
-        what = f"interrupted: {count - missing} of {count} members are finished, in {folder}"
-        what = what if count else "interrupted while members were validated; none was run"
-        click.echo(f"pbdkit: {what}; the same command goes on with the others", err=True)
+        text = f"interrupted: {count - missing} of {count} members are finished, in {folder}"
+        text = text if count else "interrupted while members were validated; none was run"
+        click.echo(f"pbdkit: {text}; the same command runs the others", err=True)
         return stop.exit_status
     if not quiet:
-        held = count - summary.run
-        before = f" ({summary.run} run now, {held} held before)" if held else ""
-        click.echo(f"{count - len(failures)} of {count} members complete{before}: {summary.path}")
+        stored = count - summary.run
+        remark = f" ({summary.run} run now, {stored} before)" if stored else ""
+        click.echo(f"{count - len(failures)} of {count} members complete{remark}: {summary.path}")
     if failures:
         _show(summary)
     return 5 if failures else 0
@@ -120,25 +126,29 @@ def _show(summary: Summary) -> None:
 
     failures = summary.failures
     table = Table("member", "status", "message", title=f"{len(failures)} members have no values")
-    for member, status, message in failures[:SHOWN]:
+    for member, status, message in failures[:MAX_LISTED]:
         table.add_row(*map(Text, (member.words, status, message.splitlines()[0])))
     width = None if sys.stderr.isatty() else UNLIMITED
     Console(stderr=True, width=width, highlight=False).print(table)
-    if len(failures) > SHOWN:
-        more = f"and {len(failures) - SHOWN} more: `status` and `message` in {summary.path}"
-        click.echo(more, err=True)
+    if len(failures) > MAX_LISTED:
+        rest = f"and {len(failures) - MAX_LISTED} more: `status` and `message` in {summary.path}"
+        click.echo(rest, err=True)
 
 
 @click.command()
 @click.argument("file", metavar="FIT")
-@click.option("-o", "--output", type=PATH, help="JSON; else the name of FIT with .json.")
-@click.option("--plot", "picture", type=PATH, help="PNG, SVG or PDF: measured, fitted, left.")
+@click.option("-o", "--output", type=PATH, help="JSON file; default the name of FIT with .json.")
+@click.option(
+    "--plot",
+    "picture",
+    type=PATH,
+    help="Picture (PNG, SVG or PDF): measurement, fit and residuals.",
+)
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @outside_option
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet: bool) -> None:
-    """Find the parameters that fit a measured field best, or the strengths of repeated tests, with
-    their errors."""
+    """Fit parameters to measured fields, or strengths to repeated tests, with their errors."""
     import pbdkit
     from pbdkit.cli.options import refuse_output, refuse_unwritable, save, waiting
     from pbdkit.fitting.strength import is_strength_fit
@@ -153,18 +163,18 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
     if picture and repeats:
         raise pbdkit.ExperimentError("a strength fit has no picture; leave --plot out")
     with waiting(f"fitting {file}", silent=quiet):
-        found = pbdkit.fit_strength(file) if repeats else pbdkit.fit(file)
-    write(path, json.dumps(found.as_dict(), indent=2) + "\n", replace=force)
+        result = pbdkit.fit_strength(file) if repeats else pbdkit.fit(file)
+    write(path, json.dumps(result.as_dict(), indent=2) + "\n", replace=force)
     if not quiet:
-        for line in found.lines():
+        for line in result.lines():
             click.echo(line)
         click.echo(f"{path} written")
     if picture:
         from pbdkit.fitting.result import Fitted
         from pbdkit.plotting.fit import draw_fit
 
-        assert isinstance(found, Fitted)
-        save(picture, draw_fit(found), replace=force, quiet=quiet)
+        assert isinstance(result, Fitted)
+        save(picture, draw_fit(result), replace=force, quiet=quiet)
 
 
 START = "start"
@@ -181,8 +191,8 @@ def experiments(name: str | None) -> None:
         click.echo(shipped_text(name), nl=False)
         return
     width = max(map(len, names := shipped_names()))
-    for each in names:
-        click.echo(f"{each:<{width}}  {shipped_title(each)}")
+    for shipped in names:
+        click.echo(f"{shipped:<{width}}  {shipped_title(shipped)}")
 
 
 @click.command()
@@ -192,12 +202,13 @@ def experiments(name: str | None) -> None:
     "origin",
     metavar="NAME",
     shell_complete=completed_by("shipped"),
-    help="Copy this shipped experiment with its data files, e.g. paper/f1.",
+    help="Shipped experiment to copy with its data files, e.g. paper/f1.",
 )
 def init(file: Path | None, origin: str | None) -> None:
     """Write an experiment to start from: a commented one, or a copy of a shipped one.
 
-    FILE is experiment.yaml by default, or with --from the last part of NAME with .yaml."""
+    FILE is experiment.yaml by default, or with --from the last part of NAME with .yaml.
+    """
     from pbdkit.errors import ExperimentError
     from pbdkit.io.atomic_file import write_together
     from pbdkit.model.shipped import SUFFIX, shipped_data, shipped_names, shipped_text
@@ -208,33 +219,34 @@ def init(file: Path | None, origin: str | None) -> None:
     )
     if origin is None and str(path) in shipped_names():
         copy = f"`pbdkit init {path.name}{SUFFIX} --from {path}` copies it"
-        raise ExperimentError(f"{path}: is a shipped experiment, no file to be written; {copy}")
+        raise ExperimentError(f"{path}: is the name of a shipped experiment, not a file; {copy}")
     data = shipped_data(origin) if origin else []
     files = {path.with_name(d.name): d.read_bytes() for d in data} | {path: text.encode()}
-    for each in files:
-        if os.path.lexists(each):
-            raise ExperimentError(f"{each}: exists and is left as it is; name another file")
+    for target in files:
+        if os.path.lexists(target):
+            raise ExperimentError(f"{target}: exists and is not changed; name another file")
     write_together(files)
-    beside = f" with {', '.join(d.name for d in data)}" if data else ""
-    click.echo(f"{path} written{beside}; next: pbdkit check {path}, then pbdkit run {path}")
+    remark = f" with {', '.join(d.name for d in data)}" if data else ""
+    click.echo(f"{path} written{remark}; next: pbdkit check {path}, then pbdkit run {path}")
 
 
 @click.command()
 @click.argument(
     "what", type=click.Choice(["experiment", "dataset", "sweep", "fit"]), default="experiment"
 )
-@click.option("--builtin", is_flag=True, help="Leave third-party components out.")
+@click.option("--builtin", is_flag=True, help="Leave out third-party components.")
 def schema(what: str, builtin: bool) -> None:
-    """Print the JSON Schema of experiments, datasets, sweeps or fits, with what is installed."""
+    """Print the JSON Schema of experiments, datasets, sweeps or fits, with all installed
+    components."""
     from pbdkit.fitting.schema import fit_schema
     from pbdkit.io.layout import dataset_schema
     from pbdkit.model.schema import experiment_schema
     from pbdkit.plugin.registry import Registry
     from pbdkit.sweeps.specification import sweep_schema
 
-    if what in (of_files := {"sweep": sweep_schema, "fit": fit_schema}):
-        made = of_files[what]()
+    if what in (schemas := {"sweep": sweep_schema, "fit": fit_schema}):
+        result = schemas[what]()
     else:
-        make = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
-        made = make(Registry(), installed=not builtin)
-    click.echo(json.dumps(made, indent=2))
+        schema_of = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
+        result = schema_of(Registry(), installed=not builtin)
+    click.echo(json.dumps(result, indent=2))

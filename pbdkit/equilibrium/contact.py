@@ -61,19 +61,19 @@ class ContactSystem(System):
         self._method, self._watch = method, watch
         self._X = scene.raster.reference(operator.followers)
         self._led = scene.raster.reference(operator.leaders)
-        free = one_minus(operator.couplings_both.entries().matrix())
+        free = one_minus(operator.couplings_steady.entries().matrix())
         self._amplification = float(np.abs(free.diagonal()).max(initial=1.0))
         assert moves.contact
         there = state.u + moves.free(state, moment)
         self.held, turned = hold(moves.contact, scene, there, self._place, moment)
         self._matrix = matrix = _contacting(free, turned)
-        led = operator.couplings_led.entries()
+        led = operator.couplings_leader.entries()
         held = np.repeat(self.held[:, 0] != NO_FACE, scene.axes)
         self._on_outlines, self._spreads = held.copy(), dict[int, float]()
         size = float(np.abs(state.u).max())
         self._share_of_places = size / max(size, moves.contact.reach)
         held[led.rows[led.values != 0.0]] = True
-        held[operator.held] = True
+        held[operator.prescribed_unknowns] = True
         self._parts = self._split(matrix, held)
 
     def _split(self, matrix: Any, held: NDArray[np.bool_]) -> list[tuple[Indices, Subsystem]]:

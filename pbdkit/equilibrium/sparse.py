@@ -355,8 +355,8 @@ class MatrixSystem(System):
         self._led = scene.raster.reference(operator.leaders)
         self._place = scene.raster.place_of(operator.followers)
         self._guided = np.zeros((len(operator.followers), scene.axes), bool)
-        self._guided.ravel()[operator.held] = True
-        self._both = both = operator.couplings_both
+        self._guided.ravel()[operator.prescribed_unknowns] = True
+        self._both = both = operator.couplings_steady
         first = 1 if both.couples(0, 1) else 0
         self._blocks = [] if both.couples(first, 1 - first) else [self._block([first])]
         # One axis has a share in the invariants of the other, where it moves it.
@@ -478,10 +478,10 @@ class MatrixSystem(System):
     def _owed(self, state: State) -> Floats | None:
         """What followers have yet to get, (follower, axis), where the step looks back:
         before · (u(t-1) - u(t)), None elsewhere."""
-        if not self._operator.couplings_before.parts:
+        if not self._operator.couplings_previous.parts:
             return None
         u, previous = self._table(state.u), self._table(state.previous)
-        return self._operator.couplings_before.times((previous - u).astype(float))
+        return self._operator.couplings_previous.times((previous - u).astype(float))
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
         """By the operator."""
@@ -516,7 +516,7 @@ class MatrixSystem(System):
 
     def _following(self, first: int) -> DiagonalBlock:
         """The block of the other axis; it shares the solvers of the first where both are alike."""
-        other, led = 1 - first, self._operator.couplings_led
+        other, led = 1 - first, self._operator.couplings_leader
         coupled = self._both.couples(other, first)
         into = self._both.entries([other], [first]).matrix() if coupled else None
         if self._both.is_isotropic() and led.is_isotropic():
@@ -531,7 +531,7 @@ class MatrixSystem(System):
             matrix = matrix + self._damping * identity_like(matrix)
         largest = float(np.abs(matrix.diagonal()).max(initial=0.0))
         self._amplification = max(self._amplification, largest)
-        led = self._operator.couplings_led.entries(axes)
+        led = self._operator.couplings_leader.entries(axes)
         count, label = connected(matrix, strongly=False)
         guided, alone = self._guided[:, axes].ravel(), np.zeros(count, bool)
         # A component that leads stands alone: it goes with its particle, or is left out.
@@ -554,14 +554,14 @@ class MatrixSystem(System):
             coordinates = self._coordinates(axes, some)
             with suppress(np.linalg.LinAlgError):
                 return ConstrainedSubsystem(matrix, self._method, coordinates, self._watch)
-        before = self._operator.couplings_before
+        before = self._operator.couplings_previous
         back = _within(before.entries(axes).matrix(), some) if before.parts else None
         return SingularSubsystem(matrix, back, self._watch)
 
     def _is_fixed(self, axes: list[int], some: Indices) -> bool:
         """Whether what leads, led components and leaders beside these unknowns, leaves them no
         motion as a whole: along the axes and, of two, a turn."""
-        led = self._operator.couplings_led.entries(axes)
+        led = self._operator.couplings_leader.entries(axes)
         beside = np.isin(led.rows, some) & (led.values != 0.0)
         leaders, count = np.unique(led.columns[beside]), len(axes)
         own = some[self._guided[:, axes].ravel()[some]]

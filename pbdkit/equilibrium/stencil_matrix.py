@@ -281,12 +281,12 @@ class _Assembly:
     def _add(self, place: Indices, responses: list[Response]) -> bool:
         """Takes the stencils of one sublattice in; False where they do not fit."""
         moves, answers = responses[0], responses[-1]
-        own = np.zeros((len(answers.own), WINDOW, 2, 2))
-        own[:, OWN] = -answers.own
+        own = np.zeros((len(answers.centre), WINDOW, 2, 2))
+        own[:, OWN] = -answers.centre
         for slot, derivative in answers.neighbours.items():
             own[:, _number(primitive_step(self._scene, slot))] -= derivative
         relaxation = self._scene.experiment.stepping.relaxation
-        scale = np.matmul(answers.own, inverses(relaxation * moves.own))
+        scale = np.matmul(answers.centre, inverses(relaxation * moves.centre))
         shown = self._shown(place, answers, own)
         if shown is None:
             return False

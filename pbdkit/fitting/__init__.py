@@ -1,1 +1,1 @@
-"""Parameters from measurements: how a state changes with them, and which fit what was measured."""
+"""Fit parameters to measurements: sensitivities, observations, least squares and uncertainty."""

@@ -1,4 +1,4 @@
-"""A fit from its description to its answer."""
+"""Carry out a fit: from the fit file to its result."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from pbdkit.fitting.specification import Fit
 from pbdkit.fitting.uncertainty import (
     Candidate,
     Posed,
-    compared,
-    profiled,
+    compare_models,
+    profile_likelihood,
     refuse_no_sampler,
-    sampled,
+    sample_posterior,
 )
 from pbdkit.model.experiment import Experiment, given_classes
 from pbdkit.model.reading import with_value
@@ -29,30 +29,49 @@ from pbdkit.plugin.component import Component
 from pbdkit.stepping.state import Floats
 
 ComponentClasses = Iterable[type[Component]]
-GIVEN = "as given"
-"""What the experiment of the fit is called among candidates."""
+BASE_MODEL = "as given"
+"""Name of the fit's own experiment among the candidates."""
 INSET = 1e-6
-"""How far within bounds, as a share of their span, a number has to be one of the experiment's."""
+"""Distance from a bound, as a fraction of the interval, at which a number must be valid."""
 TINY = 1e-6
-"""The noise as a share of what was measured, until residuals tell it: all of them are larger.
-Below that share of it again they are rounding."""
+"""First noise as a fraction of the measured values, before it is estimated from the residuals.
+Residuals smaller than this fraction of it are rounding errors."""
 
 
 def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasses = ()) -> Fitted:
-    """Carries a fit out, on one thread; its `settings` may name these components. Raises
-    ExperimentError for what cannot be fitted."""
-    import scipy.linalg  # noqa: F401  # what is loaded later would work on all threads
+    """Fit the unknown parameters of an experiment, on one thread.
 
-    known = (*given_classes(experiment), *components)
+    Parameters
+    ----------
+    fit
+        The fit file.
+    experiment
+        Experiment with the unknown parameters.
+    components
+        Component classes that `settings` of the fit may name.
+
+    Returns
+    -------
+    Fitted
+        Estimates, standard errors and residuals.
+
+    Raises
+    ------
+    ExperimentError
+        If the parameters cannot be fitted.
+    """
+    import scipy.linalg  # noqa: F401  # libraries that are loaded later would use all threads
+
+    classes = (*given_classes(experiment), *components)
     try:
         with one_thread():
-            return _fitted(fit, experiment, known)
+            return _fit(fit, experiment, classes)
     except ExperimentError as error:
-        raise _placed(error, experiment) from None
+        raise _with_place(error, experiment) from None
 
 
-def _placed(error: ExperimentError, experiment: Experiment) -> ExperimentError:
-    """With the place in the fit file, or in its experiment."""
+def _with_place(error: ExperimentError, experiment: Experiment) -> ExperimentError:
+    """Add the place in the fit file, or in its experiment, to an error."""
     if error.located or not error.where:
         return error
     if error.where[0] not in Fit.model_fields:
@@ -61,61 +80,79 @@ def _placed(error: ExperimentError, experiment: Experiment) -> ExperimentError:
     return ExperimentError(f"{place}: {error}", error.where)
 
 
-def _fitted(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitted:
+def _fit(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitted:
     if fit.sampler:
         refuse_no_sampler()
-    problem, solution = _solved(problem_of(fit, experiment, components=components), fit)
+    problem, solution = _solve(problem_of(fit, experiment, components=components), fit)
     names = [*fit.unknown]
     profiles = {
-        path: profiled(problem, solution, names.index(path), fit.loss) for path in fit.profile
+        path: profile_likelihood(problem, solution, names.index(path), fit.loss)
+        for path in fit.profile
     }
-    sample = sampled(problem, solution, **dict(fit.sampler)) if fit.sampler else None
-    candidates = _compared(fit, experiment, Posed(GIVEN, problem, solution), components)
-    found = fitted(fit, problem, solution)
-    return replace(found, profiles=profiles, sample=sample, candidates=candidates)
+    sample = sample_posterior(problem, solution, **dict(fit.sampler)) if fit.sampler else None
+    candidates = _compare_candidates(
+        fit, experiment, Posed(BASE_MODEL, problem, solution), components
+    )
+    result = fitted(fit, problem, solution)
+    return replace(result, profiles=profiles, sample=sample, candidates=candidates)
 
 
-def _compared(
-    fit: Fit, experiment: Experiment, own: Posed, components: ComponentClasses
+def _compare_candidates(
+    fit: Fit, experiment: Experiment, base: Posed, components: ComponentClasses
 ) -> tuple[Candidate, ...]:
-    """The experiment as it is given, and all that the fit names."""
+    """Compare the experiment with the candidates of the fit."""
     if not fit.candidates:
         return ()
-    posed, noises = [own], [o.noise for o in own.problem.observations]
+    models, noises = [base], [observation.noise for observation in base.problem.observations]
     for name, rival in fit.candidates.items():
-        where = f"candidates.{name}.settings"
-        changed = _with_settings(experiment, rival.settings, fit, where, components)
+        place = f"candidates.{name}.settings"
+        changed = _with_settings(experiment, rival.settings, fit, place, components)
         try:
             problem = problem_of(fit, changed, rival.unknown, components)
         except ExperimentError as error:
-            hint = "" if rival.unknown else "; a candidate may name an `unknown` of its own"
+            hint = "" if rival.unknown else "; a candidate may have a separate `unknown`"
             raise ExperimentError(f"{error}{hint}", ("candidates", name)) from None
         pairs = zip(problem.observations, noises, strict=True)
-        problem = replace(problem, observations=tuple(o.with_noise(n) for o, n in pairs))
-        posed.append(Posed(name, problem, solved(problem, problem.start(), fit.loss)))
-    return compared(posed, fit.folds, fit.loss, seed=0)
+        problem = replace(
+            problem,
+            observations=tuple(observation.with_noise(noise) for observation, noise in pairs),
+        )
+        models.append(Posed(name, problem, solved(problem, problem.start(), fit.loss)))
+    return compare_models(models, fit.folds, fit.loss, seed=0)
 
 
 def problem_of(
     fit: Fit,
     experiment: Experiment,
-    asked: Mapping[str, tuple[float, float]] | None = None,
+    unknown_bounds: Mapping[str, tuple[float, float]] | None = None,
     components: ComponentClasses = (),
 ) -> Problem:
-    """The problem that a fit file poses, or that with something else unknown. Raises
-    ExperimentError."""
-    pairs = (asked or fit.unknown).items()
+    """Return the least-squares problem of a fit file.
+
+    Parameters
+    ----------
+    unknown_bounds
+        Bounds of unknown parameters by path; default: those of the fit.
+
+    Raises
+    ------
+    ExperimentError
+        If parameters or measurements do not suit the experiment.
+    """
+    pairs = (unknown_bounds or fit.unknown).items()
     unknowns = tuple(Unknown(Parameter(path), *bounds) for path, bounds in pairs)
     for unknown in unknowns:
         unknown.parameter.value_in(experiment)
         _refuse_beyond(unknown, experiment)
     observations = []
-    for measured in fit.measured:
-        settings = measured.settings
+    for measurement in fit.measured:
+        settings = measurement.settings
         changed = _with_settings(experiment, settings, fit, "measured.settings", components)
-        found = replace(measured.observation(changed, fit.modes), weight=measured.weight)
-        _refuse_too_few(found, len(unknowns))
-        observations.append(found)
+        observation = replace(
+            measurement.observation(changed, fit.modes), weight=measurement.weight
+        )
+        _refuse_too_few(observation, len(unknowns))
+        observations.append(observation)
     if fit.force and isinstance(observations[0], FieldObservation):
         groups = observations[0].scene.leading
         if fit.force.group >= len(groups):
@@ -130,7 +167,7 @@ def _with_settings(
     experiment: Experiment,
     settings: Mapping[str, Any],
     fit: Fit,
-    where: str,
+    place: str,
     components: ComponentClasses,
 ) -> Experiment:
     if not settings:
@@ -139,52 +176,56 @@ def _with_settings(
     if source.beside.folder is None:
         source.beside = fit.beside
     for path, value in settings.items():
-        source = with_value(source, path, value, f"{where}: {path}", Experiment.defaults())
+        source = with_value(source, path, value, f"{place}: {path}", Experiment.defaults())
     return Experiment.build(source, components)
 
 
 def _refuse_too_few(observation: Observation, unknowns: int) -> None:
     if len(observation.measured) < max(1, 2 * unknowns):
         raise ExperimentError(
-            f"{len(observation.measured)} numbers of what was measured lie within the body and the "
-            "run, and they are too few; columns x and y count in the experiment's lattice units",
+            f"only {len(observation.measured)} measured numbers lie within the body and the run, "
+            "which is too few; columns x and y must be in the experiment's lattice units",
             ("measured", "file"),
         )
 
 
 def _refuse_beyond(unknown: Unknown, experiment: Experiment) -> None:
     for end in (unknown.low, unknown.high):
-        inside = end + INSET * (unknown.low + unknown.high - 2.0 * end)
+        value = end + INSET * (unknown.low + unknown.high - 2.0 * end)
         try:
-            unknown.parameter.put(experiment, inside)
+            unknown.parameter.put(experiment, value)
         except ExperimentError as error:
             path = unknown.parameter.path
-            text = f"bounds go beyond what the experiment allows: {error}"
+            text = f"a bound is not valid in the experiment: {error}"
             raise ExperimentError(text, ("unknown", path)) from None
 
 
 def _refuse_underdetermined(problem: Problem) -> None:
-    count = sum(len(o.measured) for o in problem.observations)
+    count = sum(len(observation.measured) for observation in problem.observations)
     if count < problem.size:
-        own = problem.size - problem.shared
+        separate = problem.size - problem.shared
         raise ExperimentError(
-            f"{count} numbers of what was measured cannot tell {problem.size} unknowns, {own} of "
-            "which are `modes` of boundaries and terms of `distortion`; take fewer of these",
+            f"{count} measured numbers cannot determine {problem.size} unknowns, {separate} of "
+            "which are `modes` of boundaries and terms of `distortion`; use fewer of these",
             ("measured", "file"),
         )
 
 
-def _solved(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
-    """By the noise that residuals have, where none is given."""
+def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
+    """Solve the problem; the noise is estimated from the residuals if it is not given."""
     if fit.measured[0].noise is not None:
         return problem, solved(problem, problem.start(), fit.loss)
-    (only,) = problem.observations
-    problem = replace(problem, observations=(only.with_noise(TINY * _size(only.measured)),))
+    (observation,) = problem.observations
+    problem = replace(
+        problem, observations=(observation.with_noise(TINY * _size(observation.measured)),)
+    )
     solution = solved(problem, problem.start())
-    for _ in range(1 if fit.loss == "linear" else 2):  # a loss tells outliers by the noise
-        (only,) = problem.observations
-        ratio = max(solution.ratio / np.sqrt(only.weight), TINY)
-        problem = replace(problem, observations=(only.with_noise(ratio * only.noise),))
+    for _ in range(1 if fit.loss == "linear" else 2):  # a loss identifies outliers by the noise
+        (observation,) = problem.observations
+        ratio = max(solution.ratio / np.sqrt(observation.weight), TINY)
+        problem = replace(
+            problem, observations=(observation.with_noise(ratio * observation.noise),)
+        )
         solution = solved(problem, solution.z, fit.loss)
     return problem, solution
 

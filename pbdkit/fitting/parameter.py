@@ -1,4 +1,4 @@
-"""A number of an experiment that can be changed: by its path, as `--set` names it."""
+"""A number of an experiment that can be changed, by its path as in `--set`."""
 
 from __future__ import annotations
 
@@ -18,75 +18,104 @@ from pbdkit.plugin.fields import ByRegion, TakesFields
 
 Floats = NDArray[np.floating[Any]]
 ORDER_4 = (2 / 3, -1 / 12)
+"""Weights of central differences of order 4, over 1 and 2 steps (Fornberg)."""
 WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
-"""Of central differences of order 8, over 1, 2, 3 and 4 steps to both sides (Fornberg); of order 4
-over 1 and 2."""
-STEP, FARTHER, LEAST = 2e-3, 1e-2, 1e-7
-"""The step as a share of a value, or of 1 where that is smaller than a tenth; that of parts that
-may decide who is there, which shows farther out; no smaller one is taken where a bound is near."""
-SMOOTH, ROUGH = 1e-5, 1e-8
-"""Where order 2 is off by this share of order 4, that is off by about its square; from what
-accuracy on order 2 serves, by a step of a quarter of its root."""
+"""Weights of central differences of order 8, over 1, 2, 3 and 4 steps (Fornberg)."""
+STEP = 2e-3
+"""Step of differences as a fraction of the value, or of 0.1 if the value is smaller."""
+
+LARGE_STEP = 1e-2
+"""The same for parts of the experiment that may change the particles, where errors are larger."""
+
+MIN_STEP = 1e-7
+"""The smallest such fraction, which is used near a bound."""
+SMOOTH = 1e-5
+"""Relative difference of orders 2 and 4 up to which order 4 is exact to about its square."""
+
+ROUGH = 1e-8
+"""Relative accuracy from which on order 2 suffices, with a step of a quarter of its root."""
 PARTS = ("rule", "fracture")
-"""What alone changes where one of their parameters does."""
-ALONE = ("leaders", "loads")
-"""What alone changes too, once the whole experiment is found valid."""
+"""Parts of an experiment that are replaced without any other change."""
+SEPARATE_PARTS = ("leaders", "loads")
+"""Parts that are replaced without any other change, after the experiment has been validated."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an experiment, by a dotted path: `rule.poisson_ratio`, `loads.0.force.1`,
-    `rule.stiffness.inclusion` of a field by region."""
+    """One number of an experiment.
+
+    Parameters
+    ----------
+    path
+        Dotted path: `rule.poisson_ratio`, `loads.0.force.1`, `rule.stiffness.inclusion` of a field
+        by region.
+    """
 
     path: str
 
     def value_in(self, experiment: Experiment) -> float:
-        """The number. Raises ExperimentError where there is none."""
+        """Return the number.
+
+        Raises
+        ------
+        ExperimentError
+            If there is no number at the path.
+        """
         words = self.path.split(".")
-        # Leaders may have thousands of numbers.
-        found: Any = experiment.model_dump(
+        # Leaders may have thousands of numbers, which are left out if possible.
+        value: Any = experiment.model_dump(
             mode="json", by_alias=True, exclude={"leaders"} - {*words}
         )
         for word in words:
             try:
-                found = found[int(word) if isinstance(found, list) else word]
+                value = value[int(word) if isinstance(value, list) else word]
             except (KeyError, IndexError, ValueError, TypeError):
-                hint = did_you_mean(word, found) if isinstance(found, dict) else ""
+                hint = did_you_mean(word, value) if isinstance(value, dict) else ""
                 raise ExperimentError(
-                    f"'{self.path}' is no number of the experiment: there is no '{word}'{hint}"
+                    f"'{self.path}' is not a number of the experiment: there is no '{word}'{hint}"
                 ) from None
-        if isinstance(found, bool) or not isinstance(found, (int, float)):
-            raise ExperimentError(f"'{self.path}' is no number of the experiment")
-        return float(found)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ExperimentError(f"'{self.path}' is not a number of the experiment")
+        return float(value)
 
     def put(self, experiment: Experiment, value: float) -> Experiment:
-        """The experiment with another number there. Raises ExperimentError."""
+        """Return the experiment with another number.
+
+        Raises
+        ------
+        ExperimentError
+            If the number is invalid.
+        """
         part, _, rest = self.path.partition(".")
         name, _, region = rest.partition(".")
         component = getattr(experiment, part) if part in PARTS else None
         if isinstance(component, TakesFields):
             field = component.varying.get(name)
-            new: Any = None
+            field_value: Any = None
             if not region and name in component.numbers():
-                new = value
+                field_value = value
             elif region and isinstance(field, ByRegion):
-                new = {**field.written(), region: value}
-            if new is not None:
-                changed = self._changed(component, name, new, value)
+                field_value = {**field.written(), region: value}
+            if field_value is not None:
+                changed = self._changed(component, name, field_value, value)
                 return experiment.model_copy(update={part: changed})
         source = experiment.as_written()
         label = f"{self.path} = {value:.6g}"
         source = with_value(source, self.path, value, label, Experiment.defaults())
-        found = Experiment.build(source, given_classes(experiment))
-        alone = part in ALONE
-        return experiment.model_copy(update={part: getattr(found, part)}) if alone else found
+        changed_experiment = Experiment.build(source, given_classes(experiment))
+        is_separate = part in SEPARATE_PARTS
+        return (
+            experiment.model_copy(update={part: getattr(changed_experiment, part)})
+            if is_separate
+            else changed_experiment
+        )
 
-    def _changed(self, component: TakesFields, name: str, new: Any, value: float) -> Any:
+    def _changed(self, component: TakesFields, name: str, field_value: Any, value: float) -> Any:
         try:
-            return component.with_more(**{name: new})
+            return component.with_more(**{name: field_value})
         except ValidationError as error:
-            told = error.errors()[0]["msg"]
-            raise ExperimentError(f"{self.path} = {value:.6g}: {told}") from None
+            text = error.errors()[0]["msg"]
+            raise ExperimentError(f"{self.path} = {value:.6g}: {text}") from None
 
     def derivative(
         self,
@@ -94,32 +123,51 @@ class Parameter:
         function: Callable[[Experiment], Any],
         accuracy: float = 0.0,
     ) -> Any:
-        """d function / d parameter at an experiment, of an array: by central differences of order 4
-        where these are exact to some 1e-10, else of order 8; of order 2 where an accuracy of some
-        1e-7, as a share, is enough.
+        """Differentiate a function with respect to the parameter, by central differences.
 
-        Raises ExperimentError where the number stands on its bound.
+        Parameters
+        ----------
+        experiment
+            Experiment at which the derivative is taken.
+        function
+            Function of an experiment that returns an array.
+        accuracy
+            Relative accuracy that suffices.
+
+        Notes
+        -----
+        Order 4 is used if it is exact to some 1e-10, else order 8; order 2 if an accuracy of some
+        1e-7 suffices.
+
+        Raises
+        ------
+        ExperimentError
+            If the number is at a bound.
         """
         value = self.value_in(experiment)
         part, _, _ = self.path.partition(".")
-        among = part in (*PARTS, *ALONE)
-        if among and accuracy >= ROUGH:
+        is_separate = part in (*PARTS, *SEPARATE_PARTS)
+        if is_separate and accuracy >= ROUGH:
             step, ((above, below),) = self._ends(experiment, value, math.sqrt(accuracy) / 4.0, 1)
             return (function(above) - function(below)) / (2.0 * step)
-        step, ends = self._ends(experiment, value, STEP if among else FARTHER, len(WEIGHTS))
+        step, ends = self._ends(
+            experiment, value, STEP if is_separate else LARGE_STEP, len(WEIGHTS)
+        )
         changes = [function(above) - function(below) for above, below in ends[: len(ORDER_4)]]
-        found = sum(weight / step * change for weight, change in zip(ORDER_4, changes, strict=True))
-        off = np.abs(found - changes[0] / (2.0 * step)).max(initial=0.0)
-        if among and off <= SMOOTH * np.abs(found).max(initial=0.0):
-            return found
+        result = sum(
+            weight / step * change for weight, change in zip(ORDER_4, changes, strict=True)
+        )
+        error = np.abs(result - changes[0] / (2.0 * step)).max(initial=0.0)
+        if is_separate and error <= SMOOTH * np.abs(result).max(initial=0.0):
+            return result
         changes += [function(above) - function(below) for above, below in ends[len(ORDER_4) :]]
         return sum(weight / step * change for weight, change in zip(WEIGHTS, changes, strict=True))
 
     def _ends(
-        self, experiment: Experiment, value: float, share: float, pairs: int
+        self, experiment: Experiment, value: float, fraction: float, pairs: int
     ) -> tuple[float, list[tuple[Experiment, Experiment]]]:
-        """The step, and the experiments with 1, 2, … more and fewer of it."""
-        step = share * max(abs(value), 0.1)
+        """Return the step, and the experiments with 1, 2, … steps more and less."""
+        step = fraction * max(abs(value), 0.1)
         while True:
             try:
                 return step, [
@@ -128,8 +176,8 @@ class Parameter:
                 ]
             except ExperimentError:
                 step /= 10.0
-                if step < LEAST * max(abs(value), 0.1):
+                if step < MIN_STEP * max(abs(value), 0.1):
                     raise ExperimentError(
-                        f"{self.path}: {value:.6g} stands on its bound, so that it cannot be "
-                        "changed both ways; take a number inside"
+                        f"{self.path}: {value:.6g} is at its bound, so that it cannot be changed "
+                        "in both directions; choose a number inside"
                     ) from None

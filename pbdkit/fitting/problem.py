@@ -1,10 +1,10 @@
-"""The least-squares problem of a fit: residuals divided by their noise, their derivatives, a start,
-and the iteration with what the data determine.
+"""Least-squares problem of a fit: residuals divided by their noise, their derivatives, an initial
+guess, and a Gauss-Newton iteration restricted to what the data determine.
 
-The start minimises the equilibrium gap: measured displacements, put on the particles, would not
-move under the right rule, m(u, θ) = 0 where all neighbours are known. m is nearly linear in θ, so
-that a few linear problems find θ without one equilibrium (Claire, Hild, Roux 2004). Noise biases
-that estimate, wide bounds do not: the middle of wide bounds is far off.
+The initial guess minimises the equilibrium gap: measured displacements at the particles would be in
+equilibrium for the right parameters, m(u, θ) = 0 where all neighbours are known. Since m is nearly
+linear in θ, a few linear problems give θ without an equilibrium (Claire, Hild, Roux 2004). The
+guess is biased by noise, but independent of the bounds, whose middle may be far from the solution.
 """
 
 from __future__ import annotations
@@ -20,26 +20,38 @@ from numpy.typing import NDArray
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.equilibrium.system import Moves
 from pbdkit.errors import ExperimentError
-from pbdkit.fitting.observations import FieldObservation, Near, Observation, Prediction
+from pbdkit.fitting.observations import FieldObservation, NearbyPrediction, Observation, Prediction
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.model.experiment import Experiment
 from pbdkit.stepping.state import Floats, initial_state
 
-TURNS, INSET = 3, 1e-3
-"""Linear problems; the share of the way between bounds by which a start keeps away from them."""
-PLANE, NEAREST, FAR = 3, 12, 2.0
-"""How few points tell a plane, and how many it goes through; farther than so many times their
-spacing none is known."""
+GAP_ITERATIONS = 3
+"""Number of linear problems for the initial guess."""
+
+INSET = 1e-3
+"""Distance of the guess from the bounds, relative to the interval."""
+MIN_POINTS = 3
+"""Number of points that determine a plane."""
+
+NEAREST = 12
+"""Number of points through which a plane is fitted."""
+
+FAR = 2.0
+"""Distance from the nearest point, relative to the spacing of points, beyond which displacements
+are unknown."""
 
 
 def least_gap(
     field: FieldObservation, parameters: Sequence[Parameter], low: Floats, high: Floats
 ) -> Floats:
-    """The parameters between bounds, (parameter,); their middle where too little is known."""
+    """Return the parameters between bounds that minimise the equilibrium gap, (parameter,).
+
+    The middle of the bounds is returned if too few displacements are known.
+    """
     middle, inset = (low + high) / 2.0, INSET * (high - low)
     values = middle
-    if len(field.evidence.points) < PLANE:
+    if len(field.evidence.points) < MIN_POINTS:
         return middle
     state = initial_state(field.scene)
     u = _on_particles(field)
@@ -47,20 +59,20 @@ def least_gap(
     def moves(experiment: Experiment) -> Floats:
         scene = scene_like(field.scene, experiment).at(experiment.steps)
         with np.errstate(invalid="ignore"):
-            found = Moves(scene, compiles=False).at(replace(state, u=u.copy()), experiment.steps)
-        return np.asarray(found)
+            moves_at = Moves(scene, compiles=False).at(replace(state, u=u.copy()), experiment.steps)
+        return np.asarray(moves_at)
 
     try:
-        for _ in range(TURNS):
+        for _ in range(GAP_ITERATIONS):
             experiment = field.experiment
             for parameter, value in zip(parameters, values, strict=True):
                 experiment = parameter.put(experiment, float(value))
             gap = moves(experiment)
-            known = np.isfinite(gap)
-            if known.sum() < 2 * len(values):
+            is_known = np.isfinite(gap)
+            if is_known.sum() < 2 * len(values):
                 return middle
-            slopes = [p.derivative(experiment, moves)[known] for p in parameters]
-            step, *_ = np.linalg.lstsq(np.stack(slopes, axis=1), -gap[known], rcond=1e-9)
+            slopes = [parameter.derivative(experiment, moves)[is_known] for parameter in parameters]
+            step, *_ = np.linalg.lstsq(np.stack(slopes, axis=1), -gap[is_known], rcond=1e-9)
             values = np.clip(values + step, low + inset, high - inset)
     except ExperimentError:
         return middle
@@ -68,38 +80,40 @@ def least_gap(
 
 
 def _on_particles(field: FieldObservation) -> Floats:
-    """What was measured as planes: at each particle, by a plane through the nearest points. NaN
-    where there are none near."""
+    """Interpolate measured displacements at the particles by planes through the nearest points.
+
+    They are NaN where no point is near.
+    """
     from scipy.spatial import KDTree
 
     scene, raster = field.scene, field.scene.raster
-    rows, at = raster.body_rows, field.evidence.points
+    rows, points = raster.body_rows, field.evidence.points
     places, measured = raster.reference(rows), field.measured.reshape(2, -1).T
-    tree = KDTree(at)
-    between, _ = tree.query(at, 2)
-    distance, near = tree.query(places, min(NEAREST, len(at)))
-    ways = at[near] - places[:, None]
-    basis = np.concatenate([np.ones((*near.shape, 1)), ways], axis=2)
+    tree = KDTree(points)
+    spacing, _ = tree.query(points, 2)
+    distance, nearest = tree.query(places, min(NEAREST, len(points)))
+    offsets = points[nearest] - places[:, None]
+    basis = np.concatenate([np.ones((*nearest.shape, 1)), offsets], axis=2)
     products = np.einsum("pki,pkj->pij", basis, basis)
     products += 1e-9 * np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    right = np.einsum("pki,pka->pia", basis, measured[near])
-    known = np.linalg.solve(products, right)[:, 0]
-    known[distance[:, 0] > FAR * np.median(between[:, 1])] = np.nan
+    projections = np.einsum("pki,pka->pia", basis, measured[nearest])
+    values = np.linalg.solve(products, projections)[:, 0]
+    values[distance[:, 0] > FAR * np.median(spacing[:, 1])] = np.nan
     u = np.full((scene.axes, *raster.shape), np.nan)
     flat = u.reshape(scene.axes, -1)
-    flat[:, raster.place_of(rows)] = known.T
+    flat[:, raster.place_of(rows)] = values.T
     if frame := scene.at(scene.experiment.steps).frame:
         frame.follow(flat, flat)
     return u
 
 
 WIDE = 10.0
-"""Bounds in such a ratio have a middle that says nothing."""
+"""Ratio of bounds above which the initial guess is not their middle."""
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter and the bounds between which it is looked for."""
+    """An unknown parameter and its bounds."""
 
     parameter: Parameter
     low: float
@@ -107,85 +121,117 @@ class Unknown:
 
     @property
     def span(self) -> float:
-        """From bound to bound."""
+        """Return the interval between the bounds."""
         return self.high - self.low
 
 
 @dataclass(frozen=True)
-class At:
-    """The problem at z: the residuals (measured - predicted) / weighted noise of all observations,
-    one after another, their derivatives (residual, unknown), and each observation by itself."""
+class Linearisation:
+    """The problem, linearised at z.
+
+    Parameters
+    ----------
+    z : (unknown,)
+        Values of the unknowns.
+    residuals : (residual,)
+        (measured - predicted) / weighted noise of all observations.
+    jacobian : (residual, unknown)
+        Derivatives of the predictions over the weighted noise.
+    predictions
+        Prediction of each observation.
+    """
 
     z: Floats
     residuals: Floats
     jacobian: Floats
-    seen: tuple[Prediction, ...]
+    predictions: tuple[Prediction, ...]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """z is the parameters, then Young's modulus where an observation needs it, then what each
-    observation has of its own."""
+    """Least-squares problem of a fit.
+
+    The unknowns z are the parameters, then Young's modulus if an observation needs it, then the own
+    unknowns of each observation.
+
+    Parameters
+    ----------
+    unknowns
+        Parameters and their bounds.
+    observations
+        Measurements.
+    """
 
     unknowns: tuple[Unknown, ...]
     observations: tuple[Observation, ...]
 
     @cached_property
     def with_modulus(self) -> bool:
-        """Whether Young's modulus is unknown too."""
-        return any(o.needs_modulus for o in self.observations)
+        """Return whether Young's modulus is unknown."""
+        return any(observation.needs_modulus for observation in self.observations)
 
     @cached_property
     def shared(self) -> int:
-        """How many unknowns are those of all observations."""
+        """Return the number of unknowns that all observations share."""
         return len(self.unknowns) + self.with_modulus
 
     @cached_property
     def size(self) -> int:
-        """Of z."""
-        return self.shared + sum(o.own for o in self.observations)
+        """Return the number of unknowns."""
+        return self.shared + sum(observation.own_unknowns for observation in self.observations)
 
     def rows(self) -> Iterator[tuple[Observation, slice]]:
-        """Each observation with its residuals among all."""
+        """Yield each observation with the slice of its residuals."""
         first = 0
         for observation in self.observations:
             yield observation, slice(first, first := first + len(observation.measured))
 
-    def owned(self) -> Iterator[tuple[Observation, slice]]:
-        """Each observation with what it owns of z."""
+    def own_slices(self) -> Iterator[tuple[Observation, slice]]:
+        """Yield each observation with the slice of its own unknowns."""
         first = self.shared
         for observation in self.observations:
-            yield observation, slice(first, first := first + observation.own)
+            yield observation, slice(first, first := first + observation.own_unknowns)
 
     def start(self) -> Floats:
-        """In the middle between bounds; where these are wide, with a field, where the gap to
-        equilibrium is least. Boundaries are as they were measured."""
+        """Return initial values.
+
+        Parameters are in the middle of their bounds, or minimise the equilibrium gap if bounds are
+        wide and a field is measured. Boundaries have their measured displacements.
+        """
         z, count = np.zeros(self.size), len(self.unknowns)
         low, high = (bound[:count] for bound in self.bounds())
         z[:count] = (low + high) / 2.0
-        fields = [o for o in self.observations if isinstance(o, FieldObservation)]
-        wide = (low > 0.0) & (high > WIDE * low)
-        if fields and wide.any():
+        fields = [item for item in self.observations if isinstance(item, FieldObservation)]
+        is_wide = (low > 0.0) & (high > WIDE * low)
+        if fields and is_wide.any():
             parameters = [u.parameter for u in self.unknowns]
-            found = least_gap(fields[0], parameters, low, high)
-            z[:count] = np.where(wide, found, z[:count])
-        for observation, own in self.owned():
-            z[own] = observation.start()
+            guess = least_gap(fields[0], parameters, low, high)
+            z[:count] = np.where(is_wide, guess, z[:count])
+        for observation, section in self.own_slices():
+            z[section] = observation.start()
         return self.with_best_modulus(z)
 
     def with_best_modulus(self, z: Floats) -> Floats:
-        """The same with the modulus that fits best there. Raises ExperimentError where the model
-        exerts no force."""
+        """Return z with the modulus that fits best.
+
+        Raises
+        ------
+        ExperimentError
+            If the model exerts no force.
+        """
         if not self.with_modulus:
             return z
-        terms = [o.modulus_terms(self.experiment_at(o, z)) for o in self.observations]
+        terms = [
+            observation.modulus_terms(self.experiment_at(observation, z))
+            for observation in self.observations
+        ]
         product, square = np.sum(terms, axis=0)
         if square == 0.0:
             raise ExperimentError("the group exerts no force in this experiment", ("measured",))
         if product < 0.0:
             raise ExperimentError(
-                "what was measured of the force has the other sign than in this experiment; turn "
-                "it, or name another `group` or `axis`",
+                "the measured force has the opposite sign of that in this experiment; change it, "
+                "or take another `group` or `axis`",
                 ("measured",),
             )
         z = z.copy()
@@ -193,235 +239,312 @@ class Problem:
         return z
 
     def bounds(self) -> tuple[Floats, Floats]:
-        """Of parameters; the others have none."""
+        """Return the bounds of the unknowns, infinite for all but parameters."""
         low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         for n, unknown in enumerate(self.unknowns):
             low[n], high[n] = unknown.low, unknown.high
         return low, high
 
     def experiment_at(self, observation: Observation, z: Floats) -> Experiment:
-        """The experiment of an observation with these parameters."""
-        found = observation.experiment
+        """Return the experiment of an observation with values of the parameters."""
+        experiment = observation.experiment
         for unknown, value in zip(self.unknowns, z, strict=False):
-            found = unknown.parameter.put(found, float(value))
-        return found
+            experiment = unknown.parameter.put(experiment, float(value))
+        return experiment
 
-    def at(self, z: Floats, near: At | None = None) -> At:
-        """All of it, sooner with what was found `near` there. Raises ExperimentError, and
-        UnconvergedError where nothing is predicted."""
+    def at(self, z: Floats, near: Linearisation | None = None) -> Linearisation:
+        """Linearise the problem at z.
+
+        Parameters
+        ----------
+        near
+            Linearisation at similar values, which accelerates the solution.
+
+        Raises
+        ------
+        ExperimentError
+            If an experiment is invalid.
+        UnconvergedError
+            If there is no prediction.
+        """
         parameters = [u.parameter for u in self.unknowns]
-        count = sum(len(o.measured) for o in self.observations)
-        jacobian, seen, residuals = np.zeros((count, self.size)), [], np.zeros(count)
+        count = sum(len(item.measured) for item in self.observations)
+        jacobian, predictions, residuals = np.zeros((count, self.size)), [], np.zeros(count)
         modulus = float(z[len(parameters)]) if self.with_modulus else 1.0
-        before = self._near(near, z) if near else [None] * len(self.observations)
-        each = zip(self.rows(), self.owned(), before, strict=True)
-        for (observation, rows), (_, own), seen_near in each:
+        guesses = self._near(near, z) if near else [None] * len(self.observations)
+        entries = zip(self.rows(), self.own_slices(), guesses, strict=True)
+        for (observation, rows), (_, section), guess in entries:
             experiment = self.experiment_at(observation, z)
-            found = observation.at(experiment, parameters, z[own], modulus, seen_near)
-            seen.append(found)
-            residuals[rows] = found.residuals
-            jacobian[rows, : len(parameters)] = found.by_parameter
-            jacobian[rows, own] = found.by_own
+            prediction = observation.at(experiment, parameters, z[section], modulus, guess)
+            predictions.append(prediction)
+            residuals[rows] = prediction.residuals
+            jacobian[rows, : len(parameters)] = prediction.by_parameter
+            jacobian[rows, section] = prediction.by_own
             if self.with_modulus:
-                jacobian[rows, len(parameters)] = found.by_modulus
-        return At(z, residuals, jacobian, tuple(seen))
+                jacobian[rows, len(parameters)] = prediction.by_modulus
+        return Linearisation(z, residuals, jacobian, tuple(predictions))
 
     def residuals(self, z: Floats) -> Floats:
-        """The residuals at z alone. Raises as `at` does."""
-        return np.concatenate([self.residuals_of(n, o, z) for n, o in enumerate(self.observations)])
+        """Return the residuals at z; it raises the errors of `at`."""
+        return np.concatenate(
+            [
+                self.residuals_of(n, observation, z)
+                for n, observation in enumerate(self.observations)
+            ]
+        )
 
     def residuals_of(self, n: int, part: Observation, z: Floats) -> Floats:
-        """Those of some rows of observation n."""
-        own = z[[*self.owned()][n][1]]
+        """Return the residuals of a part of observation n."""
+        own_values = z[[*self.own_slices()][n][1]]
         modulus = float(z[len(self.unknowns)]) if self.with_modulus else 1.0
-        return part.at(self.experiment_at(part, z), (), own, modulus).residuals
+        return part.at(self.experiment_at(part, z), (), own_values, modulus).residuals
 
-    def _near(self, at: At, z: Floats) -> list[Near]:
-        ways = [abs(z[n] - at.z[n]) / u.span for n, u in enumerate(self.unknowns)]
-        return [Near(seen, float(max(ways, default=0.0))) for seen in at.seen]
+    def _near(self, at: Linearisation, z: Floats) -> list[NearbyPrediction]:
+        distances = [abs(z[n] - at.z[n]) / u.span for n, u in enumerate(self.unknowns)]
+        return [
+            NearbyPrediction(prediction, float(max(distances, default=0.0)))
+            for prediction in at.predictions
+        ]
 
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 TELLS = 0.25
-"""A direction is told where its standard error is a smaller share of the way between bounds."""
+"""A direction is identifiable if its standard error is a smaller fraction of the interval between
+bounds."""
 PART = 0.3
-"""A parameter belongs to a direction that has more of it."""
+"""Component of a direction above which a parameter belongs to it."""
 AT_BOUND = 1e-6
-"""The share of the way between bounds by which a value stands on one."""
-MOST_TURNS, SMALLEST = 30, 1e-3
-"""Of Gauss and Newton; the smallest share of a step that is taken."""
-ENOUGH, SLACK = 0.25, 1e-9
-"""The share of the gain that is foretold which a step has to bring (Armijo), but for rounding."""
-MOST_WEIGHTINGS, STEADY, RANK = 100, 1e-6, 1e-5
-"""Of a linear problem with a loss; the change of residuals at which weights stay; the share of the
-largest singular value of columns of unit length below which one is none: derivatives are no more
-accurate."""
+"""Distance from a bound, relative to the interval, up to which a value is at the bound."""
+MAX_ITERATIONS = 30
+"""Maximum number of Gauss-Newton iterations."""
+
+MIN_STEP = 1e-3
+"""Minimum step length of the line search."""
+ARMIJO_C1 = 0.25
+"""Fraction of the predicted decrease of the cost that a step must achieve (Armijo)."""
+
+SLACK = 1e-9
+"""Relative increase of the cost that counts as rounding error."""
+MAX_REWEIGHTINGS = 100
+"""Maximum number of iteratively reweighted linear problems."""
+
+STEADY = 1e-6
+"""Change of residuals at which the weights have converged."""
+
+RANK = 1e-5
+"""Relative tolerance of singular values, for columns of unit length. It is that of derivatives."""
 INVOLVED = 1e-2
-"""An unknown has no part in a direction that is none where its column has less than that of it."""
-UNTOLD = 1e12
-"""The variance along such a direction."""
+"""Component of a null direction, relative to the largest, below which an unknown is not part of
+it."""
+NULL_VARIANCE = 1e12
+"""Variance along null directions."""
 MODULUS = "Young's modulus"
-SETTLED = 1e-2
-"""The share of its standard error by which no unknown would move any more."""
+"""Name of Young's modulus."""
+CONVERGED = 1e-2
+"""Largest step, in standard errors, of a converged fit."""
 SWING = 0.25
-"""A step that takes back more than such a share of the last one swings: less of it is taken."""
+"""Fraction of the last change that a step may revert; otherwise the next step is halved."""
 FROZEN = 1e-3
-"""What changes all residuals together by less of their noise, from bound to bound, stays."""
-LEAST_SLOPE = 0.05
-"""Of a loss on the mean; below it nearly all residuals are outliers."""
+"""Change of all residuals between the bounds, in units of their noise, below which an unknown is
+fixed."""
+MIN_SLOPE = 0.05
+"""Smallest mean slope ψ' of a loss; below it nearly all residuals are outliers."""
 OUTLIERS = 1.345
-"""Residuals beyond so many times their noise count less, where a loss says so (Huber)."""
+"""Residual, in units of the noise, above which a loss reduces its weight (Huber)."""
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Independent directions of z, (direction, unknown), in which each unknown counts in its
-    `scale`, (unknown,), and the variance along each, (direction,)."""
+    """Independent directions of z.
 
-    ways: Floats
+    Parameters
+    ----------
+    vectors : (direction, unknown)
+        Directions, in units of `scale`.
+    variance : (direction,)
+        Variance along each.
+    scale : (unknown,)
+        Scale of the unknowns.
+    """
+
+    vectors: Floats
     variance: Floats
     scale: Floats
 
     @property
     def covariance(self) -> Floats:
-        """Of z."""
-        return (self.ways.T * self.variance) @ self.ways * np.outer(self.scale, self.scale)
+        """Return the covariance of z."""
+        return (self.vectors.T * self.variance) @ self.vectors * np.outer(self.scale, self.scale)
 
     @property
-    def are_none(self) -> NDArray[np.bool_]:
-        """The directions along which nothing changes, (direction,)."""
-        return self.variance >= UNTOLD
+    def is_null(self) -> NDArray[np.bool_]:
+        """Return which directions do not change the residuals, (direction,)."""
+        return self.variance >= NULL_VARIANCE
 
     @property
     def unsure(self) -> NDArray[np.bool_]:
-        """The unknowns of which each direction tells too little, (direction, unknown)."""
-        share = np.abs(self.ways)
-        moved = share * np.sqrt(self.variance)[:, None] > TELLS
-        few = (self.variance > TELLS**2)[:, None]
-        return np.where(self.are_none[:, None], share > 0.0, few & (moved | (share > PART)))
+        """Return which unknowns a direction determines insufficiently, (direction, unknown)."""
+        components = np.abs(self.vectors)
+        is_large = components * np.sqrt(self.variance)[:, None] > TELLS
+        is_uncertain = (self.variance > TELLS**2)[:, None]
+        return np.where(
+            self.is_null[:, None], components > 0.0, is_uncertain & (is_large | (components > PART))
+        )
 
     def errors(self, step: Floats) -> Floats:
-        """A step along each direction, in standard errors; 0 where nothing changes."""
-        along = (self.ways @ (step / self.scale)) / np.sqrt(self.variance)
-        return np.where(self.are_none, 0.0, along)
+        """Return a step along each direction in standard errors; 0 along null directions."""
+        along = (self.vectors @ (step / self.scale)) / np.sqrt(self.variance)
+        return np.where(self.is_null, 0.0, along)
 
     def error_of(self, gradient: Floats) -> float:
-        """The standard error of a number with that gradient by z, which is the same along
-        directions in which nothing changes."""
-        along = self.ways @ (gradient * self.scale)
-        return float(np.sqrt(np.square(along[~self.are_none]) @ self.variance[~self.are_none]))
+        """Return the standard error of a number with a gradient by z, without null directions."""
+        along = self.vectors @ (gradient * self.scale)
+        return float(np.sqrt(np.square(along[~self.is_null]) @ self.variance[~self.is_null]))
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The best z with the problem there, how well it is known, how much larger residuals are than
-    their noise, and by name the parameters that the data cannot tell, and those on their bounds."""
+    """Solution of a fit.
+
+    Parameters
+    ----------
+    z : (unknown,)
+        Best values.
+    at
+        Linearisation there.
+    directions
+        Directions with their variance.
+    ratio
+        Standard deviation of the residuals over their noise.
+    unidentified, on_bounds
+        Paths of parameters that are not identifiable, and of those at their bounds.
+    evaluations
+        Number of linearisations.
+    """
 
     z: Floats
-    at: At
+    at: Linearisation
     directions: Directions
     ratio: float
-    untold: tuple[str, ...]
+    unidentified: tuple[str, ...]
     on_bounds: tuple[str, ...]
     evaluations: int
 
     @cached_property
     def covariance(self) -> Floats:
-        """Of z."""
+        """Return the covariance of z."""
         return self.directions.covariance
 
     @property
     def errors(self) -> Floats:
-        """The standard error of each z."""
+        """Return the standard errors of z."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
-    """By Gauss and Newton with exact derivatives: the problem as it is linear at z is solved
-    between bounds, with its loss, until z stays where it is along all directions that the data
-    tell; along others it stays where it began.
+    """Solve the problem by Gauss-Newton iterations with exact derivatives.
 
-    The covariance is (JᵀJ)⁻¹, times the square of the ratio where residuals are larger than their
-    noise says (Birge), or with a loss that of M-estimators (Huber). Raises UnconvergedError.
+    The linearised problem is solved between bounds, with its loss, until z converges along all
+    identifiable directions. Along others z keeps its initial values.
+
+    Parameters
+    ----------
+    start : (unknown,)
+        Initial values.
+    loss
+        Loss function.
+
+    Raises
+    ------
+    UnconvergedError
+        If the iteration does not converge.
+
+    Notes
+    -----
+    The covariance is (JᵀJ)⁻¹. It is multiplied by the square of the ratio if residuals are larger
+    than their noise (Birge). With a loss it is that of M-estimators (Huber).
     """
     low, high = problem.bounds()
     z = np.clip(start, low, high)
-    at, count, share = problem.at(z), 1, 1.0
-    before = np.zeros(len(at.residuals))
-    for _ in range(MOST_TURNS):
+    at, count, length = problem.at(z), 1, 1.0
+    last_change = np.zeros(len(at.residuals))
+    for _ in range(MAX_ITERATIONS):
         step = _linear_step(at, low - z, high - z, loss)
-        directions, untold = _known(problem, at, loss)
+        directions, unidentified = _identify_directions(problem, at, loss)
         ratio = spread_of(at.residuals, problem.size, loss)
-        if (np.abs(directions.errors(step)) <= SETTLED).all():
+        if (np.abs(directions.errors(step)) <= CONVERGED).all():
             break
         change = at.jacobian @ step
-        swings = change @ before < -SWING * (before @ before)
-        share = share / 2.0 if swings else min(1.0, 2.0 * share)
-        share, at, tried = _taken(problem, at, z, step, share, loss)
-        z, before, count = z + share * step, share * change, count + tried
+        is_reversed = change @ last_change < -SWING * (last_change @ last_change)
+        length = length / 2.0 if is_reversed else min(1.0, 2.0 * length)
+        length, at, trials = _line_search(problem, at, z, step, length, loss)
+        z, last_change, count = z + length * step, length * change, count + trials
     else:
-        raise UnconvergedError(f"the fit still moves after {MOST_TURNS} turns")
-    return Solution(z, at, directions, ratio, untold, _on_bounds(problem, z), count)
+        raise UnconvergedError(f"the fit has not converged after {MAX_ITERATIONS} iterations")
+    return Solution(z, at, directions, ratio, unidentified, _on_bounds(problem, z), count)
 
 
-def _taken(
-    problem: Problem, at: At, z: Floats, step: Floats, share: float, loss: Loss
-) -> tuple[float, At, int]:
-    """The share of a step that is taken, the problem there, and how often it was looked at."""
+def _line_search(
+    problem: Problem, at: Linearisation, z: Floats, step: Floats, length: float, loss: Loss
+) -> tuple[float, Linearisation, int]:
+    """Return the step length that reduces the cost sufficiently, the linearisation there, and the
+    number of trials."""
     cost = cost_of(at.residuals, loss)
     gain = cost - cost_of(at.residuals - at.jacobian @ step, loss)
     count = 0
-    while share >= SMALLEST:
-        there, count = _at(problem, z + share * step, at, share), count + 1
-        most = cost * (1.0 + SLACK) - ENOUGH * share * gain
-        if there is not None and cost_of(there.residuals, loss) <= most:
-            return share, there, count
-        share /= 4.0
-    raise UnconvergedError("the fit finds no way to fit better, and none to stay")
+    while length >= MIN_STEP:
+        trial, count = _at(problem, z + length * step, at, length), count + 1
+        bound = cost * (1.0 + SLACK) - ARMIJO_C1 * length * gain
+        if trial is not None and cost_of(trial.residuals, loss) <= bound:
+            return length, trial, count
+        length /= 4.0
+    raise UnconvergedError(
+        "line search failed: no step reduces the cost; narrow the bounds, or start closer"
+    )
 
 
-def _at(problem: Problem, z: Floats, near: At, share: float) -> At | None:
-    """None where nothing is predicted there, as long as a smaller step may be taken."""
+def _at(problem: Problem, z: Floats, near: Linearisation, length: float) -> Linearisation | None:
+    """Linearise at z; None if there is no prediction and a smaller step is possible."""
     try:
         return problem.at(z, near)
     except UnconvergedError:
-        if share < 4.0 * SMALLEST:
+        if length < 4.0 * MIN_STEP:
             raise
         return None
 
 
-def _linear_step(at: At, low: Floats, high: Floats, loss: Loss) -> Floats:
-    """What would fit best if residuals stayed linear: by least squares between bounds, weighted
-    anew until weights stay."""
+def _linear_step(at: Linearisation, low: Floats, high: Floats, loss: Loss) -> Floats:
+    """Solve the linearised problem between bounds by iteratively reweighted least squares."""
     size = np.linalg.norm(at.jacobian, axis=0)
-    matters = size * np.minimum(high - low, 1e100) > FROZEN
-    size = np.where(matters, size, 1.0)
-    scaled, y = np.where(matters, at.jacobian / size, 0.0), np.zeros(len(size))
-    for _ in range(1 if loss == "linear" else MOST_WEIGHTINGS):
+    is_free = size * np.minimum(high - low, 1e100) > FROZEN
+    size = np.where(is_free, size, 1.0)
+    scaled, y = np.where(is_free, at.jacobian / size, 0.0), np.zeros(len(size))
+    for _ in range(1 if loss == "linear" else MAX_REWEIGHTINGS):
         weight = np.sqrt(_weight(at.residuals - scaled @ y, loss))
-        basis, sizes, ways = _singular(scaled * weight[:, None])
-        right = basis.T @ (at.residuals * weight)
-        before, y = y, ways.T @ (right / sizes)
+        basis, sizes, vectors = _singular(scaled * weight[:, None])
+        projection = basis.T @ (at.residuals * weight)
+        previous, y = y, vectors.T @ (projection / sizes)
         if (y < low * size).any() or (y > high * size).any():
             from scipy.optimize import lsq_linear
 
-            seen = sizes[:, None] * ways
-            y = lsq_linear(seen, right, (low * size, high * size), tol=1e-14).x
-        if (np.abs(y - before) <= STEADY).all():
+            matrix = sizes[:, None] * vectors
+            y = lsq_linear(matrix, projection, (low * size, high * size), tol=1e-14).x
+        if (np.abs(y - previous) <= STEADY).all():
             break
     return np.asarray(y / size)
 
 
 def _singular(columns: Floats) -> tuple[Floats, Floats, Floats]:
-    """The singular value decomposition of columns of unit length, without what is none."""
+    """Return the singular value decomposition of columns of unit length, without null
+    directions."""
     basis, triangle = np.linalg.qr(columns)
-    own, sizes, ways = np.linalg.svd(triangle, full_matrices=False)
-    told = sizes > RANK * sizes.max(initial=0.0)
-    return basis @ own[:, told], sizes[told], ways[told]
+    left_vectors, sizes, vectors = np.linalg.svd(triangle, full_matrices=False)
+    is_regular = sizes > RANK * sizes.max(initial=0.0)
+    return basis @ left_vectors[:, is_regular], sizes[is_regular], vectors[is_regular]
 
 
 def _weight(residuals: Floats, loss: Loss) -> Floats:
-    """How much each residual counts."""
+    """Return the weights of residuals."""
     z = np.square(residuals / OUTLIERS)
     if loss == "linear":
         return np.ones(len(z))
@@ -431,7 +554,7 @@ def _weight(residuals: Floats, loss: Loss) -> Floats:
 
 
 def cost_of(residuals: Floats, loss: Loss) -> float:
-    """-2 log L of residuals over their noise: Σ r², or what the loss makes of it."""
+    """Return -2 log L of residuals over their noise: Σ r², or its equivalent for a loss."""
     z = np.square(residuals / OUTLIERS)
     if loss == "huber":
         z = np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0)
@@ -443,53 +566,63 @@ def cost_of(residuals: Floats, loss: Loss) -> float:
 
 
 def spread_of(residuals: Floats, unknowns: int, loss: Loss) -> float:
-    """The residuals' standard deviation in units of their noise; with a loss, by their median."""
+    """Return the standard deviation of residuals over their noise; with a loss, from their
+    median."""
     if loss == "linear":
         return float(np.sqrt(residuals @ residuals / max(1, len(residuals) - unknowns)))
     return float(1.4826 * np.median(np.abs(residuals)))
 
 
-def _known(problem: Problem, at: At, loss: Loss) -> tuple[Directions, tuple[str, ...]]:
-    """How well z is known, for residuals at least as large as their noise, and the parameters that
-    the data cannot tell.
+def _identify_directions(
+    problem: Problem, at: Linearisation, loss: Loss
+) -> tuple[Directions, tuple[str, ...]]:
+    """Return the directions of z with their variance, and the parameters that are not identifiable.
 
-    Parameters count in the way between their bounds, Young's modulus in its own size.
+    Residuals are assumed to be at least as large as their noise. Parameters are scaled by the
+    interval between their bounds, Young's modulus by its value.
     """
     count, size = len(problem.unknowns), np.linalg.norm(at.jacobian, axis=0)
     size = np.where(size > 0.0, size, 1.0)
     scale = 1.0 / size
-    scale[:count] = [u.span for u in problem.unknowns]
+    scale[:count] = [unknown.span for unknown in problem.unknowns]
     if problem.with_modulus:
         scale[count] = abs(at.z[count]) or 1.0
-    _, sizes, ways = _singular(at.jacobian / size)
-    told = len(sizes)
-    _, sizes, ways = np.linalg.svd(sizes[:, None] * ways * (size * scale))
-    variance = np.full(len(ways), UNTOLD)
-    variance[:told] = np.minimum(_of_loss(at.residuals, problem.size, loss) / sizes**2, UNTOLD)
-    shares = np.abs(ways[told:] * (size * scale))
-    ways[told:][shares < INVOLVED * shares.max(axis=1, initial=0.0)[:, None]] = 0.0
-    directions = Directions(ways, variance, scale)
+    _, sizes, vectors = _singular(at.jacobian / size)
+    rank = len(sizes)
+    _, sizes, vectors = np.linalg.svd(sizes[:, None] * vectors * (size * scale))
+    variance = np.full(len(vectors), NULL_VARIANCE)
+    variance[:rank] = np.minimum(
+        _variance_of_loss(at.residuals, problem.size, loss) / sizes**2, NULL_VARIANCE
+    )
+    shares = np.abs(vectors[rank:] * (size * scale))
+    vectors[rank:][shares < INVOLVED * shares.max(axis=1, initial=0.0)[:, None]] = 0.0
+    directions = Directions(vectors, variance, scale)
     spread = np.sqrt(np.diag(directions.covariance)) / scale
-    untold = (directions.unsure.any(axis=0) | (spread > TELLS))[:count]
+    is_unidentified = (directions.unsure.any(axis=0) | (spread > TELLS))[:count]
     names = [unknown.parameter.path for unknown in problem.unknowns]
-    return directions, tuple(name for name, each in zip(names, untold, strict=True) if each)
+    return directions, tuple(
+        name for name, flag in zip(names, is_unidentified, strict=True) if flag
+    )
 
 
-def _of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
-    """By how much larger the variance is: mean ψ² / (mean ψ')², in units of the noise."""
+def _variance_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
+    """Return the factor of the variance, mean ψ² / (mean ψ')², in units of the noise."""
     square, slope = _scores(residuals, unknowns, loss)
     return square / slope**2
 
 
 def rise_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
-    """By how much more -2 log L rises than χ² does: mean ψ² / mean ψ'."""
+    """Return the ratio of the increase of -2 log L to that of χ²: mean ψ² / mean ψ'."""
     square, slope = _scores(residuals, unknowns, loss)
     return square / slope
 
 
 def _scores(residuals: Floats, unknowns: int, loss: Loss) -> tuple[float, float]:
-    """Mean ψ², in units of the noise, and mean ψ', of residuals that are at least as large as it;
-    where the loss is linear the first is the square of Birge's ratio."""
+    """Return mean ψ², in units of the noise, and mean ψ', of residuals at least as large as the
+    noise.
+
+    For a linear loss the first is the square of Birge's ratio.
+    """
     spread = spread_of(residuals, unknowns, loss)
     if loss == "linear":
         return max(1.0, spread) ** 2, 1.0
@@ -500,12 +633,12 @@ def _scores(residuals: Floats, unknowns: int, loss: Loss) -> tuple[float, float]
         psi, slope = z / np.sqrt(1.0 + z * z), (1.0 + z * z) ** -1.5
     else:
         psi, slope = z / (1.0 + z * z), (1.0 - z * z) / (1.0 + z * z) ** 2
-    return float(np.mean(psi**2) * OUTLIERS**2), max(float(np.mean(slope)), LEAST_SLOPE)
+    return float(np.mean(psi**2) * OUTLIERS**2), max(float(np.mean(slope)), MIN_SLOPE)
 
 
 def _on_bounds(problem: Problem, z: Floats) -> tuple[str, ...]:
-    found = []
+    paths = []
     for unknown, value in zip(problem.unknowns, z, strict=False):
         if min(value - unknown.low, unknown.high - value) <= AT_BOUND * unknown.span:
-            found.append(unknown.parameter.path)
-    return tuple(found)
+            paths.append(unknown.parameter.path)
+    return tuple(paths)

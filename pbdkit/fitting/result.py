@@ -1,4 +1,4 @@
-"""What a fit answers with: values and their errors, and how well the data are met."""
+"""Result of a fit: estimates with their errors, and residuals of the measurements."""
 
 from __future__ import annotations
 
@@ -31,8 +31,17 @@ from pbdkit.stepping.state import Floats
 
 @dataclass(frozen=True)
 class FittedField:
-    """At the points of the measurement, (point, axis): what was measured, without the distortion
-    that was found, and what is left of it."""
+    """A measured field and the residuals of the fit.
+
+    Parameters
+    ----------
+    points : (point, axis)
+        Points of the measurement.
+    measured : (point, axis)
+        Measured displacements without the fitted distortion.
+    residual : (point, axis)
+        Measured minus fitted displacements.
+    """
 
     points: Floats
     measured: Floats
@@ -41,8 +50,19 @@ class FittedField:
 
 @dataclass(frozen=True)
 class FittedNumbers:
-    """Numbers along a time or displacement, (number,), as they were measured, fitted, and what is
-    left; what they are, and what they go over. `joined` where they are one curve."""
+    """Measured numbers along a time or displacement, and the residuals of the fit.
+
+    Parameters
+    ----------
+    along : (number,)
+        Time or displacement.
+    measured, fitted, residual : (number,)
+        Measured and fitted numbers, and their difference.
+    what, over
+        Labels of the numbers and of `along`.
+    joined
+        Whether the numbers are one curve.
+    """
 
     along: Floats
     measured: Floats
@@ -55,9 +75,23 @@ class FittedNumbers:
 
 @dataclass(frozen=True)
 class Met:
-    """How well one measurement is met: its kind, the noise of its numbers, how much larger its
-    residuals are, how many numbers count, and how many rows are left out for which reason. The
-    noise times `factor` is in `unit`, where the experiment has units."""
+    """Residuals of one measurement.
+
+    Parameters
+    ----------
+    kind
+        Kind of the measurement.
+    noise
+        Standard deviation of the noise.
+    ratio
+        Standard deviation of the residuals over the noise.
+    numbers
+        Number of measured numbers.
+    left_out, left_out_because
+        Number of rows that are left out, and the reason.
+    factor, unit
+        `factor` times the noise is in `unit`, if the experiment has units.
+    """
 
     kind: str
     noise: float
@@ -81,15 +115,34 @@ class Met:
 
 @dataclass(frozen=True)
 class Fitted:
-    """The answer of a fit.
+    """Result of a fit.
 
-    `values` by path, `correlations` (parameter, parameter), `youngs_modulus` where a force was
-    given; `combinations` of parameters that are not told one by one, those that are told and those
-    that are not. Residuals are measured - fitted; `ratio` is the standard deviation of all of them
-    over the noise, and `met` says so of each measurement: whatever its weight. Standard errors are
-    larger where residuals are larger than the noise over the root of the weight. `profiles` by
-    path, `sample` and `candidates`, the best first, where they were asked for. `solution` and
-    `problem` have all else.
+    Standard errors are scaled by the residuals if these are larger than the noise over the root of
+    the weight.
+
+    Parameters
+    ----------
+    values
+        Estimates by path.
+    correlations : (parameter, parameter)
+        Correlations of the estimates.
+    youngs_modulus
+        Young's modulus if a force is given.
+    met
+        Residuals of each measurement, independent of its weight.
+    ratio
+        Standard deviation of all residuals over the noise.
+    problem, solution
+        The least-squares problem and its solution.
+    profiles
+        Profile likelihoods by path, on request.
+    combinations
+        Combinations of parameters that are not identifiable separately: identifiable ones, then the
+        others.
+    sample
+        Sample of the posterior, on request.
+    candidates
+        Compared models, the best first, on request.
     """
 
     values: Mapping[str, Estimate]
@@ -106,20 +159,22 @@ class Fitted:
 
     @property
     def noise(self) -> float:
-        """Of the first measurement."""
+        """Return the noise of the first measurement."""
         return self.met[0].noise
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it in plain values, as the JSON file holds it."""
+        """Return the content of the JSON file as plain values."""
         named = {path: estimate.as_dict() for path, estimate in self.values.items()}
         modulus = self.youngs_modulus
         return {
             "values": named,
             "correlations": {
-                one: {other: float(self.correlations[n, m]) for m, other in enumerate(named)}
-                for n, one in enumerate(named)
+                first: {second: float(self.correlations[n, m]) for m, second in enumerate(named)}
+                for n, first in enumerate(named)
             },
-            "combinations": {each.name: each.as_dict() for each in self.combinations},
+            "combinations": {
+                combination.name: combination.as_dict() for combination in self.combinations
+            },
             "youngs_modulus": None if modulus is None else modulus.as_dict(),
             "residual_over_noise": self.ratio,
             "measured": [asdict(met) for met in self.met],
@@ -127,120 +182,140 @@ class Fitted:
         } | self._on_request()
 
     def _on_request(self) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        content: dict[str, Any] = {}
         if self.profiles:
-            found["profiles"] = {path: each.as_dict() for path, each in self.profiles.items()}
+            content["profiles"] = {path: entry.as_dict() for path, entry in self.profiles.items()}
         if self.sample:
             words = ("mean", "deviation", "error")
-            found["sample"] = {
+            content["sample"] = {
                 path: dict(zip(words, numbers, strict=True))
-                for path, *numbers in zip(*self._sampled, strict=True)
+                for path, *numbers in zip(*self._sample_columns, strict=True)
             }
         if self.candidates:
-            found["candidates"] = [asdict(each) for each in self.candidates]
-        return found
+            content["candidates"] = [asdict(entry) for entry in self.candidates]
+        return content
 
     @property
-    def _sampled(self) -> tuple[list[Any], ...]:
+    def _sample_columns(self) -> tuple[list[Any], ...]:
         assert self.sample is not None
         numbers = (self.sample.mean, self.sample.deviation, self.sample.error)
-        return [*self.values], *(each.tolist() for each in numbers)
+        return [*self.values], *(array.tolist() for array in numbers)
 
     def field(self, n: int = 0) -> FittedField:
-        """What was measured at each point of measurement n, a field, and what the fit leaves.
-        Raises ValueError for another kind."""
+        """Return the residuals of measurement n, a field.
+
+        Raises
+        ------
+        ValueError
+            For a measurement of another kind.
+        """
         observation, rows = [*self.problem.rows()][n]
         if not isinstance(observation, FieldObservation):
-            raise ValueError(f"measurement {n} is no field: {observation.kind}")
-        own = self.solution.z[[*self.problem.owned()][n][1]]
+            raise ValueError(f"measurement {n} is not a field: {observation.kind}")
+        values = self.solution.z[[*self.problem.own_slices()][n][1]]
         evidence = observation.evidence
-        strengths = own[len(own) - evidence.distortions.shape[1] :]
+        strengths = values[len(values) - evidence.distortions.shape[1] :]
         measured = evidence.measured - evidence.distortions @ strengths
-        left = self.solution.at.residuals[rows] * observation.weighted_noise
+        residual = self.solution.at.residuals[rows] * observation.weighted_noise
         return FittedField(
-            evidence.points, measured.reshape(2, -1).T, np.asarray(left.reshape(2, -1).T)
+            evidence.points, measured.reshape(2, -1).T, np.asarray(residual.reshape(2, -1).T)
         )
 
     def distortions(self, n: int = 0) -> dict[str, Estimate]:
-        """How much of each distortion field n shows, by what it is in proportion to, "ux x^2 y^0",
-        with x and y from -1 to 1 over the points."""
-        observation, own = [*self.problem.owned()][n]
+        """Return the fitted amplitudes of the distortions of field n.
+
+        Keys are the polynomials, for instance "ux x^2 y^0", with x and y from -1 to 1 over the
+        points.
+        """
+        observation, columns = [*self.problem.own_slices()][n]
         if not isinstance(observation, FieldObservation):
             return {}
         terms = observation.evidence.terms
         names = [
-            f"{u} x^{p} y^{q}" for u, of in zip(("ux", "uy"), terms, strict=True) for p, q in of
+            f"{u} x^{p} y^{q}"
+            for u, exponents in zip(("ux", "uy"), terms, strict=True)
+            for p, q in exponents
         ]
-        z, errors = self.solution.z[own], self.solution.errors[own]
+        z, errors = self.solution.z[columns], self.solution.errors[columns]
         pairs = zip(z[len(z) - len(names) :], errors[len(z) - len(names) :], strict=True)
         return {
-            name: Estimate(float(v), float(e)) for name, (v, e) in zip(names, pairs, strict=True)
+            name: Estimate(float(value), float(error))
+            for name, (value, error) in zip(names, pairs, strict=True)
         }
 
     def numbers(self, n: int = 0) -> FittedNumbers:
-        """What was measured in tracks or a curve n, and what the fit leaves. Raises ValueError for
-        a field."""
+        """Return the residuals of measurement n, tracks or a curve.
+
+        Raises
+        ------
+        ValueError
+            For a field.
+        """
         observation, rows = [*self.problem.rows()][n]
         if not isinstance(observation, TracksObservation | CurveObservation):
             raise ValueError(f"measurement {n} is a {observation.kind}")
         measured = observation.measured * observation.unit
-        left = self.solution.at.residuals[rows] * observation.weighted_noise * observation.unit
+        residual = self.solution.at.residuals[rows] * observation.weighted_noise * observation.unit
         along = np.tile(observation.along, len(measured) // len(observation.along))
         what, over, joined = observation.names
-        return FittedNumbers(along, measured, measured - left, left, what, over, joined)
+        return FittedNumbers(along, measured, measured - residual, residual, what, over, joined)
 
     def information(self, n: int = 0) -> dict[str, Floats]:
-        """By parameter, how much each number of measurement n tells of it, (number,): the square of
-        what its derivative has that no other unknown can make up for."""
-        jacobian, found = self.solution.at.jacobian, dict[str, Floats]()
+        """Return the information of each number of measurement n about each parameter, (number,) by
+        path.
+
+        It is the square of the part of the derivative that is orthogonal to those of all other
+        unknowns.
+        """
+        jacobian, result = self.solution.at.jacobian, dict[str, Floats]()
         _, rows = [*self.problem.rows()][n]
         for column, path in enumerate(self.values):
-            others, *_ = np.linalg.qr(np.delete(jacobian, column, axis=1))
-            own = jacobian[:, column] - others @ (others.T @ jacobian[:, column])
-            found[path] = np.asarray(own[rows] ** 2)
-        return found
+            basis, *_ = np.linalg.qr(np.delete(jacobian, column, axis=1))
+            part = jacobian[:, column] - basis @ (basis.T @ jacobian[:, column])
+            result[path] = np.asarray(part[rows] ** 2)
+        return result
 
     def lines(self) -> Iterator[str]:
-        """What to tell first."""
+        """Yield a summary of the result, line by line."""
         for path, estimate in self.values.items():
             yield f"{path}: {estimate}"
         if self.youngs_modulus:
             yield f"{MODULUS}: {self.youngs_modulus}"
         yield from map(str, self.combinations)
-        for n, one in enumerate(self.values):
-            for m, other in list(enumerate(self.values))[n + 1 :]:
+        for n, first in enumerate(self.values):
+            for m, second in list(enumerate(self.values))[n + 1 :]:
                 if abs(self.correlations[n, m]) > 0.5:
-                    yield f"correlation of {one} and {other}: {self.correlations[n, m]:.2f}"
+                    yield f"correlation of {first} and {second}: {self.correlations[n, m]:.2f}"
         yield from map(str, self.met)
         for path, profile in self.profiles.items():
             yield f"{path}: {profile}, by its profile"
         if self.sample:
-            numbers = zip(*self._sampled, strict=True)
+            numbers = zip(*self._sample_columns, strict=True)
             for path, mean, deviation, error in numbers:
                 yield f"{path}: {Estimate(mean, deviation)}, by the sampler, to ± {error:.1g}"
         yield from map(str, self.candidates)
 
 
 def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
-    """The answer in words of the fit file."""
+    """Return the result in terms of the fit file."""
     count = len(problem.unknowns)
     errors = solution.errors[:count]
     values = {
         unknown.parameter.path: Estimate(
             float(value),
             float(error),
-            unknown.parameter.path not in solution.untold,
+            unknown.parameter.path not in solution.unidentified,
             unknown.parameter.path in solution.on_bounds,
         )
         for unknown, value, error in zip(problem.unknowns, solution.z, errors, strict=False)
     }
     covariance = solution.covariance[:count, :count]
     correlations = covariance / np.outer(errors, errors)
-    left = solution.at.residuals.copy()
+    residuals = solution.at.residuals.copy()
     for observation, rows in problem.rows():
-        left[rows] /= np.sqrt(observation.weight)
-    met = tuple(_met(each, left[rows], fit.loss) for each, rows in problem.rows())
-    ratio = spread_of(left, problem.size, fit.loss)
+        residuals[rows] /= np.sqrt(observation.weight)
+    met = tuple(_residuals_of(each, residuals[rows], fit.loss) for each, rows in problem.rows())
+    ratio = spread_of(residuals, problem.size, fit.loss)
     modulus = youngs_modulus(fit.force, problem, solution)
     several = combinations(problem, solution)
     return Fitted(
@@ -248,8 +323,8 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     )
 
 
-def _met(observation: Observation, residuals: Floats, loss: Loss) -> Met:
-    """How well an observation is met, by its residuals over the noise."""
+def _residuals_of(observation: Observation, residuals: Floats, loss: Loss) -> Met:
+    """Summarise the residuals of an observation."""
     return Met(
         observation.kind,
         observation.noise * observation.unit,
@@ -262,8 +337,11 @@ def _met(observation: Observation, residuals: Floats, loss: Loss) -> Met:
 
 
 def unit_of(observation: Observation) -> tuple[float, str]:
-    """By what the numbers of an observation are multiplied to be in its experiment's units, and
-    these: forces are given in N, lengths in lattice units; 1 and nothing without units."""
+    """Return the factor and unit that convert numbers of an observation to the experiment's units.
+
+    Forces are in N, and lengths in lattice units. Without units the factor is 1, and the unit
+    empty.
+    """
     units = observation.experiment.units
     if units is None:
         return 1.0, ""

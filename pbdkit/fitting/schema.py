@@ -1,4 +1,4 @@
-"""The JSON Schema of fit files."""
+"""JSON Schema of fit files."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ from pbdkit.model.schema import DIALECT
 
 
 def fit_schema() -> dict[str, Any]:
-    """Of both kinds; what stands under `experiment` is left to the schema of experiments."""
-    described = TypeAdapter[Any](Fit | StrengthFit).json_schema(by_alias=True)
-    return {"$schema": DIALECT, **described, "title": "pbdkit fit"}
+    """Return the JSON Schema of fit files of both kinds, without that of their experiments."""
+    schema = TypeAdapter[Any](Fit | StrengthFit).json_schema(by_alias=True)
+    return {"$schema": DIALECT, **schema, "title": "pbdkit fit"}

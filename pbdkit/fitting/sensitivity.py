@@ -1,9 +1,9 @@
 """Sensitivity of an equilibrium to a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
 
-At equilibrium no follower moves, m(u, θ) = 0. A = -∂m/∂u is the system by which it was found, so
-that each parameter costs one more solution, and the moves of a few scenes with slightly changed
-parameters. The change of a single number J of the displacements costs one solution for all
-parameters, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ.
+In equilibrium no follower moves, m(u, θ) = 0. The matrix A = -∂m/∂u is that of the equilibrium
+solver, so each parameter costs one further solution, and the moves of a few scenes with slightly
+changed parameters. The derivative of a single number J of the displacements costs one solution for
+all parameters, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ.
 """
 
 from __future__ import annotations
@@ -28,44 +28,65 @@ from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import State, initial_state
 
 GEOMETRY = ("lattice", "body", "regions", "neighbours", "frame", "initial", "loads", "cuts")
-"""The parts of an experiment that its scene is built of besides numbers and motions."""
+"""Parts of an experiment that determine its scene, besides parameters and motions."""
 
 
 def scene_like(scene: Scene, experiment: Experiment) -> Scene:
-    """The scene of an experiment that differs by numbers, as much as possible of it as it was.
+    """Return the scene of an experiment that differs by parameters, reusing as much as possible.
 
-    Raises ExperimentError where they decide which particles there are.
+    Raises
+    ------
+    ExperimentError
+        If the parameters change which particles exist.
     """
-    own = scene.experiment
-    groups = zip(experiment.leaders, own.leaders, strict=True)
-    same_leaders = all(a.select == b.select and a.axes == b.axes for a, b in groups)
-    if same_leaders and all(getattr(experiment, name) is getattr(own, name) for name in GEOMETRY):
-        if experiment.leaders is not own.leaders:
+    original = scene.experiment
+    groups = zip(experiment.leaders, original.leaders, strict=True)
+    has_same_leaders = all(a.select == b.select and a.axes == b.axes for a, b in groups)
+    if has_same_leaders and all(
+        getattr(experiment, name) is getattr(original, name) for name in GEOMETRY
+    ):
+        if experiment.leaders is not original.leaders:
             pairs = zip(scene.leading, experiment.leaders, strict=True)
             leading = tuple(replace(leading, group=group) for leading, group in pairs)
             scene = replace(scene, leading=leading)
         return renumbered(scene, experiment)
-    found = build_scene(experiment)
-    if found.raster.shape != scene.raster.shape or (found.raster.kind != scene.raster.kind).any():
+    new_scene = build_scene(experiment)
+    if (
+        new_scene.raster.shape != scene.raster.shape
+        or (new_scene.raster.kind != scene.raster.kind).any()
+    ):
         raise ExperimentError(
-            "the number decides which particles there are, one by one, and that is no smooth way; "
-            "sensitivities are of rules, fields, loads and motions"
+            "the parameter changes which particles exist, so that there is no derivative; "
+            "sensitivities exist for parameters of rules, fields, loads and motions"
         )
-    return found
+    return new_scene
 
 
 __all__ = ["Adjoint", "Resting", "along", "scene_like"]
 
 ACCURACY = 1e-12
-"""Of solutions, as a share of themselves."""
+"""Relative accuracy of solutions."""
 FORMER = 2
-"""How many equilibria before one lend it their answers."""
+"""Number of earlier equilibria whose solutions are reused as initial guesses."""
 
 
 @dataclass(frozen=True)
 class Resting:
-    """A scene at its equilibrium; `accuracy` is that of derivatives, as a share of the largest.
-    `finder` has the numbers of the last step, and knows whether the scene is linear then."""
+    """A scene in equilibrium.
+
+    Parameters
+    ----------
+    scene, state
+        The scene and its state.
+    certificate
+        Error bound of the equilibrium.
+    finder
+        Solver, with the parameters of the last step.
+    accuracy
+        Accuracy of derivatives, relative to the largest.
+    former
+        Solutions of earlier equilibria, by their right-hand side.
+    """
 
     scene: Scene
     state: State
@@ -73,7 +94,6 @@ class Resting:
     finder: Finder = field(repr=False)
     accuracy: float = ACCURACY
     former: tuple[dict[bytes, Floats], ...] = field(default=(), repr=False)
-    """The answers of equilibria before this one, by what was led."""
 
     @classmethod
     def of(
@@ -82,185 +102,258 @@ class Resting:
         start: Scene | Resting | None = None,
         accuracy: float = ACCURACY,
     ) -> Resting:
-        """The equilibrium of an experiment; with the scene of one that differs by parameters of its
-        parts alone, nothing but its numbers is made anew, and with the equilibrium of such a one
-        its answers are where those of this one begin. Raises ExperimentError where bonds changed
-        on the way, or obstacles stand there: what comes after hangs on the way then."""
-        like = start.scene if isinstance(start, Resting) else start
-        scene = scene_like(like, experiment) if like else build_scene(experiment)
+        """Compute the equilibrium of an experiment.
+
+        Parameters
+        ----------
+        experiment
+            The experiment.
+        start
+            Scene, or equilibrium, of an experiment that differs by parameters alone. The scene is
+            reused, and solutions of the equilibrium are initial guesses.
+        accuracy
+            Accuracy of derivatives, relative to the largest.
+
+        Raises
+        ------
+        ExperimentError
+            If bonds changed on the way, or if the scene has obstacles: the equilibrium then depends
+            on the path.
+        """
+        similar = start.scene if isinstance(start, Resting) else start
+        scene = scene_like(similar, experiment) if similar else build_scene(experiment)
         if scene.barriers:
             raise ExperimentError(
-                "followers that touch an obstacle change what holds them as they move: no "
-                "sensitivities; leave the obstacles out",
+                "there are no sensitivities with obstacles, since contacts change with the "
+                "displacements; leave the obstacles out",
                 ("obstacles",),
             )
         state = initial_state(scene)
-        before, finder = _bonds(state), finder_of(scene, state, compiles=False)
+        initial_bonds, finder = _bonds(state), finder_of(scene, state, compiles=False)
         certificate = settle(scene, state, finder=finder)
-        if any((a != b).any() for a, b in zip(before, _bonds(state), strict=True)):
+        if any((a != b).any() for a, b in zip(initial_bonds, _bonds(state), strict=True)):
             raise ExperimentError(
-                "bonds break or soften on the way to this equilibrium: where it lies is no smooth "
-                "function of parameters; take a smaller load, or fracture: {type: none}",
+                "bonds break or soften on the way to this equilibrium, which is then no smooth "
+                "function of parameters; use a smaller load, or fracture: {type: none}",
                 ("fracture",),
             )
-        former = start.lent if isinstance(start, Resting) else ()
+        former = start.guesses if isinstance(start, Resting) else ()
         return cls(scene, state, certificate, finder.at(experiment.steps), accuracy, former)
 
     @property
-    def lent(self) -> tuple[dict[bytes, Floats], ...]:
-        """The answers that the next equilibrium may begin from."""
-        return (self._answers, *self.former)[:FORMER]
+    def guesses(self) -> tuple[dict[bytes, Floats], ...]:
+        """Return the solutions that are initial guesses of the next equilibrium."""
+        return (self._solutions, *self.former)[:FORMER]
 
     @cached_property
-    def _answers(self) -> dict[bytes, Floats]:
+    def _solutions(self) -> dict[bytes, Floats]:
         return {}
 
     @cached_property
     def system(self) -> System:
-        """A, at the equilibrium; of a linear scene at rest, where stencils are exact: that by which
-        it was found. Raises ExperimentError where a part that nothing holds was displaced."""
-        found = self._linearised()
+        """Return A at the equilibrium; for linear scenes that of the body at rest, which is exact.
+
+        Raises
+        ------
+        ExperimentError
+            If a part of the body that is not constrained was displaced.
+        """
+        system = self._linearised()
         try:
-            found.refuse_moving_floats(self.state.u, self.finder.moves.rounding(self.state.u))
+            system.refuse_moving_floats(self.state.u, self.finder.moves.rounding(self.state.u))
         except ExperimentError as error:
             raise ExperimentError(
-                "nothing holds a part of the body: where it comes to rest hangs on how it started, "
-                "too, so that there are no sensitivities; let a leader hold it",
+                "nothing holds a part of the body: its equilibrium depends on the initial state, "
+                "so that there are no sensitivities; constrain it with a leader group",
                 error.where,
             ) from None
-        return found
+        return system
 
     def _linearised(self) -> System:
         if self.finder.linear and self.finder.at_rest:
             return self.finder.at_rest[0]
-        at = self.state
+        state = self.state
         if self.finder.linear:
-            at = replace(at, u=np.zeros_like(at.u))
+            state = replace(state, u=np.zeros_like(state.u))
         steps, method = self.scene.experiment.steps, self.finder.method
         with one_thread():
-            return linearised(self.finder.scene, at, steps, method, Watch(), self.finder.moves)
+            return linearised(self.finder.scene, state, steps, method, Watch(), self.finder.moves)
 
     def change(self, parameter: Parameter) -> Floats:
-        """∂u/∂θ as planes, (axis, sublattice, cell, cell): leaders as they are led, followers as
-        they follow, the frame in line. Raises ExperimentError."""
-        shown, moves = self._pushed_by(parameter)
-        return self._with_frame(shown, self._answer(moves, parameter.path.encode()))
+        """Return ∂u/∂θ as planes, (axis, sublattice, cell, cell), for leaders, followers and frame
+        points.
+
+        Raises
+        ------
+        ExperimentError
+            If the derivative does not exist.
+        """
+        direct, moves = self._derivatives(parameter)
+        return self._with_frame(direct, self._solve(moves, parameter.path.encode()))
 
     def gradient(self, weights: Floats, parameters: Sequence[Parameter]) -> Floats:
-        """dJ/dθ of J = Σ weights · u, (parameter,): by one solution for all of them. `weights` are
-        planes over leaders, followers and frame points. Raises ExperimentError."""
-        found = self.adjoint(weights)
-        return np.array([found.along(*self._pushed_by(parameter)) for parameter in parameters])
+        """Return dJ/dθ of J = Σ weights · u, (parameter,), by one solution for all parameters.
+
+        Parameters
+        ----------
+        weights
+            Planes over leaders, followers and frame points.
+        parameters
+            The parameters θ.
+
+        Raises
+        ------
+        ExperimentError
+            If the derivative does not exist.
+        """
+        adjoint = self.adjoint(weights)
+        return np.array([adjoint.along(*self._derivatives(parameter)) for parameter in parameters])
 
     def adjoint(self, weights: Floats) -> Adjoint:
-        """What J = Σ weights · u hangs on."""
-        own = self._from_frame(weights)
+        """Return the adjoint solution of J = Σ weights · u."""
+        combined = self._from_frame(weights)
         with one_thread():
-            pull = self.system.solve_transposed(own, self.accuracy)
-        return Adjoint(weights, own, pull)
+            pull = self.system.solve_transposed(combined, self.accuracy)
+        return Adjoint(weights, combined, pull)
 
-    def answer(self, led: Floats) -> Floats:
-        """∂u of leaders that go on so much, as planes: followers follow."""
-        pushed = self.system.pushed_by(led) if self.finder.linear else None
-        moves = self.along(self._moves, led) if pushed is None else pushed
-        return self._with_frame(0.0, led + self._answer(moves, led.tobytes()))
+    def answer(self, leaders: Floats) -> Floats:
+        """Return ∂u for displacements of leaders, as planes; followers are in equilibrium."""
+        load = self.system.pushed_by(leaders) if self.finder.linear else None
+        moves = self.along(self._moves, leaders) if load is None else load
+        return self._with_frame(0.0, leaders + self._solve(moves, leaders.tobytes()))
 
-    def along(self, function: Callable[[Floats], Floats], way: Floats) -> Floats:
-        """The derivative of a function of displacements along a way from here: of a linear scene
-        its difference, else by central differences."""
+    def along(self, function: Callable[[Floats], Floats], direction: Floats) -> Floats:
+        """Return the derivative of a function of displacements along a direction.
+
+        It is a difference for linear scenes, else a central difference.
+        """
         linear, u = self.finder.linear, self.state.u
         if linear and function == self._moves:
-            return self._moves(u + way) - self._moves_here
-        return along(function, u, way, linear, spacing_of(self.scene))
+            return self._moves(u + direction) - self._moves_at_equilibrium
+        return along(function, u, direction, linear, spacing_of(self.scene))
 
     def _moves(self, u: Floats) -> Floats:
         steps = self.scene.experiment.steps
         return self.finder.moves.at(replace(self.state, u=u), steps)
 
     @cached_property
-    def _moves_here(self) -> Floats:
+    def _moves_at_equilibrium(self) -> Floats:
         return self._moves(self.state.u.copy())
 
-    def _pushed_by(self, parameter: Parameter) -> tuple[Floats, Floats]:
-        """How leaders, and the frame points of a body that stays, are moved by a parameter, and the
-        moves of followers among them."""
-        shown, moves = parameter.derivative(self.scene.experiment, self._pushed, self.accuracy)
-        return shown, moves
+    def _derivatives(self, parameter: Parameter) -> tuple[Floats, Floats]:
+        """Differentiate the prescribed displacements, and the moves of followers, by a
+        parameter."""
+        direct, moves = parameter.derivative(
+            self.scene.experiment, self._leaders_and_moves, self.accuracy
+        )
+        return direct, moves
 
-    def _pushed(self, experiment: Experiment) -> Floats:
-        """Where leaders and frame points stand in an experiment like this one, and the moves of
-        followers among them, (2, axis, sublattice, cell, cell)."""
+    def _leaders_and_moves(self, experiment: Experiment) -> Floats:
+        """Return the displacements of leaders and frame points in a similar experiment, and the
+        moves of followers there, (2, axis, sublattice, cell, cell)."""
         scene = scene_like(self.scene, experiment)
         u, steps = self.state.u.copy(), experiment.steps
-        led, _ = prescribe(scene, replace(self.state, u=u), steps)
-        place(u, led)
+        leaders, _ = prescribe(scene, replace(self.state, u=u), steps)
+        place(u, leaders)
         moves = Moves(scene.at(steps), compiles=False).at(replace(self.state, u=u), steps)
         return np.stack([u, moves])
 
-    def _with_frame(self, shown: Floats | float, change: Floats) -> Floats:
-        """Both together, the frame going with the change."""
+    def _with_frame(self, direct: Floats | float, change: Floats) -> Floats:
+        """Return the sum of both, with the frame points of the change."""
         if frame := self.finder.scene.frame:
             flat = change.reshape(len(change), -1)
             frame.follow(flat, flat)
-        return shown + change
+        return direct + change
 
     def _from_frame(self, weights: Floats) -> Floats:
-        """What weights of frame points come to at those whom they follow, with the others'."""
-        found, frame = weights.astype(float), self.finder.scene.frame
+        """Add the weights of frame points to those of the particles that they follow."""
+        result, frame = weights.astype(float), self.finder.scene.frame
         if frame:
-            flat = found.reshape(len(found), -1)
-            seen, weight = flat[:, frame.place[frame.map.point]], frame.map.weight
-            back = weight * seen if weight.ndim == 1 else np.einsum("eba,be->ae", weight, seen)
+            flat = result.reshape(len(result), -1)
+            frame_weights, map_weight = flat[:, frame.place[frame.map.point]], frame.map.weight
+            contributions = (
+                map_weight * frame_weights
+                if map_weight.ndim == 1
+                else np.einsum("eba,be->ae", map_weight, frame_weights)
+            )
             flat[:, frame.place] = 0.0
-            for plane, values in zip(flat, back, strict=True):
+            for plane, values in zip(flat, contributions, strict=True):
                 plane += np.bincount(frame.body_place, values, plane.size)
-        return found
+        return result
 
-    def _answer(self, moves: Floats, of: bytes) -> Floats:
-        """A⁻¹ moves, kept by what they are the moves of."""
+    def _solve(self, moves: Floats, key: bytes) -> Floats:
+        """Return A⁻¹ moves, and store it under a key."""
         if not moves.any():
             return moves
-        near = [known[of] for known in self.former if of in known]
+        guesses = [solutions[key] for solutions in self.former if key in solutions]
         with one_thread():
-            found = self.system.answer(moves, self.accuracy, near)
-        self._answers[of] = found.copy()
-        return found
+            solution = self.system.answer(moves, self.accuracy, guesses)
+        self._solutions[key] = solution.copy()
+        return solution
 
 
 @dataclass(frozen=True)
 class Adjoint:
-    """What J = Σ weights · u hangs on: dJ/dθ is Σ weights · ∂u/∂θ of leaders and frame points, the
-    body being where it is, and Σ pull · ∂m/∂θ, pull = A⁻ᵀ own, where `own` are the weights with
-    those of frame points at whom they follow. All are planes."""
+    """Adjoint solution of J = Σ weights · u.
+
+    dJ/dθ is Σ weights · ∂u/∂θ of leaders and frame points at fixed followers, plus Σ pull · ∂m/∂θ.
+    All are planes.
+
+    Parameters
+    ----------
+    weights
+        Weights of J.
+    combined
+        The weights, with those of frame points added to the particles that they follow.
+    pull
+        A⁻ᵀ combined.
+    """
 
     weights: Floats
-    own: Floats
+    combined: Floats
     pull: Floats
 
-    def along(self, shown: Floats, moves: Floats) -> float:
-        """dJ/dθ of a parameter by which leaders and frame points move so much, and followers are
-        moved so much."""
-        return float((self.weights * shown).sum() + (self.pull * moves).sum())
+    def along(self, direct: Floats, moves: Floats) -> float:
+        """Return dJ/dθ of a parameter.
+
+        Parameters
+        ----------
+        direct, moves
+            Derivatives of the displacements of leaders and frame points, and of the moves of
+            followers.
+        """
+        return float((self.weights * direct).sum() + (self.pull * moves).sum())
 
 
 def along(
     function: Callable[[Floats], Floats],
     u: Floats,
-    way: Floats,
+    direction: Floats,
     linear: bool,
     spacing: float = 1.0,
 ) -> Floats:
-    """The derivative of a function of displacements along a way: of a linear one its difference,
-    else by central differences of a share of the spacing."""
+    """Return the derivative of a function of displacements along a direction.
+
+    Parameters
+    ----------
+    linear
+        Whether the function is linear, so that a difference is exact; else a central difference is
+        used.
+    spacing
+        Length that scales its step.
+    """
     if linear:
-        return function(u + way) - function(u)
-    step = STEP * spacing / max(float(np.abs(way).max()), 1e-300)
+        return function(u + direction) - function(u)
+    step = STEP * spacing / max(float(np.abs(direction).max()), 1e-300)
     pairs = ((n * step, weight / step) for n, weight in enumerate(WEIGHTS, 1))
-    parts = [w * (function(u + h * way) - function(u - h * way)) for h, w in pairs]
+    parts = [
+        factor * (function(u + size * direction) - function(u - size * direction))
+        for size, factor in pairs
+    ]
     return np.asarray(sum(parts))
 
 
 def _bonds(state: State) -> list[Floats]:
-    """What may change in bonds."""
-    kept = [] if state.broken_step is None else [state.broken_step.copy()]
-    return [*kept, *(value.copy() for value in state.bond_values)]
+    """Copy the state of bonds that can change."""
+    arrays = [] if state.broken_step is None else [state.broken_step.copy()]
+    return [*arrays, *(value.copy() for value in state.bond_values)]

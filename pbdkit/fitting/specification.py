@@ -1,6 +1,5 @@
 """The fit file: an experiment, its unknown parameters, and the measurements (fields of
-displacements, tracks in time, curves).
-"""
+displacements, tracks in time, curves)."""
 
 from __future__ import annotations
 
@@ -46,9 +45,12 @@ if TYPE_CHECKING:
     import xarray
 
 GUESS = 1.0
-"""The noise where none is given, until residuals tell it."""
-FEW, TINY = 4, 2e-3
-"""More points than that within such a share of the body are points in another unit."""
+"""Standard deviation of the noise until it is estimated from the residuals."""
+MIN_POINTS = 4
+"""Number of points up to which their extent is not checked."""
+
+MIN_EXTENT = 2e-3
+"""Extent of the points, relative to the body, below which their unit must be wrong."""
 Positive = Annotated[float, Field(gt=0.0)]
 Term = Annotated[
     tuple[Annotated[int, Field(ge=0, le=4)], Annotated[int, Field(ge=0, le=4)]],
@@ -65,16 +67,15 @@ def _once(terms: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
 
 Terms = Annotated[tuple[Term, ...], Field(strict=False), AfterValidator(_once)]
 Pair = Annotated[tuple[float, float], Field(strict=False)]
-WAYS = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
+DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
+"""Unit vectors of the axes."""
 
 
 class MeasuredColumns(Component):
-    """The columns of a CSV `file` beside the fit file.
-
-    `noise` is the standard deviation of what was measured; without it that of the residuals is
-    taken. A `weight` of 4 makes each number count like one of half the noise. `settings` are
-    changes of the experiment, by path, for this measurement alone: another load, another end.
-    """
+    """A measurement: the columns of a CSV `file` beside the fit file. `noise` is the standard
+    deviation of the measured numbers; by default it is estimated from the residuals. With a
+    `weight` of 4 each number counts as if its noise were halved. `settings` are changes of the
+    experiment, by path, for this measurement alone, for instance another load or another end."""
 
     file: str
     noise: Positive | None = None
@@ -96,18 +97,30 @@ class MeasuredColumns(Component):
 
     @property
     def rows(self) -> Floats:
-        """(row, column)."""
+        """Return the numbers of the file, (row, column)."""
         return np.asarray(self._rows)
 
     @property
     def assumed_noise(self) -> float:
-        """The noise, or a guess until residuals tell it."""
+        """Return the noise, or a guess until it is estimated from the residuals."""
         return self.noise or GUESS
 
     @abstractmethod
     def observation(self, experiment: Experiment, modes: int) -> Observation:
-        """Of an experiment, with so many modes along measured boundaries. Raises
-        ExperimentError."""
+        """Return the observation of this measurement.
+
+        Parameters
+        ----------
+        experiment
+            The experiment with the settings of this measurement.
+        modes
+            Number of modes of displacements along measured boundaries.
+
+        Raises
+        ------
+        ExperimentError
+            If the measurement does not suit the experiment.
+        """
 
 
 DATASET = "(dataset)"
@@ -131,24 +144,22 @@ def _rows_of(table: xarray.Dataset, columns: Sequence[str]) -> Floats:
 
 
 class Distortion(Strict):
-    """What the measurement shows beside the displacement of the body, in its plane: polynomials of
-    x and y, by their exponents, each as much as fits. A camera that turns, a lens, and bending out
-    of the plane are such: `ux: [[2, 0]]` is a strain that rises evenly along x."""
+    """Apparent displacements in the plane that are not those of the body: polynomials of x and y,
+    by their exponents, with fitted amplitudes. They describe a rotated camera, a lens, and bending
+    out of the plane, for instance `ux: [[2, 0]]`, a strain that grows linearly along x."""
 
     ux: Terms = ()
     uy: Terms = ()
 
 
 def _without_type(schema: dict[str, Any]) -> None:
-    # A measurement is a field unless it says otherwise.
+    # The type of a measurement is by default a field.
     schema["required"] = [key for key in schema["required"] if key != "type"]
 
 
 class MeasuredField(MeasuredColumns):
-    """Displacements at scattered points of the equilibrium, in lattice units.
-
-    Points nearer to the outline of the body than `margin` are left out.
-    """
+    """Displacements at scattered points in equilibrium, in lattice units. Points closer to the
+    outline of the body than `margin` are left out."""
 
     model_config = ConfigDict(json_schema_extra=_without_type)
 
@@ -158,25 +169,25 @@ class MeasuredField(MeasuredColumns):
     distortion: Distortion = Field(default_factory=Distortion)
 
     def observation(self, experiment: Experiment, modes: int) -> FieldObservation:
-        """At rest, whatever the experiment says of steps."""
+        """Return the observation in equilibrium, whatever the solver of the experiment."""
         if experiment.solver.makes_steps:
             experiment = experiment.model_copy(update={"solver": Equilibrium()})
         scene = build_scene(experiment)
         points, displacements = self.rows[:, :2], self.rows[:, 2:]
-        far = np.ones(len(points), bool)
+        inside = np.ones(len(points), bool)
         if self.margin:
-            from pbdkit.fitting.observations import deeper  # shapely is loaded where it is needed
+            from pbdkit.fitting.observations import deeper  # shapely is loaded only for a margin
 
-            far = deeper(experiment.body, experiment.lattice, points, self.margin)
+            inside = deeper(experiment.body, experiment.lattice, points, self.margin)
         terms = self.distortion.ux, self.distortion.uy
-        evidence = FieldEvidence.of(scene, points[far], displacements[far], terms)
+        evidence = FieldEvidence.of(scene, points[inside], displacements[inside], terms)
         _refuse_other_unit(evidence.points, scene)
-        return FieldObservation.of(scene, evidence, self.assumed_noise, modes, far)
+        return FieldObservation.of(scene, evidence, self.assumed_noise, modes, inside)
 
 
 class MeasuredTracks(MeasuredColumns):
-    """Displacements of points of the body as it moves: at `time`, counted in steps, of the point
-    that lies at x and y in the reference."""
+    """Displacements of points of the body as it moves: at `time`, in steps, of the point at x and y
+    in the reference configuration."""
 
     type: Literal["tracks"] = "tracks"
     columns: Annotated[tuple[str, str, str, str, str], Field(strict=False)] = (
@@ -188,18 +199,16 @@ class MeasuredTracks(MeasuredColumns):
     )
 
     def observation(self, experiment: Experiment, modes: int) -> TracksObservation:
-        """Of its run."""
+        """Return the observation in a run."""
         times, points, u = self.rows[:, 0], self.rows[:, 1:3], self.rows[:, 3:]
         return TracksObservation.of(experiment, times, points, u, self.assumed_noise)
 
 
 class MeasuredCurve(MeasuredColumns):
-    """The force that leader group `group` exerts along `axis`, over its own displacement along it,
-    or over time, counted in steps, where it is measured `against` that.
-
-    Forces are those of a body of this `thickness`. Without `youngs_modulus` that is found too.
-    Where the experiment has units, these are N, mm and MPa.
-    """
+    """The force that leader group `group` exerts along `axis`, over its displacement along that
+    axis, or over time in steps with `against: time`. Forces are those of a body of this
+    `thickness`. `youngs_modulus` is fitted, too, by default. Units are N, mm and MPa if the
+    experiment has units."""
 
     type: Literal["curve"] = "curve"
     group: Annotated[int, Field(ge=0)]
@@ -210,29 +219,30 @@ class MeasuredCurve(MeasuredColumns):
     columns: Annotated[tuple[str, str], Field(strict=False)] = ("displacement", "force")
 
     def observation(self, experiment: Experiment, modes: int) -> CurveObservation:
-        """Of its run, over thickness and modulus, as far as they are known."""
+        """Return the observation in a run, divided by thickness and modulus as far as they are
+        known."""
         scale = self.thickness * (self.youngs_modulus or 1.0)
         scale *= experiment.units.length_mm if experiment.units else 1.0
-        found = CurveObservation.of(
+        curve = CurveObservation.of(
             experiment,
             self.rows[:, 0],
             self.rows[:, 1] / scale,
             self.assumed_noise / scale,
             self.group,
-            WAYS[self.axis],
+            DIRECTIONS[self.axis],
             at_times=self.against == "time",
             scaled=self.youngs_modulus is None,
         )
-        return replace(found, unit=scale)
+        return replace(curve, unit=scale)
 
 
 def _refuse_other_unit(points: Floats, scene: Scene) -> None:
     body = np.ptp(scene.raster.reference(scene.raster.body_rows), axis=0).max()
-    size = np.ptp(points, axis=0).max() if len(points) > FEW else body
-    if size < TINY * body:
+    size = np.ptp(points, axis=0).max() if len(points) > MIN_POINTS else body
+    if size < MIN_EXTENT * body:
         raise ExperimentError(
             f"the {len(points)} points lie within {size:.3g}, and the body is {body:.3g} long; "
-            "columns x, y, ux, uy count in the experiment's lattice units: multiply them",
+            "columns x, y, ux, uy must be in the experiment's lattice units: rescale them",
             ("measured", "file"),
         )
 
@@ -250,7 +260,7 @@ def _one_or_some(value: Any, info: ValidationInfo) -> tuple[MeasuredColumns, ...
     if isinstance(value, Mapping):
         return (_one.validate_python(_typed(value), context=info.context),)
     if isinstance(value, (list, tuple)):
-        value = [_typed(each) if isinstance(each, Mapping) else each for each in value]
+        value = [_typed(item) if isinstance(item, Mapping) else item for item in value]
     return _some.validate_python(value, context=info.context)
 
 
@@ -262,10 +272,11 @@ Measurements = Annotated[
     tuple[SerializeAsAny[MeasuredColumns], ...],
     BeforeValidator(_one_or_some, json_schema_input_type=_Any | tuple[_Any, ...]),
 ]
-"""One measurement, of a field unless it says otherwise, or a list of some."""
+"""One measurement, by default of a field, or a list of measurements."""
 
 
 FOLDER = Path(__file__).parent.parent / "fits"
+"""Folder of the shipped fits."""
 
 
 def _two(bounds: Pair) -> Pair:
@@ -278,9 +289,9 @@ Bounds = Annotated[Pair, AfterValidator(_two)]
 
 
 class Force(Strict):
-    """What a leader group carries, and how thick the body is: Young's modulus follows, in the unit
-    of the force over those of thickness and lattice. Where the experiment has units, these are N,
-    mm and MPa."""
+    """The force of a leader group and the thickness of the body, from which Young's modulus
+    follows, in the unit of the force over those of thickness and lattice. Units are N, mm and MPa
+    if the experiment has units."""
 
     group: Annotated[int, Field(ge=0)]
     value: Pair
@@ -289,15 +300,16 @@ class Force(Strict):
 
 
 class Rival(Strict):
-    """Another model for the same data: changes of the experiment, by path, and what is unknown of
-    it, where that is something else."""
+    """Another model for the same data: changes of the experiment, by path, and its unknown
+    parameters if they differ."""
 
     settings: Annotated[dict[str, Any], Field(min_length=1)]
     unknown: Annotated[dict[str, Bounds], Field(min_length=1)] | None = None
 
 
 class Sampler(Strict):
-    """Walkers of emcee, and their steps, a quarter of which is not counted."""
+    """Number of walkers of emcee, and of their steps; the first quarter of the steps is
+    discarded."""
 
     walkers: Annotated[int, Field(ge=4, le=1000)] = 16
     steps: Annotated[int, Field(ge=10)] = 200
@@ -305,17 +317,16 @@ class Sampler(Strict):
 
 
 class Fit(Strict):
-    """Looks for the `unknown` parameters, between bounds, with which an experiment is nearest to
-    what was measured of it: a field of its equilibrium, tracks, a curve, or some of these.
+    """Fits the `unknown` parameters of an experiment, within bounds, to measurements: a field in
+    equilibrium, tracks, a curve, or several of these.
 
-    Groups that move by `measured` are given `modes` smooth displacements along each axis, which
-    are estimated too; 0 takes what was measured there as it is. `loss` says how residuals count:
-    all but `linear` let outliers count less.
+    Leader groups that move by `measured` get `modes` smooth displacements along each axis, which
+    are estimated, too; with 0 the measured displacements are prescribed. `loss` is the loss
+    function of the residuals: all but `linear` reduce the weight of outliers.
 
-    On request, and at a price: `profile` names parameters whose likelihood is followed by fitting
-    all else anew; `sampler` draws from the posterior; `candidates` are other models by name, which
-    are compared with this one by what they foretell of points left out, one of so many `folds`
-    after another.
+    Optional and expensive: `profile` lists parameters whose profile likelihood is computed by
+    fitting all others again; `sampler` draws from the posterior; `candidates` are other models by
+    name, which are compared with this one by cross-validation over a number of `folds`.
     """
 
     version: Version = 1
@@ -334,34 +345,44 @@ class Fit(Strict):
 
     @property
     def beside(self) -> Beside:
-        """The files that it may name."""
+        """Return the folder of files that the fit may name."""
         return self._beside
 
     @model_validator(mode="after")
     def _fits_together(self, info: ValidationInfo) -> Self:
         object.__setattr__(self, "_beside", beside(info))
-        if len(self.measured) > 1 and any(m.noise is None for m in self.measured):
-            raise ValueError("several measurements need the `noise` of each, to be weighed by it")
+        if len(self.measured) > 1 and any(
+            measurement.noise is None for measurement in self.measured
+        ):
+            raise ValueError(
+                "several measurements need the `noise` of each, which determines their weights"
+            )
         if self.force and not isinstance(self.measured[0], MeasuredField):
             raise ValueError(
-                "`force` is what a group carries at rest while a field is measured; give forces "
-                "over displacement as a curve"
+                "`force` is the force of a group in equilibrium while a field is measured; give "
+                "forces over displacement as a curve"
             )
         if self.force and self.force.value == (0.0, 0.0):
-            raise ValueError("`force` is 0 both ways, which tells no modulus; leave it out")
-        scaled = [m for m in self.measured if isinstance(m, MeasuredCurve) and not m.youngs_modulus]
-        if self.force and scaled:
             raise ValueError(
-                "both `force` and a curve without `youngs_modulus` tell Young's modulus; leave "
-                "`force` out"
+                "`force` is 0 along both axes, which determines no modulus; leave it out"
             )
-        if unknown := [path for path in self.profile if path not in self.unknown]:
-            hint = did_you_mean(unknown[0], self.unknown)
-            raise ValueError(f"`profile` names '{unknown[0]}', which is not unknown{hint}")
+        curves_without_modulus = [
+            measurement
+            for measurement in self.measured
+            if isinstance(measurement, MeasuredCurve) and not measurement.youngs_modulus
+        ]
+        if self.force and curves_without_modulus:
+            raise ValueError(
+                "both `force` and a curve without `youngs_modulus` determine Young's modulus; "
+                "leave `force` out"
+            )
+        if invalid := [path for path in self.profile if path not in self.unknown]:
+            hint = did_you_mean(invalid[0], self.unknown)
+            raise ValueError(f"`profile` names '{invalid[0]}', which is not unknown{hint}")
         if self.sampler and self.loss != "linear":
-            raise ValueError("a `sampler` draws for normal noise: it needs `loss: linear`")
+            raise ValueError("a `sampler` assumes normal noise: it needs `loss: linear`")
         if self.sampler and self.sampler.walkers < 2 * len(self.unknown):
-            raise ValueError("a `sampler` needs two walkers for each parameter at least")
+            raise ValueError("a `sampler` needs at least two walkers for each parameter")
         return self
 
 
@@ -371,9 +392,27 @@ def described_fit(
     given: bool,
     measured: xarray.Dataset | None = None,
 ) -> tuple[Fit, Source]:
-    """Return the fit in a file, of a shipped name or in a dict, and the source of its experiment;
-    none is looked for where one is `given`. A dataset that was `measured` takes the place of the
-    file of the measurement. Raises ExperimentError."""
+    """Read a fit from a file, a shipped name or a mapping.
+
+    Parameters
+    ----------
+    description
+        Path or name, or the content.
+    given
+        Whether the experiment comes from elsewhere, so that the fit need not name one.
+
+    Returns
+    -------
+    fit
+        The fit.
+    source
+        Source of its experiment.
+
+    Raises
+    ------
+    ExperimentError
+        If the fit is invalid.
+    """
     if isinstance(description, Mapping):
         path, source = Path("fit"), Source("fit", dict(description), {}, OF_PROGRAM)
     else:
@@ -381,7 +420,7 @@ def described_fit(
         source = of_kind(FIT, read_file(path))
     if isinstance(source.data, dict) and source.data.get("kind") == "strength":
         raise ExperimentError(
-            f"{source.name}: is a fit of strength; pbdkit.fit_strength carries it out", ("kind",)
+            f"{source.name}: is a fit of strength; use pbdkit.fit_strength", ("kind",)
         )
     if given and isinstance(source.data, dict):
         source = Source(
@@ -408,7 +447,7 @@ def _with_dataset(source: Source) -> Source:
 
 
 def shipped_fits() -> list[str]:
-    """The names of the fits that come along, sorted."""
+    """Return the sorted names of the shipped fits."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
@@ -418,6 +457,6 @@ def _file(name: str) -> Path:
         return path
     if name in (names := shipped_fits()):
         return FOLDER / f"{name}.yaml"
-    near = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-    hint = did_you_mean(name, [*near, *names])
-    raise ExperimentError(f"{name}: is no file and no shipped fit{hint} ({', '.join(names)})")
+    files = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+    hint = did_you_mean(name, [*files, *names])
+    raise ExperimentError(f"{name}: is neither a file nor a shipped fit{hint} ({', '.join(names)})")

@@ -1,22 +1,24 @@
 """Strength of bonds and its scatter from repeated tests: fit file, likelihood, simulated specimens
 and result.
 
-The load at which the first bond breaks in a body whose displacements grow in proportion to the
-load: with d the difference along a bond under the experiment's full load, the strain under a share
-λ of it is ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1, p = r·d/|r|², q = |d|²/|r|². It is
-convex and 0 at λ = 0, so that a strained bond is strained the more the larger λ.
+The load at which the first bond breaks in a body with displacements proportional to the load: with
+d the difference along a bond under the experiment's full load, the strain at the load factor λ is
+ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1, p = r·d/|r|², q = |d|²/|r|². It is convex and
+0 at λ = 0, so that the strain of a stretched bond grows with λ.
 
-A specimen bears the load λ where all its bonds do: with probability Π_b (1 - F(ε_b(λ))). The
+A specimen bears the load λ if all its bonds do, with probability Π_b (1 - F(ε_b(λ))). The
 likelihood of repeats is therefore known without any run (weakest link: W. Weibull, J. Appl. Mech.
 18 (1951) 293). Location μ and scale σ of ln strength (Weibull: μ = ln s, σ = 1/m) or of strength
-(uniform) have the density dμ dσ/σ and the likelihood is integrated. Where all bonds are strained
-alike specimens are of a location-scale family too, and intervals from the integrated likelihood are
-exact, however few the specimens (J. Berger, Statistical Decision Theory, 1985, section 6.6).
+(uniform) have the prior density dμ dσ/σ, and the likelihood is integrated. If all bonds have equal
+strains, specimens also belong to a location-scale family, and intervals from the integrated
+likelihood are exact for any number of specimens (J. Berger, Statistical Decision Theory, 1985,
+section 6.6).
 
-Where no likelihood is known it is synthetic: single specimens are torn at strengths all over the
+If the likelihood is unknown it is synthetic: single specimens are torn at strengths over all
 bounds, and then where the measurement is likely. Mean and spread of ln peak follow by regression
-over the logarithms of the parameters; the mean of the measured ln peaks and the logarithm of their
-standard deviation, which are about normal, are compared (S. Wood, Nature 466 (2010) 1102).
+over the logarithms of the parameters. They are compared with the mean of the measured ln peaks and
+the logarithm of their standard deviation, which are approximately normal (S. Wood, Nature 466
+(2010) 1102).
 """
 
 from __future__ import annotations
@@ -57,20 +59,20 @@ from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import Floats, State, initial_state, unmoved_state
 
 KIND = "strength"
-"""What a strength fit says under `kind`."""
-FEWEST = 3
-"""So many specimens have to break: of fewer nothing is known of the scatter."""
+"""Value of `kind` in strength fits."""
+MIN_BROKEN = 3
+"""Smallest number of broken specimens from which scatter can be estimated."""
 
 
 class Peaks(Strict):
-    """How far each specimen bore the load, one number each: `peaks` themselves, or the `column` of
-    a CSV `file` beside this one. `of` says what they are: the `force` or the `displacement` of the
-    leader group `group` at the peak, or `factor`, the share of the experiment's own load.
+    """The peak load of each specimen: a list of `peaks`, or the `column` of a CSV `file` beside
+    this one. `of` is their quantity: the `force` or the `displacement` of the leader group `group`
+    at the peak, or `factor`, the fraction of the experiment's load.
 
-    In place of `column`, `curve` names the columns specimen, displacement and force of whole
-    curves, of which the peaks are taken. `broke` is 1 where a specimen broke and 0 where its test
-    ended before; a list, or the name of a column. Without it all broke. Forces are those of a body
-    of `youngs_modulus` and `thickness`; `group` is by default the one that moves farthest.
+    Instead of `column`, `curve` names the columns specimen, displacement and force of whole curves,
+    whose peaks are used. `broke` is 1 if a specimen broke and 0 if its test ended before, as a list
+    or the name of a column; by default all broke. Forces are those of a body of `youngs_modulus`
+    and `thickness`. `group` is by default the one with the largest displacement.
     """
 
     file: str | None = None
@@ -89,23 +91,23 @@ class Peaks(Strict):
     def _read(self, info: ValidationInfo) -> Self:
         if (self.file is None) == (not self.peaks):
             raise fault("needs either a file, or the peaks themselves", key="file")
-        values, broke = self._columns(info) if self.file is not None else self._given()
+        values, broke = self._columns(info) if self.file is not None else self._listed()
         for n, value in enumerate(values):
             if not 0.0 < value < np.inf:
-                text = f"peaks are above 0; that of specimen {n + 1} is {value:g}"
+                text = f"peaks must be above 0; that of specimen {n + 1} is {value:g}"
                 raise fault(text, key="file" if self.file else "peaks")
-        if broke.sum() < FEWEST:
+        if broke.sum() < MIN_BROKEN:
             raise fault(
-                f"{int(broke.sum())} specimens broke; scatter needs at least {FEWEST}",
+                f"{int(broke.sum())} specimens broke; scatter needs at least {MIN_BROKEN}",
                 key="file" if self.file else "peaks",
             )
         object.__setattr__(self, "_values", values)
         object.__setattr__(self, "_broke", broke)
         return self
 
-    def _given(self) -> tuple[Floats, Any]:
+    def _listed(self) -> tuple[Floats, Any]:
         if isinstance(self.broke, str):
-            raise fault("names a column, and there is no file; give a list of 0 and 1", key="broke")
+            raise fault("names a column without a file; give a list of 0 and 1", key="broke")
         broke = np.array(self.broke or [1] * len(self.peaks), bool)
         if len(broke) != len(self.peaks):
             text = f"{len(broke)} numbers for {len(self.peaks)} peaks; give one each"
@@ -115,47 +117,48 @@ class Peaks(Strict):
     def _columns(self, info: ValidationInfo) -> tuple[Floats, Any]:
         if self.broke and not isinstance(self.broke, str):
             raise fault("is a list, and peaks are in a file; name its column", key="broke")
-        more = (self.broke,) if isinstance(self.broke, str) else ()
+        further = (self.broke,) if isinstance(self.broke, str) else ()
         if self.curve is None:
-            rows = np.array(read_columns(self.file, info, (self.column, *more)))
+            rows = np.array(read_columns(self.file, info, (self.column, *further)))
         else:
             if self.of == "factor":
-                raise fault("curves tell forces and displacements, no factor", key="of")
-            rows = _of_curves(
-                np.array(read_columns(self.file, info, (*self.curve, *more))), self.of
+                raise fault("curves contain forces and displacements, but no factor", key="of")
+            rows = _peaks_of_curves(
+                np.array(read_columns(self.file, info, (*self.curve, *further))), self.of
             )
-        return rows[:, 0], rows[:, 1] != 0.0 if more else np.ones(len(rows), bool)
+        return rows[:, 0], rows[:, 1] != 0.0 if further else np.ones(len(rows), bool)
 
     @property
     def values(self) -> Floats:
-        """(specimen,): the peaks."""
+        """Return the peaks, (specimen,)."""
         return np.asarray(self._values)
 
     @property
     def failed(self) -> Any:
-        """(specimen,): whether it broke."""
+        """Return whether each specimen broke, (specimen,)."""
         return self._broke
 
 
-def _of_curves(rows: Floats, of: str) -> Floats:
-    """Of each specimen its largest force, or the displacement there, and the rest of the row."""
-    kept = []
+def _peaks_of_curves(rows: Floats, quantity: str) -> Floats:
+    """Return the largest force of each specimen, or the displacement there, and the rest of the
+    row."""
+    peaks = []
     for specimen in np.unique(rows[:, 0]):
-        own = rows[rows[:, 0] == specimen]
-        top = own[own[:, 2].argmax()]
-        kept.append([top[2] if of == "force" else top[1], *top[3:]])
-    return np.array(kept)
+        curve = rows[rows[:, 0] == specimen]
+        top = curve[curve[:, 2].argmax()]
+        peaks.append([top[2] if quantity == "force" else top[1], *top[3:]])
+    return np.array(peaks)
 
 
 class StrengthFit(Strict):
-    """Looks for the strength of bonds and its scatter, the `unknown` parameters between bounds, in
+    """Fits the strength of bonds and its scatter, the `unknown` parameters within bounds, to
     repeats of one experiment.
 
     `law` is the distribution of strengths, by default that of the experiment's fracture. `method`:
-    `likelihood` counts the first bond that breaks as the failure of the specimen, `simulation`
-    compares with specimens that are torn, `auto` takes the second where the first does not hold.
-    So many specimens are torn to `check` that, so many sets of them make the `simulations`; `seed`
-    is of the random numbers of both.
+    `likelihood` assumes that a specimen fails with its first bond, `simulation` compares with
+    simulated specimens, `auto` uses the second if that assumption does not hold. `check` is the
+    number of specimens that are simulated to test it, `simulations` the number for the second
+    method, `seed` that of the random numbers of both.
     """
 
     version: Version = 1
@@ -173,13 +176,16 @@ class StrengthFit(Strict):
     def _positive(self) -> Self:
         for path, (low, _) in self.unknown.items():
             if low <= 0.0:
-                raise fault(f"strengths and their scatter are above 0; got {low:g}", key=path)
+                raise fault(f"strengths and their scatter must be above 0; got {low:g}", key=path)
         return self
 
 
 def is_strength_fit(description: Mapping[str, Any] | str | Path) -> bool:
-    """Whether a fit file, a shipped fit or a dict describes a strength fit: by its `kind`. False
-    where nothing can be read there; whoever reads it next says why."""
+    """Return whether a fit file, a shipped fit or a mapping describes a strength fit, by its
+    `kind`.
+
+    It is False if the file cannot be read, which is reported when it is read again.
+    """
     if isinstance(description, Mapping):
         return description.get("kind") == KIND
     path = _file(description)
@@ -189,8 +195,27 @@ def is_strength_fit(description: Mapping[str, Any] | str | Path) -> bool:
 def described_strength_fit(
     description: Mapping[str, Any] | str | Path, *, given: bool
 ) -> tuple[StrengthFit, Source]:
-    """The strength fit in a file, of a shipped name or in a dict, and the source of its experiment;
-    none is looked for where one is `given`. Raises ExperimentError."""
+    """Read a strength fit from a file, a shipped name or a mapping.
+
+    Parameters
+    ----------
+    description
+        Path or name, or the content.
+    given
+        Whether the experiment comes from elsewhere, so that the fit need not name one.
+
+    Returns
+    -------
+    fit
+        The fit.
+    source
+        Source of its experiment.
+
+    Raises
+    ------
+    ExperimentError
+        If the fit is invalid.
+    """
     if isinstance(description, Mapping):
         path, source = Path("fit"), Source("fit", dict(description), {}, OF_PROGRAM)
     else:
@@ -212,40 +237,54 @@ def _file(name: str | Path) -> Path:
 
 
 PARTS = 4
-"""Of the load, after each of which proportion is looked at."""
-PROPORTION, ALIKE = 1e-6, 1e-9
-"""The share of the largest displacement by which displacements may be out of it; that of the
-largest p and q within which bonds count as alike."""
+"""Number of load increments after which proportionality is checked."""
+PROPORTION = 1e-6
+"""Largest deviation from proportionality, relative to the largest displacement."""
 
-FIRST = "the load of the first break is not known from one equilibrium; take method: simulation"
+ALIKE = 1e-9
+"""Largest difference of p and q of equal bonds, relative to the largest p and q."""
+
+NOT_PROPORTIONAL = (
+    "the load of the first break does not follow from one equilibrium; use method: simulation"
+)
+"""End of messages about bodies that are not proportional to the load."""
 
 
 @dataclass(frozen=True)
 class BondStrains:
-    """p and q of bonds, (bond,), and how many bonds each row counts for."""
+    """Strains of bonds as functions of the load factor.
+
+    Parameters
+    ----------
+    p, q : (bond,)
+        Coefficients, see the module.
+    count : (bond,)
+        Number of bonds that a row stands for.
+    """
 
     p: Floats
     q: Floats
     count: Floats
 
     def at(self, load: Floats) -> Floats:
-        """ε, (load, bond); 0 for what is pressed."""
+        """Return the strains ε, (load, bond); 0 for compressed bonds."""
         x = load[:, None] * (2.0 * self.p + load[:, None] * self.q)
         return np.asarray(np.maximum(x, 0.0) / (np.sqrt(1.0 + np.maximum(x, 0.0)) + 1.0))
 
     def rate(self, load: Floats) -> Floats:
-        """dε/dλ, (load, bond), where ε > 0."""
+        """Return dε/dλ, (load, bond), where ε > 0."""
         return np.asarray((self.p + load[:, None] * self.q) / (1.0 + self.at(load)))
 
     def load_at(self, strain: Floats) -> Floats:
-        """λ at which each bond has a strain of its own, (bond,); inf for bonds without motion."""
+        """Return the load factor at which each bond reaches a strain, (bond,); infinite for bonds
+        without strain."""
         x = strain * (2.0 + strain)
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = x / (self.p + np.sqrt(self.p**2 + self.q * x))
-        return np.asarray(np.where(self.q > 0.0, found, np.inf))
+            load = x / (self.p + np.sqrt(self.p**2 + self.q * x))
+        return np.asarray(np.where(self.q > 0.0, load, np.inf))
 
     def merged(self) -> BondStrains:
-        """Those that are strained at some load, and bonds that are alike in one row."""
+        """Return the bonds that are strained at some load, with equal bonds merged."""
         strained = self.q > 0.0
         pq = np.stack([self.p[strained], self.q[strained]], axis=1)
         steps = np.round(pq / (ALIKE * np.abs(pq).max(axis=0)))
@@ -255,50 +294,59 @@ class BondStrains:
 
 
 def bond_strains(scene: Scene, state: State) -> BondStrains:
-    """Of the bonds of a scene in their order, from where they are in a state; p = q = 0 for those
-    that are broken or cannot break."""
+    """Return the strains of the bonds of a scene, extrapolated from a state.
+
+    p = q = 0 for bonds that are broken or cannot break.
+    """
     bonds, shape = scene.bonds, scene.raster.shape
     p, q = np.zeros((2, len(bonds.ends)))
     for n, plane in enumerate(scene.neighbourhood.planes):
         rows = np.flatnonzero(bonds.plane == n)
-        here = Places(shape, bonds.place[rows] + plane.slot.source * int(np.prod(shape[1:])))
-        d = here.seen_through(plane.slot).of(state.u) - here.of(state.u)
+        places = Places(shape, bonds.place[rows] + plane.slot.source * int(np.prod(shape[1:])))
+        d = places.seen_through(plane.slot).of(state.u) - places.of(state.u)
         rest = np.array(plane.slot.rest)
         p[rows] = rest @ d / (rest @ rest)
         q[rows] = (d**2).sum(axis=0) / (rest @ rest)
-    whole = np.ones(len(p), bool)
+    can_break = np.ones(len(p), bool)
     if state.broken_step is not None:
-        whole = state.broken_step.reshape(len(state.broken_step), -1)[bonds.plane, bonds.place] < 0
+        can_break = (
+            state.broken_step.reshape(len(state.broken_step), -1)[bonds.plane, bonds.place] < 0
+        )
     if not scene.experiment.fracture.breaks_frame_bonds():
-        whole &= (scene.raster.table_kind[bonds.ends] == FOLLOWER).all(axis=1)
-    return BondStrains(np.where(whole, p, 0.0), np.where(whole, q, 0.0), np.ones(len(p)))
+        can_break &= (scene.raster.table_kind[bonds.ends] == FOLLOWER).all(axis=1)
+    return BondStrains(np.where(can_break, p, 0.0), np.where(can_break, q, 0.0), np.ones(len(p)))
 
 
 def strengths(scene: Scene, state: State) -> Floats:
-    """The strain at which each bond of a scene breaks, (bond,). Raises ExperimentError where the
-    model does not tell."""
+    """Return the strain at which each bond breaks, (bond,).
+
+    Raises
+    ------
+    ExperimentError
+        If the fracture model does not define it.
+    """
     model, bonds = scene.experiment.fracture, scene.bonds
     if not isinstance(model, BreaksAtStrain):
         raise ExperimentError(
-            f"'{model.type}' tells no strain at which a bond breaks", ("fracture",)
+            f"'{model.type}' defines no strain at which a bond breaks", ("fracture",)
         )
-    found = np.zeros(len(bonds.ends))
+    limits = np.zeros(len(bonds.ends))
     for n, plane in enumerate(scene.neighbourhood.planes):
         rows = np.flatnonzero(bonds.plane == n)
         home = Places(scene.raster.shape, bonds.place[rows])
-        own = [home.within(value[n]) for value in state.bond_values]
-        c = scene.constants.of_bond(*scene.constants.limits_at(plane.slot, n, home), *own)
-        found[rows] = model.breaking_strain(plane.slot.rest, c, scene.constants.fracture)
-    return found
+        values = [home.within(value[n]) for value in state.bond_values]
+        c = scene.constants.of_bond(*scene.constants.limits_at(plane.slot, n, home), *values)
+        limits[rows] = model.breaking_strain(plane.slot.rest, c, scene.constants.fracture)
+    return limits
 
 
-def knows_forces(scene: Scene) -> bool:
-    """Whether its rule pulls with forces: others only say where particles go."""
+def has_forces(scene: Scene) -> bool:
+    """Return whether the rule of a scene defines forces, or displacements alone."""
     return isinstance(scene.experiment.rule, Calibrated)
 
 
 class MachineReading(NamedTuple):
-    """What a testing machine shows; the force is nan where the rule knows none."""
+    """MachineReading of a testing machine; the force is NaN if the rule defines none."""
 
     force: float
     displacement: float
@@ -306,43 +354,59 @@ class MachineReading(NamedTuple):
 
 @dataclass(frozen=True)
 class Pull:
-    """The leader group that tears a body, the direction in which it goes, and what forces are
-    multiplied by."""
+    """Leader group that loads a body.
+
+    Parameters
+    ----------
+    group
+        Its number.
+    direction
+        Unit vector of its displacement.
+    factor
+        Factor of forces.
+    """
 
     group: int
-    way: Floats
+    direction: Floats
     factor: float
 
     @classmethod
     def of(cls, scene: Scene, state: State, peaks: Peaks) -> Pull:
-        """The group that is asked for, or the one that moves farthest, along its way. Raises
-        ExperimentError where there is none, and where it does not move."""
+        """Return the selected group, or the one with the largest displacement.
+
+        Raises
+        ------
+        ExperimentError
+            If there is none, or if it does not move.
+        """
         if not scene.leading:
-            raise ExperimentError("there are no leaders that tear the body", ("leaders",))
-        moved = np.stack([_mean(scene, state, n) for n in range(len(scene.leading))])
-        size = np.hypot.reduce(moved, axis=1)
+            raise ExperimentError("there are no leaders that load the body", ("leaders",))
+        displacements = np.stack([_mean(scene, state, n) for n in range(len(scene.leading))])
+        size = np.hypot.reduce(displacements, axis=1)
         group = int(size.argmax()) if peaks.group is None else peaks.group
-        if group >= len(moved):
+        if group >= len(displacements):
             raise ExperimentError(f"there is no leader group {group}", ("measured", "group"))
         if size[group] == 0.0:
             raise ExperimentError(
-                f"leader group {group} does not move; name one that tears the body",
+                f"leader group {group} does not move; name one that loads the body",
                 ("measured", "group"),
             )
-        return cls(group, moved[group] / size[group], peaks.youngs_modulus * peaks.thickness)
-
-    def seen(self, tables: Tables, state: State) -> MachineReading:
-        """Both along the way; the displacement is the mean of the group's particles."""
-        carried = np.full(len(self.way), np.nan)
-        if knows_forces(tables.scene):
-            carried = reactions(StateMoment(state, tables))[self.group]
-        return MachineReading(
-            self.factor * float(self.way @ carried), self.moved(tables.scene, state)
+        return cls(
+            group, displacements[group] / size[group], peaks.youngs_modulus * peaks.thickness
         )
 
-    def moved(self, scene: Scene, state: State) -> float:
-        """The displacement alone."""
-        return float(self.way @ _mean(scene, state, self.group))
+    def read(self, tables: Tables, state: State) -> MachineReading:
+        """Return force and mean displacement of the group along its direction."""
+        reaction = np.full(len(self.direction), np.nan)
+        if has_forces(tables.scene):
+            reaction = reactions(StateMoment(state, tables))[self.group]
+        return MachineReading(
+            self.factor * float(self.direction @ reaction), self.displacement(tables.scene, state)
+        )
+
+    def displacement(self, scene: Scene, state: State) -> float:
+        """Return the displacement alone."""
+        return float(self.direction @ _mean(scene, state, self.group))
 
 
 def _mean(scene: Scene, state: State, group: int) -> Floats:
@@ -352,8 +416,19 @@ def _mean(scene: Scene, state: State, group: int) -> Floats:
 
 @dataclass(frozen=True)
 class ElasticResponse:
-    """A body before anything breaks, under the experiment's full load: its displacements u as
-    planes, how its bonds are strained, and what is seen of it, if a leader group is asked for."""
+    """A body before fracture under the experiment's full load.
+
+    Parameters
+    ----------
+    strains
+        Strains of its bonds.
+    pull
+        Leader group that loads it, if forces or displacements are measured.
+    full
+        MachineReading at the full load.
+    u
+        Displacements as planes.
+    """
 
     strains: BondStrains
     pull: Pull | None
@@ -362,67 +437,93 @@ class ElasticResponse:
 
     @classmethod
     def of(cls, experiment: Experiment, peaks: Peaks) -> ElasticResponse:
-        """From the equilibrium of an experiment whose bonds do not break. Raises ExperimentError
-        where displacements do not grow in proportion to the load."""
+        """Compute the equilibrium of an experiment with bonds that do not break.
+
+        Raises
+        ------
+        ExperimentError
+            If displacements are not proportional to the load.
+        """
         experiment = experiment.model_copy(update={"solver": Equilibrium(increments=PARTS)})
         scene = build_scene(experiment)
         if scene.barriers:
-            raise ExperimentError("what touches obstacles is held by more and more of it: " + FIRST)
-        state, seen = initial_state(scene), list[Floats]()
+            raise ExperimentError(
+                "contacts with obstacles change with the load: " + NOT_PROPORTIONAL
+            )
+        state, displacements = initial_state(scene), list[Floats]()
         finder = finder_of(scene, state, compiles=False)
         for _ in increments(scene, state, Watch(), finder=finder):
-            seen.append(state.u.copy())
-        _refuse_out_of_proportion(seen, state.u, experiment.rule.linear)
+            displacements.append(state.u.copy())
+        _refuse_out_of_proportion(displacements, state.u, experiment.rule.linear)
         strains = bond_strains(scene, state)
         if peaks.of == "factor":
             return cls(strains, None, MachineReading(1.0, 1.0), state.u)
         pull = Pull.of(scene, state, peaks)
-        return cls(strains, pull, pull.seen(Tables(scene), state), state.u)
+        return cls(strains, pull, pull.read(Tables(scene), state), state.u)
 
 
-def _refuse_out_of_proportion(seen: list[Floats], last: Floats, linear: bool) -> None:
-    size, before = float(np.abs(last).max()), 0.0
+def _refuse_out_of_proportion(displacements: list[Floats], last: Floats, linear: bool) -> None:
+    size, last_share = float(np.abs(last).max()), 0.0
     if size == 0.0:
         raise ExperimentError("nothing moves under the load of this experiment", ("leaders",))
-    if not (seen or linear):
-        raise ExperimentError("the rule is not linear: " + FIRST)
-    for u in seen:
+    if not (displacements or linear):
+        raise ExperimentError("the rule is not linear: " + NOT_PROPORTIONAL)
+    for u in displacements:
         share = float((u * last).sum() / (last * last).sum())
-        off = float(np.abs(u - share * last).max()) / size
-        if off > PROPORTION or share < before:
+        deviation = float(np.abs(u - share * last).max()) / size
+        if deviation > PROPORTION or share < last_share:
             raise ExperimentError(
-                f"displacements do not grow in proportion to the load ({off:.2g} off): " + FIRST
+                f"displacements are not proportional to the load ({deviation:.2g} off): "
+                + NOT_PROPORTIONAL
             )
-        before = share
+        last_share = share
 
 
 LOST = 0.5
-"""The share of its peak below which a specimen that bears no more has failed."""
+"""Fraction of its peak force below which a specimen has failed."""
 
 
 @dataclass(frozen=True)
 class Specimen:
-    """What was seen of one at its peak, and when its first bond broke (None where one equilibrium
-    does not tell), and whether it failed."""
+    """A simulated specimen.
+
+    Parameters
+    ----------
+    peak
+        MachineReading at its peak.
+    first
+        MachineReading at the first break; None if it does not follow from one equilibrium.
+    failed
+        Whether it failed.
+    """
 
     peak: MachineReading
     first: MachineReading | None
     failed: bool
 
-    def peak_of(self, of: str) -> float:
-        """Force or displacement at the peak."""
-        return self.peak.force if of == "force" else self.peak.displacement
+    def peak_of(self, quantity: str) -> float:
+        """Return force or displacement at the peak."""
+        return self.peak.force if quantity == "force" else self.peak.displacement
 
-    def first_of(self, of: str) -> float:
-        """Force or displacement at the first break."""
+    def first_of(self, quantity: str) -> float:
+        """Return force or displacement at the first break."""
         assert self.first is not None
-        return self.first.force if of == "force" else self.first.displacement
+        return self.first.force if quantity == "force" else self.first.displacement
 
 
 @dataclass(frozen=True)
 class Specimens:
-    """Where they come from: the scene of an experiment, and its equilibrium before anything breaks,
-    if it is known."""
+    """Simulated specimens of an experiment.
+
+    Parameters
+    ----------
+    scene
+        Scene of the experiment.
+    peaks
+        Measured peaks.
+    elastic
+        The body before fracture, if it is known.
+    """
 
     scene: Scene
     peaks: Peaks
@@ -430,72 +531,88 @@ class Specimens:
 
     @classmethod
     def of(cls, experiment: Experiment, peaks: Peaks, elastic: ElasticResponse | None) -> Specimens:
-        """Torn by the experiment's solver, or in increments. Raises ExperimentError."""
+        """Prepare simulations by the experiment's solver, or by equilibria.
+
+        Raises
+        ------
+        ExperimentError
+            If the experiment is invalid.
+        """
         if experiment.solver.makes_steps:
             experiment = experiment.model_copy(update={"solver": Equilibrium()})
         return cls(build_scene(experiment), peaks, elastic)
 
-    def torn(self, experiment: Experiment) -> Specimen:
-        """One of an experiment that is like that of the scene but for its numbers and its seed,
-        until it has lost half of what it bore. Between two increments its load grows in proportion
-        until the next bond breaks."""
+    def tear(self, experiment: Experiment) -> Specimen:
+        """Simulate a specimen until it has lost half of its peak force.
+
+        The experiment differs from that of the scene by parameters and seed. Between increments the
+        load is scaled until the next bond breaks.
+        """
         scene = scene_like(self.scene, experiment)
         state, tables = initial_state(scene), Tables(scene)
-        limits = strengths(scene, state) if self._tells_breaks else None
+        limits = strengths(scene, state) if self._has_known_breaks else None
         first = None if limits is None else self._first(limits)
-        since = self._whole_until(state, first) if first else 0.0
+        start = self._advance_to_first_break(state, first) if first else 0.0
         pull = self.elastic.pull if self.elastic else None
-        top, before, grows = first or MachineReading(0.0, 0.0), MachineReading(0.0, 0.0), 1.0
-        for _ in chain(increments(scene, state, Watch(), since), [None]):
+        peak, last, growth = first or MachineReading(0.0, 0.0), MachineReading(0.0, 0.0), 1.0
+        for _ in chain(increments(scene, state, Watch(), start), [None]):
             pull = pull or Pull.of(scene, state, self.peaks)
-            seen = pull.seen(tables, state)
-            if grows > 1.0 and before.displacement > 0.0:
-                share = min(grows, seen.displacement / before.displacement)
-                top = max(top, MachineReading(share * before.force, share * before.displacement))
-            top = max(top, seen) if seen.displacement > (first or seen).displacement else top
-            if seen.force < LOST * top.force and seen.displacement >= top.displacement:
-                return Specimen(top, first, True)
-            before = seen
+            reading = pull.read(tables, state)
+            if growth > 1.0 and last.displacement > 0.0:
+                share = min(growth, reading.displacement / last.displacement)
+                peak = max(peak, MachineReading(share * last.force, share * last.displacement))
+            peak = (
+                max(peak, reading)
+                if reading.displacement > (first or reading).displacement
+                else peak
+            )
+            if reading.force < LOST * peak.force and reading.displacement >= peak.displacement:
+                return Specimen(peak, first, True)
+            last = reading
             if limits is not None:
-                grows = float(bond_strains(scene, state).load_at(limits).min())
-        return Specimen(top, first, first is not None and top.displacement < before.displacement)
+                growth = float(bond_strains(scene, state).load_at(limits).min())
+        return Specimen(peak, first, first is not None and peak.displacement < last.displacement)
 
     @property
-    def _tells_breaks(self) -> bool:
+    def _has_known_breaks(self) -> bool:
         model = self.scene.experiment.fracture
         tells = isinstance(model, BreaksAtStrain) and not isinstance(model, Softens)
         return tells and self.elastic is not None
 
-    def _whole_until(self, state: State, first: MachineReading) -> float:
-        """Takes a state to the last increment before its first bond breaks, and returns its moment:
-        on the way there nothing but the load changes."""
+    def _advance_to_first_break(self, state: State, first: MachineReading) -> float:
+        """Set a state to the last increment before the first break, and return its moment.
+
+        The load alone changes until then.
+        """
         assert self.elastic is not None
-        before = [(m, share) for m, share in self._way if share * self.elastic.full.displacement
-                  < first.displacement]  # fmt: skip
-        if not before:
+        full = self.elastic.full.displacement
+        earlier = [
+            (end, share) for end, share in self._load_path if share * full < first.displacement
+        ]
+        if not earlier:
             return 0.0
-        moment, share = before[-1]
+        moment, share = earlier[-1]
         _, state.starts = prescribe(self.scene, state, moment)
         state.u[...] = state.previous[...] = share * self.elastic.u
         state.step = math.floor(moment)
         return moment
 
     @cached_property
-    def _way(self) -> list[tuple[float, float]]:
-        """The ends of increments but the last, and the share of the load there."""
+    def _load_path(self) -> list[tuple[float, float]]:
+        """Return the ends of all increments but the last, with the load factor."""
         assert self.elastic is not None
         assert self.elastic.pull is not None
-        count, found = self.scene.experiment.solver.sought.increments, []
+        count, path = self.scene.experiment.solver.sought.increments, []
         for moment in moments(self.scene, count)[:-1]:
             state = unmoved_state(self.scene, self.scene.raster.shape[1:])
-            led, _ = prescribe(self.scene, state, moment)
-            place(state.u, led)
-            moved = self.elastic.pull.moved(self.scene, state)
-            found.append((moment, moved / self.elastic.full.displacement))
-        return found
+            leaders, _ = prescribe(self.scene, state, moment)
+            place(state.u, leaders)
+            displacement = self.elastic.pull.displacement(self.scene, state)
+            path.append((moment, displacement / self.elastic.full.displacement))
+        return path
 
     def _first(self, limits: Floats) -> MachineReading:
-        """Bond by bond, in their order: exact."""
+        """Return the reading at the first break, exactly."""
         assert self.elastic is not None
         share = float(self.elastic.strains.load_at(limits).min())
         return MachineReading(
@@ -504,7 +621,7 @@ class Specimens:
 
 
 def seeded(experiment: Experiment, seed: int) -> Experiment:
-    """The experiment with another seed: strengths and random fields are drawn anew."""
+    """Return the experiment with another seed, from which strengths and random fields are drawn."""
     varies = any(getattr(part, "varying", None) for part in (experiment.rule, experiment.fracture))
     if not varies:
         return experiment.model_copy(update={"seed": seed})
@@ -513,19 +630,24 @@ def seeded(experiment: Experiment, seed: int) -> Experiment:
     return Experiment.build(source, given_classes(experiment))
 
 
-COARSE, FINE = 40, 64
-"""Nodes along a parameter: to find where the likelihood is, and to integrate it."""
+COARSE = 40
+"""Number of nodes along a parameter to locate the likelihood."""
+
+FINE = 64
+"""Number of nodes along a parameter to integrate it."""
 NEGLIGIBLE = 18.0
-"""Below the largest logarithm: less than 2e-8 of it."""
+"""Difference to the largest logarithm above which the likelihood is negligible (2e-8)."""
 DRAWS = 20_000
+"""Number of draws."""
 DEPTH = 1e-8
-"""The share of the weakest specimen's strain that counts as none."""
+"""Fraction of the strain of the weakest specimen that is negligible."""
 LawBounds = tuple[tuple[float, float], tuple[float, float]]
+"""Bounds of both parameters of a law."""
 
 
 @dataclass(frozen=True)
 class Breaks:
-    """Load factors of specimens, (specimen,), and whether each broke there or bore more."""
+    """Load factors of specimens, (specimen,), and whether each broke there or survived."""
 
     load: Floats
     broke: Mask
@@ -533,58 +655,63 @@ class Breaks:
 
 @dataclass(frozen=True)
 class WeightedSamples:
-    """Parameters that go with the measurement, (draw, parameter), and how much each counts."""
+    """WeightedSamples of parameters, (draw, parameter), with their weights."""
 
     values: Floats
     weights: Floats
 
 
 class StrengthLaw(ABC):
-    """A distribution of strengths with two parameters, by their paths in an experiment."""
+    """A distribution of strengths with two parameters, `paths` in an experiment."""
 
     paths: ClassVar[tuple[str, str]]
 
     @staticmethod
     @abstractmethod
     def whole(path: str) -> float:
-        """The number at a path with which no bond breaks."""
+        """Return the value of the parameter at a path for which no bond breaks."""
 
     @abstractmethod
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
-        """From the integrated likelihood between bounds."""
+        """Draw parameters from the integrated likelihood between bounds."""
 
     @staticmethod
     @abstractmethod
     def variation(first: Floats, second: Floats) -> Floats:
-        """The coefficient of variation of strengths."""
+        """Return the coefficient of variation of strengths."""
 
 
 class WeibullLaw(StrengthLaw):
-    """F(ε) = 1 - exp(-(ε/s)^m)."""
+    """Weibull distribution, F(ε) = 1 - exp(-(ε/s)^m)."""
 
     paths = ("fracture.scale", "fracture.modulus")
 
     @staticmethod
     def whole(path: str) -> float:
-        """A scale out of reach, and hardly any scatter."""
+        """Return a scale out of reach, or a modulus without scatter."""
         return 1e60 if path == "fracture.scale" else 1000.0
 
     @staticmethod
     def variation(first: Floats, second: Floats) -> Floats:
-        """√(Γ(1 + 2/m)/Γ(1 + 1/m)² - 1)."""
+        """Return √(Γ(1 + 2/m)/Γ(1 + 1/m)² - 1)."""
         from scipy.special import gammaln
 
         return np.asarray(np.sqrt(np.expm1(gammaln(1 + 2 / second) - 2 * gammaln(1 + 1 / second))))
 
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
-        """For a modulus, Σ_specimens Σ_b ε^m / s^m is gamma-distributed with the number of
-        failures; moduli are drawn from what is left when that is integrated."""
+        """Draw parameters from the integrated likelihood.
+
+        Notes
+        -----
+        For a modulus, Σ_specimens Σ_b ε^m / s^m has a gamma distribution with the number of
+        failures. Moduli are drawn from the marginal density.
+        """
         from scipy.special import gammainc, gammaincinv
 
         count = int(breaks.broke.sum())
 
         def logarithm(log_m: Floats) -> tuple[Floats, Floats]:
-            """Of the density of ln m, and of the sum."""
+            """Return the logarithms of the density of ln m, and of the sum."""
             m = np.exp(log_m)
             sums, slopes = weibull_sums(strains, breaks, m)
             total = np.logaddexp.reduce(sums, axis=1)
@@ -595,143 +722,162 @@ class WeibullLaw(StrengthLaw):
                 return density + np.log(np.maximum(inside[0] - inside[1], 0.0)), total
 
         nodes = _nodes(bounds[1])
-        (nodes,) = _where(logarithm(nodes)[0], nodes)
+        (nodes,) = _refine_nodes(logarithm(nodes)[0], nodes)
         density, total = logarithm(nodes)
         order = (np.arange(DRAWS) + 0.5) / DRAWS
         share = np.exp(density - density.max())
-        within = np.concatenate([[0.0], np.cumsum((share[1:] + share[:-1]) / 2)])
-        log_m = np.interp(order, within / within[-1], nodes)
+        cumulative = np.concatenate([[0.0], np.cumsum((share[1:] + share[:-1]) / 2)])
+        log_m = np.interp(order, cumulative / cumulative[-1], nodes)
         m, log_total = np.exp(log_m), np.interp(log_m, nodes, total)
         low, high = (gammainc(count, np.exp(np.minimum(log_total - m * np.log(end), 700.0)))
                      for end in reversed(bounds[0]))  # fmt: skip
-        # A low-discrepancy sequence beside `order`: the same draws whenever the fit is made.
+        # A low-discrepancy sequence beside `order` makes the draws reproducible.
         other = (np.arange(DRAWS) * 0.6180339887498949 + 0.5) % 1.0
         log_s = (log_total - np.log(gammaincinv(count, low + other * (high - low)))) / m
         return WeightedSamples(np.stack([np.exp(log_s), m], axis=1), np.full(DRAWS, 1.0 / DRAWS))
 
 
 def weibull_sums(strains: BondStrains, breaks: Breaks, m: Floats) -> tuple[Floats, Floats]:
-    """For each modulus and load ln Σ_b ε^m, and the logarithm of its rate by the load, (modulus,
-    specimen)."""
+    """Return ln Σ_b ε^m for each modulus and load, and the logarithm of its derivative by the load,
+    (modulus, specimen)."""
     with np.errstate(divide="ignore"):
         strain = np.log(strains.at(breaks.load))
         rate = np.where(strain > -np.inf, strains.rate(breaks.load), 1.0)
     top = strain.max(axis=1, keepdims=True)
     sums, slopes = np.empty((2, len(m), len(strain)))
-    for n, each in enumerate(m):
-        share = np.exp(each * (strain - top)) * strains.count
-        sums[n] = np.log(share.sum(axis=1)) + each * top[:, 0]
-        grows = (share * rate * np.exp(-np.maximum(strain - top, -700.0))).sum(axis=1)
-        slopes[n] = np.log(each * grows) + (each - 1.0) * top[:, 0]
+    for n, modulus in enumerate(m):
+        share = np.exp(modulus * (strain - top)) * strains.count
+        sums[n] = np.log(share.sum(axis=1)) + modulus * top[:, 0]
+        growth = (share * rate * np.exp(-np.maximum(strain - top, -700.0))).sum(axis=1)
+        slopes[n] = np.log(modulus * growth) + (modulus - 1.0) * top[:, 0]
     return sums, slopes
 
 
 class UniformLaw(StrengthLaw):
-    """Uniform within f (1 ± s): from a = f (1 - s), w = 2 f s wide."""
+    """Uniform distribution within f (1 ± s): from a = f (1 - s), with the width w = 2 f s."""
 
     paths = ("fracture.failure", "fracture.scatter")
 
     @staticmethod
     def whole(path: str) -> float:
-        """A strain out of reach, the same for all."""
+        """Return a strain out of reach, or zero scatter."""
         return 1e60 if path == "fracture.failure" else 0.0
 
     @staticmethod
     def variation(first: Floats, second: Floats) -> Floats:
-        """s/√3."""
+        """Return s/√3."""
         return np.asarray(second / np.sqrt(3.0))
 
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
-        """On a grid of ln w and of how far a lies below what the weakest specimen bore."""
+        """Draw parameters on a grid of ln w and of the distance of a below the strain of the
+        weakest specimen."""
         strain, rate = strains.at(breaks.load), strains.rate(breaks.load)
         lowest = float(strain[breaks.broke].max(axis=1).min())
 
         def logarithm(depth: Floats, log_w: Floats) -> Floats:
             a, w = lowest - np.exp(depth)[:, None], np.exp(log_w)[None, :]
-            matters = strain.max(axis=0) > a.min()
-            parts = strain[:, matters], rate[:, matters], strains.count[matters], breaks.broke
-            found = np.array([[_uniform(*parts, x, y) for y in w[0]] for x in a[:, 0]])
+            is_relevant = strain.max(axis=0) > a.min()
+            parts = (
+                strain[:, is_relevant],
+                rate[:, is_relevant],
+                strains.count[is_relevant],
+                breaks.broke,
+            )
+            log_likelihood = np.array([[_uniform(*parts, x, y) for y in w[0]] for x in a[:, 0]])
             f, s = a + w / 2, w / np.maximum(2 * a + w, 1e-300)
             inside = (a > 0.0) & (f >= bounds[0][0]) & (f <= bounds[0][1])
             inside &= (s >= bounds[1][0]) & (s <= bounds[1][1])
-            return np.where(inside, found + depth[:, None], -np.inf)
+            return np.where(inside, log_likelihood + depth[:, None], -np.inf)
 
         depth = np.log(lowest) + np.linspace(np.log(DEPTH), -1e-9, COARSE)
         widths = 2 * bounds[0][0] * bounds[1][0], 2 * bounds[0][1] * bounds[1][1]
         log_w = _nodes(widths)
-        depth, log_w = _where(logarithm(depth, log_w), depth, log_w)
-        found = logarithm(depth, log_w)
+        depth, log_w = _refine_nodes(logarithm(depth, log_w), depth, log_w)
+        log_likelihood = logarithm(depth, log_w)
         a, w = np.meshgrid(lowest - np.exp(depth), np.exp(log_w), indexing="ij")
-        weights = np.exp(found - found.max()).ravel()
+        weights = np.exp(log_likelihood - log_likelihood.max()).ravel()
         values = np.stack([a + w / 2, w / (2 * a + w)], axis=-1).reshape(-1, 2)
         return WeightedSamples(values[weights > 0.0], weights[weights > 0.0] / weights.sum())
 
 
 def _uniform(strain: Floats, rate: Floats, count: Floats, broke: Mask, a: float, w: float) -> float:
-    """The logarithm of the likelihood, -inf where a specimen bore what no bond does."""
+    """Return the logarithm of the likelihood, -inf if a specimen survived what no bond does."""
     z = (strain - a) / w
     if z.max() >= 1.0 or z[broke].max(axis=1).min() <= 0.0:
         return -np.inf
-    left = 1.0 - np.maximum(z, 0.0)
-    rates = np.where(z > 0.0, count * rate / left, 0.0)[broke].sum(axis=1) / w
-    return float(np.log(rates).sum() + (np.log(left) @ count).sum())
+    survival = 1.0 - np.maximum(z, 0.0)
+    rates = np.where(z > 0.0, count * rate / survival, 0.0)[broke].sum(axis=1) / w
+    return float(np.log(rates).sum() + (np.log(survival) @ count).sum())
 
 
 def _nodes(ends: tuple[float, float]) -> Floats:
-    """The logarithms from end to end."""
+    """Return logarithms from end to end."""
     return np.linspace(np.log(ends[0]), np.log(ends[1]), COARSE)
 
 
-def _where(found: Floats, *nodes: Floats) -> tuple[Floats, ...]:
-    """Finer nodes along each axis over where the logarithms are not negligible."""
-    if not np.isfinite(found).any():
+def _refine_nodes(logarithms: Floats, *nodes: Floats) -> tuple[Floats, ...]:
+    """Return finer nodes along each axis where the likelihood is not negligible."""
+    if not np.isfinite(logarithms).any():
         raise ExperimentError(
-            "no strengths between the bounds go with these peaks: take wider ones, and look "
-            "whether the peaks are in the experiment's units",
+            "no strengths between the bounds agree with these peaks: use wider bounds, and check "
+            "that the peaks are in the experiment's units",
             ("unknown",),
         )
-    kept = found > found.max() - NEGLIGIBLE
-    finer = []
-    for axis, each in enumerate(nodes):
-        some = np.flatnonzero(kept.any(axis=tuple({*range(kept.ndim)} - {axis})))
-        low, high = max(some[0] - 1, 0), min(some[-1] + 1, len(each) - 1)
-        finer.append(np.linspace(each[low], each[high], FINE))
-    return tuple(finer)
+    is_relevant = logarithms > logarithms.max() - NEGLIGIBLE
+    refined = []
+    for axis, coarse in enumerate(nodes):
+        indices = np.flatnonzero(is_relevant.any(axis=tuple({*range(is_relevant.ndim)} - {axis})))
+        low, high = max(indices[0] - 1, 0), min(indices[-1] + 1, len(coarse) - 1)
+        refined.append(np.linspace(coarse[low], coarse[high], FINE))
+    return tuple(refined)
 
 
 LAWS: dict[str, StrengthLaw] = {"weibull": WeibullLaw(), "uniform": UniformLaw()}
+"""Laws by name."""
 OF_FRACTURE = {"weibull": "weibull", "strain": "uniform"}
-"""The law of the strengths of a fracture model, by its type."""
+"""Law of the strengths of a fracture model, by its type."""
 
 
 LIMITS = (0.025, 0.975)
+"""Quantiles of the 95 % interval."""
 MIDDLE = (0.15865525393145707, 0.8413447460685429)
+"""Quantiles of one standard error."""
 CUT = 1.02
-"""An interval ends at a bound that is no farther away, as a ratio."""
+"""Ratio of a bound to the end of an interval up to which the interval ends at the bound."""
 SHIFT = 0.25
-"""The share of the standard error of the mean of ln peak by which peaks may lie above first breaks:
-an interval of 95 % that is so far off holds 94.3 %."""
+"""Largest mean of ln peak above first breaks, in standard errors of the mean: an interval of 95 %
+with this bias contains 94.3 %."""
 
 
 @dataclass(frozen=True)
 class StrengthEstimate:
-    """A median with its standard error, half of the interval that holds 68.3 %, and the ends of
-    that of 95 %. `told` is False where the data cannot tell it; `cut` is True where a bound ends
-    the interval, beyond which it might go on."""
+    """An estimate of a strength parameter.
+
+    Parameters
+    ----------
+    value, error
+        Median, and half of the interval of 68.3 %.
+    low, high
+        Ends of the interval of 95 %.
+    identifiable
+        Whether the data determine the value.
+    cut
+        Whether a bound ends the interval, which might extend beyond.
+    """
 
     value: float
     error: float
     low: float
     high: float
-    told: bool = True
+    identifiable: bool = True
     cut: bool = False
 
     def __str__(self) -> str:
-        if not self.told:
-            return "the data cannot tell it"
+        if not self.identifiable:
+            return "not identifiable from the data"
         digits = max(0, 1 - int(np.floor(np.log10(max(self.error, 1e-12)))))
         value, error, low, high = (
-            f"{each:.{digits}f}" for each in (self.value, self.error, self.low, self.high)
+            f"{number:.{digits}f}" for number in (self.value, self.error, self.low, self.high)
         )
         text = f"{value} ± {error}, 95 % from {low} to {high}"
         return text + (", cut off by its bounds" if self.cut else "")
@@ -739,8 +885,19 @@ class StrengthEstimate:
 
 @dataclass(frozen=True)
 class Checked:
-    """How far above the load of their first break specimens were borne: the mean of ln peak/first
-    over `count` torn ones, and how many bore more; `limit` is what does no harm."""
+    """Test of the assumption that specimens fail at their first break.
+
+    Parameters
+    ----------
+    excess
+        Mean of ln peak/first over simulated specimens.
+    bore_more
+        Number of specimens with a larger peak.
+    count
+        Number of specimens.
+    limit
+        Largest excess that is harmless.
+    """
 
     excess: float
     bore_more: int
@@ -749,34 +906,49 @@ class Checked:
 
     @classmethod
     def of(cls, excess: Sequence[float], peaks: Floats) -> Checked:
-        """From that of each, against the spread of what was measured."""
+        """Return the test for the excess of each specimen, compared with the spread of measured
+        peaks."""
         limit = SHIFT * float(np.log(peaks).std(ddof=1)) / len(peaks) ** 0.5
-        more = sum(each > 1e-6 for each in excess)
-        return cls(float(np.mean(excess)), more, len(excess), limit)
+        larger = sum(value > 1e-6 for value in excess)
+        return cls(float(np.mean(excess)), larger, len(excess), limit)
 
     @property
     def holds(self) -> bool:
-        """Whether the first break counts as the failure of the specimen."""
+        """Return whether the first break is the failure of the specimen."""
         return self.excess <= self.limit
 
     def __str__(self) -> str:
-        how = f"{self.bore_more} of {self.count} torn specimens bore more than at their first break"
+        text = (
+            f"{self.bore_more} of {self.count} torn specimens bore more than at their first break"
+        )
         if self.holds:
-            return f"the first break is the failure: {how}"
+            return f"the first break is the failure: {text}"
         return (
-            f"the first break is not the failure: {how}, on average {np.expm1(self.excess):.1%} "
-            f"more; no harm does {np.expm1(self.limit):.2%}"
+            f"the first break is not the failure: {text}, on average {np.expm1(self.excess):.1%} "
+            f"more; harmless are {np.expm1(self.limit):.2%}"
         )
 
 
 @dataclass(frozen=True)
 class FittedStrength:
-    """The answer of a strength fit.
+    """Result of a strength fit.
 
-    `values` by path, `correlations` (parameter, parameter), `variation`, the coefficient of
-    variation of bonds, where their law is known. `method` is how they were found; `checked` whether
-    specimens fail at their first break, None where that was not looked at. `draws` are parameters
-    as the measurement leaves them open.
+    Parameters
+    ----------
+    values
+        Estimates by path.
+    correlations : (parameter, parameter)
+        Correlations of the estimates.
+    variation
+        Coefficient of variation of the strengths of bonds, if their law is known.
+    method
+        likelihood or simulation.
+    specimens, failed
+        Number of specimens, and of broken ones.
+    checked
+        Test whether specimens fail at their first break; None without it.
+    draws
+        WeightedSamples of the parameters.
     """
 
     values: Mapping[str, StrengthEstimate]
@@ -789,17 +961,19 @@ class FittedStrength:
     draws: WeightedSamples = field(kw_only=True, repr=False)
 
     def with_check(self, checked: Checked | None) -> FittedStrength:
-        """The same with what was seen of torn specimens."""
+        """Return the result with a test of the first break."""
         return replace(self, checked=checked)
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it in plain values, as the JSON file holds it."""
+        """Return the content of the JSON file as plain values."""
         checked = self.checked
         return {
-            "values": {path: _plain(each) for path, each in self.values.items()},
+            "values": {path: _plain(estimate) for path, estimate in self.values.items()},
             "correlations": {
-                one: {other: float(self.correlations[n, m]) for m, other in enumerate(self.values)}
-                for n, one in enumerate(self.values)
+                first: {
+                    second: float(self.correlations[n, m]) for m, second in enumerate(self.values)
+                }
+                for n, first in enumerate(self.values)
             },
             "coefficient_of_variation": self.variation and _plain(self.variation),
             "method": self.method,
@@ -810,23 +984,23 @@ class FittedStrength:
         }
 
     def lines(self) -> Iterator[str]:
-        """What to tell first."""
+        """Yield a summary of the result, line by line."""
         for path, estimate in self.values.items():
             yield f"{path}: {estimate}"
-        if self.variation and all(each.told for each in self.values.values()):
+        if self.variation and all(value.identifiable for value in self.values.values()):
             yield f"coefficient of variation of strengths: {self.variation}"
-        for n, one in enumerate(self.values):
-            for m, other in list(enumerate(self.values))[n + 1 :]:
+        for n, first in enumerate(self.values):
+            for m, second in list(enumerate(self.values))[n + 1 :]:
                 if abs(self.correlations[n, m]) > 0.5:
-                    yield f"correlation of {one} and {other}: {self.correlations[n, m]:.2f}"
-        kept = self.specimens - self.failed
+                    yield f"correlation of {first} and {second}: {self.correlations[n, m]:.2f}"
+        unbroken = self.specimens - self.failed
         yield f"by {self.method}, of {self.specimens} specimens" + (
-            f", {kept} of which did not break" if kept else ""
+            f", {unbroken} of which did not break" if unbroken else ""
         )
         if self.checked:
             yield str(self.checked)
         elif self.method == "likelihood":
-            yield "taken for granted: a specimen fails as its first bond breaks"
+            yield "assumption: a specimen fails when its first bond breaks"
 
 
 def fitted_strength(
@@ -836,17 +1010,19 @@ def fitted_strength(
     method: str,
     law: StrengthLaw | None,
 ) -> FittedStrength:
-    """The answer in words of the fit file."""
+    """Return the result in terms of the fit file."""
     values = {}
     for n, path in enumerate(paths):
         low, high = fit.unknown[path]
-        found = _estimate(draws.values[:, n], draws.weights)
-        cut = min(found.low / low, high / found.high) < CUT
-        values[path] = replace(found, told=found.error <= TELLS * (high - low), cut=cut)
+        estimate = _estimate(draws.values[:, n], draws.weights)
+        cut = min(estimate.low / low, high / estimate.high) < CUT
+        values[path] = replace(
+            estimate, identifiable=estimate.error <= TELLS * (high - low), cut=cut
+        )
     variation = None
     if law is not None:
-        each = draws.values[:, [list(paths).index(path) for path in law.paths]]
-        variation = _estimate(law.variation(each[:, 0], each[:, 1]), draws.weights)
+        parameters = draws.values[:, [list(paths).index(path) for path in law.paths]]
+        variation = _estimate(law.variation(parameters[:, 0], parameters[:, 1]), draws.weights)
     spread = np.cov(np.log(draws.values).T, aweights=draws.weights).reshape((len(paths),) * 2)
     errors = np.sqrt(np.diag(spread))
     failed = fit.measured.failed
@@ -865,28 +1041,44 @@ def _estimate(values: Floats, weights: Floats) -> StrengthEstimate:
 
 
 def _plain(estimate: StrengthEstimate) -> dict[str, Any]:
-    if not estimate.told:
-        return dict.fromkeys(("value", "error", "low", "high", "cut")) | {"told": False}
+    if not estimate.identifiable:
+        return dict.fromkeys(("value", "error", "low", "high", "cut")) | {"identifiable": False}
     return asdict(estimate)
 
 
 SHARES = 0.2, 0.2, 0.6
-"""Of specimens: over the bounds, then twice where the measurement is likely."""
+"""Fractions of the specimens: over all bounds, then twice where the measurement is likely."""
 POINTS = 2**14
-"""At which the likelihood is evaluated."""
-LIKELY, WIDER = 8.0, 0.25
-"""Logarithms below the largest likelihood that is still looked at, and by how much of itself the
-box around these points is made wider."""
-TURNS, MOST = 50, 3.0
-"""Of the regression of the spread, and the largest step in ln of a variance."""
-AMPLE = 1.25
-"""The load of the experiment over the largest that was measured, at least."""
+"""Number of points at which the likelihood is evaluated."""
+LIKELY = 8.0
+"""Difference to the largest logarithm of the likelihood up to which points are kept."""
+
+WIDER = 0.25
+"""Margin of the box around these points, relative to its size."""
+REGRESSION_ITERATIONS = 50
+"""Number of iterations of the regression of the spread."""
+
+MAX_LOG_STEP = 3.0
+"""Largest step in the logarithm of a variance."""
+MIN_LOAD_RATIO = 1.25
+"""Smallest ratio of the experiment's load to the largest measured one."""
 
 
 @dataclass(frozen=True)
 class PeakDistribution:
-    """How ln peak is distributed over ln parameters in a box: its mean and the logarithm of its
-    variance are quadratic; `skewness` and `kurtosis` are those of what is left."""
+    """Distribution of ln peak over ln parameters in a box.
+
+    Parameters
+    ----------
+    low, high : (parameter,)
+        The box.
+    mean, log_variance : (term,)
+        Quadratic polynomials of the mean and of the logarithm of the variance.
+    inverse : (term, term)
+        Covariance of the coefficients of the mean.
+    skewness, kurtosis
+        Moments of the residuals.
+    """
 
     low: Floats
     high: Floats
@@ -898,167 +1090,186 @@ class PeakDistribution:
 
     @classmethod
     def of(cls, logs: Floats, y: Floats) -> PeakDistribution:
-        """By the likelihood of normal numbers, mean and variance in turn."""
-        nothing = np.zeros(0)
+        """Fit the distribution by the likelihood of normal residuals, mean and variance in turn."""
+        empty = np.zeros(0)
         ends = logs.min(axis=0), logs.max(axis=0)
-        found = cls(*ends, nothing, nothing, nothing, 0.0, 3.0)
-        x = found.terms(logs)
+        distribution = cls(*ends, empty, empty, empty, 0.0, 3.0)
+        x = distribution.terms(logs)
         gamma = np.zeros(x.shape[1])
         mean, *_ = np.linalg.lstsq(x, y, rcond=None)
         gamma[0] = np.log(np.mean((y - x @ mean) ** 2))
-        for _ in range(TURNS):
+        for _ in range(REGRESSION_ITERATIONS):
             weight = np.exp(-x @ gamma)
             mean = np.linalg.solve((x.T * weight) @ x, x.T @ (weight * y))
             step, *_ = np.linalg.lstsq(x, (y - x @ mean) ** 2 * weight - 1.0, rcond=None)
-            gamma += np.clip(step, -MOST, MOST)
+            gamma += np.clip(step, -MAX_LOG_STEP, MAX_LOG_STEP)
         z = (y - x @ mean) * np.exp(-x @ gamma / 2.0)
         z = (z - z.mean()) / z.std()
         inverse = np.linalg.inv((x.T * np.exp(-x @ gamma)) @ x)
-        more = float(np.mean(z**3)), float(np.mean(z**4))
+        higher = float(np.mean(z**3)), float(np.mean(z**4))
         return replace(
-            found,
+            distribution,
             mean=mean,
             log_variance=gamma,
             inverse=inverse,
-            skewness=more[0],
-            kurtosis=more[1],
+            skewness=higher[0],
+            kurtosis=higher[1],
         )
 
     def terms(self, logs: Floats) -> Floats:
-        """1, what is linear and what is quadratic, (point, term), over the box from -1 to 1."""
+        """Return constant, linear and quadratic terms, (point, term), over the box from -1 to 1."""
         x = 2.0 * (logs - self.low) / (self.high - self.low) - 1.0
         pairs = combinations_with_replacement(range(x.shape[1]), 2)
         return np.column_stack([np.ones(len(x)), x, *(x[:, a] * x[:, b] for a, b in pairs)])
 
     def likelihood(self, logs: Floats, y: Floats) -> Floats:
-        """Its logarithm at points: the mean of the measured ln peaks y and ln of their standard
-        deviation have the variances σ²/n and (κ - 1)/4n, and the covariance σ · skewness/2n; what
-        few torn specimens leave open of mean and variance is added."""
+        """Return the logarithm of the likelihood at points.
+
+        Notes
+        -----
+        The mean of the measured ln peaks y and ln of their standard deviation have the variances
+        σ²/n and (κ - 1)/4n, and the covariance σ · skewness/2n. The uncertainty of mean and
+        variance due to the number of simulated specimens is added.
+        """
         n, x = len(y), self.terms(logs)
         variance = np.exp(x @ self.log_variance)
-        open_ = np.einsum("pi,ij,pj->p", x, self.inverse, x)
-        share = 1.0 / n + open_ / variance
+        uncertainty = np.einsum("pi,ij,pj->p", x, self.inverse, x)
+        share = 1.0 / n + uncertainty / variance
         width = (self.kurtosis - 1.0) / 4.0
         a = y.mean() - x @ self.mean
         b = np.log(y.std(ddof=1)) - x @ self.log_variance / 2.0 + width / (2.0 * n)
         v, w, c = variance * share, width * share, np.sqrt(variance) * self.skewness / 2.0 * share
         determinant = v * w - c**2
-        away = (w * a**2 - 2.0 * c * a * b + v * b**2) / determinant
-        return np.asarray(-(away + np.log(determinant)) / 2.0)
+        distance = (w * a**2 - 2.0 * c * a * b + v * b**2) / determinant
+        return np.asarray(-(distance + np.log(determinant)) / 2.0)
 
 
-def simulated(fit: StrengthFit, experiment: Experiment, specimens: Specimens) -> WeightedSamples:
-    """Strengths that go with the measured peaks, between the bounds, on which the logarithm is
-    spread evenly. Raises ExperimentError."""
+def fit_by_simulation(
+    fit: StrengthFit, experiment: Experiment, specimens: Specimens
+) -> WeightedSamples:
+    """Draw strengths that agree with the measured peaks, between bounds, with a prior uniform in
+    the logarithm.
+
+    Raises
+    ------
+    ExperimentError
+        If the measurement cannot be simulated.
+    """
     if not fit.measured.failed.all():
         raise ExperimentError(
-            "tests that ended before the specimen broke cannot be compared with torn specimens; "
-            "leave them out",
+            "tests that ended before the specimen broke cannot be simulated; leave them out",
             ("measured", "broke"),
         )
     if fit.measured.of == "factor":
-        text = "torn specimens show forces and displacements, no factor"
+        text = "simulated specimens have forces and displacements, but no factor"
         raise ExperimentError(text, ("measured", "of"))
     _refuse_short_load(specimens, float(fit.measured.values.max()))
     y = np.log(fit.measured.values)
-    box = whole = np.log(list(fit.unknown.values())).T
+    box = bounds = np.log(list(fit.unknown.values())).T
     logs, peaks = np.zeros((0, len(fit.unknown))), np.zeros(0)
     for stage, share in enumerate(SHARES):
-        more = _spread(box, int(share * fit.simulations), fit.seed + stage)
-        found = _torn(fit, experiment, specimens, more, len(logs))
-        logs, peaks = np.vstack([logs, more]), np.concatenate([peaks, found])
+        new_logs = _spread(box, int(share * fit.simulations), fit.seed + stage)
+        new_peaks = _simulate_peaks(fit, experiment, specimens, new_logs, len(logs))
+        logs, peaks = np.vstack([logs, new_logs]), np.concatenate([peaks, new_peaks])
         inside = ((logs >= box[0]) & (logs <= box[1])).all(axis=1)
         model, points = (
             PeakDistribution.of(logs[inside], peaks[inside]),
             _spread(box, POINTS, fit.seed),
         )
         logarithm = model.likelihood(points, y)
-        near = points[logarithm > logarithm.max() - LIKELY]
-        margin = WIDER * np.ptp(near, axis=0)
-        box = np.clip([near.min(axis=0) - margin, near.max(axis=0) + margin], *whole)
+        likely = points[logarithm > logarithm.max() - LIKELY]
+        margin = WIDER * np.ptp(likely, axis=0)
+        box = np.clip([likely.min(axis=0) - margin, likely.max(axis=0) + margin], *bounds)
     weights = np.exp(logarithm - logarithm.max())
     return WeightedSamples(np.exp(points), weights / weights.sum())
 
 
 def _spread(box: Floats, count: int, seed: int) -> Floats:
-    """Points all over a box, (point, parameter): Sobol's, scrambled."""
+    """Return points all over a box, (point, parameter), by a scrambled Sobol sequence."""
     from scipy.stats import qmc
 
-    whole = qmc.Sobol(box.shape[1], seed=seed).random_base2(int(np.ceil(np.log2(count))))
-    return np.asarray(box[0] + whole[:count] * (box[1] - box[0]))
+    unit_points = qmc.Sobol(box.shape[1], seed=seed).random_base2(int(np.ceil(np.log2(count))))
+    return np.asarray(box[0] + unit_points[:count] * (box[1] - box[0]))
 
 
-def _torn(
-    fit: StrengthFit, experiment: Experiment, specimens: Specimens, logs: Floats, begun: int
+def _simulate_peaks(
+    fit: StrengthFit, experiment: Experiment, specimens: Specimens, logs: Floats, offset: int
 ) -> Floats:
-    """ln peak of one specimen a point."""
-    found = []
+    """Return ln peak of one specimen for each point."""
+    peaks = []
     for n, point in enumerate(np.exp(logs).tolist()):
-        there = experiment
+        changed = experiment
         for path, value in zip(fit.unknown, point, strict=True):
-            there = Parameter(path).put(there, value)
-        specimen = specimens.torn(seeded(there, (fit.seed << 20) + begun + n))
-        found.append(np.log(specimen.peak_of(fit.measured.of)))
-    return np.array(found)
+            changed = Parameter(path).put(changed, value)
+        specimen = specimens.tear(seeded(changed, (fit.seed << 20) + offset + n))
+        peaks.append(np.log(specimen.peak_of(fit.measured.of)))
+    return np.array(peaks)
 
 
 def _refuse_short_load(specimens: Specimens, largest: float) -> None:
-    """Those that outlast the load count with what they bore by its end: that has to be far above
-    what was measured."""
+    """Raise ExperimentError if the load of the experiment is not far above the measured ones.
+
+    Specimens that survive it would count with the load at its end.
+    """
     if (elastic := specimens.elastic) is None:
         return
-    of = specimens.peaks.of
-    full = elastic.full.force if of == "force" else elastic.full.displacement
-    if full < AMPLE * largest:
+    quantity = specimens.peaks.of
+    full = elastic.full.force if quantity == "force" else elastic.full.displacement
+    if full < MIN_LOAD_RATIO * largest:
         raise ExperimentError(
-            f"the experiment's load ends at a {of} of {full:.4g} while nothing breaks, and the "
-            f"strongest specimen bore {largest:.4g}: let the leaders go "
-            f"{AMPLE * largest / full:.3g} times as far, or farther",
+            f"the experiment's load ends at a {quantity} of {full:.4g} without fracture, and the "
+            f"strongest specimen bore {largest:.4g}: increase the motion of the leaders by a "
+            f"factor of at least {MIN_LOAD_RATIO * largest / full:.3g}",
             ("leaders",),
         )
 
 
 def fit_strength_of(fit: StrengthFit, experiment: Experiment) -> FittedStrength:
-    """Carries a strength fit out, on one thread. Raises ExperimentError for what cannot be
-    fitted."""
+    """Carry out a strength fit, on one thread.
+
+    Raises
+    ------
+    ExperimentError
+        If the strengths cannot be fitted.
+    """
     with one_thread():
         if fit.method == "simulation":
-            return _by_simulation(fit, experiment, None)
-        found = _by_likelihood(fit, experiment)
-        if fit.method == "auto" and found.checked and not found.checked.holds:
-            return _by_simulation(fit, experiment, found.checked)
-        return found
+            return _fit_with_simulations(fit, experiment, None)
+        result = _fit_by_likelihood(fit, experiment)
+        if fit.method == "auto" and result.checked and not result.checked.holds:
+            return _fit_with_simulations(fit, experiment, result.checked)
+        return result
 
 
-def _by_likelihood(fit: StrengthFit, experiment: Experiment) -> FittedStrength:
+def _fit_by_likelihood(fit: StrengthFit, experiment: Experiment) -> FittedStrength:
     law = _law(fit, experiment)
     if {*fit.unknown} != {*law.paths}:
         raise ExperimentError(
-            f"the likelihood is of {' and '.join(law.paths)}, both: give bounds of these",
+            f"the likelihood needs bounds of both {' and '.join(law.paths)}",
             ("unknown",),
         )
     elastic = _elastic(fit, experiment, law)
     full = getattr(elastic.full, "displacement" if fit.measured.of == "displacement" else "force")
     if np.isnan(full):
         raise ExperimentError(
-            f"the rule '{experiment.rule.type}' knows no forces; take 'elastic' or another "
+            f"the rule '{experiment.rule.type}' defines no forces; use 'elastic' or another "
             "calibrated rule, or peaks of: displacement",
             ("measured", "of"),
         )
     if full <= 0.0:
         raise ExperimentError(
-            f"under the experiment's load the {fit.measured.of} is {full:g}: nothing pulls along "
-            "the way of the leader group",
+            f"under the experiment's load the {fit.measured.of} is {full:g}: there is no tension "
+            "along the displacement of the leader group",
             ("measured", "of"),
         )
     strains = elastic.strains.merged()
     breaks = Breaks(fit.measured.values / full, fit.measured.failed)
     if not (strains.at(breaks.load).max(axis=1) > 0.0).all():
-        raise ExperimentError("no bond is drawn out under this load", ("leaders",))
+        raise ExperimentError("no bond is stretched under this load", ("leaders",))
     first, second = (fit.unknown[path] for path in law.paths)
     draws = law.draws(strains, breaks, (first, second))
-    found = fitted_strength(fit, law.paths, draws, "likelihood", law)
-    return found.with_check(_checked(fit, experiment, law, elastic, found))
+    result = fitted_strength(fit, law.paths, draws, "likelihood", law)
+    return result.with_check(_check_first_break(fit, experiment, law, elastic, result))
 
 
 def _elastic(fit: StrengthFit, experiment: Experiment, law: StrengthLaw) -> ElasticResponse:
@@ -1073,8 +1284,8 @@ def _law(fit: StrengthFit, experiment: Experiment) -> StrengthLaw:
     name = fit.law or OF_FRACTURE.get(kind)
     if name is None:
         raise ExperimentError(
-            f"of what law strengths are is not known of fracture '{kind}'; give law: weibull or "
-            "uniform, or take method: simulation",
+            f"fracture '{kind}' has no known law of strengths; give law: weibull or uniform, or "
+            "use method: simulation",
             ("law",),
         )
     if OF_FRACTURE.get(kind, name) != name:
@@ -1084,15 +1295,17 @@ def _law(fit: StrengthFit, experiment: Experiment) -> StrengthLaw:
     return LAWS[name]
 
 
-def _checked(
+def _check_first_break(
     fit: StrengthFit,
     experiment: Experiment,
     law: StrengthLaw,
     elastic: ElasticResponse,
-    found: FittedStrength,
+    result: FittedStrength,
 ) -> Checked | None:
-    """Whether specimens of the strengths found fail as their first bond breaks; None where the
-    experiment says nothing of what happens then."""
+    """Simulate specimens of the fitted strengths, to test whether they fail at their first break.
+
+    None if the experiment does not define what happens afterwards.
+    """
     kind = experiment.fracture.type
     if (
         not fit.check
@@ -1102,19 +1315,21 @@ def _checked(
     ):
         return None
     for path in law.paths:
-        experiment = Parameter(path).put(experiment, found.values[path].value)
+        experiment = Parameter(path).put(experiment, result.values[path].value)
     specimens = Specimens.of(experiment, fit.measured, elastic)
-    torn = [specimens.torn(seeded(experiment, fit.seed + n)) for n in range(fit.check)]
-    return Checked.of([_excess(each, fit.measured.of) for each in torn], fit.measured.values)
+    broken = [specimens.tear(seeded(experiment, fit.seed + n)) for n in range(fit.check)]
+    return Checked.of(
+        [_excess(specimen, fit.measured.of) for specimen in broken], fit.measured.values
+    )
 
 
-def _excess(specimen: Specimen, of: str) -> float:
-    """ln of its peak over that of its first break."""
+def _excess(specimen: Specimen, quantity: str) -> float:
+    """Return ln of the peak over that of the first break."""
     assert specimen.first is not None
-    return float(np.log(specimen.peak_of(of) / specimen.first_of(of)))
+    return float(np.log(specimen.peak_of(quantity) / specimen.first_of(quantity)))
 
 
-def _by_simulation(
+def _fit_with_simulations(
     fit: StrengthFit, experiment: Experiment, checked: Checked | None
 ) -> FittedStrength:
     for path in fit.unknown:
@@ -1123,13 +1338,13 @@ def _by_simulation(
     if (name := OF_FRACTURE.get(experiment.fracture.type)) and experiment.rule.linear:
         elastic = _elastic(fit, experiment, LAWS[name])
     specimens = Specimens.of(experiment, fit.measured, elastic)
-    if not knows_forces(specimens.scene):
+    if not has_forces(specimens.scene):
         raise ExperimentError(
-            f"the rule '{experiment.rule.type}' knows no forces, so that torn specimens have no "
-            "peak; take 'elastic' or another calibrated rule",
+            f"the rule '{experiment.rule.type}' defines no forces, so that specimens have no "
+            "peak; use 'elastic' or another calibrated rule",
             ("rule",),
         )
-    draws: WeightedSamples = simulated(fit, experiment, specimens)
+    draws: WeightedSamples = fit_by_simulation(fit, experiment, specimens)
     law = LAWS[name] if name and {*fit.unknown} == {*LAWS[name].paths} else None
-    found = fitted_strength(fit, tuple(fit.unknown), draws, "simulation", law)
-    return found.with_check(checked)
+    result = fitted_strength(fit, tuple(fit.unknown), draws, "simulation", law)
+    return result.with_check(checked)

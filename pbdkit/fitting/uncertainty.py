@@ -1,22 +1,23 @@
-"""Errors of a fit: standard errors, identifiable combinations, profile likelihoods, samples of the
-posterior, and comparison of models by cross-validation.
+"""Uncertainty of a fit: standard errors, identifiable combinations, profile likelihoods, samples of
+the posterior, and comparison of models by cross-validation.
 
-Profile likelihood: for each value of a parameter all others are fitted anew. Where -2 log L exceeds
-its minimum by less than 3.84 lies the 95 % interval (Wilks), however the parameter bends the
-predictions. With a loss the increase is that of M-estimators: it is divided by mean ψ² / mean ψ'.
+Profile likelihood: all other parameters are fitted again for each value of one. The 95 % interval
+contains the values at which -2 log L exceeds its minimum by less than 3.84 (Wilks), also for
+strongly nonlinear predictions. With a loss the increase is that of M-estimators: it is divided by
+mean ψ² / mean ψ'.
 
-Posterior: all that enters linearly - boundaries of a linear rule, distortions, Young's modulus - is
-integrated out exactly, boundaries of other rules as far as they are linear around the fit: with
-their derivatives J, the remaining residuals r and a flat prior, log p = -½ |r|² - ½ log det JᵀJ.
-Walkers make the affine-invariant stretch moves of Goodman and Weare (emcee).
+Posterior: unknowns that enter linearly - boundaries of a linear rule, distortions, Young's modulus
+- are integrated out exactly, boundaries of other rules by linearisation at the fit: with their
+derivatives J, the remaining residuals r and a flat prior, log p = -½ |r|² - ½ log det JᵀJ. Walkers
+make the affine-invariant stretch moves of Goodman and Weare (emcee).
 
 Combinations: a direction v of parameters along which nothing changes is also one of their
 logarithms, d ln θ = v / θ. Products of powers Π θ^e with e · d ln θ = 0 are identifiable, and so
-are sums Σ e θ with e · v = 0. Both agree near the fit; the one that holds farther along the
-direction is found by going there.
+are sums Σ e θ with e · v = 0. Both agree near the fit. The one that holds farther along the
+direction is chosen by evaluating residuals there.
 
 Cross-validation leaves out blocks of neighbouring points together (Roberts et al. 2017, Ecography
-40, 913), since the points beside a left-out point would reveal it.
+40, 913), since the neighbours of a left-out point would reveal it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError, refuse_without
-from pbdkit.fitting.observations import Carried, FieldPrediction
+from pbdkit.fitting.observations import FieldPrediction, GroupReaction
 from pbdkit.fitting.problem import (
     MODULUS,
     RANK,
@@ -51,82 +52,120 @@ from pbdkit.stepping.state import Floats
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its standard error. `told` is False where the data cannot tell it: then it says
-    nothing. `on_bound`: it stands on a bound, beyond which it might fit better. `unit` is that of
-    both, empty where the experiment has no units."""
+    """An estimate with its standard error.
+
+    Parameters
+    ----------
+    value, error
+        Value and standard error.
+    identifiable
+        Whether the data determine the value.
+    on_bound
+        Whether the value is at a bound, beyond which the fit might be better.
+    unit
+        Unit of both; empty if the experiment has no units.
+    """
 
     value: float
     error: float
-    told: bool = True
+    identifiable: bool = True
     on_bound: bool = False
     unit: str = ""
 
     def __str__(self) -> str:
-        if not self.told:
-            return "the data cannot tell it"
+        if not self.identifiable:
+            return "not identifiable from the data"
         digits = max(0, 1 - int(np.floor(np.log10(self.error)))) if self.error > 0.0 else 6
         text = f"{self.value:.{min(digits, 12)}f} ± {self.error:.{min(digits, 12)}f}"
-        return text + f" {self.unit}" * bool(self.unit) + ", on its bound" * self.on_bound
+        return text + f" {self.unit}" * bool(self.unit) + ", at its bound" * self.on_bound
 
     def as_dict(self) -> dict[str, Any]:
-        """In plain values; none of what the data cannot tell."""
-        return asdict(self) if self.told else {"value": None, "error": None, "told": False}
+        """Return plain values; None if the value is not identifiable."""
+        return (
+            asdict(self)
+            if self.identifiable
+            else {"value": None, "error": None, "identifiable": False}
+        )
 
 
 def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) -> Estimate | None:
-    """What curves tell of it, else what follows from a force; None where there is neither. In MPa
-    where the experiment has units."""
+    """Return Young's modulus from curves, else from a force; None without either.
+
+    It is in MPa if the experiment has units.
+    """
     count, units = len(problem.unknowns), problem.observations[0].experiment.units
     unit = STRESS.unit if units else ""
     if problem.with_modulus:
         value, error = float(solution.z[count]), float(solution.errors[count])
-        return Estimate(value, error, told=error < TELLS * abs(value), unit=unit)
+        return Estimate(value, error, identifiable=error < TELLS * abs(value), unit=unit)
     if force is None:
         return None
-    found, size = _of_force(force, problem, solution), units.length_mm if units else 1.0
-    return replace(found, value=found.value / size, error=found.error / size, unit=unit)
+    estimate, size = (
+        _modulus_from_force(force, problem, solution),
+        units.length_mm if units else 1.0,
+    )
+    return replace(estimate, value=estimate.value / size, error=estimate.error / size, unit=unit)
 
 
-def _of_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
-    """Force over thickness and what the group carries over Young's modulus, along the force."""
-    way = np.array(force.value) / np.hypot(*force.value)
-    count, seen = len(problem.unknowns), solution.at.seen[0]
-    assert isinstance(seen, FieldPrediction)
-    carried = Carried(seen.resting, force.group)
-    unit, gradient = float(way @ carried.predicted), np.zeros(problem.size)
-    for n, (du, unknown) in enumerate(zip(seen.changes, problem.unknowns, strict=True)):
-        gradient[n] = way @ carried.change(du, unknown.parameter)
-    carried = Carried(seen.answering, force.group)  # answers in balance with this state alone
-    for n, du in enumerate(seen.answers, start=count):
-        gradient[n] = way @ carried.change(du)
-    untold = [n for n, u in enumerate(problem.unknowns) if u.parameter.path in solution.untold]
-    matters = (np.abs(gradient[untold]) > 1e-9 * abs(unit)).any()
-    gradient[untold] = 0.0
-    part = solution.directions.error_of(gradient)
+def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
+    """Divide the force over the thickness by the group's force over Young's modulus, along the
+    force."""
+    direction = np.array(force.value) / np.hypot(*force.value)
+    count, prediction = len(problem.unknowns), solution.at.predictions[0]
+    assert isinstance(prediction, FieldPrediction)
+    reaction = GroupReaction(prediction.resting, force.group)
+    unit, gradient = float(direction @ reaction.predicted), np.zeros(problem.size)
+    for n, (du, unknown) in enumerate(zip(prediction.changes, problem.unknowns, strict=True)):
+        gradient[n] = direction @ reaction.change(du, unknown.parameter)
+    reaction = GroupReaction(
+        prediction.answering, force.group
+    )  # responses to boundary modes are those at this state
+    for n, du in enumerate(prediction.answers, start=count):
+        gradient[n] = direction @ reaction.change(du)
+    unidentified = [
+        n
+        for n, unknown_ in enumerate(problem.unknowns)
+        if unknown_.parameter.path in solution.unidentified
+    ]
+    is_affected = (np.abs(gradient[unidentified]) > 1e-9 * abs(unit)).any()
+    gradient[unidentified] = 0.0
+    error_of_unit = solution.directions.error_of(gradient)
     if unit <= 0.0:
         raise ExperimentError(
-            f"group {force.group} carries no force that way in this experiment, rather one the "
-            "other way; turn its sign, or look for it at another group",
+            f"the force of group {force.group} has the opposite direction in this experiment; "
+            "change its sign, or take the force of another group",
             ("force", "value"),
         )
     size = float(np.hypot(*force.value))
     value = size / force.thickness / unit
-    error = abs(value) * np.hypot(part / unit, force.noise / size)
-    return Estimate(value, float(error), told=not matters)
+    error = abs(value) * np.hypot(error_of_unit / unit, force.noise / size)
+    return Estimate(value, float(error), identifiable=not is_affected)
 
 
-BLOCKS = 32
-"""So many along the longest way: of larger ones at an end, nothing else tells how it moves."""
+BLOCKS_PER_SIDE = 32
+"""Number of blocks along the longest side. Larger blocks at an end would determine its displacement
+alone."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model by name: the mean square of left-out residuals over their noise and its standard
-    error over blocks; by how much that is `behind` the best one's, block by block, and the error of
-    this; the root mean square by which its predictions differ from the best one's, over the noise;
-    and the parameters that fit, by path.
+    """Cross-validation of a model.
 
-    1 is the noise alone. Who is behind by less than two errors is as good.
+    Models within two standard errors of the best are equivalent.
+
+    Parameters
+    ----------
+    name
+        Name of the model.
+    left_out, error
+        Mean square of left-out residuals over their noise (1 is the noise alone), and its standard
+        error over blocks.
+    behind, behind_error
+        Difference of `left_out` to that of the best model, block by block, and its standard error.
+    differs
+        Root mean square difference to the predictions of the best model, over the noise.
+    values
+        Fitted parameters by path.
     """
 
     name: str
@@ -146,108 +185,146 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Posed:
-    """A candidate's problem and its solution."""
+    """Least-squares problem of a model, and its solution."""
 
     name: str
     problem: Problem
     solution: Solution
 
 
-def compared(posed: Sequence[Posed], folds: int, loss: Loss, seed: int) -> tuple[Candidate, ...]:
-    """All against the same blocks of the points that each of them has, the best first. Raises
-    UnconvergedError."""
-    posed = _of_common_rows(posed, loss)
-    blocks = [_blocks(o.places(), seed) for o in posed[0].problem.observations]
-    scores = [_left_out(each, blocks, folds, loss) for each in posed]
+def compare_models(
+    models: Sequence[Posed], folds: int, loss: Loss, seed: int
+) -> tuple[Candidate, ...]:
+    """Compare models by cross-validation, the best first, over blocks of the points that all of
+    them include.
+
+    Raises
+    ------
+    UnconvergedError
+        If a fit does not converge.
+    """
+    models = _fit_common_rows(models, loss)
+    blocks = [_blocks(observation.places(), seed) for observation in models[0].problem.observations]
+    scores = [_cross_validate(model, blocks, folds, loss) for model in models]
     best = int(np.argmin([score.mean() for score in scores]))
-    right = posed[best].solution.at.residuals
-    weight = _mean_weight(posed[best].problem)
-    found = [
+    best_residuals = models[best].solution.at.residuals
+    weight = _mean_weight(models[best].problem)
+    candidates = [
         Candidate(
-            each.name,
+            model.name,
             *_mean(score),
             *_mean(score - scores[best]),
-            float(np.sqrt(np.mean((each.solution.at.residuals - right) ** 2) / weight)),
-            _values(each),
+            float(np.sqrt(np.mean((model.solution.at.residuals - best_residuals) ** 2) / weight)),
+            _values(model),
         )
-        for each, score in zip(posed, scores, strict=True)
+        for model, score in zip(models, scores, strict=True)
     ]
-    return tuple(sorted(found, key=lambda candidate: candidate.left_out))
+    return tuple(sorted(candidates, key=lambda candidate: candidate.left_out))
 
 
 def _mean_weight(problem: Problem) -> float:
-    """The mean weight of the numbers that were measured."""
-    weights, counts = zip(*((o.weight, len(o.measured)) for o in problem.observations), strict=True)
+    """Return the mean weight of the measured numbers."""
+    weights, counts = zip(
+        *((observation.weight, len(observation.measured)) for observation in problem.observations),
+        strict=True,
+    )
     return float(np.average(weights, weights=counts))
 
 
 def _mean(score: Floats) -> tuple[float, float]:
-    """With its standard error."""
+    """Return the mean and its standard error."""
     return float(score.mean()), float(score.std(ddof=1) / np.sqrt(len(score)))
 
 
-def _of_common_rows(posed: Sequence[Posed], loss: Loss) -> list[Posed]:
-    """Each fitted to what all of them can predict."""
-    groups = zip(*(each.problem.observations for each in posed), strict=True)
-    common = [reduce(np.intersect1d, (o.rows for o in group)) for group in groups]
-    found = []
-    for each in posed:
-        pairs = zip(each.problem.observations, common, strict=True)
-        parts = tuple(o.part(np.isin(o.rows, rows)) for o, rows in pairs)
-        problem = replace(each.problem, observations=parts)
-        found.append(Posed(each.name, problem, solved(problem, each.solution.z, loss)))
-    return found
+def _fit_common_rows(models: Sequence[Posed], loss: Loss) -> list[Posed]:
+    """Fit each model to the rows that all of them can predict."""
+    groups = zip(*(model.problem.observations for model in models), strict=True)
+    common_rows = [
+        reduce(np.intersect1d, (observation.rows for observation in group)) for group in groups
+    ]
+    result = []
+    for model in models:
+        pairs = zip(model.problem.observations, common_rows, strict=True)
+        parts = tuple(
+            observation.part(np.isin(observation.rows, rows)) for observation, rows in pairs
+        )
+        problem = replace(model.problem, observations=parts)
+        result.append(Posed(model.name, problem, solved(problem, model.solution.z, loss)))
+    return result
 
 
-def _values(posed: Posed) -> dict[str, float]:
-    names = [u.parameter.path for u in posed.problem.unknowns]
-    return dict(zip(names, map(float, posed.solution.z), strict=False))
+def _values(model: Posed) -> dict[str, float]:
+    names = [unknown.parameter.path for unknown in model.problem.unknowns]
+    return dict(zip(names, map(float, model.solution.z), strict=False))
 
 
-def _left_out(posed: Posed, blocks: Sequence[NDArray[np.intp]], folds: int, loss: Loss) -> Floats:
-    """The mean square residual of each block by what was fitted to the other folds, (block,)."""
-    found = []
-    observations = posed.problem.observations
+def _cross_validate(
+    model: Posed, blocks: Sequence[NDArray[np.intp]], folds: int, loss: Loss
+) -> Floats:
+    """Return the mean square residual of each block, predicted by a fit to the other folds,
+    (block,)."""
+    scores = []
+    observations = model.problem.observations
     for fold in range(folds):
-        chosen = [numbers % folds == fold for numbers in blocks]
-        kept = tuple(o.part(~c) for o, c in zip(observations, chosen, strict=True))
-        z = solved(replace(posed.problem, observations=kept), posed.solution.z, loss).z
-        for n, (observation, c) in enumerate(zip(observations, chosen, strict=True)):
-            if c.any():
-                left = posed.problem.residuals_of(n, observation.part(c), z)
-                own = blocks[n][c]
-                parts = (left.reshape(-1, len(own))[:, own == block] for block in np.unique(own))
-                found += [cost_of(part.ravel(), loss) / part.size for part in parts]
-    return np.array(found) / _mean_weight(posed.problem)
+        masks = [numbers % folds == fold for numbers in blocks]
+        rest = tuple(item.part(~mask) for item, mask in zip(observations, masks, strict=True))
+        z = solved(replace(model.problem, observations=rest), model.solution.z, loss).z
+        for n, (observation, mask) in enumerate(zip(observations, masks, strict=True)):
+            if mask.any():
+                residuals = model.problem.residuals_of(n, observation.part(mask), z)
+                block_of_row = blocks[n][mask]
+                parts = (
+                    residuals.reshape(-1, len(block_of_row))[:, block_of_row == block]
+                    for block in np.unique(block_of_row)
+                )
+                scores += [cost_of(part.ravel(), loss) / part.size for part in parts]
+    return np.array(scores) / _mean_weight(model.problem)
 
 
 def _blocks(places: Floats, seed: int) -> NDArray[np.intp]:
-    """To which block each row belongs, numbered in an order drawn at random."""
+    """Return the block of each row, numbered in a random order."""
     low = places.min(axis=0)
-    side = max(float(np.ptp(places, axis=0).max()) / BLOCKS, 1e-300)
+    side = max(float(np.ptp(places, axis=0).max()) / BLOCKS_PER_SIDE, 1e-300)
     cells = np.floor((places - low) / side * (1.0 - 1e-12)).astype(np.intp)
     _, numbers = np.unique(cells, axis=0, return_inverse=True)
     order = np.random.default_rng(seed).permutation(int(numbers.max()) + 1)
     return np.asarray(order[numbers.ravel()])
 
 
-STEP, EVEN, MOST = 0.75, 4, 12
-"""Values are so many standard errors apart, and after so many twice as far each time."""
-WIDEST = 0.1
-"""The largest first step, as a share of the way between bounds."""
-STRAIGHT, REFINEMENTS = 1.5, 30
-"""The root of the rise counts as straight over so much of it; the most values that are looked at
-until it is."""
-ENOUGH = 8.0
-"""The rise after which no farther value is looked at."""
-RISE = 3.841
+STEP = 0.75
+"""First step of a profile in standard errors."""
+
+EQUAL_STEPS = 4
+"""Number of equal steps; further steps double."""
+
+MAX_STEPS = 12
+"""Largest number of steps."""
+MAX_FIRST_STEP = 0.1
+"""Largest first step, as a fraction of the interval between the bounds."""
+STRAIGHT = 1.5
+"""Increment of the root of the rise over which it is interpolated linearly."""
+
+REFINEMENTS = 30
+"""Largest number of further values until it is."""
+MAX_RISE = 8.0
+"""Rise at which a profile ends."""
+RISE_95 = 3.841
 """The 95 % quantile of χ² with one degree of freedom."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Values of a parameter, (value,), and by how much -2 log L rises there, (value,), with the
-    ends of the 95 % interval; None where data do not bound it within the bounds of the fit."""
+    """Profile likelihood of a parameter.
+
+    Parameters
+    ----------
+    values : (value,)
+        Values of the parameter.
+    rises : (value,)
+        Increase of -2 log L.
+    low, high
+        Ends of the 95 % interval; None if the data do not bound it within the bounds of the fit.
+    """
 
     values: Floats
     rises: Floats
@@ -255,7 +332,7 @@ class Profile:
     high: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """In plain values."""
+        """Return plain values."""
         return {
             "values": self.values.tolist(),
             "rises": self.rises.tolist(),
@@ -267,14 +344,18 @@ class Profile:
         return f"95 % interval from {low} to {high}"
 
 
-def profiled(problem: Problem, solution: Solution, n: int, loss: Loss) -> Profile:
-    """The profile of parameter n: outward from the fit until it has risen enough, on both sides."""
+def profile_likelihood(problem: Problem, solution: Solution, n: int, loss: Loss) -> Profile:
+    """Compute the profile of parameter n from the fit outwards, in both directions."""
     best = (float(solution.z[n]), 0.0)
     sides = [
-        _refined(
-            np.array([best, *_walk(problem, solution, n, way, loss)]), problem, solution, n, loss
+        _refine(
+            np.array([best, *_walk(problem, solution, n, direction, loss)]),
+            problem,
+            solution,
+            n,
+            loss,
         )
-        for way in (-1.0, 1.0)
+        for direction in (-1.0, 1.0)
     ]
     low, high = (_crossing(*side.T) for side in sides)
     values, rises = np.concatenate([sides[0][:0:-1], sides[1]]).T
@@ -282,91 +363,103 @@ def profiled(problem: Problem, solution: Solution, n: int, loss: Loss) -> Profil
 
 
 def _walk(
-    problem: Problem, solution: Solution, n: int, way: float, loss: Loss
+    problem: Problem, solution: Solution, n: int, direction: float, loss: Loss
 ) -> Iterator[tuple[float, float]]:
-    """Values one way, and the rise at each, as far as all else can be fitted."""
+    """Yield values in one direction, with the rise at each, as long as all others can be fitted."""
     low, high = _ends(problem.unknowns[n])
     value, z = float(solution.z[n]), solution.z
-    step = min(STEP * float(solution.errors[n]), WIDEST * (high - low))
-    unit, least = _unit(problem, solution, loss)
-    for count in range(MOST):
-        value = min(max(value + way * step, low), high)
+    step = min(STEP * float(solution.errors[n]), MAX_FIRST_STEP * (high - low))
+    unit, minimum = _unit(problem, solution, loss)
+    for count in range(MAX_STEPS):
+        value = min(max(value + direction * step, low), high)
         try:
-            cost, z = _fitted_at(problem, n, value, z, loss)
+            cost, z = _fit_at(problem, n, value, z, loss)
         except UnconvergedError:
             return
-        yield value, (cost - least) / unit
-        if value in (low, high) or cost - least > ENOUGH * unit:
+        yield value, (cost - minimum) / unit
+        if value in (low, high) or cost - minimum > MAX_RISE * unit:
             return
-        step *= 1.0 if count < EVEN else 2.0
+        step *= 1.0 if count < EQUAL_STEPS else 2.0
 
 
-def _refined(side: Floats, problem: Problem, solution: Solution, n: int, loss: Loss) -> Floats:
-    """Values and rises going outward, (value, 2), with more of them where the rise comes to RISE:
-    where it is flat at first, it is not straight there."""
-    unit, least = _unit(problem, solution, loss)
+def _refine(side: Floats, problem: Problem, solution: Solution, n: int, loss: Loss) -> Floats:
+    """Insert values, (value, 2), where the rise reaches RISE_95.
+
+    Its root is not linear there if it was flat before.
+    """
+    unit, minimum = _unit(problem, solution, loss)
     for _ in range(REFINEMENTS):
         roots = np.sqrt(np.maximum(side[:, 1], 0.0))
-        beyond = np.flatnonzero(roots >= np.sqrt(RISE))
-        if not beyond.size or (k := int(beyond[0])) == 0 or roots[k] - roots[k - 1] <= STRAIGHT:
+        indices = np.flatnonzero(roots >= np.sqrt(RISE_95))
+        if not indices.size or (k := int(indices[0])) == 0 or roots[k] - roots[k - 1] <= STRAIGHT:
             break
         value = float(side[k - 1 : k + 1, 0].mean())
         try:
-            cost, _ = _fitted_at(problem, n, value, solution.z, loss)
+            cost, _ = _fit_at(problem, n, value, solution.z, loss)
         except UnconvergedError:
             break
-        side = np.insert(side, k, (value, (cost - least) / unit), axis=0)
+        side = np.insert(side, k, (value, (cost - minimum) / unit), axis=0)
     return side
 
 
 def _unit(problem: Problem, solution: Solution, loss: Loss) -> tuple[float, float]:
-    """The rise of -2 log L that counts as 1, and its least value."""
+    """Return the increase of the cost that counts as 1 in -2 log L, and the minimum of the cost."""
     residuals = solution.at.residuals
     return rise_of_loss(residuals, problem.size, loss), cost_of(residuals, loss)
 
 
 def _ends(unknown: Any) -> tuple[float, float]:
-    """The bounds, and a little within them: derivatives look to both sides."""
+    """Return the bounds, slightly reduced, since derivatives are taken on both sides."""
     inset = 1e-9 * unknown.span
     return unknown.low + inset, unknown.high - inset
 
 
-def _fitted_at(
+def _fit_at(
     problem: Problem, n: int, value: float, start: Floats, loss: Loss
 ) -> tuple[float, Floats]:
-    """The least cost with parameter n at a value, and the whole z there."""
+    """Return the smallest cost with parameter n at a value, and z there."""
     parameter = problem.unknowns[n].parameter
     observations = tuple(
-        replace(o, experiment=parameter.put(o.experiment, value)) for o in problem.observations
+        replace(observation, experiment=parameter.put(observation.experiment, value))
+        for observation in problem.observations
     )
-    others = Problem((*problem.unknowns[:n], *problem.unknowns[n + 1 :]), observations)
+    reduced = Problem((*problem.unknowns[:n], *problem.unknowns[n + 1 :]), observations)
     rest = np.delete(start, n)
-    if others.size:
-        found = solved(others, rest, loss)
-        at, rest = found.at, found.z
+    if reduced.size:
+        solution = solved(reduced, rest, loss)
+        at, rest = solution.at, solution.z
     else:
-        at = others.at(rest)
+        at = reduced.at(rest)
     return cost_of(at.residuals, loss), np.insert(rest, n, value)
 
 
 def _crossing(values: Floats, rises: Floats) -> float | None:
-    """Where the rise, going outward, first comes to RISE: its root is nearly straight."""
+    """Interpolate where the rise first reaches RISE_95; its root is nearly linear."""
     roots = np.sqrt(np.maximum(rises, 0.0))
-    beyond = np.flatnonzero(roots >= np.sqrt(RISE))
-    if not beyond.size or beyond[0] == 0:
+    indices = np.flatnonzero(roots >= np.sqrt(RISE_95))
+    if not indices.size or indices[0] == 0:
         return None
-    k = int(beyond[0])
-    return float(np.interp(np.sqrt(RISE), roots[k - 1 : k + 1], values[k - 1 : k + 1]))
+    k = int(indices[0])
+    return float(np.interp(np.sqrt(RISE_95), roots[k - 1 : k + 1], values[k - 1 : k + 1]))
 
 
-BURN = 0.25
-"""The share of steps that is not counted."""
+BURN_IN = 0.25
+"""Fraction of the steps that is discarded."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Draws of the parameters, (draw, parameter), the share of moves that were taken, and the steps
-    after which a walker has forgotten where it was (NaN where there are too few to tell)."""
+    """Sample of the posterior.
+
+    Parameters
+    ----------
+    draws : (draw, parameter)
+        Values of the parameters.
+    acceptance
+        Fraction of accepted moves.
+    memory
+        Autocorrelation time in steps; NaN if there are too few steps.
+    """
 
     draws: Floats
     acceptance: float
@@ -374,27 +467,29 @@ class Sample:
 
     @property
     def mean(self) -> Floats:
-        """(parameter,)."""
+        """Return the means, (parameter,)."""
         return np.asarray(self.draws.mean(axis=0))
 
     @property
     def deviation(self) -> Floats:
-        """The standard deviation, (parameter,)."""
+        """Return the standard deviations, (parameter,)."""
         return np.asarray(self.draws.std(axis=0))
 
     @property
     def error(self) -> Floats:
-        """How far the mean may be off for want of draws, (parameter,): one standard error."""
+        """Return the standard errors of the means due to the number of draws, (parameter,)."""
         return np.asarray(self.deviation * np.sqrt(self.memory / len(self.draws)))
 
 
 def refuse_no_sampler() -> None:
-    """Raises ExperimentError where emcee is missing."""
+    """Raise ExperimentError if emcee is not installed."""
     refuse_without("emcee", "sample", "the sampler needs emcee")
 
 
-def sampled(problem: Problem, solution: Solution, *, walkers: int, steps: int, seed: int) -> Sample:
-    """By so many walkers, so many steps each."""
+def sample_posterior(
+    problem: Problem, solution: Solution, *, walkers: int, steps: int, seed: int
+) -> Sample:
+    """Sample the posterior with a number of walkers and steps."""
     import emcee
 
     low, high = (bound[: len(problem.unknowns)] for bound in problem.bounds())
@@ -410,15 +505,15 @@ def sampled(problem: Problem, solution: Solution, *, walkers: int, steps: int, s
     start = solution.z[:count] + spread * generator.normal(size=(walkers, count))
     start = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
     chain = emcee.EnsembleSampler(walkers, count, log_posterior)
-    chain.random_state = np.random.RandomState(seed).get_state()  # emcee's own
+    chain.random_state = np.random.RandomState(seed).get_state()  # emcee keeps a state of its own
     chain.run_mcmc(start, steps)
     memory = chain.get_autocorr_time(quiet=True, tol=0)
-    draws = chain.get_chain(discard=int(BURN * steps), flat=True)
+    draws = chain.get_chain(discard=int(BURN_IN * steps), flat=True)
     return Sample(draws, float(np.mean(chain.acceptance_fraction)), float(np.max(memory)))
 
 
 def _marginal(problem: Problem, z: Floats, values: Floats, size: float) -> float:
-    """log p of parameters, with residuals that are so many times as large as their noise."""
+    """Return log p of parameters, for residuals `size` times as large as their noise."""
     observations = []
     for observation in problem.observations:
         experiment = observation.experiment
@@ -427,36 +522,49 @@ def _marginal(problem: Problem, z: Floats, values: Floats, size: float) -> float
         observations.append(replace(observation, experiment=experiment))
     rest = Problem((), tuple(observations))
     try:
-        at = rest.at(z[len(values) :])
+        linearisation = rest.at(z[len(values) :])
     except (UnconvergedError, ExperimentError):
         return -np.inf
-    left, log_volume = at.residuals, 0.0
+    residuals, log_volume = linearisation.residuals, 0.0
     if rest.size:
-        size_of = np.linalg.norm(at.jacobian, axis=0)
+        size_of = np.linalg.norm(linearisation.jacobian, axis=0)
         size_of[size_of == 0.0] = 1.0
-        basis, sizes, _ = np.linalg.svd(at.jacobian / size_of, full_matrices=False)
-        own = sizes > RANK * sizes.max(initial=0.0)  # the others change nothing, in any way
-        left = left - basis[:, own] @ (basis[:, own].T @ left)
-        log_volume = float(np.log(size_of).sum() + np.log(sizes[own]).sum())
-    return float(-0.5 * (left @ left) / size**2 - log_volume)
+        basis, sizes, _ = np.linalg.svd(linearisation.jacobian / size_of, full_matrices=False)
+        is_regular = sizes > RANK * sizes.max(initial=0.0)  # the others have no influence
+        residuals = residuals - basis[:, is_regular] @ (basis[:, is_regular].T @ residuals)
+        log_volume = float(np.log(size_of).sum() + np.log(sizes[is_regular]).sum())
+    return float(-0.5 * (residuals @ residuals) / size**2 - log_volume)
 
 
-SAME, SIMPLE = 1e-3, 5e-3
-"""The share of the largest below which an exponent is 0; how far one may be from a half or whole
-number that is taken for it."""
+SAME = 1e-3
+"""Exponents below this fraction of the largest are 0."""
+
+SIMPLE = 5e-3
+"""Largest deviation of exponents that are rounded to whole or half numbers."""
 NEAR_ZERO = 1e-2
-"""A parameter that is a smaller share of the way between its bounds may be 0."""
+"""Fraction of the interval between its bounds below which a parameter may be 0."""
 UNSEEN = 1e-2
-"""The change of residuals², over that of the noise, that is none."""
-FARTHER, WITHIN = 0.2, 0.8
-"""How far parameters go along a way where the data tell nothing, as a share of themselves, and of
-the way to their bounds."""
+"""Change of the squared residuals, over that of the noise, that is negligible."""
+MAX_RELATIVE_CHANGE = 0.2
+"""Largest relative change of parameters along a direction that is not identifiable."""
+
+MAX_BOUND_FRACTION = 0.8
+"""Largest fraction of the distance to their bounds."""
 
 
 @dataclass(frozen=True)
 class Combination:
-    """A product of powers of parameters, or a weighted sum: `weights` by path are exponents or
-    factors."""
+    """A product of powers of parameters, or a weighted sum.
+
+    Parameters
+    ----------
+    weights
+        Exponents, or factors, by path.
+    is_product
+        Whether it is a product.
+    estimate
+        Its value.
+    """
 
     weights: dict[str, float]
     is_product: bool
@@ -464,22 +572,24 @@ class Combination:
 
     @property
     def name(self) -> str:
-        """A formula of it."""
+        """Return the combination as a formula."""
         if not self.is_product:
-            terms = (f"{_times(abs(w))}{path}" for path, w in self.weights.items())
-            signs = (" - " if w < 0.0 else " + " for w in self.weights.values())
+            terms = (f"{_times(abs(factor))}{path}" for path, factor in self.weights.items())
+            signs = (" - " if factor < 0.0 else " + " for factor in self.weights.values())
             return "".join(map("".join, zip(signs, terms, strict=True))).removeprefix(" + ")
-        over = [_power(path, weight) for path, weight in self.weights.items() if weight > 0.0]
-        under = [_power(path, -weight) for path, weight in self.weights.items() if weight < 0.0]
-        return " / ".join([" · ".join(over), *under])
+        numerator = [_power(path, weight) for path, weight in self.weights.items() if weight > 0.0]
+        denominators = [
+            _power(path, -weight) for path, weight in self.weights.items() if weight < 0.0
+        ]
+        return " / ".join([" · ".join(numerator), *denominators])
 
     def __str__(self) -> str:
         return f"{self.name}: {self.estimate}"
 
     def as_dict(self) -> dict[str, Any]:
-        """In plain values."""
-        what = "exponents" if self.is_product else "factors"
-        return {what: self.weights} | self.estimate.as_dict()
+        """Return plain values."""
+        key = "exponents" if self.is_product else "factors"
+        return {key: self.weights} | self.estimate.as_dict()
 
 
 def _times(factor: float) -> str:
@@ -491,69 +601,88 @@ def _power(path: str, exponent: float) -> str:
 
 
 def combinations(problem: Problem, solution: Solution) -> tuple[Combination, ...]:
-    """Those of parameters that are not told one by one: first those that are told."""
-    count, found = problem.shared, solution.directions
+    """Return combinations of parameters that are not identifiable separately: identifiable ones,
+    then the others."""
+    count, directions = problem.shared, solution.directions
     names = [unknown.parameter.path for unknown in problem.unknowns]
     names += [MODULUS] if problem.with_modulus else []
-    among = found.unsure[:, :count]
-    unsure, rows = among.any(axis=1), np.flatnonzero(among.any(axis=0))
+    unsure_shared = directions.unsure[:, :count]
+    unsure, rows = unsure_shared.any(axis=1), np.flatnonzero(unsure_shared.any(axis=0))
     if len(rows) < 2:
         return ()
-    z, span = solution.z[rows], found.scale[rows]
-    ways = found.ways[unsure][:, rows]
+    z, span = solution.z[rows], directions.scale[rows]
+    vectors = directions.vectors[unsure][:, rows]
     paths = [names[n] for n in rows]
     is_product = bool((np.abs(z) > NEAR_ZERO * span).all())
     if is_product:
-        is_whole = all((each % 1.0 == 0.0).all() for each in _complementary(ways * span / z))
+        is_whole = all(
+            (weights % 1.0 == 0.0).all() for weights in _complementary(vectors * span / z)
+        )
         is_product = bool((z > 0.0).all() or is_whole)
-        is_product = is_product and _is_product(problem, solution, rows, ways[0] * span / z)
-    blind, seen = _complementary(ways * span / z) if is_product else _complementary(ways, span)
-    some = [_told(found, rows, z, each, paths, is_product) for each in seen]
-    none = [_combination(each, z, paths, is_product) for each in blind]
-    return (*some, *none)
+        is_product = is_product and _is_product(problem, solution, rows, vectors[0] * span / z)
+    null, complement = (
+        _complementary(vectors * span / z) if is_product else _complementary(vectors, span)
+    )
+    identifiable = [
+        _identifiable_combination(directions, rows, z, weights, paths, is_product)
+        for weights in complement
+    ]
+    unidentified = [_make_combination(weights, z, paths, is_product) for weights in null]
+    return (*identifiable, *unidentified)
 
 
-def _is_product(problem: Problem, solution: Solution, rows: NDArray[np.intp], way: Floats) -> bool:
-    """Whether less changes where the logarithms of parameters go on along a way than where they go
-    on themselves."""
+def _is_product(
+    problem: Problem, solution: Solution, rows: NDArray[np.intp], direction: Floats
+) -> bool:
+    """Return whether residuals change less along a direction of logarithms than along one of
+    parameters."""
     low, high = (bound[rows] for bound in problem.bounds())
-    z, way = solution.z[rows], way / np.abs(way).max()
+    z, direction = solution.z[rows], direction / np.abs(direction).max()
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.stack([(low - z) / (z * way), (high - z) / (z * way)])
-    ends[:, np.abs(way) <= SAME] = [[-np.inf], [np.inf]]
+        ends = np.stack([(low - z) / (z * direction), (high - z) / (z * direction)])
+    ends[:, np.abs(direction) <= SAME] = [[-np.inf], [np.inf]]
     room = max(ends.max(axis=0).min(), ends.min(axis=0).max(), key=abs)
-    room = float(np.clip(WITHIN * room, -FARTHER, FARTHER))
+    room = float(np.clip(MAX_BOUND_FRACTION * room, -MAX_RELATIVE_CHANGE, MAX_RELATIVE_CHANGE))
     changes = []
-    for moved in (z * np.exp(room * way), z * (1.0 + room * way)):
-        there = solution.z.copy()
-        there[rows] = np.clip(moved, low, high)
+    for values in (z * np.exp(room * direction), z * (1.0 + room * direction)):
+        z_moved = solution.z.copy()
+        z_moved[rows] = np.clip(values, low, high)
         try:
-            change = problem.residuals(there) - solution.at.residuals
+            change = problem.residuals(z_moved) - solution.at.residuals
         except (UnconvergedError, ExperimentError):
             return True
         changes.append(float(change @ change))
     return changes[0] <= max(2.0 * changes[1], UNSEEN)
 
 
-def _complementary(ways: Floats, scale: Floats | float = 1.0) -> tuple[Floats, Floats]:
-    """Bases of the space of some directions, in which parameters count in a scale, as the way that
-    parameters go, and of what is at right angles to it, as factors of parameters."""
-    _, sizes, basis = np.linalg.svd(ways)
+def _complementary(directions: Floats, scale: Floats | float = 1.0) -> tuple[Floats, Floats]:
+    """Return bases of a space of directions, and of its orthogonal complement as factors of
+    parameters.
+
+    Parameters
+    ----------
+    directions
+        Directions.
+    scale
+        Scale of the parameters.
+    """
+    _, sizes, basis = np.linalg.svd(directions)
     rank = int((sizes > SAME * sizes.max(initial=0.0)).sum())
-    blind, seen = _reduced(basis[:rank]) * scale, _reduced(basis[rank:]) / scale
-    return _simplified(blind), _simplified(seen)
+    space, complement = _row_reduce(basis[:rank]) * scale, _row_reduce(basis[rank:]) / scale
+    return _round_factors(space), _round_factors(complement)
 
 
-def _simplified(rows: Floats) -> Floats:
-    """Factors over the first of each row, and those as whole or half numbers that nearly are."""
+def _round_factors(rows: Floats) -> Floats:
+    """Divide each row by its first entry, and round entries that are nearly whole or half
+    numbers."""
     first = (rows != 0.0).argmax(axis=1)
     rows = rows / rows[np.arange(len(rows)), first][:, None]
     simple = np.round(2.0 * rows) / 2.0
     return np.where(np.abs(rows - simple) <= SIMPLE, simple, rows)
 
 
-def _reduced(rows: Floats) -> Floats:
-    """A basis with as many zeros as there can be, by Gauss's elimination."""
+def _row_reduce(rows: Floats) -> Floats:
+    """Return a basis with as many zeros as possible, by Gaussian elimination."""
     rows, first = rows.copy(), 0
     for column in range(rows.shape[1]):
         if first == len(rows):
@@ -563,20 +692,22 @@ def _reduced(rows: Floats) -> Floats:
             continue
         rows[[first, pivot]] = rows[[pivot, first]]
         rows[first] /= rows[first, column]
-        others = np.arange(len(rows)) != first
-        rows[others] -= rows[others, column, None] * rows[first]
+        other_rows = np.arange(len(rows)) != first
+        rows[other_rows] -= rows[other_rows, column, None] * rows[first]
         first += 1
     return np.where(np.abs(rows) > SAME, rows, 0.0)
 
 
-def _combination(weights: Floats, z: Floats, paths: Sequence[str], is_product: bool) -> Combination:
-    """One that is not told; `weights` are exponents or factors."""
+def _make_combination(
+    weights: Floats, z: Floats, paths: Sequence[str], is_product: bool
+) -> Combination:
+    """Return an unidentified combination; `weights` are exponents or factors."""
     value = float(np.prod(z**weights) if is_product else weights @ z)
-    named = {path: float(e) for path, e in zip(paths, weights, strict=True) if e}
-    return Combination(named, is_product, Estimate(value, np.inf, told=False))
+    by_path = {path: float(weight) for path, weight in zip(paths, weights, strict=True) if weight}
+    return Combination(by_path, is_product, Estimate(value, np.inf, identifiable=False))
 
 
-def _told(
+def _identifiable_combination(
     directions: Directions,
     rows: NDArray[np.intp],
     z: Floats,
@@ -584,12 +715,16 @@ def _told(
     paths: Sequence[str],
     is_product: bool,
 ) -> Combination:
-    """One that is told, with its error."""
-    found, gradient = _combination(weights, z, paths, is_product), np.zeros(len(directions.scale))
+    """Return an identifiable combination with its error."""
+    combination, gradient = (
+        _make_combination(weights, z, paths, is_product),
+        np.zeros(len(directions.scale)),
+    )
     gradient[rows] = weights / z if is_product else weights
     error = directions.error_of(gradient)
-    most = 1.0 if is_product else np.abs(weights * directions.scale[rows]).max()
-    size = abs(found.estimate.value) if is_product else 1.0
+    largest = 1.0 if is_product else np.abs(weights * directions.scale[rows]).max()
+    size = abs(combination.estimate.value) if is_product else 1.0
     return replace(
-        found, estimate=Estimate(found.estimate.value, error * size, error < TELLS * most)
+        combination,
+        estimate=Estimate(combination.estimate.value, error * size, error < TELLS * largest),
     )

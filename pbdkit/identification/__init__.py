@@ -1,3 +1,4 @@
-"""What a rule is physically, on its lattice and neighbours: from its answer to plane waves."""
+"""Physical identity of a rule on its lattice and neighbourhood, from its response to plane
+waves."""
 
 from __future__ import annotations

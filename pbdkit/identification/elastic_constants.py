@@ -1,6 +1,6 @@
 """Elastic constants of a rule from its long-wave expansion, and whether they exist.
 
-To second order a step moves a body by Q_abcd ∂_c ∂_d u_b. The rule is elastic where a symmetric
+To second order a step moves a body by Q_abcd ∂_c ∂_d u_b. The rule is elastic if a symmetric
 positive B exists, the inverse of the mobility, with
 
     B_ae Q_ebcd = (C_acbd + C_adbc) / 2
@@ -25,26 +25,39 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 PAIRS = ((0, 0), (1, 1), (0, 1))
+"""Pairs of axes xx, yy and xy."""
 HUANG = tuple(combinations(PAIRS, 2))
-"""Axes of Γ that may be exchanged."""
+"""Pairs of axes of Γ that Huang's relations exchange."""
 MOBILITIES = np.eye(3)[:, [[0, 2], [2, 1]]]
-"""What B is made of: xx, yy, xy."""
-DIFFUSION, ELASTICITY, NEITHER = "diffusion", "elasticity", "neither"
+"""Basis of the symmetric matrices B: xx, yy, xy."""
+DIFFUSION = "diffusion"
+"""Kind of rules that diffuse each component of the displacement separately."""
+ELASTICITY = "elasticity"
+"""Kind of rules that solve an elastic body."""
+NEITHER = "neither"
+"""Kind of rules that are neither."""
 SAME = 1e-8
-"""Shares below this are nothing; what central differences give is good to 1e-9."""
+"""Relative tolerance for zero; central differences are accurate to 1e-9."""
 
 
 @dataclass(frozen=True)
 class Elasticity:
-    """`stiffness` in Voigt's order xx, yy, xy (spacing²/step), `mobility` the inverse of B scaled
-    to tr B = 2: a step moves by mobility · div σ."""
+    """An elastic body in plane stress.
+
+    Parameters
+    ----------
+    stiffness : (3, 3)
+        Elastic constants C in the order xx, yy, xy of Voigt, spacing²/step.
+    mobility : (2, 2)
+        Inverse of B, scaled to tr B = 2. A step moves a particle by mobility · div σ.
+    """
 
     stiffness: Floats
     mobility: Floats
 
     @property
     def symmetry(self) -> str:
-        """isotropic, square (a quarter turn and two mirrors), orthotropic, or general."""
+        """Return isotropic, square (a quarter turn and two mirrors), orthotropic, or general."""
         fourth, second, scale = *self._harmonics, float(np.abs(self.stiffness).max())
         if abs(second) < SAME * scale:
             return "isotropic" if abs(fourth) < SAME * scale else "square"
@@ -53,8 +66,10 @@ class Elasticity:
 
     @property
     def axis(self) -> float | None:
-        """The direction of an axis of symmetry in degrees, 0 to 90; None where every direction is
-        one, or none."""
+        """Return the direction of an axis of symmetry in degrees, 0 to 90.
+
+        None if the body is isotropic or has no such axis.
+        """
         fourth, second = self._harmonics
         if self.symmetry in ("isotropic", "general"):
             return None
@@ -66,51 +81,67 @@ class Elasticity:
 
     @property
     def _harmonics(self) -> tuple[complex, complex]:
-        """R0 exp(4iΦ0) and R1 exp(2iΦ1)."""
+        """Return R0 exp(4iΦ0) and R1 exp(2iΦ1)."""
         (c11, c12, c16), (_, c22, c26), (*_, c66) = self.stiffness
         fourth = (c11 - 2 * c12 - 4 * c66 + c22 + 4j * (c16 - c26)) / 8
         return complex(fourth), complex(c11 - c22 + 2j * (c16 + c26)) / 8
 
     @property
     def least_stiffness(self) -> float:
-        """The smallest eigenvalue of the strain energy as a share of the largest."""
-        weights = np.diag([1.0, 1.0, np.sqrt(2.0)])  # of Mandel: the same length for every strain
+        """Return the ratio of the smallest to the largest eigenvalue of the strain energy."""
+        weights = np.diag(
+            [1.0, 1.0, np.sqrt(2.0)]
+        )  # Mandel's notation preserves the norm of strains
         sizes = np.linalg.eigvalsh(weights @ self.stiffness @ weights)
         return float(sizes[0] / sizes[-1])
 
     @property
     def zener(self) -> float | None:
-        """4 C66 / (C11 + C22 - 2 C12), in x and y: 1 for isotropic bodies; None where stretching
-        one way and shrinking the other costs nothing."""
+        """Return 4 C66 / (C11 + C22 - 2 C12) in x and y, 1 for isotropic bodies.
+
+        None if stretching along x and shrinking along y costs no energy.
+        """
         (c11, c12, _), (_, c22, _), (*_, c66) = self.stiffness
         stretching = c11 + c22 - 2 * c12
         return float(4 * c66 / stretching) if stretching else None
 
     def youngs_modulus(self, degrees: float) -> float:
-        """Of a bar in plane stress cut along that direction, in the units of `stiffness`; 0 where
-        it can be pulled at no cost."""
-        own, _ = self._strains(degrees)
-        return float(np.linalg.det(self.stiffness) / own) if own else 0.0
+        """Compute Young's modulus of a bar in plane stress cut along a direction, in units of
+        `stiffness`.
+
+        It is 0 if the bar can be stretched at no cost.
+        """
+        longitudinal, _ = self._strains(degrees)
+        return float(np.linalg.det(self.stiffness) / longitudinal) if longitudinal else 0.0
 
     def poisson_ratio(self, degrees: float) -> float | None:
-        """-ε_across / ε_along of a bar in plane stress cut along that direction; None where it
-        cannot be pulled along it."""
-        own, other = self._strains(degrees)
-        return -other / own if own else None
+        """Compute -ε_across / ε_along of a bar in plane stress cut along a direction.
+
+        None if the bar cannot be stretched.
+        """
+        longitudinal, transverse = self._strains(degrees)
+        return -transverse / longitudinal if longitudinal else None
 
     def _strains(self, degrees: float) -> tuple[float, float]:
-        """Along and across a bar pulled along a direction, times det C; the first is 0 where
-        it is nothing. From the minors of C, so that a body without stiffness against one strain has
-        them too."""
+        """Compute the strains along and across a bar under tension, times det C; rounding errors
+        along it are 0.
+
+        They are computed from the minors of C, so that they exist for a singular C, too.
+        """
         rows = self.stiffness
         compliance = np.cross(rows[[1, 2, 0]], rows[[2, 0, 1]]).T
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         along, across = np.array([c * c, s * s, c * s]), np.array([s * s, c * c, -c * s])
-        own, other = float(along @ compliance @ along), float(across @ compliance @ along)
-        return own if abs(own) > SAME * np.abs(compliance).max() else 0.0, other
+        longitudinal, transverse = (
+            float(along @ compliance @ along),
+            float(across @ compliance @ along),
+        )
+        return longitudinal if abs(longitudinal) > SAME * np.abs(
+            compliance
+        ).max() else 0.0, transverse
 
     def as_dict(self) -> dict[str, Any]:
-        """The constants by name and what follows from them."""
+        """Return the constants, and what follows from them, by name."""
         pairs = combinations_with_replacement(range(3), 2)
         constants = {f"C{'126'[i]}{'126'[j]}": float(self.stiffness[i, j]) for i, j in pairs}
         return constants | {
@@ -125,27 +156,34 @@ class Elasticity:
 
 
 def second_order(along_x: Floats, along_y: Floats, along_both: Floats) -> Floats:
-    """Q_abcd from the second-order terms for k = (1, 0), (0, 1) and (1, 1)."""
+    """Compute Q_abcd from the second-order terms for k = (1, 0), (0, 1) and (1, 1)."""
     mixed = (along_both - along_x - along_y) / 2
     return np.array([[along_x, mixed], [mixed, along_y]]).transpose(2, 3, 0, 1)
 
 
 def diffusion(q: Floats) -> Floats | None:
-    """D_cd where Q_abcd = δ_ab D_cd, x and y each diffusing by itself and alike; else None."""
+    """Return D_cd if Q_abcd = δ_ab D_cd, so that x and y diffuse separately and equally; else
+    None."""
     mean = (q[0, 0] + q[1, 1]) / 2
-    left_over = q - np.einsum("ab,cd->abcd", np.eye(2), mean)
-    return mean if np.abs(left_over).max() < SAME * np.abs(q).max() else None
+    remainder = q - np.einsum("ab,cd->abcd", np.eye(2), mean)
+    return mean if np.abs(remainder).max() < SAME * np.abs(q).max() else None
 
 
 def elasticity(q: Floats) -> Elasticity | str:
-    """The elastic body, or why there is none."""
-    equations = np.array([_failures(_applied(unit, q)) for unit in MOBILITIES]).T
+    """Return the elastic body of a rule, or the reason why there is none.
+
+    Parameters
+    ----------
+    q : (2, 2, 2, 2)
+        Second-order terms Q_abcd.
+    """
+    equations = np.array([_asymmetries(_apply(unit, q)) for unit in MOBILITIES]).T
     scale = float(np.abs(q).max())
     inverse = _inverse_mobility(equations, scale)
     if inverse is None:
         with_energy = _inverse_mobility(equations[: len(PAIRS)], scale)
-        return _no_energy(q) if with_energy is None else _no_rotation(_applied(with_energy, q))
-    g = _applied(inverse, q)
+        return _no_energy(q) if with_energy is None else _no_rotation(_apply(with_energy, q))
+    g = _apply(inverse, q)
     c66 = (g[0, 0, 1, 1] + g[1, 1, 0, 0]) / 2
     c16, c26 = (g[0, 0, 0, 1] + g[0, 1, 0, 0]) / 2, (g[1, 1, 0, 1] + g[0, 1, 1, 1]) / 2
     c12 = g[0, 1, 0, 1] + g[1, 0, 0, 1] - c66
@@ -153,21 +191,21 @@ def elasticity(q: Floats) -> Elasticity | str:
     return Elasticity(stiffness, np.linalg.inv(inverse).astype(float))
 
 
-def _applied(inverse: Floats, q: Floats) -> Floats:
-    """Γ = B Q."""
-    found: Floats = np.einsum("ae,ebcd->abcd", inverse, q)
-    return found
+def _apply(inverse: Floats, q: Floats) -> Floats:
+    """Return Γ = B Q."""
+    gamma: Floats = np.einsum("ae,ebcd->abcd", inverse, q)
+    return gamma
 
 
-def _failures(g: Floats) -> list[float]:
-    """By how much Γ is not symmetric in its first two axes, for each pair of the others, and by how
-    much Huang's relations fail."""
+def _asymmetries(g: Floats) -> list[float]:
+    """Return the asymmetry of Γ in its first two axes, for each pair of the others, and the errors
+    of Huang's relations."""
     coupling = [g[0, 1][p] - g[1, 0][p] for p in PAIRS]
     return coupling + [g[p][q] - g[q][p] for p, q in HUANG]
 
 
 def _inverse_mobility(equations: Floats, scale: float) -> Floats | None:
-    """B nearest to 1 among the solutions, tr B = 2; None where none is positive."""
+    """Return the B nearest to 1 among the solutions, with tr B = 2; None if none is positive."""
     _, sizes, rows = np.linalg.svd(equations)
     free = rows[sizes < SAME * scale]
     xx, yy, xy = free.T @ (free @ np.array([1.0, 1.0, 0.0]))
@@ -179,7 +217,7 @@ def _inverse_mobility(equations: Floats, scale: float) -> Floats | None:
 
 
 def _no_energy(q: Floats) -> str:
-    c, d = PAIRS[np.abs(_failures(q)[: len(PAIRS)]).argmax()]
+    c, d = PAIRS[np.abs(_asymmetries(q)[: len(PAIRS)]).argmax()]
     wave = f"∂{'xy'[c]}∂{'xy'[d]}"
     return (
         f"the coupling is not symmetric: {wave} of y moves x by {q[0, 1, c, d]:.6g} and {wave} of "
@@ -188,9 +226,9 @@ def _no_energy(q: Floats) -> str:
 
 
 def _no_rotation(g: Floats) -> str:
-    p, q = HUANG[np.abs(_failures(g)[len(PAIRS) :]).argmax()]
-    one, other = ("xy"[a] + "xy"[b] for a, b in (p, q))
+    p, q = HUANG[np.abs(_asymmetries(g)[len(PAIRS) :]).argmax()]
+    first, second = ("xy"[a] + "xy"[b] for a, b in (p, q))
     return (
-        f"a rigid rotation costs energy: the second-order terms Q_{one}{other} = {g[p][q]:.6g} and "
-        f"Q_{other}{one} = {g[q][p]:.6g} would be one constant"
+        f"a rigid rotation costs energy: the second-order terms Q_{first}{second} = {g[p][q]:.6g} "
+        f"and Q_{second}{first} = {g[q][p]:.6g} would be one constant"
     )

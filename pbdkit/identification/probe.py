@@ -1,6 +1,5 @@
-"""Identify a rule from its own functions: whether it rests, is linear, turns with the body and is
-the same everywhere, and its response to small displacements and long waves.
-"""
+"""Identify a rule by evaluating its functions at rest, for small and finite displacements, and for
+plane waves."""
 
 from __future__ import annotations
 
@@ -43,22 +42,45 @@ from pbdkit.scene.scene import Scene
 Floats = NDArray[np.float64]
 Slots = tuple[Slot, ...]
 Differences = dict[Slot, Floats]
-ROUNDING, STILL = 1e-9, 1e-8
+ROUNDING = 1e-9
+"""Relative tolerance for equality, above rounding errors."""
+
+STILL = 1e-8
+"""Largest move of a body at rest, in units of the spacing."""
+
 SLANT = 0.3137
-"""Of a free edge: no row of a lattice lies along it."""
+"""Slope of a free edge that is parallel to no row of a lattice."""
 ANGLE = 1.0
-"""A finite rotation, in radians: any but a symmetry of some lattice."""
-AMPLITUDE, SMALL = 0.1, 1e-5
-"""Of the displacements that a rule is tried with, in units of the spacing."""
+"""Angle of a finite rotation in radians, which is a symmetry of no lattice."""
+AMPLITUDE = 0.1
+"""Size of finite displacements, in units of the spacing."""
+
+SMALL = 1e-5
+"""Size of small displacements, in units of the spacing."""
 STRAIGHT = 1e-3
-"""How far the answer to small displacements may be from a linear one."""
+"""Largest relative deviation from linearity for small displacements."""
 
 
 @dataclass(frozen=True)
-class Probed:
-    """What a rule answers: `stencil` in the middle of the body; `reasons`, in words, why no long
-    wave tells what it is; `linear` and `turns` anywhere in the body, `symmetric`, and
-    `rests_at_edges`, whether it leaves a body at rest alone with half the neighbours missing."""
+class RuleProperties:
+    """Properties of a rule, found by evaluating it.
+
+    Parameters
+    ----------
+    stencil
+        Derivatives of the move in the middle of the body.
+    reasons
+        Reasons why the rule is neither diffusion nor elasticity, apart from the response to long
+        waves.
+    linear
+        Whether finite displacements move particles as infinitesimal ones do.
+    turns
+        Whether a finite rotation of the neighbours rotates the move.
+    symmetric
+        Whether the stencil is symmetric.
+    rests_at_edges
+        Whether a particle at rest does not move if half of its neighbours are missing.
+    """
 
     stencil: Stencil
     reasons: tuple[str, ...]
@@ -68,45 +90,48 @@ class Probed:
     rests_at_edges: bool
 
 
-def probed(scene: Scene, spacing: float) -> Probed:
-    """The answers of the scene's rule, in the middle and, where it asks for the place, in the
-    corners of the body."""
-    stencils = {at: linearised(scene, at) for at in _places(scene)}
-    half = tuple(_one_side(own) for own in scene.neighbourhood.slots)
-    passes = [(one, at) for one in _passes(scene) for at in stencils]
-    return Probed(
+def probe(scene: Scene, spacing: float) -> RuleProperties:
+    """Evaluate the scene's rule in the middle and, if it depends on the place, in the corners of
+    the body."""
+    stencils = {place: linearised(scene, place) for place in _places(scene)}
+    half = tuple(_half_neighbourhood(slots) for slots in scene.neighbourhood.slots)
+    cases = [(rule, place) for rule in _single_rules(scene) for place in stencils]
+    return RuleProperties(
         next(iter(stencils.values())),
-        tuple(_reasons(scene, passes, stencils, spacing)),
-        all(_answers(one, at, AMPLITUDE * spacing, ROUNDING) for one, at in passes),
-        all(_turns_with_the_body(one, at, spacing) for one, at in passes),
-        all(_is_symmetric(of) for of in stencils.values()),
-        all(_move_at_rest(one, at, half) <= ROUNDING * spacing for one, at in passes),
+        tuple(_reasons(scene, cases, stencils, spacing)),
+        all(_is_linear(rule, place, AMPLITUDE * spacing, ROUNDING) for rule, place in cases),
+        all(_commutes_with_rotation(rule, place, spacing) for rule, place in cases),
+        all(_is_symmetric(stencil) for stencil in stencils.values()),
+        all(_move_at_rest(rule, place, half) <= ROUNDING * spacing for rule, place in cases),
     )
 
 
 def _reasons(
-    scene: Scene, passes: list[tuple[Scene, Here]], stencils: dict[Here, Stencil], spacing: float
+    scene: Scene, cases: list[tuple[Scene, Here]], stencils: dict[Here, Stencil], spacing: float
 ) -> Iterator[str]:
-    """Why the rule is no diffusion and no elasticity, apart from what long waves see."""
-    moved = max(_move_at_rest(one, at, scene.neighbourhood.slots) for one, at in passes) / spacing
-    if not moved <= STILL:
-        yield f"a body at rest does not stay: the rule moves it by {moved:.6g} h a step"
-    if not all(_answers(one, at, SMALL * spacing, STRAIGHT) for one, at in passes):
+    """Yield why the rule is neither diffusion nor elasticity, apart from long waves."""
+    drift = (
+        max(_move_at_rest(rule, place, scene.neighbourhood.slots) for rule, place in cases)
+        / spacing
+    )
+    if not drift <= STILL:
+        yield f"a body at rest does not stay at rest: the rule moves it by {drift:.6g} h a step"
+    if not all(_is_linear(rule, place, SMALL * spacing, STRAIGHT) for rule, place in cases):
         yield (
-            "small displacements do not add up, however small: the rule is not differentiable at "
-            "rest, and no plane wave answers for another"
+            "small displacements do not superpose, however small: the rule is not differentiable "
+            "at rest, and plane waves do not describe it"
         )
     yield from _place_dependence(scene, stencils)
 
 
-def _passes(scene: Scene) -> list[Scene]:
-    """The scene with each of its rules alone, where one works on the moves of another."""
-    inner = _passes(scene.inner) if scene.inner else []
+def _single_rules(scene: Scene) -> list[Scene]:
+    """Return the scene with its own rule alone, and with each inner rule alone."""
+    inner = _single_rules(scene.inner) if scene.inner else []
     return [replace(scene, inner=None), *inner]
 
 
 def _places(scene: Scene) -> list[Here]:
-    """The middle of the body, and its corners, for rules that ask for the place."""
+    """Return the middle of the body and, for rules that depend on the place, its corners."""
     if not scene.experiment.rule.uses_reference:
         return [NOWHERE]
     lower, upper = body_box(scene.raster)
@@ -117,134 +142,145 @@ def _places(scene: Scene) -> list[Here]:
     ]
 
 
-def _one_side(slots: Slots) -> Slots:
-    """The neighbours that a particle on a free edge has: those on one side of a slanted line."""
+def _half_neighbourhood(slots: Slots) -> Slots:
+    """Return the neighbours of a particle at a free edge: those on one side of a slanted line."""
     return tuple(slot for slot in slots if slot.rest.x + SLANT * slot.rest.y > 0.0)
 
 
 def _move_at_rest(scene: Scene, at: Here, slots: tuple[Slots, ...]) -> float:
-    moves = [np.abs(_moved(scene, own, {}, at)).max() for own in slots if own]
+    moves = [
+        np.abs(_move(scene, sublattice_slots, {}, at)).max()
+        for sublattice_slots in slots
+        if sublattice_slots
+    ]
     return float(max(moves, default=0.0))
 
 
-def _answers(scene: Scene, at: Here, size: float, within: float) -> bool:
-    """Whether the rule's move is Σ W d for random differences d of that size."""
+def _is_linear(scene: Scene, at: Here, size: float, tolerance: float) -> bool:
+    """Return whether the rule's move is Σ W d for random differences d of a size."""
     stencil = linearised(scene, at)
     for slots, d in _random(scene, size, seed=0):
-        moved = _moved(scene, slots, d, at) - _moved(scene, slots, {}, at)
+        change = _move(scene, slots, d, at) - _move(scene, slots, {}, at)
         expected = sum(stencil.neighbours[slot] @ d[slot] for slot in slots)
-        if not np.abs(moved - expected).max() <= within * size:
+        if not np.abs(change - expected).max() <= tolerance * size:
             return False
     return True
 
 
-def _turns_with_the_body(scene: Scene, at: Here, spacing: float) -> bool:
-    """Whether a finite rotation of all neighbours about the particle rotates its move."""
+def _commutes_with_rotation(scene: Scene, at: Here, spacing: float) -> bool:
+    """Return whether a finite rotation of all neighbours about the particle rotates its move."""
     c, s = np.cos(ANGLE), np.sin(ANGLE)
     turn = np.array([[c, -s], [s, c]])
     for slots, d in _random(scene, AMPLITUDE * spacing, seed=1):
         turned = {k: turn @ (np.array(k.rest) + d[k]) - np.array(k.rest) for k in slots}
-        apart = _moved(scene, slots, turned, at) - turn @ _moved(scene, slots, d, at)
-        if not np.abs(apart).max() < ROUNDING * spacing:
+        error = _move(scene, slots, turned, at) - turn @ _move(scene, slots, d, at)
+        if not np.abs(error).max() < ROUNDING * spacing:
             return False
     return True
 
 
 def _random(scene: Scene, size: float, seed: int) -> Iterator[tuple[Slots, Differences]]:
-    """The slots of each sublattice with differences of that size."""
+    """Yield the slots of each sublattice with random differences of a size."""
     generator = np.random.default_rng(seed)
     for slots in scene.neighbourhood.slots:
         yield slots, {slot: size * generator.uniform(-1, 1, 2) for slot in slots}
 
 
 def _is_symmetric(stencil: Stencil) -> bool:
-    """Whether the matrix of j for k is the transpose of that of k for j."""
+    """Return whether the matrix of j for k is the transpose of that of k for j."""
     by_key = {(s.source, s.target, s.cell): matrix for s, matrix in stencil.neighbours.items()}
-    apart = [matrix - by_key[t, s, (-m, -n)].T for (s, t, (m, n)), matrix in by_key.items()]
-    apart += [own - own.T for own in stencil.own]
-    return bool(np.abs(apart).max() <= ROUNDING * np.abs(list(by_key.values())).max())
+    asymmetries = [matrix - by_key[t, s, (-m, -n)].T for (s, t, (m, n)), matrix in by_key.items()]
+    asymmetries += [centre - centre.T for centre in stencil.centre]
+    return bool(np.abs(asymmetries).max() <= ROUNDING * np.abs(list(by_key.values())).max())
 
 
 def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> Iterator[str]:
-    """How the rule differs between the body's middle and the corner where it differs most."""
+    """Yield how the rule at the corner that differs most differs from the body's middle."""
     places, slots = list(stencils), scene.neighbourhood.slots
-    weights = np.array([[*of.neighbours.values(), *of.own] for of in stencils.values()])
+    weights = np.array(
+        [[*stencil.neighbours.values(), *stencil.centre] for stencil in stencils.values()]
+    )
     differences = weights - weights[0]
     worst = int(np.abs(differences).max(axis=(1, 2, 3)).argmax())
     if not np.abs(differences[worst]).max() > ROUNDING * np.abs(weights[0]).max():
         return
     corner = f"({places[worst].X.x:.6g}, {places[worst].X.y:.6g})"
     parameters = ", ".join(scene.experiment.rule.numeric_parameters())
-    verdict = f"; no constant of a material does that: {parameters} is no Poisson ratio"
+    verdict = f"; no material constant does that: {parameters} is not a Poisson ratio"
     text = f"it depends on the place: the weights at {corner} are not those in the middle"
-    # The effect on a translation, where there is one.
+    # The effect on a translation is the clearest sign, if there is one.
     defect = differences[worst, : len(slots[0])].sum(axis=0) + differences[worst, -len(slots)]
-    pushed = int(np.abs(defect).argmax())
-    if abs(defect.ravel()[pushed]) >= ROUNDING:
-        to, along = "xy"[pushed // 2], "xy"[pushed % 2]
+    entry = int(np.abs(defect).argmax())
+    if abs(defect.ravel()[entry]) >= ROUNDING:
+        to, along = "xy"[entry // 2], "xy"[entry % 2]
         text = (
             f"it depends on the place: when everything moves by 1 along {along}, the particle at "
-            f"{corner} of the body moves {defect.ravel()[pushed]:.6g} more along {to} a step than "
+            f"{corner} of the body moves {defect.ravel()[entry]:.6g} more along {to} a step than "
             "the one in the middle"
         )
     yield text + (verdict if parameters else "")
 
 
-def _moved(scene: Scene, slots: Slots, d: Differences, at: Here) -> Floats:
-    still = vector(np.zeros(scene.axes))
+def _move(scene: Scene, slots: Slots, d: Differences, at: Here) -> Floats:
+    zero = vector(np.zeros(scene.axes))
     with np.errstate(all="ignore"):
-        moved = move(
-            scene, slots, lambda k: vector(d[k]) if k in d else still, at._replace(u=still)
+        move_vector = move(
+            scene, slots, lambda k: vector(d[k]) if k in d else zero, at._replace(u=zero)
         )
-    return np.array(moved, float)
+    return np.array(move_vector, float)
 
 
 def identified(scene: Scene) -> Identity:
-    """The identity of the scene's rule on its lattice and neighbours.
+    """Identify the scene's rule on its lattice and neighbourhood.
 
-    PluginError where the rule's own code fails, ExperimentError where it answers without numbers.
+    Raises
+    ------
+    PluginError
+        If the rule's own code fails.
+    ExperimentError
+        If the rule returns values that are not finite.
     """
     experiment, cell = scene.experiment, scene.experiment.lattice.cell()
     spacing = spacing_of(cell)
-    with blaming(experiment.rule, "when asked for its answer to small displacements", "rule"):
-        answers = probed(scene, spacing)
-    _refuse_no_numbers(answers.stencil, experiment.rule.type)
-    stencil, around = primitive(cell, answers.stencil), len(scene.neighbourhood.slots[0])
-    long, against = _long_waves(stencil)
-    reasons = (*answers.reasons, *against)
-    kind = ELASTICITY if long is not None and long.diffusivity is None else DIFFUSION
-    found = Identity(
+    with blaming(experiment.rule, "when evaluated for small displacements", "rule"):
+        response = probe(scene, spacing)
+    _refuse_no_numbers(response.stencil, experiment.rule.type)
+    stencil, degree = primitive(cell, response.stencil), len(scene.neighbourhood.slots[0])
+    long_waves, reasons_of_waves = _long_waves(stencil)
+    reasons = (*response.reasons, *reasons_of_waves)
+    kind = ELASTICITY if long_waves is not None and long_waves.diffusivity is None else DIFFUSION
+    identity = Identity(
         name=experiment.name,
         lattice=experiment.lattice.type,
-        neighbours=f"{around} neighbours ({experiment.neighbours.type})",
+        neighbours=f"{degree} neighbours ({experiment.neighbours.type})",
         rule=experiment.rule.type,
         reasons=reasons,
         spacing=spacing,
-        linear=answers.linear,
-        turns=answers.turns,
-        symmetric=answers.symmetric,
-        rests_at_edges=answers.rests_at_edges,
+        linear=response.linear,
+        turns=response.turns,
+        symmetric=response.symmetric,
+        rests_at_edges=response.rests_at_edges,
         stencil=stencil,
         spectrum=spectrum(stencil, experiment.stepping.memory),
         relaxation=experiment.stepping.relaxation,
         memory=experiment.stepping.memory,
         kind=NEITHER if reasons else kind,
-        long=long,
+        long=long_waves,
     )
-    return replace(found, notes=tuple(notes_on(found, scene)))
+    return replace(identity, notes=tuple(notes_on(identity, scene)))
 
 
 def _refuse_no_numbers(stencil: Stencil, rule: str) -> None:
-    if not np.isfinite([*stencil.own, *stencil.neighbours.values()]).all():
+    if not np.isfinite([*stencil.centre, *stencil.neighbours.values()]).all():
         raise ExperimentError(
-            f"'{rule}' answers small displacements of a body at rest with numbers that are not "
-            "finite: look at what it divides by",
+            f"'{rule}' returns values that are not finite for small displacements of a body at "
+            "rest: check its divisions",
             ("rule",),
         )
 
 
 def _long_waves(stencil: Primitive) -> tuple[LongWaves | None, list[str]]:
-    """What long waves see, and why that is no diffusion and no elasticity."""
+    """Expand the response to long waves, and list why it is neither diffusion nor elasticity."""
     waves = slow_waves(stencil)
     if isinstance(waves, str):
         return None, [waves]
@@ -252,7 +288,7 @@ def _long_waves(stencil: Primitive) -> tuple[LongWaves | None, list[str]]:
     second = second_order(*(np.array(series[2].real, float) for series in along))
     reasons = [*_drift(np.array([series[1].imag for series in along[:2]], float))]
     if np.abs(second).max() <= SAME * np.abs(stencil.matrix).max():
-        reasons.append("nothing of second order is left: long waves do not decay as diffusion does")
+        reasons.append("the second-order terms vanish: long waves do not decay as in diffusion")
         return None, reasons
     fast, slow = ranges(second)
     if slow.smallest < -SAME * abs(fast.largest):
@@ -269,11 +305,11 @@ def _long_waves(stencil: Primitive) -> tuple[LongWaves | None, list[str]]:
 
 
 def _drift(first: Floats) -> list[str]:
-    """Of the first-order terms i A_1 k, along x and y: a step takes u(x) to u(x - A_1)."""
+    """Describe the first-order terms i A_1 k, along x and y: a step takes u(x) to u(x - A_1)."""
     if np.abs(first).max() < SAME:
         return []
     velocity = first.trace(axis1=1, axis2=2) / 2
     return [
-        "neighbours opposite to each other do not weigh the same: a displacement is carried along, "
+        "opposite neighbours have different weights: displacements drift, "
         f"on average by ({velocity[0]:.6g}, {velocity[1]:.6g}) h a step"
     ]

@@ -21,15 +21,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Identity:
-    """A rule on its lattice and neighbours, linearised at rest; exact for linear rules.
+    """Physical identity of a rule on its lattice and neighbourhood, linearised at rest; exact for
+    linear rules.
 
-    `kind` is diffusion, elasticity or neither; `reasons` say why neither, `notes` what else there
-    is to know. `spacing`, the unit of length, is the smallest distance of two sites (lattice
-    units). `linear`: finite displacements move it as infinitesimal ones do; `turns`: a finite
-    rotation of its neighbours rotates its move; `symmetric`: j weighs for k as k for j;
-    `rests_at_edges`: a particle at rest stays where neighbours are missing. `long` is None where
-    there are no slow waves. `spectrum` is of all waves; `relaxation` and `memory` are the
-    solver's.
+    Parameters
+    ----------
+    name, lattice, neighbours, rule
+        Name of the experiment, and types of its components.
+    reasons
+        Reasons why the rule is neither diffusion nor elasticity.
+    spacing
+        Smallest distance of two sites (lattice units), the unit of length.
+    linear
+        Whether finite displacements move particles as infinitesimal ones do.
+    turns
+        Whether a finite rotation of the neighbours rotates the move.
+    symmetric
+        Whether the weight of j for k is that of k for j.
+    rests_at_edges
+        Whether a particle at rest does not move if neighbours are missing.
+    stencil
+        Derivatives of the move.
+    spectrum
+        Eigenvalues over all plane waves.
+    relaxation, memory
+        Parameters of the solver.
+    kind
+        diffusion, elasticity or neither.
+    long
+        Response to long waves; None if there are no slow waves.
+    notes
+        Further properties, a sentence each.
     """
 
     name: str
@@ -51,12 +73,13 @@ class Identity:
     notes: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: what the rule is, with its constants."""
+        """Return the identity with its constants for notebooks."""
         return str(import_module("pbdkit.plotting.notebook").identity_html(self))
 
     @property
     def symmetry(self) -> str | None:
-        """isotropic, anisotropic (diffusion), square, orthotropic, general; None for neither."""
+        """Return isotropic, anisotropic (diffusion), square, orthotropic, general; None for
+        neither."""
         if self.long is None or self.kind == NEITHER:
             return None
         if self.kind == DIFFUSION:
@@ -65,7 +88,7 @@ class Identity:
 
     @property
     def isotropic(self) -> bool:
-        """Whether long waves of each kind are as fast in every direction."""
+        """Return whether the diffusivities of long waves are equal in every direction."""
         return self.long is not None and all(
             r.largest - r.smallest <= SAME * abs(self.long.fast.largest)
             for r in (self.long.fast, self.long.slow)
@@ -73,36 +96,37 @@ class Identity:
 
     @property
     def body(self) -> Elasticity | None:
-        """The elastic body that it is; isotropic diffusion is one too, away from free edges."""
-        is_one = self.kind == ELASTICITY or (self.kind == DIFFUSION and self.isotropic)
-        return self.long.elasticity if self.long and is_one else None
+        """Return the elastic body; isotropic diffusion is one, too, away from free edges."""
+        is_elastic = self.kind == ELASTICITY or (self.kind == DIFFUSION and self.isotropic)
+        return self.long.elasticity if self.long and is_elastic else None
 
     @property
     def diffusivity(self) -> float | None:
-        """D of isotropic diffusion, spacing²/step."""
-        known = self.kind == DIFFUSION and self.isotropic and self.long
-        return self.long.fast.largest if self.long and known else None
+        """Return D of isotropic diffusion, spacing²/step."""
+        is_diffusion = self.kind == DIFFUSION and self.isotropic and self.long
+        return self.long.fast.largest if self.long and is_diffusion else None
 
     @property
     def poisson_ratio(self) -> float | None:
-        """In plane stress, of an isotropic body."""
+        """Return Poisson's ratio in plane stress of an isotropic body."""
         isotropic = self.body is not None and self.body.symmetry == "isotropic"
         return self.body.poisson_ratio(0.0) if self.body and isotropic else None
 
     def as_dict(self) -> dict[str, Any]:
-        """What ``pbdkit identify --json`` prints, in units of the spacing and of a step."""
+        """Return the values of ``pbdkit identify --json``, in units of the spacing and of a
+        step."""
         names = (
             *("name", "lattice", "neighbours", "rule", "kind", "spacing", "linear", "symmetric"),
             *("rests_at_edges", "symmetry", "reasons", "notes", "diffusivity", "poisson_ratio"),
         )
-        found = {name: getattr(self, name) for name in names} | {
+        values = {name: getattr(self, name) for name in names} | {
             "turns_with_the_body": self.turns,
             "sites": self.stencil.sites,
             "elasticity": self.body.as_dict() if self.body else None,
             "long_waves": self.long.as_dict() if self.long else None,
             "spectrum": vars(self.spectrum),
         }
-        plain: dict[str, Any] = json.loads(json.dumps(found, default=np.ndarray.tolist))
+        plain: dict[str, Any] = json.loads(json.dumps(values, default=np.ndarray.tolist))
         return plain
 
 
@@ -113,59 +137,69 @@ SYMMETRIES = {
     "orthotropic": "orthotropic {}",
     "general": "{} with no axis of symmetry",
 }
+"""Description by symmetry; {} is the kind."""
 Row = tuple[str, str]
-WIDEST = 19
-"""Characters of a title."""
+TITLE_WIDTH = 19
+"""Width of the titles in characters."""
 
 
-def verdict(found: Identity) -> str:
-    """What it is, in a few words."""
-    if found.kind == NEITHER:
+def verdict(identity: Identity) -> str:
+    """Return the identity in a few words."""
+    if identity.kind == NEITHER:
         return "neither diffusion nor elasticity"
-    return SYMMETRIES[found.symmetry or "general"].format(found.kind)
+    return SYMMETRIES[identity.symmetry or "general"].format(identity.kind)
 
 
-def table(found: Identity, *, whole: bool = True) -> Table:
-    """A row a property; h is the spacing. Without `whole` the verdict and the constants alone."""
+def table(identity: Identity, *, whole: bool = True) -> Table:
+    """Return a table with a row for each property; h is the spacing.
+
+    Parameters
+    ----------
+    whole
+        Whether all properties are listed, or the verdict and the constants alone.
+    """
     from rich import box
     from rich.table import Column, Table
 
     rows = Table(
-        Column(no_wrap=True, min_width=WIDEST),
+        Column(no_wrap=True, min_width=TITLE_WIDTH),
         "",
         box=box.SIMPLE,
         show_header=False,
         pad_edge=False,
     )
-    for row in rows_of(found, whole=whole):
+    for row in rows_of(identity, whole=whole):
         rows.add_row(*row)
     return rows
 
 
-def rows_of(found: Identity, *, whole: bool = False) -> list[Row]:
-    """Titles and what they say, the verdict first."""
-    first = [*_what(found), ("relaxation", _relaxation_text(found))]
-    return [*first, *_waves(found), *_character(found)] if whole else first
+def rows_of(identity: Identity, *, whole: bool = False) -> list[Row]:
+    """Return titles and values, the verdict first."""
+    first = [*_what(identity), ("relaxation", _relaxation_text(identity))]
+    return [*first, *_waves(identity), *_character(identity)] if whole else first
 
 
-def _what(found: Identity) -> Iterator[Row]:
-    yield "it is", verdict(found)
-    for n, reason in enumerate(found.reasons):
+def _what(identity: Identity) -> Iterator[Row]:
+    yield "it is", verdict(identity)
+    for n, reason in enumerate(identity.reasons):
         yield "because" if n == 0 else "and", reason
-    yield "spacing h", f"{_number(found.spacing)} lattice unit{'s' if found.spacing != 1 else ''}"
-    if found.diffusivity is not None:
-        yield "diffusivity D", f"{_number(found.diffusivity)} h²/step"
-    if found.kind != DIFFUSION and found.body is not None:
-        yield from _elastic(found, found.body)
+    yield (
+        "spacing h",
+        f"{_number(identity.spacing)} lattice unit{'s' if identity.spacing != 1 else ''}",
+    )
+    if identity.diffusivity is not None:
+        yield "diffusivity D", f"{_number(identity.diffusivity)} h²/step"
+    if identity.kind != DIFFUSION and identity.body is not None:
+        yield from _elastic(identity, identity.body)
 
 
-def _elastic(found: Identity, body: Elasticity) -> Iterator[Row]:
+def _elastic(identity: Identity, body: Elasticity) -> Iterator[Row]:
     (_, c12, c16), (_, c22, c26), (*_, c66) = body.stiffness / body.stiffness[0, 0]
     ratios = {"C22": c22, "C12": c12, "C66": c66}
     ratios |= {name: c for name, c in (("C16", c16), ("C26", c26)) if abs(c) > SAME}
     text = ", ".join(f"{name} {_number(c)}" for name, c in ratios.items())
     yield "elastic constants", f"{text} in units of C11 = {_number(body.stiffness[0, 0])} h²/step"
-    if (ratio := found.poisson_ratio) is not None:
+    if (ratio := identity.poisson_ratio) is not None:
         strain = f", {_number(ratio / (1 + ratio))} in plane strain" if ratio > -0.999 else ""
         yield "Poisson's ratio", f"{_number(ratio)} in plane stress{strain}"
         return
@@ -177,20 +211,23 @@ def _elastic(found: Identity, body: Elasticity) -> Iterator[Row]:
         yield "axis of symmetry", f"at {_number(body.axis)}°"
 
 
-def _waves(found: Identity) -> Iterator[Row]:
-    if found.long is None:
+def _waves(identity: Identity) -> Iterator[Row]:
+    if identity.long is None:
         return
-    if found.kind != DIFFUSION:
-        yield "fast long waves", _range_text(found.long.fast, "h²/step diffusivity")
-        yield "slow long waves", _range_text(found.long.slow, "h²/step diffusivity")
-    elif not found.isotropic:
-        yield "diffusivity D", _range_text(found.long.fast, "h²/step")
-    for gradient in found.long.gradients:
+    if identity.kind != DIFFUSION:
+        yield "fast long waves", _range_text(identity.long.fast, "h²/step diffusivity")
+        yield "slow long waves", _range_text(identity.long.slow, "h²/step diffusivity")
+    elif not identity.isotropic:
+        yield "diffusivity D", _range_text(identity.long.fast, "h²/step")
+    for gradient in identity.long.gradients:
         fast, slow = (_number(length) for length in gradient.material)
-        alike = abs(gradient.material[0] - gradient.material[1]) < 1e-9
-        where = f"along {_number(gradient.direction)}°"
+        is_isotropic = abs(gradient.material[0] - gradient.material[1]) < 1e-9
+        direction = f"along {_number(gradient.direction)}°"
         rows = f"across rows {_number(gradient.rows_apart)} h apart"
-        yield "gradient length²", f"{fast if alike else f'{fast} and {slow}'} h² {where}, {rows}"
+        yield (
+            "gradient length²",
+            f"{fast if is_isotropic else f'{fast} and {slow}'} h² {direction}, {rows}",
+        )
 
 
 def _range_text(waves: DirectionalRange, unit: str) -> str:
@@ -201,58 +238,58 @@ def _range_text(waves: DirectionalRange, unit: str) -> str:
     return f"{largest} along {_number(waves.at_largest)}°, {smallest}"
 
 
-def _character(found: Identity) -> Iterator[Row]:
-    spectrum, yes = found.spectrum, {True: "yes", False: "no"}
+def _character(identity: Identity) -> Iterator[Row]:
+    spectrum, yes = identity.spectrum, {True: "yes", False: "no"}
     turning = f", imaginary parts up to {_number(spectrum.imaginary)}"
     ends = f"{_number(spectrum.smallest)} to {_number(spectrum.largest)}"
     yield "eigenvalues", ends + turning * (spectrum.imaginary > NEUTRAL)
-    yield "linear", yes[found.linear]
-    yield "symmetric", "yes, k weighs for j as j for k" if found.symmetric else "no"
-    yield "turns with the body", yes[found.turns]
-    yield "rests at free edges", yes[found.rests_at_edges]
+    yield "linear", yes[identity.linear]
+    yield "symmetric", "yes, k weighs for j as j for k" if identity.symmetric else "no"
+    yield "turns with the body", yes[identity.turns]
+    yield "rests at free edges", yes[identity.rests_at_edges]
 
 
-def _relaxation_text(found: Identity) -> str:
-    with_memory = f" with memory {found.memory:g}" if found.memory else ""
-    bound = found.spectrum.largest_stable_relaxation
+def _relaxation_text(identity: Identity) -> str:
+    with_memory = f" with memory {identity.memory:g}" if identity.memory else ""
+    bound = identity.spectrum.largest_stable_relaxation
     if bound is not None:
         return f"stable below {_number(bound)}{with_memory}"
-    grows = found.spectrum.largest > 1.0 + NEUTRAL or abs(found.memory) >= 1.0
+    grows = identity.spectrum.largest > 1.0 + NEUTRAL or abs(identity.memory) >= 1.0
     return f"diverges at any{with_memory}" if grows else "no bound"
 
 
 def _number(value: float) -> str:
-    """Six digits; what is rounding, in units of the spacing, is 0."""
+    """Format with six digits; rounding errors, in units of the spacing, are 0."""
     return f"{round(value, 11) + 0.0:.6g}"
 
 
-def notes_on(found: Identity, scene: Scene) -> Iterator[str]:
-    """A line each."""
-    if not found.linear:
-        yield "the rule is not linear: this is what it is for small displacements from rest"
+def notes_on(identity: Identity, scene: Scene) -> Iterator[str]:
+    """Yield further properties of the rule, a sentence each."""
+    if not identity.linear:
+        yield "the rule is not linear: the figures hold for small displacements from rest"
     if scene.experiment.rule.uses_reference:
-        yield "it asks for the place: the figures are those in the middle of the body"
+        yield "it depends on the place: the figures hold in the middle of the body"
     if scene.experiment.neighbours.nearness():
-        yield "neighbours are found anew: the figures hold while they are those at rest"
-    if found.stencil.sites > 1:
-        yield f"{found.stencil.sites} sites a cell: shifts of them are eliminated"
-    if found.long is not None:
-        yield from _notes_of_long_waves(found, found.long)
-    bound = found.spectrum.largest_stable_relaxation
-    if bound is None and found.spectrum.largest > 1 + NEUTRAL:
+        yield "neighbours are searched at every step: the figures hold while they are those at rest"
+    if identity.stencil.sites > 1:
+        yield f"{identity.stencil.sites} sites a cell: shifts of them are eliminated"
+    if identity.long is not None:
+        yield from _notes_of_long_waves(identity, identity.long)
+    bound = identity.spectrum.largest_stable_relaxation
+    if bound is None and identity.spectrum.largest > 1 + NEUTRAL:
         yield "some waves grow at any relaxation"
-    elif bound is not None and found.relaxation > bound * (1 + NEUTRAL):
-        yield f"relaxation {found.relaxation:g} diverges; it is stable below {bound:.6g}"
+    elif bound is not None and identity.relaxation > bound * (1 + NEUTRAL):
+        yield f"relaxation {identity.relaxation:g} diverges; it is stable below {bound:.6g}"
 
 
-def _notes_of_long_waves(found: Identity, long: LongWaves) -> Iterator[str]:
+def _notes_of_long_waves(identity: Identity, long: LongWaves) -> Iterator[str]:
     if abs(long.slow.smallest) <= SAME * abs(long.fast.largest):
         yield f"some long waves along {long.slow.at_smallest:.4g}° do not decay at all"
-    if found.kind == DIFFUSION and found.body:
+    if identity.kind == DIFFUSION and identity.body:
         yield "away from free edges it is plane-stress elasticity with Poisson's ratio -1"
-    if found.kind == ELASTICITY and long.elasticity:
+    if identity.kind == ELASTICITY and long.elasticity:
         yield from _notes_of_body(long.elasticity)
-        if not found.rests_at_edges:
+        if not identity.rests_at_edges:
             yield "away from free edges it is elastic; at them it pulls inwards"
     lengths = [length for gradient in long.gradients for length in gradient.material]
     attracting = [f"{g.direction:.4g}°" for g in long.gradients if min(g.material) < -SAME]
@@ -269,8 +306,8 @@ def _notes_of_long_waves(found: Identity, long: LongWaves) -> Iterator[str]:
 
 def _notes_of_body(body: Elasticity) -> Iterator[str]:
     if body.least_stiffness < -SAME:
-        yield "some uniform strain lowers the energy: only held edges keep it in shape"
+        yield "some uniform strain lowers the energy: the body is stable only with prescribed edges"
     elif body.least_stiffness < SAME:
         yield "some uniform strain costs no energy"
     if np.abs(body.mobility - np.eye(2)).max() > SAME:
-        yield "x and y go to equilibrium at different rates; the equilibrium is elastic"
+        yield "x and y converge to equilibrium at different rates; the equilibrium is elastic"

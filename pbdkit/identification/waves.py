@@ -1,8 +1,9 @@
 """Response of a rule to plane waves u = exp(i k·r), its expansion for long waves, and the
 dispersion of slow waves by direction and length.
 
-With L(k) = -(own + Σ W exp(i k·r)) a step multiplies a wave by 1 - L(k). Where a cell has several
-sites, L couples them; the slow waves, in which all sites move nearly alike, are
+With L(k) = -(W_0 + Σ W exp(i k·r)), where W_0 is the derivative with respect to the own
+displacement, a step multiplies a wave by 1 - L(k). If a cell has several sites, L couples them. The
+slow waves, in which all sites move nearly alike, satisfy
 
     L(k) X(k) = X(k) A(k),  A(k) = Σ_m A_m,  A_m of degree m in k,
 
@@ -12,20 +13,20 @@ to every order: a step removes A(k) u from u. With one site A is L.
 
 A lattice may be described by a larger cell than necessary: two sites a cell for the rows of a
 hexagonal lattice, one of which is the other shifted. Sites that a translation maps onto one
-another, stencil included, count as one site; what remains are the sublattices of a lattice with a
-basis.
+another, stencil included, count as one site. The remaining ones are the sublattices of a lattice
+with a basis.
 
-The rate z of a wave is the part of it that a step removes. For long waves z = d k² (1 + λ² k²): d
-is the diffusivity along the direction, of the faster and of the slower wave, and λ² the fourth-
-order length. In gradient elasticity, u'' - l² u'''', λ² is l²; a lattice alone has λ² < 0. Along
-the normal of a family of lattice rows, h apart, interactions with the next row alone give z = d s,
-s = (2 sin(kh/2) / h)², hence λ² = -h²/12. That part belongs to the lattice, and
+The rate z of a wave is the fraction of it that a step removes. For long waves z = d k² (1 + λ² k²),
+where d is the diffusivity along the direction, of the faster and of the slower wave, and λ² the
+fourth-order length. In gradient elasticity, u'' - l² u'''', λ² is l²; a lattice alone has λ² < 0.
+Along the normal of a family of lattice rows, h apart, interactions with the next row alone give z =
+d s, s = (2 sin(kh/2) / h)², hence λ² = -h²/12. That part belongs to the lattice, and
 
     l² = λ² + h²/12
 
 to the material: the contribution of rows beyond the next. It is exactly c D for a rule (1 - P) u +
-c (1 - P)² u whose P couples next rows, and negative, of the wrong sign for gradient elasticity,
-where rows beyond the next attract.
+c (1 - P)² u whose P couples next rows. It is negative, of the wrong sign for gradient elasticity,
+if rows beyond the next attract.
 """
 
 from __future__ import annotations
@@ -45,24 +46,35 @@ from pbdkit.plugin import Cell
 
 Floats = NDArray[np.float64]
 NEAR = 1e-6
-"""Places nearer than this, in units of the spacing, are one."""
+"""Distance below which two places coincide, in units of the spacing."""
 ALIKE = 1e-8
-"""Matrices that differ by less, as a share of the largest entry, are one."""
+"""Relative tolerance, of the largest entry, for the equality of matrices."""
 
 
 @dataclass(frozen=True)
 class Primitive:
-    """move_s = own_s u_s + Σ matrix_e u_target_e over the entries e with source_e = s.
+    """Stencil on the smallest repeat cell: move_s = centre_s u_s + Σ matrix_e u_target_e over the
+    entries e with source_e = s.
 
-    `spacing` is the smallest distance of two sites (lattice units), the unit of all other
-    lengths; `basis` holds the shortest two independent translations as rows; `own` is
-    (site, axis, axis), `source` and `target` (entry,), `rest` (entry, axis), `matrix`
-    (entry, axis, axis).
+    Parameters
+    ----------
+    spacing
+        Smallest distance of two sites in lattice units; the unit of all other lengths.
+    basis : (2, axis)
+        The two shortest independent translations.
+    centre : (site, axis, axis)
+        Derivative of a particle's move with respect to its own displacement.
+    source, target : (entry,)
+        Sites of the particle and of its neighbour.
+    rest : (entry, axis)
+        Offset of the neighbour at rest.
+    matrix : (entry, axis, axis)
+        Derivative with respect to the neighbour's displacement.
     """
 
     spacing: float
     basis: Floats
-    own: Floats
+    centre: Floats
     source: NDArray[np.intp]
     target: NDArray[np.intp]
     rest: Floats
@@ -70,62 +82,69 @@ class Primitive:
 
     @property
     def sites(self) -> int:
-        """How many sites a cell has."""
-        return len(self.own)
+        """Return the number of sites in a cell."""
+        return len(self.centre)
 
 
 def spacing_of(cell: Cell) -> float:
-    """The smallest distance between two sites, in lattice units."""
+    """Return the smallest distance between two sites, in lattice units."""
     reach = min(float(np.hypot(v.x, v.y)) for v in cell.vectors) * (1 + NEAR)
     return min(o.length for s in range(len(cell.sites)) for o in cell.offsets(s, reach))
 
 
 def primitive(cell: Cell, stencil: Stencil) -> Primitive:
-    """The stencil with sites that are translated copies of one another taken together."""
+    """Return the stencil with sites that are translated copies of one another merged."""
     spacing = spacing_of(cell)
-    at = np.array([site.at for site in cell.sites]) / spacing
+    positions = np.array([site.at for site in cell.sites]) / spacing
     vectors = np.array(cell.vectors) / spacing
     source, target = np.array([(slot.source, slot.target) for slot in stencil.neighbours]).T
     rest = np.array([slot.rest for slot in stencil.neighbours]) / spacing
     matrix = np.array(list(stencil.neighbours.values()))
-    whole = Primitive(spacing, vectors, stencil.own, source, target, rest, matrix)
-    found = {s: _image(at, vectors, place - at[0]) for s, place in enumerate(at)}
-    images = {s: i for s, i in found.items() if i is not None and _same_under(whole, i)}
-    basis = _shortest(vectors, np.array([at[s] - at[0] for s in images]))
-    names, number = np.unique(np.min(list(images.values()), axis=0), return_inverse=True)
-    kept = np.isin(source, names)
-    source, target, own = number[source[kept]], number[target[kept]], stencil.own[names]
-    return Primitive(spacing, basis, own, source, target, rest[kept], matrix[kept])
+    stencil_of_cell = Primitive(spacing, vectors, stencil.centre, source, target, rest, matrix)
+    candidates = {
+        s: _image(positions, vectors, place - positions[0]) for s, place in enumerate(positions)
+    }
+    images = {
+        s: i for s, i in candidates.items() if i is not None and _is_invariant(stencil_of_cell, i)
+    }
+    basis = _shortest(vectors, np.array([positions[s] - positions[0] for s in images]))
+    sites, number = np.unique(np.min(list(images.values()), axis=0), return_inverse=True)
+    is_kept = np.isin(source, sites)
+    source, target, centre = number[source[is_kept]], number[target[is_kept]], stencil.centre[sites]
+    return Primitive(spacing, basis, centre, source, target, rest[is_kept], matrix[is_kept])
 
 
-def _image(at: Floats, vectors: Floats, shift: Floats) -> NDArray[np.intp] | None:
-    """Which site each site lands on when all are shifted; None where one lands on no site."""
-    apart = at[:, None, :] + shift - at[None, :, :]
-    cells = apart @ np.linalg.inv(vectors)
+def _image(positions: Floats, vectors: Floats, shift: Floats) -> NDArray[np.intp] | None:
+    """Return the site onto which a shift maps each site; None if it maps one onto no site."""
+    differences = positions[:, None, :] + shift - positions[None, :, :]
+    cells = differences @ np.linalg.inv(vectors)
     misses = np.linalg.norm((cells - np.rint(cells)) @ vectors, axis=-1)
     image: NDArray[np.intp] = misses.argmin(axis=1)
     return image if (misses.min(axis=1) < NEAR).all() else None
 
 
-def _same_under(whole: Primitive, image: NDArray[np.intp]) -> bool:
-    """Whether every site has the stencil of its image: it then answers some waves alike."""
-    some = np.random.default_rng(0).uniform(-np.pi, np.pi, (8, 2))
-    answer = operator(whole, some).reshape(8, whole.sites, 2, whole.sites, 2)
-    apart = np.abs(answer[:, image][:, :, :, image] - answer).max()
-    return bool(apart <= ALIKE * np.abs(whole.matrix).max())
+def _is_invariant(stencil: Primitive, image: NDArray[np.intp]) -> bool:
+    """Return whether every site has the stencil of its image, tested by its response to some
+    waves."""
+    wave_vectors = np.random.default_rng(0).uniform(-np.pi, np.pi, (8, 2))
+    response = operator(stencil, wave_vectors).reshape(8, stencil.sites, 2, stencil.sites, 2)
+    error = np.abs(response[:, image][:, :, :, image] - response).max()
+    return bool(error <= ALIKE * np.abs(stencil.matrix).max())
 
 
 def _shortest(vectors: Floats, shifts: Floats) -> Floats:
-    """The shortest two independent translations among shifts + cells: a reduced basis."""
+    """Return the shortest two independent translations among shifts + cells: a reduced basis."""
     a, b = sorted(vectors, key=lambda v: v @ v)
-    # Lagrange and Gauss, so that few cells around have to be looked at.
-    while turns := np.rint(a @ b / (a @ a)):
-        a, b = sorted((a, b - turns * a), key=lambda v: v @ v)
+    # The reduction of Lagrange and Gauss limits the search to few cells.
+    while multiple := np.rint(a @ b / (a @ a)):
+        a, b = sorted((a, b - multiple * a), key=lambda v: v @ v)
     cells = np.array([m * a + n * b for m in range(-2, 3) for n in range(-2, 3)])
-    within = shifts - np.rint(shifts @ np.linalg.inv(np.array([a, b]))) @ np.array([a, b])
-    found = (cells[:, None] + within[None]).reshape(-1, 2)
-    # Nearly equal lengths are told apart by direction, so that rounding does not choose.
-    upper = found[(found[:, 1] > NEAR) | ((np.abs(found[:, 1]) <= NEAR) & (found[:, 0] > NEAR))]
+    reduced = shifts - np.rint(shifts @ np.linalg.inv(np.array([a, b]))) @ np.array([a, b])
+    candidates = (cells[:, None] + reduced[None]).reshape(-1, 2)
+    # Nearly equal lengths are ordered by direction, so that rounding has no influence.
+    upper = candidates[
+        (candidates[:, 1] > NEAR) | ((np.abs(candidates[:, 1]) <= NEAR) & (candidates[:, 0] > NEAR))
+    ]
     lengths = np.round(np.linalg.norm(upper, axis=1), 6)
     upper = upper[np.lexsort((np.arctan2(upper[:, 1], upper[:, 0]), lengths))]
     across = np.abs(upper[:, 0] * upper[0, 1] - upper[:, 1] * upper[0, 0])
@@ -133,43 +152,58 @@ def _shortest(vectors: Floats, shifts: Floats) -> Floats:
 
 
 ZERO = 1e-8
-"""What is smaller, as a share of the stencil's largest entry, is nothing."""
+"""Relative tolerance for zero, of the stencil's largest entry."""
 
 
 @dataclass(frozen=True)
 class SlowWaves:
-    """The slow waves of a stencil: see the module."""
+    """Slow waves of a stencil (see the module's description).
+
+    Parameters
+    ----------
+    stencil
+        The stencil.
+    left : (2, 2S)
+        Y, the left null vectors of L(0), scaled so that Y·X_0 = 1.
+    solver : (2S + 2, 2S + 2)
+        Inverse of L(0), bordered by X_0 and Y.
+    """
 
     stencil: Primitive
     left: Complex
     solver: Complex
 
     def series(self, direction: Floats, order: int = 4) -> list[Complex]:
-        """A_0 to A_order for k along `direction`, to be multiplied by |k|^m / |direction|^m;
-        exact, from the moments of the stencil."""
+        """Compute A_0 to A_order for k along a direction.
+
+        They are to be multiplied by |k|^m / |direction|^m, and exact, from the moments of the
+        stencil.
+        """
         terms = [_moment(self.stencil, direction, m) for m in range(order + 1)]
-        alike = _all_alike(self.stencil.sites).astype(complex)
-        x, a = [alike], [np.zeros((2, 2), complex)]
+        translations = _translations(self.stencil.sites).astype(complex)
+        x, a = [translations], [np.zeros((2, 2), complex)]
         for m in range(1, order + 1):
-            pushed = sum((terms[j] @ x[m - j] for j in range(1, m + 1)), 0 * alike)
-            a.append(self.left @ pushed)
-            taken = sum((x[m - j] @ a[j] for j in range(1, m + 1)), 0 * alike)
-            right = np.concatenate([taken - pushed, np.zeros((2, 2))])
-            x.append((self.solver @ right)[: len(alike)])
+            forcing = sum((terms[j] @ x[m - j] for j in range(1, m + 1)), 0 * translations)
+            a.append(self.left @ forcing)
+            removal = sum((x[m - j] @ a[j] for j in range(1, m + 1)), 0 * translations)
+            right = np.concatenate([removal - forcing, np.zeros((2, 2))])
+            x.append((self.solver @ right)[: len(translations)])
         return a
 
 
 def slow_waves(stencil: Primitive) -> SlowWaves | str:
-    """The slow waves, or why there are none: a translation of the whole is not left alone, or
-    sites move by themselves."""
+    """Return the slow waves, or the reason why there are none.
+
+    There are none if a translation of the whole is not preserved, or if sites can move separately.
+    """
     rest = operator(stencil, np.zeros((1, 2)))[0].real
-    alike = _all_alike(stencil.sites)
-    scale = max(np.abs(stencil.matrix).max(), np.abs(stencil.own).max())
-    defect = rest @ alike
+    translations = _translations(stencil.sites)
+    scale = max(np.abs(stencil.matrix).max(), np.abs(stencil.centre).max())
+    defect = rest @ translations
     if np.abs(defect).max() > ZERO * scale:
         worst = np.unravel_index(np.abs(defect).argmax(), defect.shape)
         return (
-            "a rigid translation is not left alone: when everything moves by 1 along "
+            "a rigid translation is not preserved: when everything moves by 1 along "
             f"{'xy'[worst[1]]}, the rule moves a particle by {-defect[worst]:.6g} along "
             f"{'xy'[worst[0] % 2]} a step"
         )
@@ -177,52 +211,62 @@ def slow_waves(stencil: Primitive) -> SlowWaves | str:
     left = u[:, -2:].T
     if len(rest) > 2 and sizes[-3] <= ZERO * scale:
         return "the sublattices can move against each other at no rate at all: not one body"
-    shared = left @ alike
-    if abs(np.linalg.det(shared)) < ZERO:
+    overlap = left @ translations
+    if abs(np.linalg.det(overlap)) < ZERO:
         return "the sublattices keep moving once they are shifted, ever faster"
-    left = np.linalg.inv(shared) @ left
-    bordered = np.block([[rest, alike], [left, np.zeros((2, 2))]])
+    left = np.linalg.inv(overlap) @ left
+    bordered = np.block([[rest, translations], [left, np.zeros((2, 2))]])
     return SlowWaves(stencil, left.astype(complex), np.linalg.inv(bordered).astype(complex))
 
 
 def operator(stencil: Primitive, k: Floats) -> Complex:
-    """L(k) for waves k, (wave, axis): (wave, 2S, 2S); 1 - L(k) is what a step multiplies by."""
+    """Return L(k) for waves k, (wave, axis), as (wave, 2S, 2S). A step multiplies by 1 - L(k)."""
     return -_coupled(stencil, np.exp(1j * k @ stencil.rest.T), 1.0)
 
 
 def _moment(stencil: Primitive, direction: Floats, m: int) -> Complex:
-    """The part of L of degree m in k: -(i^m / m!) Σ W (k·r)^m, and -own for m = 0."""
+    """Return the part of L of degree m in k: -(i^m / m!) Σ W (k·r)^m, and -W_0 for m = 0."""
     weight = -(1j**m) / math.factorial(m) * (stencil.rest @ direction) ** m
-    found: Complex = _coupled(stencil, weight[None], -float(m == 0))[0]
-    return found
+    moment: Complex = _coupled(stencil, weight[None], -float(m == 0))[0]
+    return moment
 
 
 def _coupled(stencil: Primitive, weight: Complex, share: float) -> Complex:
-    """Σ weight W over the entries, (wave, entry), between the sites that they couple, and the share
-    of each site's own."""
+    """Return Σ weight W over the entries, (wave, entry), by pairs of sites, plus `share` times
+    W_0."""
     sites = stencil.sites
-    found = np.zeros((len(weight), sites, 2, sites, 2), complex)
+    result = np.zeros((len(weight), sites, 2, sites, 2), complex)
     for e, (s, t) in enumerate(zip(stencil.source, stencil.target, strict=True)):
-        found[:, s, :, t] += weight[:, e, None, None] * stencil.matrix[e]
-    for s, own in enumerate(stencil.own):
-        found[:, s, :, s] += share * own
-    return found.reshape(len(weight), 2 * sites, 2 * sites)
+        result[:, s, :, t] += weight[:, e, None, None] * stencil.matrix[e]
+    for s, centre in enumerate(stencil.centre):
+        result[:, s, :, s] += share * centre
+    return result.reshape(len(weight), 2 * sites, 2 * sites)
 
 
-def _all_alike(sites: int) -> Floats:
+def _translations(sites: int) -> Floats:
     return np.tile(np.eye(2), (sites, 1))
 
 
-WAVES, ANGLES = 48, 180
-"""Waves along each axis of the reciprocal cell, and directions in half a turn, to begin with."""
-ROUNDS, FINER = 14, 7
-"""How often the neighbourhood of a minimum is looked at again, and with how many points a side."""
-SAME_CURVATURE, ROUNDING = 1e-6, 1e-13
+WAVES = 48
+"""Number of waves along each axis of the reciprocal cell in the first grid."""
+
+ANGLES = 180
+"""Number of directions in half a turn in the first grid."""
+ROUNDS = 14
+"""Number of grids by which a minimum is refined."""
+
+FINER = 7
+"""Number of points along each axis of a refined grid."""
+SAME_CURVATURE = 1e-6
+"""Relative difference of diffusivities below which both waves are equally fast."""
+
+ROUNDING = 1e-13
+"""Relative difference of values that are equal up to rounding."""
 
 
 @dataclass(frozen=True)
 class DirectionalRange:
-    """The smallest and the largest value over all directions, and where they are, in degrees."""
+    """Smallest and largest value over all directions, and their directions in degrees."""
 
     smallest: float
     at_smallest: float
@@ -232,8 +276,20 @@ class DirectionalRange:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Lengths along the normal, at `direction` degrees, of lattice rows `rows_apart`: of the fast
-    and the slow wave λ² in all, and l² = λ² + rows_apart²/12 of the material (spacing²)."""
+    """Fourth-order lengths along the normal of a family of lattice rows, of the fast and the slow
+    wave.
+
+    Parameters
+    ----------
+    direction
+        Direction of the normal in degrees.
+    rows_apart
+        Distance between the rows.
+    total
+        λ², spacing².
+    material
+        l² = λ² + rows_apart²/12, the part of the material.
+    """
 
     direction: float
     rows_apart: float
@@ -243,12 +299,20 @@ class Gradient:
 
 @dataclass(frozen=True)
 class LongWaves:
-    """What long waves see, in units of the spacing and of a step.
+    """Response to long waves, in units of the spacing and of a step.
 
-    `second` is Q_abcd, of which a step moves a body by Q_abcd ∂_c ∂_d u_b; `diffusivity` D_cd where
-    x and y diffuse by themselves and alike; `elasticity` the body that the rule solves for, also
-    that of a diffusion; `fast` and `slow` the diffusivities of the two waves by direction;
-    `gradients` the lengths of the fourth order.
+    Parameters
+    ----------
+    second : (2, 2, 2, 2)
+        Q_abcd: a step moves a body by Q_abcd ∂_c ∂_d u_b.
+    diffusivity : (2, 2)
+        D_cd if x and y diffuse separately and equally, else None.
+    elasticity
+        The elastic body whose equilibrium the rule approaches, also that of a diffusion.
+    fast, slow
+        Diffusivities of the two waves by direction.
+    gradients
+        Fourth-order lengths.
     """
 
     second: Floats
@@ -259,16 +323,25 @@ class LongWaves:
     gradients: tuple[Gradient, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """By the names of ``pbdkit identify --json``."""
-        found = {"second_order": self.second, "diffusivity_tensor": self.diffusivity}
+        """Return the numbers by the names of ``pbdkit identify --json``."""
+        numbers = {"second_order": self.second, "diffusivity_tensor": self.diffusivity}
         waves = {"fast": vars(self.fast), "slow": vars(self.slow)}
-        return found | waves | {"gradients": [vars(gradient) for gradient in self.gradients]}
+        return numbers | waves | {"gradients": [vars(gradient) for gradient in self.gradients]}
 
 
 @dataclass(frozen=True)
 class WaveSpectrum:
-    """Over all waves: the smallest real part, the largest modulus of the imaginary part, the
-    largest real part of the eigenvalues of the rule's step; the largest stable relaxation."""
+    """Eigenvalues of the rule's step over all plane waves.
+
+    Parameters
+    ----------
+    smallest, largest
+        Smallest and largest real part.
+    imaginary
+        Largest modulus of the imaginary part.
+    largest_stable_relaxation
+        Bound of stable relaxations, None if there is none.
+    """
 
     smallest: float
     imaginary: float
@@ -277,49 +350,52 @@ class WaveSpectrum:
 
 
 def ranges(q: Floats) -> tuple[DirectionalRange, DirectionalRange]:
-    """Of the diffusivities of the fast and of the slow long wave; of the real parts where they
-    turn."""
+    """Return the ranges of the diffusivities of the fast and of the slow long wave.
 
-    def least(wave: int, sign: float) -> tuple[float, float]:
-        def value(at: Floats) -> Floats:
-            n = np.array([np.cos(np.radians(at[:, 0])), np.sin(np.radians(at[:, 0]))])
+    Real parts are taken if they are complex.
+    """
+
+    def extreme(wave: int, sign: float) -> tuple[float, float]:
+        def value(angle: Floats) -> Floats:
+            n = np.array([np.cos(np.radians(angle[:, 0])), np.sin(np.radians(angle[:, 0]))])
             rates = np.linalg.eigvals(np.einsum("abcd,c...,d...->...ab", q, n, n)).real
             return sign * np.sort(rates)[:, wave]
 
-        at, found = minimum(value, np.array([0.0]), np.array([180.0]), ANGLES)
-        return sign * found, round(float(at[0]), 3) % 180.0
+        angle, size = minimum(value, np.array([0.0]), np.array([180.0]), ANGLES)
+        return sign * size, round(float(angle[0]), 3) % 180.0
 
-    slow, fast = (DirectionalRange(*least(wave, 1.0), *least(wave, -1.0)) for wave in (0, 1))
+    slow, fast = (DirectionalRange(*extreme(wave, 1.0), *extreme(wave, -1.0)) for wave in (0, 1))
     return fast, slow
 
 
 def gradients(waves: SlowWaves) -> tuple[Gradient, ...]:
-    """Along the normals of the lattice's three densest families of rows, by direction."""
+    """Return the lengths along the normals of the lattice's three densest families of rows, by
+    direction."""
     a, b = waves.stencil.basis
     area = abs(float(np.linalg.det(waves.stencil.basis)))
     diagonal = min(a - b, a + b, key=lambda row: round(float(np.linalg.norm(row)), 6))
-    found = []
+    result = []
     for row in (a, b, diagonal):
         length = float(np.linalg.norm(row))
         normal = np.array([-row[1], row[0]]) / length
-        apart = area / length
+        distance = area / length
         fast, slow = fourth_order(waves, normal)
-        material = (fast + apart**2 / 12, slow + apart**2 / 12)
+        material = (fast + distance**2 / 12, slow + distance**2 / 12)
         degrees = round(float(np.degrees(np.arctan2(normal[1], normal[0]))), 9) % 180.0
-        found.append(Gradient(degrees, apart, (fast, slow), material))
-    return tuple(sorted(found, key=lambda gradient: gradient.direction))
+        result.append(Gradient(degrees, distance, (fast, slow), material))
+    return tuple(sorted(result, key=lambda gradient: gradient.direction))
 
 
 def fourth_order(waves: SlowWaves, normal: Floats) -> tuple[float, float]:
-    """λ² of the fast and of the slow wave along a unit vector: z = d k² (1 + λ² k²)."""
+    """Return λ² of the fast and of the slow wave along a unit vector: z = d k² (1 + λ² k²)."""
     _, _, second, third, fourth = waves.series(normal)
     d, vectors = np.linalg.eig(second)
     if abs(d[0] - d[1]) < SAME_CURVATURE * np.abs(d).max():
-        # Any direction is one of the wave: the fourth-order term tells them apart.
-        apart = np.sort(np.linalg.eigvals(fourth / d.mean()).real)[::-1]
-        return float(apart[0]), float(apart[1])
-    back = np.linalg.inv(vectors)
-    odd, even = back @ third @ vectors, back @ fourth @ vectors
+        # Both waves are equally fast: the fourth-order term alone separates them.
+        lengths_of_both = np.sort(np.linalg.eigvals(fourth / d.mean()).real)[::-1]
+        return float(lengths_of_both[0]), float(lengths_of_both[1])
+    inverse = np.linalg.inv(vectors)
+    odd, even = inverse @ third @ vectors, inverse @ fourth @ vectors
     mixing = odd[0, 1] * odd[1, 0] / (d[0] - d[1])
     lengths = (even.diagonal() + np.array([mixing, -mixing])) / d
     fast = int(d[0].real < d[1].real)
@@ -327,40 +403,50 @@ def fourth_order(waves: SlowWaves, normal: Floats) -> tuple[float, float]:
 
 
 def spectrum(stencil: Primitive, memory: float) -> WaveSpectrum:
-    """Of all waves on the infinite lattice, extremes refined beyond the grid of WAVES²."""
+    """Compute the spectrum of all plane waves; extremes are refined beyond the grid of WAVES²."""
     reciprocal = 2 * np.pi * np.linalg.inv(stencil.basis).T
     low, high = np.zeros(2), np.ones(2)
 
     def eigenvalues(at: Floats) -> Complex:
-        found: Complex = 1.0 - np.linalg.eigvals(operator(stencil, at @ reciprocal))
-        return found
+        values: Complex = 1.0 - np.linalg.eigvals(operator(stencil, at @ reciprocal))
+        return values
 
     at_smallest, smallest = minimum(lambda at: eigenvalues(at).real.min(axis=1), low, high, WAVES)
     at_largest, largest = minimum(lambda at: -eigenvalues(at).real.max(axis=1), low, high, WAVES)
     sampled = eigenvalues(_grid(low, high, WAVES)).ravel()
     ends = eigenvalues(np.array([at_smallest, at_largest])).ravel()
-    known = np.concatenate([sampled, ends])
-    imaginary, bound = float(np.abs(known.imag).max()), largest_stable_relaxation(known, memory)
+    all_values = np.concatenate([sampled, ends])
+    imaginary, bound = (
+        float(np.abs(all_values.imag).max()),
+        largest_stable_relaxation(all_values, memory),
+    )
     return WaveSpectrum(smallest, imaginary, -largest, bound)
 
 
 def minimum(
     value: Callable[[Floats], Floats], low: Floats, high: Floats, points: int
 ) -> tuple[Floats, float]:
-    """(where, least): of a periodic function of (point, axis) between low and high.
+    """Minimise a periodic function of (point, axis) between low and high.
 
-    The best of a grid, then of ever finer grids around it; found to rounding where one point of
-    the first grid lies in its valley.
+    The best point of a grid is refined on ever finer grids around it. The minimum is exact up to
+    rounding if one point of the first grid lies in its valley.
+
+    Returns
+    -------
+    where : (axis,)
+        Place of the minimum.
+    least
+        Value there.
     """
     grid, half = _grid(low, high, points), (high - low) / points
     where, best = low, np.inf
     for _ in range(ROUNDS):
         values = value(grid)
-        # Where rounding alone tells points apart, the first one, or none.
-        alike = values <= values.min() + ROUNDING * np.abs(values).max()
-        one = int(alike.argmax())
-        if best == np.inf or values[one] < best - ROUNDING * abs(best):
-            where, best = grid[one], float(values[one])
+        # Of points that differ by rounding only the first counts, and none after an equal best.
+        candidates = values <= values.min() + ROUNDING * np.abs(values).max()
+        index = int(candidates.argmax())
+        if best == np.inf or values[index] < best - ROUNDING * abs(best):
+            where, best = grid[index], float(values[index])
         grid = _grid(where - half, where + half, FINER, ends=True)
         half = half * 2 / (FINER - 1)
     return where, best

@@ -1,3 +1,3 @@
-"""What a step is to small displacements: the step operator, its spectrum, plane waves."""
+"""Steps as linear maps of small displacements: step operator, spectrum, response to plane waves."""
 
 from __future__ import annotations

@@ -1,8 +1,11 @@
 """The step operator: the paper's "transformation operator between matrices" as a sparse matrix.
 
-u(t+1) = now · u(t) + before · u(t-1) + led · u_L + source for the displacements of the followers,
-one unknown a particle and axis. `before` is empty except for frames with lag and for memory; loads
-are in `source`.
+A step maps the displacements of the followers, one unknown a particle and axis, as
+
+    u(t+1) = A u(t) + B u(t-1) + C u_L + f
+
+with A = `current`, B = `previous`, C = `leader` and f = `source`. B is empty unless the frame has a
+lag or the solver has memory (momentum). Loads are part of f.
 """
 
 from __future__ import annotations
@@ -34,22 +37,29 @@ Floats = NDArray[np.floating[Any]]
 
 
 class Guiding:
-    """The guided particles of a step, looked up by their flat place. `turns` takes the moves of
-    each to those that it makes, (particle, axis, axis): T = 1 along free axes, and shares there of
-    the move along others (stepping/guidance.py)."""
+    """Guided particles of a step: prescribed along some axes, free along the others.
+
+    Attributes
+    ----------
+    free : (particle, axis, axis)
+        Identity along the free axes, zero elsewhere.
+    turns : (particle, axis, axis)
+        T, which maps the unconstrained move of each particle to its constrained move: the identity
+        along free axes, plus the shares of the move along prescribed axes
+        (`pbdkit.stepping.leaders`).
+    """
 
     def __init__(self, scene: Scene, step: int) -> None:
         guidance = Guidance(scene)
         self.guided = guided = guidance.at(step)
         self.free = np.eye(scene.axes) * ~guided.led.T[:, None]
-        """(particle, axis, axis): 1 along free axes."""
         self.turns = self.free + guidance.shares(guided)
 
     def __bool__(self) -> bool:
         return len(self.guided.place) > 0
 
     def numbers(self, place: Indices) -> Indices:
-        """Of those at flat places, -1 where nobody is guided."""
+        """Return the number of the guided particle at each flat place, -1 where there is none."""
         if not self:
             return np.full(len(place), -1)
         order = np.argsort(self.guided.place)
@@ -57,25 +67,38 @@ class Guiding:
         return np.where(self.guided.place[order[at]] == place, order[at], -1)
 
     def turned(self, place: Indices, values: Floats) -> Floats:
-        """The moves, or blocks, (particle, axis, ...), of particles at flat places."""
-        own = self.numbers(place)
-        if not (some := np.flatnonzero(own >= 0)).size:
+        """Return the constrained moves or blocks, (particle, axis, ...), of particles at flat
+        places."""
+        numbers = self.numbers(place)
+        if not (rows := np.flatnonzero(numbers >= 0)).size:
             return values
         turned = values.copy()
-        turned[some] = np.einsum("eab,eb...->ea...", self.turns[own[some]], values[some])
+        turned[rows] = np.einsum("eab,eb...->ea...", self.turns[numbers[rows]], values[rows])
         return turned
 
     def put(
-        self, free: Couplings, led: Couplings, rows: Indices, there: Indices,
+        self, free: Couplings, leader: Couplings, rows: Indices, places: Indices,
         numbers: tuple[Indices, Indices], blocks: Floats,
     ) -> None:  # fmt: skip
-        """Add what particles at flat places do as followers, and what guided ones do as leaders;
-        `numbers` are those of each as a follower and as a leader."""
-        own = self.numbers(there)
-        if (some := np.flatnonzero(own >= 0)).size:
-            led_blocks, blocks = blocks[some], blocks.copy()
-            blocks[some] = np.einsum("eab,ebc->eac", led_blocks, self.free[own[some]])
-            led.add(rows[some], numbers[1][some], led_blocks - blocks[some])
+        """Add the blocks of followers to `free`, and split those of guided particles between both.
+
+        Parameters
+        ----------
+        free, leader
+            Couplings with free unknowns and with prescribed displacements. Both are extended.
+        rows, places
+            Row and flat place of each block.
+        numbers
+            Number of the unknown, and of the prescribed displacement, of each block.
+        blocks : (entry, axis, axis)
+            ∂move/∂u.
+        """
+        guided_numbers = self.numbers(places)
+        if (guided := np.flatnonzero(guided_numbers >= 0)).size:
+            all_blocks, blocks = blocks[guided], blocks.copy()
+            free_axes = self.free[guided_numbers[guided]]
+            blocks[guided] = np.einsum("eab,ebc->eac", all_blocks, free_axes)
+            leader.add(rows[guided], numbers[1][guided], all_blocks - blocks[guided])
         free.add(rows, numbers[0], blocks)
 
 
@@ -84,75 +107,114 @@ Integers = NDArray[np.signedinteger[Any]]
 
 @dataclass(frozen=True)
 class StepOperator:
-    """One step, linearised at a state, for fixed roles and leaders that stand still.
+    """One step, linearised at a state, for fixed roles and leaders at rest.
 
-    `followers` and `leaders` are rows of the particle table; in the plane unknown 2n is x of the
-    n-th follower, 2n + 1 its y, and the same for leaders. The couplings hold the same by
-    particle; of those with leaders, `couplings_shown` is the share that frame points show. Guided
-    particles are of both: `held` are their unknowns that lead, with empty rows and columns.
+    In the plane, unknown 2n is the x displacement of the n-th follower and 2n + 1 its y
+    displacement; leaders are numbered in the same way. The couplings hold the same matrices by
+    particle.
+
+    Parameters
+    ----------
+    followers, leaders
+        Rows of the particle table. Guided particles are among both.
+    couplings_current, couplings_previous, couplings_leader
+        ∂u(t+1)/∂u(t), ∂u(t+1)/∂u(t-1) and ∂u(t+1)/∂u_L.
+    couplings_frame
+        The part of `couplings_leader` that acts through frame points.
+    source : (unknown,)
+        Displacement that a step adds at u = 0: loads and the nonlinear remainder.
+    prescribed_unknowns
+        Unknowns of guided particles along prescribed axes. Their rows and columns are empty.
     """
 
     followers: Indices
     leaders: Indices
-    couplings_now: Couplings
-    couplings_before: Couplings
-    couplings_led: Couplings
-    couplings_shown: Couplings
+    couplings_current: Couplings
+    couplings_previous: Couplings
+    couplings_leader: Couplings
+    couplings_frame: Couplings
     source: Floats
-    held: Indices
+    prescribed_unknowns: Indices
 
     @property
-    def couplings_both(self) -> Couplings:
-        """`now` + `before`: the step where displacements stay as they are."""
-        now = self.couplings_now
-        return Couplings(now.shape, now.axes, now.parts + self.couplings_before.parts)
+    def couplings_steady(self) -> Couplings:
+        """Return `couplings_current` + `couplings_previous`: the step of displacements at rest."""
+        current = self.couplings_current
+        return Couplings(current.shape, current.axes, current.parts + self.couplings_previous.parts)
 
     @cached_property
-    def now(self) -> scipy.sparse.csr_array:
-        """What u(t) is multiplied with."""
-        return self.couplings_now.entries().sparse()
+    def current(self) -> scipy.sparse.csr_array:
+        """Assemble ∂u(t+1)/∂u(t)."""
+        return self.couplings_current.entries().sparse()
 
     @cached_property
-    def before(self) -> scipy.sparse.csr_array:
-        """What u(t-1) is multiplied with."""
-        return self.couplings_before.entries().sparse()
+    def previous(self) -> scipy.sparse.csr_array:
+        """Assemble ∂u(t+1)/∂u(t-1)."""
+        return self.couplings_previous.entries().sparse()
 
     @cached_property
-    def led(self) -> scipy.sparse.csr_array:
-        """What the leaders' displacements are multiplied with."""
-        return self.couplings_led.entries().sparse()
+    def leader(self) -> scipy.sparse.csr_array:
+        """Assemble ∂u(t+1)/∂u_L, the derivative with respect to prescribed displacements."""
+        return self.couplings_leader.entries().sparse()
 
     def augmented(self) -> Entries:
-        """The operator on (u(t), u(t-1)); that on u(t) where the step does not look back. Without
-        what is held."""
-        parts = self.couplings_now, self.couplings_before
-        now, before = (couplings.entries().without(self.held) for couplings in parts)
-        if not len(before.values):
-            return now
-        size = now.shape[0]
-        every, shape = np.arange(size), (2 * size, 2 * size)
-        earlier = Entries(before.rows, before.columns + size, before.values, shape)
-        return now.plus(earlier).plus(Entries(every + size, every, np.ones(size), shape))
+        """Return the operator on (u(t), u(t-1)), or on u(t) alone if the step does not read u(t-1).
+
+        Prescribed unknowns are left out.
+        """
+        parts = self.couplings_current, self.couplings_previous
+        current, previous = (
+            couplings.entries().without(self.prescribed_unknowns) for couplings in parts
+        )
+        if not len(previous.values):
+            return current
+        size = current.shape[0]
+        unknowns, shape = np.arange(size), (2 * size, 2 * size)
+        upper = Entries(previous.rows, previous.columns + size, previous.values, shape)
+        return current.plus(upper).plus(Entries(unknowns + size, unknowns, np.ones(size), shape))
 
 
 def step_operator(
     scene: Scene, state: State | None = None, step: int | None = None
 ) -> StepOperator:
-    """The operator of a scene at a state (default: the start), with the roles of a step (default:
-    the last), relaxation, memory and frame included.
+    """Assemble the step operator of a scene, including relaxation, memory and frame.
 
-    Raises ExperimentError where neighbours are found anew at every step.
+    Parameters
+    ----------
+    scene
+        Scene whose rule is linearised.
+    state
+        State at which the rule is linearised; default: the initial state.
+    step
+        Step whose roles and loads apply; default: the last.
+
+    Raises
+    ------
+    ExperimentError
+        If neighbours are searched at every step.
     """
     if scene.experiment.neighbours.nearness():
-        text = "neighbours that are found anew have no step operator"
+        text = "no step operator: neighbours are searched at every step; choose fixed neighbours"
         raise ExperimentError(text, ("neighbours",))
     state, step = state or initial_state(scene), step or scene.experiment.steps
     return _Assembly(scene, state, step).operator()
 
 
 def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Floats, Couplings]:
-    """The moves (particle, axis) of the particles at some flat places, and ∂move/∂u: rows in the
-    order of the places, columns by flat place."""
+    """Compute the moves of particles and their derivatives ∂move/∂u.
+
+    Parameters
+    ----------
+    place
+        Flat places of the particles.
+
+    Returns
+    -------
+    moves : (particle, axis)
+        Moves at `state`.
+    couplings
+        ∂move/∂u, rows in the order of `place`, columns by flat place.
+    """
     if scene.inner is None:
         return _directly(scene, state, place)
     body = scene.raster.place_of(scene.raster.body_rows)
@@ -163,8 +225,8 @@ def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Flo
     if scene.frame:
         scene.frame.follow(flat, flat)
     moves, outer = _directly(scene, replace(state, u=field), place)
-    seen = _followed(scene).entries().sparse() @ inner.entries().sparse()
-    product = (outer.entries().sparse() @ seen).tobsr((scene.axes, scene.axes))
+    chain = _followed(scene).entries().sparse() @ inner.entries().sparse()
+    product = (outer.entries().sparse() @ chain).tobsr((scene.axes, scene.axes))
     product.sum_duplicates()
     rows = np.repeat(np.arange(len(place)), np.diff(product.indptr))
     couplings = Couplings(outer.shape, scene.axes)
@@ -173,8 +235,8 @@ def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Flo
 
 
 def _followed(scene: Scene) -> Couplings:
-    """What body and frame show of the body: rows by flat place, columns in the order of the body's
-    particles."""
+    """Return the map from body displacements to those of body and frame: rows by flat place,
+    columns in the order of the body's particles."""
     raster = scene.raster
     body, place = raster.body_rows, raster.place_of(np.arange(raster.count))
     followed = Couplings((raster.kind.size, len(body)), scene.axes)
@@ -188,24 +250,24 @@ def _followed(scene: Scene) -> Couplings:
 
 
 def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, Couplings]:
-    """By the scene's own rule; who has no neighbours stays, whatever it makes of nothing."""
+    """Compute the same with the scene's own rule; particles without neighbours do not move."""
     kind, moves = scene.raster.kind.ravel(), np.zeros((len(place), scene.axes))
     couplings = Couplings((len(place), kind.size), scene.axes)
     moving = np.flatnonzero(has_neighbours(scene, place)).astype(np.int32)
-    for s, own in by_sublattice(scene, place[moving]):
-        some = moving[own]
-        (response,) = respond(scene, state, s, place[some])
-        moves[some] = response.of_each(response.answer)
+    for s, numbers in by_sublattice(scene, place[moving]):
+        rows = moving[numbers]
+        (response,) = respond(scene, state, s, place[rows])
+        moves[rows] = response.of_each(response.answer)
         steps = [0, *(slot_step(scene.raster.shape, slot) for slot in response.neighbours)]
-        there = place[some] + np.array(steps)[:, None]
-        blocks = np.stack([response.own, *response.neighbours.values()])
-        slot, row = np.nonzero(kind[there] != EMPTY)
-        couplings.add(some[row], there[slot, row], blocks[slot, response.kind[row]])
+        ends = place[rows] + np.array(steps)[:, None]
+        blocks = np.stack([response.centre, *response.neighbours.values()])
+        slot, row = np.nonzero(kind[ends] != EMPTY)
+        couplings.add(rows[row], ends[slot, row], blocks[slot, response.kind[row]])
     return moves, couplings
 
 
 class _Assembly:
-    """Collects the couplings, looking particles up by their flat place on the raster."""
+    """Assemble the couplings. Particles are looked up by their flat place on the raster."""
 
     def __init__(self, scene: Scene, state: State, step: int) -> None:
         self._scene, self._state, self._step = scene, state, step
@@ -216,91 +278,100 @@ class _Assembly:
         rows = {kind: np.flatnonzero(kinds == kind) for kind in (FRAME, LEADER, FOLLOWER)}
         rows[FOLLOWER] = np.sort(np.concatenate([rows[FOLLOWER], guiding.guided.rows]))
         self._as_leader = self._unknown
-        for kind, some in rows.items():
-            place = raster.place_of(some)
+        for kind, members in rows.items():
+            place = raster.place_of(members)
             self._kind[place] = kind
-            self._unknown[place] = np.arange(len(some))
+            self._unknown[place] = np.arange(len(members))
             if kind == LEADER and guiding:
                 self._as_leader = self._unknown.copy()
         self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
-        free, led = len(self._followers), len(self._leaders)
-        self._now, self._before = (Couplings((free, free), scene.axes) for _ in range(2))
-        self._led, self._shown = (Couplings((free, led), scene.axes) for _ in range(2))
+        free, leaders = len(self._followers), len(self._leaders)
+        self._current, self._previous = (Couplings((free, free), scene.axes) for _ in range(2))
+        self._leader, self._frame_leader = (
+            Couplings((free, leaders), scene.axes) for _ in range(2)
+        )
 
     def operator(self) -> StepOperator:
         scene, solver, u = self._scene, self._scene.experiment.stepping, self._state.u
         place = scene.raster.place_of(self._followers)
         moves, couplings = moves_and_couplings(scene, self._state, place)
-        self._stay(self._now, place, np.arange(len(place), dtype=np.int32), 1.0)
+        self._add_identity(self._current, place, np.arange(len(place), dtype=np.int32), 1.0)
         moves = self._guiding.turned(place, moves)
         couplings.parts = [
-            (rows, there, self._guiding.turned(place[rows], blocks))
-            for rows, there, blocks in couplings.parts
+            (rows, places, self._guiding.turned(place[rows], blocks))
+            for rows, places, blocks in couplings.parts
         ]
-        for rows, there, blocks in couplings.parts:
-            self._see(rows, there, solver.relaxation * blocks)
+        for rows, places, blocks in couplings.parts:
+            self._add(rows, places, solver.relaxation * blocks)
         if solver.memory:
             moving = np.flatnonzero(has_neighbours(scene, place))
-            self._stay(self._now, place, moving, solver.memory)
-            self._stay(self._before, place, moving, -solver.memory)
+            self._add_identity(self._current, place, moving, solver.memory)
+            self._add_identity(self._previous, place, moving, -solver.memory)
         if u.any():
             moves = moves - couplings.times(u.reshape(scene.axes, -1).T.astype(float, copy=False))
         if scene.loads:
-            moves = moves + self._pushed(place)
-        source, who = (solver.relaxation * moves).ravel(), (self._followers, self._leaders)
-        axis, some = np.nonzero(self._guiding.guided.led)
-        guided = self._unknown[self._guiding.guided.place[some]]
-        couplings_of = self._now, self._before, self._led, self._shown
-        return StepOperator(*who, *couplings_of, source, np.sort(scene.axes * guided + axis))
+            moves = moves + self._load_moves(place)
+        source, members = (solver.relaxation * moves).ravel(), (self._followers, self._leaders)
+        axis, guided_number = np.nonzero(self._guiding.guided.led)
+        unknown = self._unknown[self._guiding.guided.place[guided_number]]
+        couplings_by_source = self._current, self._previous, self._leader, self._frame_leader
+        return StepOperator(
+            *members, *couplings_by_source, source, np.sort(scene.axes * unknown + axis)
+        )
 
-    def _stay(self, couplings: Couplings, place: Indices, rows: Indices, factor: float) -> None:
-        """Adds factor · 1 where followers are free."""
-        own = self._guiding.numbers(place[rows])
-        couplings.add_scaled_identity(rows[own < 0], factor)
-        some = np.flatnonzero(own >= 0)
-        couplings.add(rows[some], rows[some], factor * self._guiding.free[own[some]])
+    def _add_identity(
+        self, couplings: Couplings, place: Indices, rows: Indices, factor: float
+    ) -> None:
+        """Add factor · 1 along the free axes of followers."""
+        numbers = self._guiding.numbers(place[rows])
+        couplings.add_scaled_identity(rows[numbers < 0], factor)
+        guided = np.flatnonzero(numbers >= 0)
+        couplings.add(rows[guided], rows[guided], factor * self._guiding.free[numbers[guided]])
 
-    def _pushed(self, place: Indices) -> Floats:
-        """(follower, axis): what the loads of the step add to the moves."""
-        moved = []
+    def _load_moves(self, place: Indices) -> Floats:
+        """Compute what the loads of the step add to the moves, (follower, axis)."""
+        moves = []
         for scene in (replace(self._scene, loads=None), self._scene):
             state = replace(self._state.copy(), step=self._step - 1)
             SlotFollowers(scene, Stepping()).move(self._state.u, state.previous, state)
-            moved.append(state.previous.reshape(scene.axes, -1)[:, place].T)
-        return moved[1] - moved[0]
+            moves.append(state.previous.reshape(scene.axes, -1)[:, place].T)
+        return moves[1] - moves[0]
 
-    def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
-        """Add what particles at flat places do to followers: frame points through those that they
-        follow, each in the place of the frame point."""
-        by_frame, frame = self._kind[there] == FRAME, self._scene.frame
+    def _add(self, rows: Integers, places: Indices, blocks: Floats) -> None:
+        """Add the blocks of followers and leaders directly, those of frame points through the body
+        particles that these follow."""
+        by_frame, frame = self._kind[places] == FRAME, self._scene.frame
         if frame is not None and by_frame.any():
             first, last = (
-                np.searchsorted(frame.map.point, self._unknown[there[by_frame]], side)
+                np.searchsorted(frame.map.point, self._unknown[places[by_frame]], side)
                 for side in ("left", "right")
             )
-            count = np.ones(len(there), np.intp)
+            count = np.ones(len(places), np.intp)
             count[by_frame] = last - first
             offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-            start = np.zeros(len(there), np.intp)
+            start = np.zeros(len(places), np.intp)
             start[by_frame] = first
-            rows, there, weight, by_frame, entry = (
+            rows, places, blocks, by_frame, entry = (
                 np.repeat(values, count, axis=0)
-                for values in (rows, there, weight, by_frame, start)
+                for values in (rows, places, blocks, by_frame, start)
             )
             entry = (entry + offset)[by_frame]
-            follows = frame_matrices(frame.map.weight[entry], self._scene.axes)
-            there[by_frame] = frame.body_place[entry]
-            weight[by_frame] = np.einsum("eab,ebc->eac", weight[by_frame], follows)
-        led, free = (self._kind[there] == kind for kind in (LEADER, FOLLOWER))
-        self._led.add(rows[led], self._as_leader[there[led]], weight[led])
-        shown = led & by_frame
-        self._shown.add(rows[shown], self._as_leader[there[shown]], weight[shown])
+            frame_weights = frame_matrices(frame.map.weight[entry], self._scene.axes)
+            places[by_frame] = frame.body_place[entry]
+            blocks[by_frame] = np.einsum("eab,ebc->eac", blocks[by_frame], frame_weights)
+        is_leader, is_follower = (self._kind[places] == kind for kind in (LEADER, FOLLOWER))
+        self._leader.add(rows[is_leader], self._as_leader[places[is_leader]], blocks[is_leader])
+        through_frame = is_leader & by_frame
+        leaders = self._as_leader[places[through_frame]]
+        self._frame_leader.add(rows[through_frame], leaders, blocks[through_frame])
         lags = by_frame if frame is not None and frame.map.lag else np.zeros_like(by_frame)
-        nowhere = Couplings((0, 0), 0)
-        for couplings, leads, some in (
-            (self._now, self._led, free & ~lags),
-            (self._before, self._led, free & lags),
-            (nowhere, self._shown, free & by_frame),
+        discarded = Couplings((0, 0), 0)
+        for couplings, leads, selected in (
+            (self._current, self._leader, is_follower & ~lags),
+            (self._previous, self._leader, is_follower & lags),
+            (discarded, self._frame_leader, is_follower & by_frame),
         ):
-            numbers = self._unknown[there[some]], self._as_leader[there[some]]
-            self._guiding.put(couplings, leads, rows[some], there[some], numbers, weight[some])
+            numbers = self._unknown[places[selected]], self._as_leader[places[selected]]
+            self._guiding.put(
+                couplings, leads, rows[selected], places[selected], numbers, blocks[selected]
+            )

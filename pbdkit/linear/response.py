@@ -1,7 +1,8 @@
 """Linear response of a rule to small displacements, computed from the rule's own functions.
 
-Linear rules are exact in any configuration; others are linearised at a state. At rest, particles
-with the same neighbours present respond alike, and one of each kind is evaluated.
+The response of a linear rule is exact in any configuration; other rules are linearised at a state.
+At rest, particles with the same neighbourhood have the same response, so one of each kind is
+evaluated.
 """
 
 from __future__ import annotations
@@ -28,25 +29,35 @@ from pbdkit.stepping.state import State
 Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
 Answer = Callable[[Contributions, Here], Any]
-AT_ONCE = 8192
-"""Number of places that are evaluated together, so that temporaries stay small."""
+CHUNK_SIZE = 8192
+"""Number of places that are evaluated together, which bounds the size of temporary arrays."""
 FEW = 200
 """Number of places up to which each is evaluated: to find equal ones takes longer."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """The answer of some followers, linearised: it is of some kinds only. `kind` is that of each
-    follower, `own` ∂answer/∂u_j and `neighbours` ∂answer/∂u_k by slot, (kind, axis of the answer,
-    axis of u), `answer` the answer itself, (kind, axis)."""
+    """Linearised response of followers, stored once for each kind of follower.
+
+    Parameters
+    ----------
+    kind : (follower,)
+        Kind of each follower.
+    centre : (kind, axis of the response, axis of u)
+        Derivative with respect to the follower's own displacement.
+    neighbours : (kind, axis of the response, axis of u) by slot
+        Derivative with respect to the displacement of the neighbour at each slot.
+    answer : (kind, axis)
+        The response itself.
+    """
 
     kind: Indices
-    own: Floats
+    centre: Floats
     neighbours: dict[Slot, Floats]
     answer: Floats
 
     def of_each(self, values: Floats) -> Floats:
-        """The values of all followers; a view of one where all answer alike."""
+        """Return the values of all followers; a broadcast view if all are of one kind."""
         if len(values) == 1:
             return np.broadcast_to(values[0], (len(self.kind), *values.shape[1:]))
         return values[self.kind]
@@ -55,192 +66,242 @@ class Response:
 def respond(
     scene: Scene, state: State, sublattice: int, place: Indices, answers: Sequence[str] = ("move",)
 ) -> list[Response]:
-    """The answers at a state of the followers at some flat places, all of one sublattice: the
-    "move", and the "force" where the rule knows forces.
+    """Linearise moves, or forces, of followers at a state.
 
-    Raises PluginError where the rule's functions fail, or are not finite at rest.
+    Parameters
+    ----------
+    sublattice
+        Sublattice of all the followers.
+    place
+        Flat places of the followers.
+    answers
+        Quantities to linearise: "move", or "force" for rules with forces.
+
+    Returns
+    -------
+    list of Response
+        One for each of `answers`.
+
+    Raises
+    ------
+    PluginError
+        If the rule's functions fail, or are not finite at rest.
     """
     kinds = np.arange(len(place))
-    same = not scene.experiment.rule.uses_reference and not _differ(scene, state)
+    is_uniform = not scene.experiment.rule.uses_reference and not _varies(scene, state)
     at_rest = not state.u.any()
     with blaming(scene.experiment.rule, "when linearised"):
-        if same and at_rest and len(place) > FEW:
-            kinds, place = _alike(scene, state, sublattice, place)
+        if is_uniform and at_rest and len(place) > FEW:
+            kinds, place = _group_alike(scene, state, sublattice, place)
         parts = []
-        for some in np.split(place, range(AT_ONCE, len(place), AT_ONCE)):
-            followers = _Followers(scene, state, sublattice, some)
+        for chunk in np.split(place, range(CHUNK_SIZE, len(place), CHUNK_SIZE)):
+            followers = _Followers(scene, state, sublattice, chunk)
             parts.append([followers.response(answer, at_rest) for answer in answers])
-        return [_joined(kinds, some) for some in zip(*parts, strict=True)]
+        return [_concatenate(kinds, responses) for responses in zip(*parts, strict=True)]
 
 
-def _joined(kinds: Indices, parts: Sequence[Response]) -> Response:
-    """The answer of followers of these kinds, from those of the kinds."""
-    own, answer = (np.concatenate([getattr(p, of) for p in parts]) for of in ("own", "answer"))
+def _concatenate(kinds: Indices, parts: Sequence[Response]) -> Response:
+    """Concatenate the responses of chunks of kinds."""
+    centre, answer = (
+        np.concatenate([getattr(p, of) for p in parts]) for of in ("centre", "answer")
+    )
     neighbours = {
         slot: np.concatenate([part.neighbours[slot] for part in parts])
         for slot in parts[0].neighbours
     }
-    return Response(kinds, own, neighbours, answer)
+    return Response(kinds, centre, neighbours, answer)
 
 
 def by_sublattice(scene: Scene, place: Indices) -> Iterator[tuple[int, Indices]]:
-    """Every sublattice with those of the flat places that are its, by their number."""
+    """Yield each sublattice that occurs among flat places, with the indices of its places."""
     sublattices = scene.raster.shape[0]
-    of = place // (scene.raster.kind.size // sublattices)
+    sublattice = place // (scene.raster.kind.size // sublattices)
     for s in range(sublattices):
-        some = np.flatnonzero(of == s)
-        if len(some):
-            yield s, some
+        members = np.flatnonzero(sublattice == s)
+        if len(members):
+            yield s, members
 
 
 def has_neighbours(scene: Scene, place: Indices) -> Present:
-    """Which particles at flat places have any."""
-    found, kind = np.zeros(len(place), bool), scene.raster.kind.ravel()
-    for s, some in by_sublattice(scene, place):
+    """Return which of the particles at flat places have at least one neighbour."""
+    result, kind = np.zeros(len(place), bool), scene.raster.kind.ravel()
+    for s, members in by_sublattice(scene, place):
         for slot in scene.neighbourhood.slots[s]:
-            found[some] |= kind[place[some] + slot_step(scene.raster.shape, slot)] != EMPTY
-    return found
+            result[members] |= kind[place[members] + slot_step(scene.raster.shape, slot)] != EMPTY
+    return result
 
 
-def _differ(scene: Scene, state: State) -> bool:
-    """Whether what is remembered of bonds or particles, and reaches the rule, is not the same
-    everywhere."""
+def _varies(scene: Scene, state: State) -> bool:
+    """Return whether state variables or constants that the rule reads vary between particles."""
     if scene.constants.by_particle:
         return True
     softens = isinstance(scene.experiment.fracture, (Softens, SoftensCells))
-    of_bonds = list(state.bond_values) if softens else []
-    of_bonds += scene.constants.by_bond.values() if of_bonds else ()
-    return any((values != values.flat[0]).any() for values in (*of_bonds, *state.particle_values))
+    bond_values = list(state.bond_values) if softens else []
+    bond_values += scene.constants.by_bond.values() if bond_values else ()
+    return any(
+        (values != values.flat[0]).any() for values in (*bond_values, *state.particle_values)
+    )
 
 
-def _alike(scene: Scene, state: State, sublattice: int, place: Indices) -> tuple[Indices, Indices]:
-    """(kind, place): which kind each place is of, and one place of each; those of a kind have the
-    same neighbours, the same shares of cells around them and the same broken bonds."""
-    plain = _plain(scene, state, sublattice).ravel()[place % math.prod(scene.raster.shape[1:])]
-    others = np.flatnonzero(~plain)
-    first = np.flatnonzero(plain)[:1] if len(others) < len(place) else others[:0]
-    kind, some = np.zeros(len(place), np.intp), place[others]
-    around = Surroundings(scene, Places(scene.raster.shape, some), sublattice)
+def _group_alike(
+    scene: Scene, state: State, sublattice: int, place: Indices
+) -> tuple[Indices, Indices]:
+    """Group places whose particles respond alike.
+
+    They have the same neighbours, the same fractions of cells around them, and the same broken
+    bonds.
+
+    Returns
+    -------
+    kind : (place,)
+        Kind of each place.
+    place : (kind,)
+        One place of each kind.
+    """
+    regular = _is_regular(scene, state, sublattice).ravel()[
+        place % math.prod(scene.raster.shape[1:])
+    ]
+    irregular = np.flatnonzero(~regular)
+    first = np.flatnonzero(regular)[:1] if len(irregular) < len(place) else irregular[:0]
+    kind, places = np.zeros(len(place), np.intp), place[irregular]
+    around = Surroundings(scene, Places(scene.raster.shape, places), sublattice)
     neighbours = around.neighbours(state)
-    code = np.zeros(len(some), np.int64)
+    code = np.zeros(len(places), np.int64)
     numbers = [to.w.left - 1.0 for to in neighbours if scene.cells]
     numbers += [w.left for to in neighbours for w in to.more]
     numbers += [value for to in neighbours if to.torn for value in to.torn]
     if numbers:
-        table = np.array([np.broadcast_to(value, some.shape) for value in numbers])
-        odd = (table != 0.0).any(axis=0)
-        code[odd] = 1 + np.unique(table[:, odd], axis=1, return_inverse=True)[1].ravel()
+        table = np.array([np.broadcast_to(value, places.shape) for value in numbers])
+        modified = (table != 0.0).any(axis=0)
+        code[modified] = 1 + np.unique(table[:, modified], axis=1, return_inverse=True)[1].ravel()
     differing = [mask for to in neighbours for mask in (to.present, to.broken) if mask is not None]
     for mask in differing:
         code = 2 * code + mask
     # More than fits a number, leaving 20 bits for the cut and torn cells around a particle.
     if len(differing) > 42:
         return np.arange(len(place)), place
-    _, found, kind[others] = np.unique(code, return_index=True, return_inverse=True)
-    kind[others] += len(first)
-    return kind, place[np.concatenate([first, others[found]])]
+    _, representatives, kind[irregular] = np.unique(code, return_index=True, return_inverse=True)
+    kind[irregular] += len(first)
+    return kind, place[np.concatenate([first, irregular[representatives]])]
 
 
-def _plain(scene: Scene, state: State, sublattice: int) -> Present:
-    """(cell, cell): around which particles of a sublattice all neighbours are there, all cells
-    whole and no bonds broken."""
+def _is_regular(scene: Scene, state: State, sublattice: int) -> Present:
+    """Return which places of a sublattice, (cell, cell), have all neighbours, whole cells around
+    them and no broken bond."""
     raster, around = scene.raster, scene.neighbourhood
-    plain = np.zeros(raster.shape[1:], bool)
+    regular = np.zeros(raster.shape[1:], bool)
     if not (block := raster.body_block(sublattice)):
-        return plain
-    here = block.within(plain)
-    here[...] = True
-    there = raster.kind != EMPTY
-    whole = scene.cells.weight == 1.0 if scene.cells else there
+        return regular
+    inside = block.within(regular)
+    inside[...] = True
+    occupied = raster.kind != EMPTY
+    whole = scene.cells.weight == 1.0 if scene.cells else occupied
     for slot in around.slots[sublattice]:
-        here &= block.seen_through(slot).of(there)
+        inside &= block.seen_through(slot).of(occupied)
         if state.broken_step is not None and not scene.tears:
             plane, at_this_end = around.home[slot]
             home = block if at_this_end else block.seen_through(slot)
-            here &= home.within(state.broken_step[plane]) < 0
+            inside &= home.within(state.broken_step[plane]) < 0
         for side in around.tiling.beside[slot] if scene.cells else ():
             first = block.seen_through(side.first) if side.first else block
-            here &= first.of(whole[side.kind])
+            inside &= first.of(whole[side.kind])
     if scene.tears:
         assert state.broken_step is not None
         for cell in around.cells_around[sublattice].cells:
             for bond in cell:
                 home = block.seen_through(bond.home) if bond.home else block
-                here &= home.within(state.broken_step[bond.plane]) < 0
-    return plain
+                inside &= home.within(state.broken_step[bond.plane]) < 0
+    return regular
 
 
 class _Followers:
-    """The rule on some places, asked what small steps do: answers to all of them at once, (axis,
-    step, place). The first step is none; then come a particle's own along each axis, with all
-    neighbours where they are; then those of the neighbour at each slot.
+    """Evaluate the rule at some places for small displacements, all at once: (axis, step, place).
+
+    The first step is zero. Steps of the particle along each axis come next, with all neighbours
+    fixed, then those of the neighbour at each slot.
     """
 
     def __init__(self, scene: Scene, state: State, sublattice: int, place: Indices) -> None:
         around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
         self._evaluator = Evaluator(scene).given(around.parameters)
         u = state.u.astype(float, copy=False)
-        self._here, self._slots = around.here(u, state), around.slots
+        self._local, self._slots = around.here(u, state), around.slots
         self._neighbours = list(zip(around.differences(u), around.neighbours(state), strict=True))
         steps = 1 + scene.axes * (1 + len(around.slots))
         self._unit = scene.neighbourhood.nudge_unit
-        self._shape, self._known = (steps, len(place)), dict[complex, Contributions]()
+        self._shape, self._cache = (steps, len(place)), dict[complex, Contributions]()
 
     def response(self, name: str, finite: bool) -> Response:
-        """The answer of that name, `finite` or refused."""
+        """Linearise one quantity; raise ValueError if `finite` is demanded and the result is
+        not."""
         answer = {"move": self._evaluator.move, "force": self._evaluator.force}[name]
-        ask = partial(self._asked, answer)
+        evaluate = partial(self._evaluate, answer)
         if self._evaluator.rule.linear:
-            answers = array_of(ask(self._unit), self._shape)
-            still, changes = answers[:, 0], (answers - answers[:, :1]) / self._unit
+            answers = array_of(evaluate(self._unit), self._shape)
+            value, derivatives = answers[:, 0], (answers - answers[:, :1]) / self._unit
         else:
-            still = array_of(ask(SMALL * self._unit), self._shape)[:, 0]
-            changes = derivative(ask, self._shape, self._unit)
-        if np.iscomplexobj(still):
-            raise ValueError(f"it returned values of {still.dtype}, not real numbers")
-        if finite and not (np.isfinite(still).all() and np.isfinite(changes).all()):
+            value = array_of(evaluate(SMALL * self._unit), self._shape)[:, 0]
+            derivatives = derivative(evaluate, self._shape, self._unit)
+        if np.iscomplexobj(value):
+            raise ValueError(f"it returned values of {value.dtype}, not real numbers")
+        if finite and not (np.isfinite(value).all() and np.isfinite(derivatives).all()):
             raise ValueError(f"its {name} at rest, or a derivative of it, is not finite")
         # (mover, place, axis of the answer, axis of u)
-        own, *others = np.moveaxis(
-            changes[:, 1:].reshape(len(changes), -1, len(changes), self._shape[1]), 0, -1
+        centre, *neighbours = np.moveaxis(
+            derivatives[:, 1:].reshape(len(derivatives), -1, len(derivatives), self._shape[1]),
+            0,
+            -1,
         ).transpose(0, 2, 3, 1)
         kinds = np.arange(self._shape[1])
-        return Response(kinds, own, dict(zip(self._slots, others, strict=True)), still.T)
+        return Response(kinds, centre, dict(zip(self._slots, neighbours, strict=True)), value.T)
 
-    def _asked(self, answer: Answer, step: complex) -> Any:
-        if step not in self._known:
-            self._known[step] = self._totals(step)
+    def _evaluate(self, answer: Answer, step: complex) -> Any:
+        if step not in self._cache:
+            self._cache[step] = self._totals(step)
         with np.errstate(all="ignore"):
-            here = self._here.u + self._steps(step, 1, self._shape[0])
-            return answer(self._known[step], self._here._replace(u=here))
+            displacement = self._local.u + self._steps(step, 1, self._shape[0])
+            return answer(self._cache[step], self._local._replace(u=displacement))
 
     def _totals(self, step: complex) -> Contributions:
-        """What the neighbours contribute together after each step: those of the neighbours change
-        one contribution."""
-        axes = len(self._here.u)
-        count = 1 + 2 * axes  # steps that a slot's own contribution knows: none, own, neighbour's
-        own, other = self._steps(step, 1, count), self._steps(step, 1 + axes, count)
-        here = self._here.u + own
+        """Return the sums over the neighbours after each step.
+
+        A step of one neighbour changes one contribution only.
+        """
+        axes = len(self._local.u)
+        count = 1 + 2 * axes  # steps that change a slot's contribution: none, own, neighbour's
+        own_step, neighbour_step = self._steps(step, 1, count), self._steps(step, 1 + axes, count)
+        displacement = self._local.u + own_step
         with np.errstate(all="ignore"):
             parts = [
-                summed([(self._evaluator.contribution(d + (other - own), here, to), to.present)])
+                summed(
+                    [
+                        (
+                            self._evaluator.contribution(
+                                d + (neighbour_step - own_step), displacement, to
+                            ),
+                            to.present,
+                        )
+                    ]
+                )
                 for d, to in self._neighbours
             ]
             return tuple(self._total(values, 1 + axes) for values in zip(*parts, strict=True))
 
-    def _total(self, parts: Sequence[Any], kept: int) -> Any:
+    def _total(self, by_slot: Sequence[Any], common: int) -> Any:
         """Return the totals of one number or vector, given by slot."""
-        if isinstance(parts[0], Vector):
-            return vector(self._total(along, kept) for along in zip(*parts, strict=True))
-        shape = (2 * kept - 1, self._shape[1])
-        parts = [np.broadcast_to(part, shape) for part in parts]
-        whole = sum(part[:kept] for part in parts)
-        return np.concatenate([whole, *(whole[:1] + (part[kept:] - part[0]) for part in parts)])
+        if isinstance(by_slot[0], Vector):
+            return vector(self._total(along, common) for along in zip(*by_slot, strict=True))
+        shape = (2 * common - 1, self._shape[1])
+        by_slot = [np.broadcast_to(values, shape) for values in by_slot]
+        whole = sum(values[:common] for values in by_slot)
+        return np.concatenate(
+            [whole, *(whole[:1] + (values[common:] - values[0]) for values in by_slot)]
+        )
 
     def _steps(self, step: complex, first: int, count: int) -> Any:
-        """A step along each axis as the `first` of so many and those after it, as a vector of
+        """Return `count` displacements, one along each axis from number `first` on, as a vector of
         (step, 1)."""
-        steps = np.zeros((len(self._here.u), count, 1), type(step))
-        for axis, along in enumerate(steps):
-            along[first + axis] = step
+        steps = np.zeros((len(self._local.u), count, 1), type(step))
+        for axis, component in enumerate(steps):
+            component[first + axis] = step
         return vector(steps)

@@ -1,6 +1,4 @@
-"""Eigenvalues of the step operator of a scene that is small enough for a matrix, block by block of
-coupled unknowns.
-"""
+"""Eigenvalues of the step operator, computed by blocks of coupled unknowns."""
 
 from __future__ import annotations
 
@@ -17,12 +15,12 @@ Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.signedinteger[Any]]
 
 DENSE = 500
-"""Matrices of up to so many rows are made dense."""
+"""Largest number of rows of matrices that are stored densely."""
 
 
 @dataclass(frozen=True)
 class Entries:
-    """A matrix as (row, column, value); entries of one place are added."""
+    """Matrix in coordinate form: (row, column, value). Values at the same place are added."""
 
     rows: NDArray[np.signedinteger[Any]]
     columns: NDArray[np.signedinteger[Any]]
@@ -30,38 +28,38 @@ class Entries:
     shape: tuple[int, int]
 
     def plus(self, other: Entries, factor: float = 1.0) -> Entries:
-        """The sum with `factor` times a matrix, in the shape of that."""
+        """Return the sum with `factor` times another matrix, in the shape of the other."""
         rows = np.concatenate([self.rows, other.rows])
         columns = np.concatenate([self.columns, other.columns])
         values = np.concatenate([self.values, factor * other.values])
         return Entries(rows, columns, values, other.shape)
 
     def without(self, unknowns: Indices) -> Entries:
-        """The matrix less some rows and columns."""
-        kept = np.ones(self.shape[0], bool)
-        kept[unknowns] = False
-        number = np.cumsum(kept) - 1
-        some = kept[self.rows] & kept[self.columns]
-        size = int(np.count_nonzero(kept))
-        at = number[self.rows[some]], number[self.columns[some]]
-        return Entries(*at, self.values[some], (size, size))
+        """Return the matrix without the rows and columns of some unknowns."""
+        is_kept = np.ones(self.shape[0], bool)
+        is_kept[unknowns] = False
+        number = np.cumsum(is_kept) - 1
+        entries = is_kept[self.rows] & is_kept[self.columns]
+        size = int(np.count_nonzero(is_kept))
+        places = number[self.rows[entries]], number[self.columns[entries]]
+        return Entries(*places, self.values[entries], (size, size))
 
     def matrix(self) -> Any:
-        """Dense up to DENSE rows, else sparse."""
+        """Return a dense matrix up to DENSE rows, else a sparse one."""
         if self.shape[0] > DENSE:
             return self.sparse()
         place = self.rows * self.shape[1] + self.columns
         return np.bincount(place, self.values, self.shape[0] * self.shape[1]).reshape(self.shape)
 
     def sparse(self) -> Any:
-        """A scipy.sparse.csr_array."""
+        """Return a scipy.sparse.csr_array."""
         import scipy.sparse
 
         return scipy.sparse.coo_array((self.values, (self.rows, self.columns)), self.shape).tocsr()
 
 
 def identity_like(matrix: Any) -> Any:
-    """1, dense or sparse as a square matrix is."""
+    """Return the identity, dense or sparse as the square matrix is."""
     if isinstance(matrix, np.ndarray):
         return np.eye(len(matrix))
     from scipy.sparse import eye_array
@@ -70,13 +68,26 @@ def identity_like(matrix: Any) -> Any:
 
 
 def one_minus(matrix: Any) -> Any:
-    """1 - a matrix, dense or sparse as it is."""
-    found = identity_like(matrix) - matrix
-    return found if isinstance(matrix, np.ndarray) else found.tocsr()
+    """Return the identity minus a matrix, dense or sparse as the matrix is."""
+    difference = identity_like(matrix) - matrix
+    return difference if isinstance(matrix, np.ndarray) else difference.tocsr()
 
 
 def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
-    """(count, label): the groups of unknowns that reach one another, along arrows or either way."""
+    """Find the connected components of a matrix, seen as a directed graph.
+
+    Parameters
+    ----------
+    strongly
+        Whether edges count in their direction only (strongly connected components).
+
+    Returns
+    -------
+    count
+        Number of components.
+    label : (unknown,)
+        Component of each unknown.
+    """
     if not matrix.shape[0]:
         return 0, np.empty(0, np.intp)
     if not isinstance(matrix, np.ndarray):
@@ -87,19 +98,19 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
         return count, label
     reach = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
     if not strongly:
-        return _touching(reach | reach.T)
+        return _undirected_components(reach | reach.T)
     while True:
-        further = reach.astype(np.float32) @ reach.astype(np.float32) > 0.0
-        if (further == reach).all():
+        longer = reach.astype(np.float32) @ reach.astype(np.float32) > 0.0
+        if (longer == reach).all():
             break
-        reach = further
-    first = np.argmax(reach & reach.T, axis=1)  # the lowest unknown of each group names it
+        reach = longer
+    first = np.argmax(reach & reach.T, axis=1)  # components are labelled by their lowest unknown
     names, label = np.unique(first, return_inverse=True)
     return len(names), label
 
 
-def _touching(reach: NDArray[np.bool_]) -> tuple[int, Indices]:
-    """The same where all lead both ways: each group from its lowest unknown outwards."""
+def _undirected_components(reach: NDArray[np.bool_]) -> tuple[int, Indices]:
+    """Find the components of a symmetric graph by breadth-first search."""
     count, label = 0, np.full(len(reach), -1)
     while (unlabelled := label < 0).any():
         front = np.flatnonzero(unlabelled)[:1]
@@ -112,9 +123,17 @@ def _touching(reach: NDArray[np.bool_]) -> tuple[int, Indices]:
 
 @dataclass
 class Couplings:
-    """Blocks (axis, axis) at (row, column), in parts, counted in particles; those of one place add.
+    """Block matrix of (axis, axis) blocks at (row, column), counted in particles.
 
-    `shape` is in particles, `axes` how many space has.
+    Parameters
+    ----------
+    shape
+        Number of rows and columns in particles.
+    axes
+        Number of axes of space.
+    parts
+        Rows, columns and blocks, (entry, axis, axis). Blocks at the same place are added. Blocks
+        that are all equal may be broadcast views of one.
     """
 
     shape: tuple[int, int]
@@ -122,19 +141,24 @@ class Couplings:
     parts: list[tuple[Indices, Indices, Floats]] = field(default_factory=list)
 
     def add(self, rows: Indices, columns: Indices, blocks: Floats) -> None:
-        """Adds blocks, (entry, axis, axis)."""
+        """Add blocks, (entry, axis, axis)."""
         if len(rows):
             self.parts.append((rows, columns, blocks))
 
     def add_scaled_identity(self, rows: Indices, factor: float) -> None:
-        """Adds factor · 1 on the diagonal of some rows."""
+        """Add factor · 1 on the diagonal of some rows."""
         block = factor * np.eye(self.axes)
         self.add(rows, rows, np.broadcast_to(block, (len(rows), *block.shape)))
 
     def entries(self, to: Sequence[int] = (), of: Sequence[int] = ()) -> Entries:
-        """Of the matrix from some axes `of` particles `to` others, (all of them, the same): with
-        unknowns 2n (x) and 2n + 1 (y) of particle n in the plane, 3n to 3n + 2 in space, n for one
-        axis."""
+        """Return the scalar entries of the couplings between axes.
+
+        Parameters
+        ----------
+        to, of
+            Axes of the rows and of the columns; default: all, and the same as `to`. With all axes,
+            particle n has the unknowns 2n (x) and 2n + 1 (y) in the plane.
+        """
         to = to or range(self.axes)
         of = of or to
         shape = (len(to) * self.shape[0], len(of) * self.shape[1])
@@ -154,11 +178,11 @@ class Couplings:
         return rows, columns, blocks
 
     def couples(self, a: int, b: int) -> bool:
-        """Whether anything leads from axis b to axis a."""
+        """Return whether displacements along axis b change those along axis a."""
         return any(blocks[:, a, b].any() for _, _, blocks in self.parts)
 
     def is_isotropic(self) -> bool:
-        """Whether all axes move alike."""
+        """Return whether the couplings along all axes are equal."""
         return all(
             np.array_equal(blocks[:, 0, 0], blocks[:, a, a])
             for _, _, blocks in self.parts
@@ -166,61 +190,94 @@ class Couplings:
         )
 
     def times(self, vectors: Floats) -> Floats:
-        """The product with vectors, (particle, axis)."""
+        """Return the product with vectors, (particle, axis)."""
         rows, columns, blocks = self._joined()
         terms = np.einsum("eab,eb->ea", blocks, vectors[columns])
         return np.stack([np.bincount(rows, along, self.shape[0]) for along in terms.T], axis=1)
 
 
 def frame_matrices(weights: Floats, axes: int) -> Floats:
-    """(entry, axis, axis): a frame's weights as matrices."""
+    """Return a frame's weights as matrices, (entry, axis, axis)."""
     return weights[:, None, None] * np.eye(axes) if weights.ndim == 1 else weights
 
 
-MOST_PARTICLES, MOST_ENDS, MOST_ANSWERS, MANY = 50_000, 800_000, 2e8, 42
-"""The most particles, ends of bonds, and answers of a rule: where somebody has more than MANY
-neighbours each particle is asked what each neighbour does to each."""
+MAX_PARTICLES = 50_000
+"""Largest number of particles of a scene whose step operator is assembled."""
+
+MAX_BOND_ENDS = 800_000
+"""Largest number of bond ends, two a bond."""
+
+MAX_EVALUATIONS = 2e8
+"""Largest number of evaluations of the rule. They grow with the square of the number of neighbours
+for neighbourhoods larger than `LARGE_NEIGHBOURHOOD`."""
+
+LARGE_NEIGHBOURHOOD = 42
+"""Number of neighbours above which every particle is evaluated separately."""
 
 
 def excess(scene: Scene) -> str:
-    """What the scene has too much of, in words; empty where it is small enough."""
+    """Return the reason why a scene is too large for a step operator, or an empty string."""
     particles, neighbourhood = scene.raster.count, scene.neighbourhood
-    if particles > MOST_PARTICLES:
-        return f"{particles} particles, {MOST_PARTICLES} at most"
-    each = 2 * len(neighbourhood.planes) // len(neighbourhood.slots)
-    most = min(MOST_ENDS // each, int(MOST_ANSWERS / each**2) if each > MANY else particles)
-    if particles > most:
-        return f"{particles} particles with {each} neighbours each, {most} at most"
+    if particles > MAX_PARTICLES:
+        return f"{particles} particles, {MAX_PARTICLES} at most"
+    degree = 2 * len(neighbourhood.planes) // len(neighbourhood.slots)
+    limit = min(
+        MAX_BOND_ENDS // degree,
+        int(MAX_EVALUATIONS / degree**2) if degree > LARGE_NEIGHBOURHOOD else particles,
+    )
+    if particles > limit:
+        return f"{particles} particles with {degree} neighbours each, {limit} at most"
     return ""
 
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 NEUTRAL = 1e-9
-"""Eigenvalues this near to 1 in modulus count as 1."""
+"""Eigenvalues whose modulus differs from 1 by less count as 1."""
 STRAIGHT = 1e-6
-"""Imaginary parts below this are rounding: a mode that turns by less a step does not swing."""
+"""Imaginary parts below this are rounding errors: such a mode does not oscillate."""
 
 
 @dataclass(frozen=True)
 class Swing:
-    """A mode that swings: its period in steps, 2π / |arg μ|, and by what it shrinks a step, |μ|."""
+    """An oscillating mode.
+
+    Parameters
+    ----------
+    period
+        Period in steps, 2π / |arg μ|.
+    decay
+        Factor by which the amplitude changes in a step, |μ|.
+    """
 
     period: float
     decay: float
 
 
 def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
-    """(2n,): both roots μ for each of n eigenvalues λ of the rule's own step; the λ themselves,
-    relaxed, and zeros without memory."""
+    """Return the eigenvalues μ of the step with relaxation and memory, (2n,).
+
+    Parameters
+    ----------
+    eigenvalues : (n,)
+        Eigenvalues λ of the rule's own step.
+    relaxation, memory
+        Parameters w and b of the solver.
+
+    Notes
+    -----
+    Both roots of μ² - (1 + b - w (1 - λ)) μ + b = 0. Without memory they are 1 - w (1 - λ), and
+    zeros.
+    """
     half = (1.0 + memory - relaxation * (1.0 - eigenvalues)) / 2.0
     root = np.sqrt(half * half - memory + 0j)
     return np.concatenate([half + root, half - root])
 
 
 def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | None:
-    """The w below which all modes λ shrink with this memory, those with λ = 1 apart.
+    """Return the relaxation below which all modes decay with this memory, apart from those with λ =
+    1.
 
-    None where there is no such w > 0 (an eigenvalue above 1, |memory| ≥ 1) or no bound to it.
+    None if no positive relaxation is stable (an eigenvalue above 1, |memory| ≥ 1) or all are.
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z) or z.real.min() < NEUTRAL or abs(memory) >= 1.0:
@@ -229,9 +286,10 @@ def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | No
     return float((2.0 * (1.0 + memory) * z.real / (z.real**2 + stretched**2)).min())
 
 
-def slowest_swing(found: Complex) -> Swing | None:
-    """The swing of the longest period among modes μ of a step; None where all have real μ."""
-    swinging = found[np.abs(found.imag) > STRAIGHT]
+def slowest_swing(mu: Complex) -> Swing | None:
+    """Return the oscillation of the longest period among modes μ of a step, if any μ is not
+    real."""
+    swinging = mu[np.abs(mu.imag) > STRAIGHT]
     if not len(swinging):
         return None
     slowest = swinging[np.argmin(np.abs(np.angle(swinging)))]
@@ -239,23 +297,36 @@ def slowest_swing(found: Complex) -> Swing | None:
 
 
 def swings_below(relaxation: float, memory: float) -> float:
-    """Real λ swing from here down, 1 - (1 - √b)² / w for 0 < b, as long as they are above
-    1 - (1 + √b)² / w."""
+    """Return the real λ below which modes oscillate, 1 - (1 - √b)² / w, for a memory 0 < b < 1.
+
+    They do so down to 1 - (1 + √b)² / w.
+    """
     return 1.0 - float((1.0 - np.sqrt(memory)) ** 2) / relaxation
 
 
-BEYOND = 1e-7
-"""How far outside the spectrum the shift of the inverse iteration lies."""
+SHIFT_MARGIN = 1e-7
+"""Distance of the shift of the inverse iteration from the bounds of the spectrum."""
 
-DEAREST, VECTORS = 1e9, 20
-"""So many multiplications are made at most for a spectrum, VECTORS a number beside each product."""
+MAX_MULTIPLICATIONS = 1e9
+"""Largest number of multiplications that are spent on one spectrum."""
+
+KRYLOV_VECTORS = 20
+"""Number of Krylov vectors, and thus of multiplications a component beside each matrix product."""
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """`radius` = max |λ|, `smallest` = min Re λ, `largest` = max Re λ; `symmetric` whether all
-    groups are; `eigenvalues` those that were computed: all of small groups, the extreme ones of
-    others."""
+    """Eigenvalues λ of a matrix.
+
+    Parameters
+    ----------
+    radius, smallest, largest
+        max |λ|, min Re λ and max Re λ.
+    symmetric
+        Whether all diagonal blocks are symmetric.
+    eigenvalues
+        The eigenvalues that were computed: all of small blocks, the extreme ones of large blocks.
+    """
 
     radius: float
     smallest: float
@@ -265,128 +336,145 @@ class Spectrum:
 
 
 class TooDearError(RuntimeError):
-    """The eigenvalues lie too close together to be told apart with a bounded number of products."""
+    """The eigenvalues are too close together for a bounded number of matrix products."""
 
 
 def spectrum(matrix: Any) -> Spectrum:
-    """The extreme eigenvalues of a matrix, dense or sparse; all of them of small groups. Raises
-    TooDearError where that would take long."""
-    values, symmetric, meter = [np.empty(0, complex)], True, _Meter()
-    for group in _groups(matrix):
-        even = abs(group - group.T).max() <= 1e-12 * max(1.0, abs(group).max())
-        symmetric &= bool(even)
-        values.append(_extremes(group, bool(even), meter))
+    """Compute the extreme eigenvalues of a matrix, dense or sparse, and all eigenvalues of small
+    blocks.
+
+    Raises
+    ------
+    TooDearError
+        If more than `MAX_MULTIPLICATIONS` multiplications are needed.
+    """
+    values, symmetric, budget = [np.empty(0, complex)], True, _Budget()
+    for block in _diagonal_blocks(matrix):
+        is_symmetric = abs(block - block.T).max() <= 1e-12 * max(1.0, abs(block).max())
+        symmetric &= bool(is_symmetric)
+        values.append(_extremes(block, bool(is_symmetric), budget))
     return spectrum_of(np.concatenate(values), symmetric)
 
 
-def spectrum_of(found: Complex, symmetric: bool) -> Spectrum:
-    """The spectrum with these eigenvalues."""
-    if not len(found):
-        return Spectrum(0.0, 0.0, 0.0, True, found)
-    real = found.real
-    return Spectrum(float(abs(found).max()), float(real.min()), float(real.max()), symmetric, found)
+def spectrum_of(eigenvalues: Complex, symmetric: bool) -> Spectrum:
+    """Return the spectrum with these eigenvalues."""
+    if not len(eigenvalues):
+        return Spectrum(0.0, 0.0, 0.0, True, eigenvalues)
+    real = eigenvalues.real
+    return Spectrum(
+        float(abs(eigenvalues).max()), float(real.min()), float(real.max()), symmetric, eigenvalues
+    )
 
 
 def just_below(matrix: Any, edge: float) -> Complex:
-    """Of each large group of a sparse matrix, the eigenvalue nearest to `edge` among those with a
-    smaller real part, by a shifted inverse iteration; those of small groups `spectrum` has. Raises
-    TooDearError where that would take long."""
-    meter = _Meter()
-    groups = _groups(matrix) if matrix.shape[0] > DENSE else ()
-    large = (group for group in groups if group.shape[0] > DENSE)
-    found = [meter.nearest(group, edge, symmetric=False, k=1, which="SR") for group in large]
-    return np.concatenate([np.empty(0, complex), *found])
+    """Compute the eigenvalue of each large block that is nearest to `edge` from below.
+
+    Eigenvalues are compared by their real part, and found by a shifted inverse iteration. Those of
+    small blocks are in `Spectrum.eigenvalues`.
+
+    Raises
+    ------
+    TooDearError
+        If more than `MAX_MULTIPLICATIONS` multiplications are needed.
+    """
+    budget = _Budget()
+    blocks = _diagonal_blocks(matrix) if matrix.shape[0] > DENSE else ()
+    large = (block for block in blocks if block.shape[0] > DENSE)
+    eigenvalues = [budget.nearest(block, edge, symmetric=False, k=1, which="SR") for block in large]
+    return np.concatenate([np.empty(0, complex), *eigenvalues])
 
 
 def has_symmetric_rows(matrix: Any) -> bool:
-    """Whether positive factors of its rows make a sparse matrix symmetric: its eigenvalues are real
-    then."""
+    """Return whether positive factors of its rows make a sparse matrix symmetric.
+
+    Its eigenvalues are real then.
+    """
     from scipy.sparse import diags_array
     from scipy.sparse.csgraph import breadth_first_order
 
     _, label = connected(matrix, strongly=False)
     factor = np.ones(matrix.shape[0])
     for root in np.unique(label, return_index=True)[1]:
-        order, before = breadth_first_order(matrix, root, directed=False)
-        others, known = order[1:], before[order[1:]]
-        there, back = (np.ravel(matrix[i, j]) for i, j in ((known, others), (others, known)))
-        if not (there * back > 0.0).all():
+        order, predecessor = breadth_first_order(matrix, root, directed=False)
+        nodes, parents = order[1:], predecessor[order[1:]]
+        downward, upward = (np.ravel(matrix[i, j]) for i, j in ((parents, nodes), (nodes, parents)))
+        if not (downward * upward > 0.0).all():
             return False
-        for i, j, ratio in zip(others, known, there / back, strict=True):
+        for i, j, ratio in zip(nodes, parents, downward / upward, strict=True):
             factor[i] = factor[j] * ratio
-    even = diags_array(factor) @ matrix
-    return bool(abs(even - even.T).max() <= 1e-9 * abs(even).max())
+    symmetrised = diags_array(factor) @ matrix
+    return bool(abs(symmetrised - symmetrised.T).max() <= 1e-9 * abs(symmetrised).max())
 
 
-def _groups(matrix: Any) -> Iterator[Any]:
-    """The strongly connected diagonal blocks, equal ones once."""
+def _diagonal_blocks(matrix: Any) -> Iterator[Any]:
+    """Yield the strongly connected diagonal blocks; equal ones once."""
     count, label = connected(matrix, strongly=True)
     order = np.argsort(label, kind="stable")
     bounds = np.searchsorted(label[order], np.arange(count + 1))
-    alone = np.diff(bounds) == 1
-    values = matrix.diagonal()[order[bounds[:-1][alone]]].tolist()
-    yield from (np.array([[v]]) for v in sorted(set(values)))
-    seen = set()
-    for n in np.flatnonzero(~alone):
-        own = np.sort(order[bounds[n] : bounds[n + 1]])
-        block = matrix[own][:, own]
-        key = hash(_content(block))
-        if key not in seen:
-            seen.add(key)
+    single = np.diff(bounds) == 1
+    values = matrix.diagonal()[order[bounds[:-1][single]]].tolist()
+    yield from (np.array([[value]]) for value in sorted(set(values)))
+    keys = set()
+    for n in np.flatnonzero(~single):
+        members = np.sort(order[bounds[n] : bounds[n + 1]])
+        block = matrix[members][:, members]
+        key = hash(_hashable(block))
+        if key not in keys:
+            keys.add(key)
             yield block
 
 
-def _content(block: Any) -> tuple[Any, ...]:
+def _hashable(block: Any) -> tuple[Any, ...]:
     if isinstance(block, np.ndarray):
         return block.shape, block.tobytes()
     block.sort_indices()
     return block.shape, block.data.tobytes(), block.indices.tobytes()
 
 
-class _Meter:
-    """Counts the multiplications of an iteration, and ends it when they are too many."""
+class _Budget:
+    """Count the multiplications of an iteration, and stop it when they are too many."""
 
     def __init__(self) -> None:
-        self._left = DEAREST
+        self._remaining = MAX_MULTIPLICATIONS
 
     def counted(self, size: int, cost: int, product: Callable[[Any], Any]) -> Any:
-        """The product as a scipy.sparse.linalg.LinearOperator."""
+        """Return the product as a scipy.sparse.linalg.LinearOperator."""
         from scipy.sparse.linalg import LinearOperator
 
         def counted(x: Any) -> Any:
-            self._left -= cost + VECTORS * size
-            if self._left < 0:
+            self._remaining -= cost + KRYLOV_VECTORS * size
+            if self._remaining < 0:
                 raise TooDearError
             return product(x)
 
         return LinearOperator((size, size), matvec=counted, dtype=float)
 
-    def nearest(self, block: Any, end: float, *, symmetric: bool, **wanted: Any) -> Any:
-        """The eigenvalues of a sparse block near `end`, by a shifted inverse iteration."""
+    def nearest(self, block: Any, end: float, *, symmetric: bool, **options: Any) -> Any:
+        """Compute eigenvalues of a sparse block near `end`, by a shifted inverse iteration."""
         from scipy.sparse import eye_array
         from scipy.sparse.linalg import eigs, eigsh, splu
 
         size = block.shape[0]
         factors = splu((block - end * eye_array(size)).tocsc())
         inverse = self.counted(size, factors.L.nnz + factors.U.nnz, factors.solve)
-        find = eigsh if symmetric else eigs
-        return find(block, sigma=end, OPinv=inverse, return_eigenvectors=False, **wanted)
+        solver = eigsh if symmetric else eigs
+        return solver(block, sigma=end, OPinv=inverse, return_eigenvectors=False, **options)
 
 
-def _extremes(block: Any, symmetric: bool, meter: _Meter) -> Complex:
+def _extremes(block: Any, symmetric: bool, budget: _Budget) -> Complex:
     if block.shape[0] <= DENSE:
         dense = block if isinstance(block, np.ndarray) else block.toarray()
-        found = np.linalg.eigvalsh(dense) if symmetric else np.linalg.eigvals(dense)
-        return found.astype(complex)
+        eigenvalues = np.linalg.eigvalsh(dense) if symmetric else np.linalg.eigvals(dense)
+        return eigenvalues.astype(complex)
     if not symmetric:
         from scipy.sparse.linalg import eigs
 
-        product = meter.counted(block.shape[0], block.nnz, block.dot)
-        some = [eigs(product, k=6, which=w, return_eigenvectors=False) for w in ("LM", "LR", "SR")]
-        return np.concatenate(some)
-    # Shifted inverses just outside the spectrum: Gershgorin's discs bound it.
+        product = budget.counted(block.shape[0], block.nnz, block.dot)
+        parts = [eigs(product, k=6, which=w, return_eigenvectors=False) for w in ("LM", "LR", "SR")]
+        return np.concatenate(parts)
+    # Shift just outside the spectrum, which Gershgorin's discs bound.
     diagonal = block.diagonal()
     spread = np.asarray(abs(block).sum(axis=1)).ravel() - abs(diagonal)
-    ends = ((diagonal + spread).max() + BEYOND, (diagonal - spread).min() - BEYOND)
-    how: dict[str, Any] = {"symmetric": True, "k": 2, "which": "LM", "tol": 1e-10}
-    return np.concatenate([meter.nearest(block, end, **how) for end in ends]).astype(complex)
+    ends = ((diagonal + spread).max() + SHIFT_MARGIN, (diagonal - spread).min() - SHIFT_MARGIN)
+    options: dict[str, Any] = {"symmetric": True, "k": 2, "which": "LM", "tol": 1e-10}
+    return np.concatenate([budget.nearest(block, end, **options) for end in ends]).astype(complex)

@@ -1,14 +1,14 @@
 """Stencil of a rule at rest on the infinite lattice: derivatives of its functions, and their symbol
-for waves.
+for plane waves.
 
-Derivatives of elementwise functions are taken by a complex step where that is valid, else by
+Derivatives of elementwise functions are taken by a complex step if that is valid, else by
 differences. Functions built from arithmetic and roots are analytic, and ∂f = Im f(x + ih) / h is
-exact to rounding. Others (an absolute value, a hypotenuse) drop the imaginary part or refuse it: a
-central difference detects this and replaces it with about nine digits.
+exact to rounding. Other functions (an absolute value, a hypotenuse) drop or refuse the imaginary
+part: a central difference detects this and replaces the result, with about nine digits.
 
 A step multiplies a displacement exp(iθ·c) over repeat cells c by the symbol, a matrix of blocks
-(axis, axis) over sublattices. Modes of a finite body lie within the range of the waves as long as
-its frame copies or mirrors: a bound that costs milliseconds.
+(axis, axis) over sublattices. The eigenvalues of a finite body lie within the range of those of
+plane waves if its frame copies or mirrors displacements. This bound is computed in milliseconds.
 """
 
 from __future__ import annotations
@@ -31,31 +31,45 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.rule_evaluation import Evaluator, summed
 
 NO_REMEDY = "; no relaxation helps: look at the rule, and keep |memory| below 1"
-"""What a bound adds where no relaxation is stable."""
-TINY, SMALL = 1e-100, 1e-6
-"""The steps of derivatives, imaginary and real, as shares of the spacing."""
+"""End of the message about a bound if no relaxation is stable."""
+TINY = 1e-100
+"""Imaginary step of derivatives, as a fraction of the spacing."""
+
+SMALL = 1e-6
+"""Real step of derivatives, as a fraction of the spacing."""
+
 Moved = Callable[[complex], tuple[Any, Any]]
-"""The components of a function's value, for a step along one direction."""
+"""Components of a function's value as a function of a step along one direction."""
 
 
 def derivative(moved: Moved, shape: tuple[int, ...], unit: float) -> NDArray[np.float64]:
-    """(component, *shape): the derivative at a step of zero; steps are shares of a unit."""
+    """Differentiate at a step of zero, (component, *shape).
+
+    Parameters
+    ----------
+    moved
+        Function of the step, in units of `unit`.
+    shape
+        Shape of its components.
+    unit
+        Length that scales the steps.
+    """
     small, tiny = SMALL * unit, TINY * unit
     with np.errstate(all="ignore"):
         ahead, behind = array_of(moved(small), shape), array_of(moved(-small), shape)
         difference: NDArray[np.float64] = (ahead - behind).real / (2 * small)
         try:
             exact: NDArray[np.float64] = array_of(moved(1j * tiny), shape).imag / tiny
-        except (TypeError, ValueError):  # a function that takes no complex numbers
+        except (TypeError, ValueError):  # the function accepts no complex numbers
             return difference
-    known = np.isfinite(exact) & np.isfinite(difference)
-    scale = np.abs(difference).max(initial=1.0, where=known)
-    off = np.abs(exact - difference).max(initial=0.0, where=known)
-    return exact if off <= 1e-4 * scale else difference
+    finite = np.isfinite(exact) & np.isfinite(difference)
+    scale = np.abs(difference).max(initial=1.0, where=finite)
+    error = np.abs(exact - difference).max(initial=0.0, where=finite)
+    return exact if error <= 1e-4 * scale else difference
 
 
 def array_of(components: tuple[Any, ...], shape: tuple[int, ...]) -> NDArray[Any]:
-    """(component, *shape) of components that may be the same everywhere."""
+    """Stack components, broadcast to a shape: (component, *shape)."""
     return np.array([np.broadcast_to(component, shape) for component in components])
 
 
@@ -65,15 +79,30 @@ NOWHERE = Here(cast(Any, None))
 
 @dataclass(frozen=True)
 class Stencil:
-    """`own` is (sublattice, axis of the move, axis of u), `neighbours` holds W_k of every slot,
-    (axis of the move, axis of u)."""
+    """Derivatives of a rule's move at rest, W_k = ∂move/∂u_k.
 
-    own: Floats
+    Parameters
+    ----------
+    centre : (sublattice, axis of the move, axis of u)
+        Derivative with respect to the particle's own displacement.
+    neighbours : (axis of the move, axis of u) by slot
+        Derivative with respect to the displacement of each neighbour.
+    """
+
+    centre: Floats
     neighbours: dict[Slot, Floats]
 
 
 def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any], here: Here) -> Any:
-    """The rule's move of a particle with all its neighbours, d = difference(slot) along each."""
+    """Compute the move of a particle with all its neighbours.
+
+    Parameters
+    ----------
+    difference
+        Difference d of the displacements along each slot.
+    here
+        Place of the particle and its displacement.
+    """
     evaluator = Evaluator(scene)
     neighbours = zip(slots, evaluator.everywhere(slots), strict=True)
     parts = [(evaluator.contribution(difference(s), here.u, to), None) for s, to in neighbours]
@@ -81,82 +110,97 @@ def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any],
 
 
 def _derivatives(scene: Scene, slots: Sequence[Slot], at: Here) -> Floats:
-    """∂move/∂u_j at rest with all neighbours where they are, and after it ∂move/∂u_k of each slot,
-    (1 + slot, axis of the move, axis of u); all of them are asked for at once."""
+    """Compute the derivatives of the move at rest, (1 + slot, axis of the move, axis of u).
+
+    The first is that with respect to the own displacement. All are evaluated at once.
+    """
     count, axes = 1 + len(slots), scene.axes
-    nudges = np.eye(count * axes).reshape(count, axes, -1)
-    seen = dict(zip(slots, nudges[1:] - nudges[0], strict=True))
+    steps = np.eye(count * axes).reshape(count, axes, -1)
+    differences = dict(zip(slots, steps[1:] - steps[0], strict=True))
 
     def moved(step: complex) -> Any:
         def difference(slot: Slot) -> Any:
-            return vector(step * seen[slot])
+            return vector(step * differences[slot])
 
-        return move(scene, slots, difference, at._replace(u=vector(step * nudges[0])))
+        return move(scene, slots, difference, at._replace(u=vector(step * steps[0])))
 
-    found = derivative(moved, nudges.shape[-1:], scene.neighbourhood.nudge_unit)
-    return found.reshape(axes, count, axes).swapaxes(0, 1)
+    derivatives = derivative(moved, steps.shape[-1:], scene.neighbourhood.nudge_unit)
+    return derivatives.reshape(axes, count, axes).swapaxes(0, 1)
 
 
 def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
-    """The stencil of the scene's rule, of all its rules together where it works on the moves of
-    another; `at` says where for rules that ask."""
-    every = scene.neighbourhood.slots
-    found = [_derivatives(scene, slots, at) for slots in every]
-    own = np.array([answers[0] for answers in found])
+    """Return the stencil of the scene's rule, composed with that of an inner rule if there is one.
+
+    Parameters
+    ----------
+    at
+        Place, for rules that depend on it.
+    """
+    slot_lists = scene.neighbourhood.slots
+    derivatives = [_derivatives(scene, slots, at) for slots in slot_lists]
+    centre = np.array([entries[0] for entries in derivatives])
     neighbours = {
-        slot: answer
-        for slots, answers in zip(every, found, strict=True)
-        for slot, answer in zip(slots, answers[1:], strict=True)
+        slot: entry
+        for slots, entries in zip(slot_lists, derivatives, strict=True)
+        for slot, entry in zip(slots, entries[1:], strict=True)
     }
-    stencil = Stencil(own, neighbours)
+    stencil = Stencil(centre, neighbours)
     return _composed(stencil, linearised(scene.inner, at)) if scene.inner else stencil
 
 
 def _composed(outer: Stencil, inner: Stencil) -> Stencil:
-    """The stencil of a rule that works on the moves of another."""
-    own = np.zeros_like(outer.own)
+    """Return the stencil of a rule applied to the moves of another."""
+    centre = np.zeros_like(outer.centre)
     neighbours: dict[Slot, Floats] = {}
-    known: dict[tuple[int, int, Index], Slot] = {}
+    slots: dict[tuple[int, int, Index], Slot] = {}
     for (first, W), (second, V) in product(_with_itself(outer), _with_itself(inner)):
         if first.target != second.source:
             continue
         slot = _after(first, second)
         if slot.source == slot.target and not any(slot.cell):
-            own[slot.source] += W @ V
+            centre[slot.source] += W @ V
         else:
-            slot = known.setdefault((slot.source, slot.target, slot.cell), slot)
+            slot = slots.setdefault((slot.source, slot.target, slot.cell), slot)
             neighbours[slot] = neighbours.get(slot, 0.0) + W @ V
-    return Stencil(own, neighbours)
+    return Stencil(centre, neighbours)
 
 
 def _with_itself(stencil: Stencil) -> Iterator[tuple[Slot, Floats]]:
-    for s, own in enumerate(stencil.own):
-        nowhere = (0,) * len(own)
-        yield Slot(s, s, nowhere, nowhere, vector(np.zeros(len(own))), 0), own
+    for s, centre in enumerate(stencil.centre):
+        nowhere = (0,) * len(centre)
+        yield Slot(s, s, nowhere, nowhere, vector(np.zeros(len(centre))), 0), centre
     yield from stencil.neighbours.items()
 
 
 def _after(first: Slot, second: Slot) -> Slot:
-    """Where two slots lead, one after the other."""
+    """Return the slot from the start of the first to the end of the second."""
     cell, site = map(add, first.cell, second.cell), map(add, first.site, second.site)
     rest, shell = first.rest + second.rest, first.shell + second.shell
     return Slot(first.source, second.target, tuple(cell), tuple(site), rest, shell)
 
 
 WAVES = 48
-"""Wave numbers along each axis; an even number, so that the shortest waves are among them."""
+"""Number of wave numbers along each axis; even, so that the shortest waves are among them."""
 
-MOST_ANSWERS = 100_000
-"""Of a rule that is asked what each neighbour does to each: about half a second."""
+MAX_EVALUATIONS = 100_000
+"""Largest number of evaluations of a rule by pairs of neighbours: about half a second."""
 LITTLE_MEMORY = 0.9
 """Up to which plane waves were seen to bound random bodies (tests/stability/test_forecast.py)."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """Over all waves: the smallest and largest real part and the largest imaginary part of the
-    eigenvalues of the rule's step without relaxation and memory, and the largest modulus of the
-    solver's step with them."""
+    """Bounds of eigenvalues λ over all plane waves.
+
+    Parameters
+    ----------
+    smallest, largest
+        min Re λ and max Re λ of the rule's step without relaxation and memory.
+    imaginary
+        max |Im λ| of the same.
+    radius
+        max |μ| of the step with the relaxation and memory of the solver.
+    """
 
     smallest: float
     largest: float
@@ -164,29 +208,34 @@ class Bound:
     radius: float
 
     def largest_stable_relaxation(self, memory: float) -> float | None:
-        """2 (1 + memory) / (1 - λ_min); None where eigenvalues are complex or above 1, or the
-        memory grows by itself: no such bound exists there."""
+        """Return 2 (1 + memory) / (1 - λ_min).
+
+        None if eigenvalues are complex or exceed 1, or |memory| ≥ 1: no such bound exists then.
+        """
         if self.imaginary > 1e-9 or self.largest > 1.0 + 1e-9 or abs(memory) >= 1.0:
             return None
         return 2.0 * (1.0 + memory) / (1.0 - self.smallest) if self.smallest < 1.0 - 1e-9 else None
 
 
 def wave_bound(scene: Scene) -> Bound | None:
-    """The bound for the scene's rule at rest.
+    """Compute the bound of plane waves for the scene's rule at rest.
 
-    None for rules that depend on the place or take no single numbers, where neighbours are found
-    anew or are more than some 300, and where the frame lags: its delay can make modes grow that no
-    plane wave knows.
+    None for rules that depend on the place or accept no single numbers, for neighbourhoods that are
+    searched at every step or have more than some 300 neighbours, and for frames with a lag: the
+    delay can make modes grow that are no plane waves.
     """
-    if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MOST_ANSWERS:
+    if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MAX_EVALUATIONS:
         return None
     solver = scene.experiment.stepping
     if scene.lag or scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
         return None
     try:
-        with blaming(scene.experiment.rule, "when asked about plane waves"):
+        with blaming(scene.experiment.rule, "when evaluated for plane waves"):
             eigenvalues = _eigenvalues(_symbols(scene)).ravel()
-    except (Exception, SystemExit):  # a prediction stops no run; the run names the rule at fault
+    except (
+        Exception,
+        SystemExit,
+    ):  # a failed prediction must not stop a run; the run itself reports the error
         return None
     if not np.isfinite(eigenvalues).all():
         return None
@@ -196,19 +245,21 @@ def wave_bound(scene: Scene) -> Bound | None:
 
 
 def bounds_the_body(scene: Scene) -> bool:
-    """Whether no mode of the body can grow where no wave does: particles with fewer neighbours have
-    modes of their own, so have bodies of several materials, and with much memory frames on leaning
-    lattices."""
+    """Return whether plane waves bound the modes of the finite body.
+
+    Particles with fewer neighbours have modes of their own, and so have bodies of several materials
+    and, with much memory, frames on oblique lattices.
+    """
     reach = scene.neighbourhood.reach
     whole = scene.experiment.frame.depth(reach) >= reach and not scene.experiment.rule.varying
     return whole and abs(scene.experiment.stepping.memory) <= LITTLE_MEMORY
 
 
 def _eigenvalues(matrices: Complex) -> Complex:
-    """Of (wave, n, n) matrices; two by two in closed form."""
+    """Compute the eigenvalues of (wave, n, n) matrices; in closed form for n = 2."""
     if matrices.shape[-1] > 2:
-        found: Complex = np.linalg.eigvals(matrices)
-        return found
+        eigenvalues: Complex = np.linalg.eigvals(matrices)
+        return eigenvalues
     (a, b), (c, d) = np.moveaxis(matrices, 0, -1)
     middle, half = (a + d) / 2, (a - d) / 2
     root = np.sqrt(half * half + b * c)
@@ -216,16 +267,18 @@ def _eigenvalues(matrices: Complex) -> Complex:
 
 
 def _symbols(scene: Scene) -> Complex:
-    """(wave, axes · S, axes · S): the rule's step on plane waves; opposite ones answer
-    alike."""
+    """Return the symbols of the rule's step, (wave, axes · S, axes · S).
+
+    Only one of each pair of opposite waves is included; both have the same eigenvalues.
+    """
     stencil = linearised(scene)
-    angle, axes, sites = 2 * np.pi * np.arange(WAVES) / WAVES, scene.axes, len(stencil.own)
+    angle, axes, sites = 2 * np.pi * np.arange(WAVES) / WAVES, scene.axes, len(stencil.centre)
     waves = [angle[: WAVES // 2 + 1], *[angle] * (axes - 1)]
     theta = np.stack(np.meshgrid(*waves, indexing="ij"), axis=-1).reshape(-1, axes)
     symbols: Complex = np.zeros((len(theta), sites, axes, sites, axes), complex)
     symbols += np.eye(sites * axes).reshape(symbols.shape[1:])
-    for s, own in enumerate(stencil.own):
-        symbols[:, s, :, s] += own
+    for s, centre in enumerate(stencil.centre):
+        symbols[:, s, :, s] += centre
     for slot, matrix in stencil.neighbours.items():
         phase = np.exp(1j * theta @ np.array(slot.cell, float))
         symbols[:, slot.source, :, slot.target] += phase[:, None, None] * matrix

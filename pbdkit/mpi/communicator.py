@@ -137,7 +137,7 @@ class MPICommunicator(Communicator):
         try:
             yield
         except PbdkitError as error:
-            error.told = not self.is_root
+            error.is_reported = not self.is_root
             raise
         except BaseException:
             atexit.register(self._comm.Abort, FAILED)

@@ -1,3 +1,4 @@
-"""What is said of a run before its first step: its spectrum, its lag, warnings, its memory."""
+"""Predictions about a run before its first step: spectrum, lag, warnings, best relaxation and
+memory."""
 
 from __future__ import annotations

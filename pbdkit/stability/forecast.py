@@ -1,9 +1,9 @@
-"""What `check` reports of an experiment without running it, and `run` before its first step:
-stability, supports, memory and time.
+"""Forecast of a run before its first step: stability, supports, memory and time.
 
-Leaders of small mass: the symplectic Euler method is stable for ω ≤ 2. Supports: a part of the body
-that can move as a rigid body resists nothing; where leaders leave it such a motion and the loads do
-work along it, there is no equilibrium, and the steps never end.
+`pbdkit check` reports it, and `pbdkit run` warns of what is known quickly. Leaders with a mass: the
+symplectic Euler method is stable for ω ≤ 2. Supports: a part of the body resists no rigid-body
+motion by itself. If leaders do not constrain such a motion and the loads do work along it, there is
+no equilibrium, and the steps do not converge.
 """
 
 from __future__ import annotations
@@ -43,37 +43,62 @@ if TYPE_CHECKING:
 
 
 NUDGE = 1e-3
-"""By which they are moved, in lattice units."""
+"""Displacement by which the stiffness against a leader group is measured, in lattice units."""
 
 
 def too_light(scene: Scene) -> list[str]:
-    """A warning for each group whose stiffest way, others standing still, is too stiff."""
-    forces, found = NewtonForces(scene), []
+    """Warn of groups with a mass too small for stable steps, with all other particles fixed."""
+    forces, warnings = NewtonForces(scene), []
     state = initial_state(scene) if forces.numbers else None
     for n in forces.numbers:
         motion = scene.leading[n].group.motion
         assert state
         assert isinstance(motion, Newton)
-        least = motion.lightest(forces.stiffness(n, state, NUDGE))
-        if motion.mass < least:
-            found.append(
-                f"leaders.{n}.motion.mass: {motion.mass:g} is too light, its swing may grow for "
-                f"ever; steps are stable from {least:.4g} on"
+        lightest = motion.lightest(forces.stiffness(n, state, NUDGE))
+        if motion.mass < lightest:
+            warnings.append(
+                f"leaders.{n}.motion.mass: {motion.mass:g} is too small, its oscillation may grow "
+                f"without bound; steps are stable from {lightest:.4g} on"
             )
-    return found
+    return warnings
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Counts, with followers at step 1; memory and output in MiB; about how many seconds the steps
-    take, None for an equilibrium; the solver's relaxation and
-    memory; what the analysis found, None where it cannot tell or it would take too long; with
-    memory, the period in steps of the slowest mode that swings and by what it shrinks a step, None
-    where nothing swings; by how much the body trails its equilibrium in the leaders' fastest steps,
-    in lattice units, once that is steady and when these steps end, None where no leader moves
-    steadily; how far the body's particles reach along each axis, in mm, None without `units`;
-    whether what the analysis found is exact, or linearised at the start; whether it is estimated,
-    1 - ρ to 1 %; warnings."""
+    """Forecast of a run.
+
+    Numbers of the stability analysis are None if they do not exist or take too long to compute.
+
+    Parameters
+    ----------
+    particles, bonds
+        Numbers of particles and bonds.
+    followers
+        Number of followers in step 1.
+    memory_mib, output_mib
+        Memory of the run and size of its output in MiB.
+    seconds
+        Estimated duration of the steps; None for an equilibrium.
+    relaxation, memory
+        Parameters of the solver.
+    spectral_radius, smallest_eigenvalue, largest_stable_relaxation, stable, steps_to
+        See `pbdkit.Analysis`.
+    period, decay
+        Period in steps, and decay a step, of the slowest oscillating mode; None without memory or
+        if no mode oscillates.
+    exact
+        Whether the analysis holds for the whole run, or is linearised at the start.
+    estimated
+        Whether the spectrum is estimated, 1 - ρ to 1 %.
+    lag, lag_reached
+        Largest distance of a follower from its equilibrium in the fastest steps of the leaders, in
+        lattice units: the steady value, and the value at the end of these steps. None if no leader
+        moves steadily.
+    size_mm
+        Extent of the body's particles along each axis in mm; None without `units`.
+    warnings
+        Warnings, a sentence each.
+    """
 
     particles: int
     followers: int
@@ -98,28 +123,29 @@ class Forecast:
     warnings: list[str]
 
     def as_dict(self) -> dict[str, Any]:
-        """The same as plain values, for JSON."""
+        """Return the forecast as plain values for JSON."""
         return asdict(self)
 
 
-LOOKED_AT = 2000
-"""Particles up to which a run looks at what `check` knows of it (at most 0.9 s of a processor)."""
-MOST_MOMENTS = 16
-"""Of those at which numbers turn, to be looked at."""
-ANALYSED = (
+QUICK_PARTICLES = 2000
+"""Number of particles up to which a run analyses the body as `check` does (at most 0.9 s)."""
+MAX_CHANGES = 16
+"""Largest number of steps at which parameters change that are analysed separately."""
+ANALYSIS_FIELDS = (
     *("spectral_radius", "smallest_eigenvalue", "largest_stable_relaxation", "stable", "steps_to"),
     *("exact", "estimated", "lag"),
 )
-"""What the analysis calls by the same names."""
+"""Fields of a forecast that have the same names in the analysis."""
 
-WITHOUT = (
-    "obstacles: stability and settling are told of the body without them, and whether they hold it "
-    "is not looked at",
+OBSTACLES_IGNORED = (
+    "obstacles: stability and convergence are those of the body without them; supports by "
+    "obstacles are not considered",
 )
+"""Warning for scenes with obstacles."""
 
 
 def forecast(scene: Scene) -> Forecast:
-    """The forecast of a scene."""
+    """Compute the forecast of a scene."""
     from pbdkit.stability.analysis import Analysis
 
     kinds = kinds_at(scene.raster, scene.leading, 1)
@@ -141,15 +167,15 @@ def forecast(scene: Scene) -> Forecast:
         lag_reached=analysis.trailing.reached if analysis.trailing else None,
         size_mm=_size_mm(scene),
         warnings=[
-            *_doubts(scene),
-            *_unheld(scene),
-            *WITHOUT[: len(scene.barriers)],
+            *_scene_warnings(scene),
+            *_missing_supports(scene),
+            *OBSTACLES_IGNORED[: len(scene.barriers)],
             *analysis.warnings(),
-            *_on_the_way(scene),
+            *_divergence_in_time(scene),
             *_too_short(analysis),
             *waves,
         ],
-        **{name: getattr(analysis, name) for name in ANALYSED},
+        **{name: getattr(analysis, name) for name in ANALYSIS_FIELDS},
     )
 
 
@@ -167,7 +193,7 @@ def _seconds(scene: Scene) -> float | None:
 
 
 def _sizes(analysis: Analysis) -> Sizes:
-    """Of a large equilibrium by what serves it."""
+    """Estimate sizes; those of a large equilibrium depend on its linear solver."""
     scene = analysis.scene
     count, grids = scene.raster.count, not scene.barriers
     if grids and count > LARGEST_ANEW and not scene.experiment.solver.makes_steps:
@@ -176,13 +202,16 @@ def _sizes(analysis: Analysis) -> Sizes:
 
 
 def quick_warnings(scene: Scene, bound: Bound | None) -> tuple[str, ...]:
-    """What can be said in milliseconds, before a run, with its bound from plane waves."""
-    return (*_doubts(scene), *_growing_waves(scene, bound))
+    """Return the warnings that are known in milliseconds, with the bound of plane waves."""
+    return (*_scene_warnings(scene), *_growing_waves(scene, bound))
 
 
 def prediction(scene: Scene, bound: Bound | None) -> dict[str, Any]:
-    """What the dataset keeps of the bound from plane waves; empty where there is none. `stable` is
-    None where no wave grows and waves do not bound the body."""
+    """Return the attributes of the dataset that predict stability, from the bound of plane waves.
+
+    They are empty without a bound. `stable` is None if no wave grows and waves do not bound the
+    body.
+    """
     memory = scene.experiment.stepping.memory
     if bound is None:
         return {}
@@ -194,55 +223,57 @@ def prediction(scene: Scene, bound: Bound | None) -> dict[str, Any]:
 
 
 def _too_short(analysis: Analysis) -> list[str]:
-    """Where a run ends long before its loads have come to rest: nobody could see it."""
-    experiment, settled = analysis.scene.experiment, analysis.steps_to["1e-3"]
-    if not (experiment.loads and experiment.solver.makes_steps and settled):
+    """Warn of a run that ends long before the body converges under its loads."""
+    experiment, steps_needed = analysis.scene.experiment, analysis.steps_to["1e-3"]
+    if not (experiment.loads and experiment.solver.makes_steps and steps_needed):
         return []
-    if experiment.stepping.settle or settled <= experiment.steps:
+    if experiment.stepping.settle or steps_needed <= experiment.steps:
         return []
     return [
-        f"steps: under its loads the body comes to rest in about {settled} steps, and the run has "
+        f"steps: under its loads the body converges in about {steps_needed} steps, and the run has "
         f"{experiment.steps}; take solver: {{type: equilibrium}}, memory: auto, or more steps"
     ]
 
 
-def _on_the_way(scene: Scene) -> list[str]:
-    """Where steps diverge within the run with other numbers than the last."""
+def _divergence_in_time(scene: Scene) -> list[str]:
+    """Warn of steps that diverge within the run with other parameters than the last."""
     from pbdkit.stability.analysis import Analysis
 
     courses, steps = scene.experiment.courses, scene.experiment.steps
     bends = sorted({min(bend, steps) for course in courses.values() for bend in course.bends})
     moments = [n for n in bends if any(c.at(n) != c.last for c in courses.values())]
-    found = list[str]()
-    for moment in moments[:MOST_MOMENTS] if scene.experiment.solver.makes_steps else ():
+    warnings = list[str]()
+    for moment in moments[:MAX_CHANGES] if scene.experiment.solver.makes_steps else ():
         if Analysis(scene.at(moment)).stable is False:
-            now = (f"{'.'.join(at)} {course.at(moment):g}" for at, course in courses.items())
-            found.append(
-                f"{min(courses)[0]}: at step {moment} steps diverge, with {', '.join(now)}"
+            values = (f"{'.'.join(at)} {course.at(moment):g}" for at, course in courses.items())
+            warnings.append(
+                f"{min(courses)[0]}: at step {moment} steps diverge, with {', '.join(values)}"
             )
-    if len(moments) > MOST_MOMENTS:
-        found.append(f"analysis: of {len(moments)} moments the first {MOST_MOMENTS} were looked at")
-    return found
+    if len(moments) > MAX_CHANGES:
+        warnings.append(
+            f"analysis: of {len(moments)} changes in time the first {MAX_CHANGES} were analysed"
+        )
+    return warnings
 
 
-def _doubts(scene: Scene) -> list[str]:
+def _scene_warnings(scene: Scene) -> list[str]:
     sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total)
     warnings = list(scene.warnings)
     followers = kinds_of_places(scene.raster, scene.leading, 1) == FOLLOWER
     if not scene.raster.communicator.any(followers.any()):
-        warnings.append("leaders: everybody leads in step 1, nobody follows")
+        warnings.append("leaders: all particles are leaders in step 1, none is a follower")
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:
-            warnings.append(f"leaders.{n}: begins to lead after the run's last step")
+            warnings.append(f"leaders.{n}: starts after the last step of the run")
     for n, load in enumerate(scene.experiment.loads):
         if load.from_ > scene.experiment.steps:
-            warnings.append(f"loads.{n}: begins to act after the run's last step")
+            warnings.append(f"loads.{n}: starts after the last step of the run")
     warnings += of_category(StabilityWarning, too_light(scene))
     for n, barrier in enumerate(scene.barriers):
         if barrier.group.from_ > scene.experiment.steps:
-            warnings.append(f"obstacles.{n}: begins after the run's last step")
+            warnings.append(f"obstacles.{n}: starts after the last step of the run")
     if not (scene.driven or scene.loads):
-        warnings.append("leaders: there are none, nothing will move")
+        warnings.append("leaders: there are none, and no loads: nothing will move")
     if sizes.output > machine_memory():
         warnings.append(
             f"record: the output of {sizes.output / 2**30:.3g} GiB exceeds this machine's memory: "
@@ -265,46 +296,50 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
 
 
 def refuse_unheld_loads(scene: Scene) -> None:
-    """Raises ExperimentError, as the run would, where loads push a part of the body on for ever and
-    its equilibrium is asked for."""
+    """Raise the ExperimentError of the run if loads act on a part of the body without supports.
+
+    Equilibria only: such a part has none.
+    """
     if scene.experiment.solver.makes_steps or not scene.loads:
         return
     from pbdkit.equilibrium.sparse import DRIFTS
 
     for part in pushed_parts(scene):
-        named = f"{part.particles} particles (with number {part.first})"
-        error = ExperimentError(DRIFTS.format(named), ("leaders",))
+        text = f"{part.particles} particles (with number {part.first})"
+        error = ExperimentError(DRIFTS.format(text), ("leaders",))
         raise scene.experiment.located(error)
 
 
-def _unheld(scene: Scene) -> list[str]:
-    """A warning for each part of the body that loads push on step by step."""
+def _missing_supports(scene: Scene) -> list[str]:
+    """Warn of each part of the body that loads move without bound."""
     if not (scene.loads and scene.experiment.solver.makes_steps):
         return []
 
     return [
         f"loads: nothing holds a part of {part.particles} particles (with number {part.first}) "
-        "against them, so that it moves on in every step; let a leader hold it"
+        "against them, so that it moves on in every step; constrain it with a leader group"
         for part in pushed_parts(scene)
     ]
 
 
 def outlook(scene: Scene) -> list[str]:
-    """What `check` warns of besides `quick_warnings` and is known in less than a second: whether
-    loads find supports, and of small bodies what stands in the way of settling."""
-    found = _unheld(scene)
-    if scene.raster.count > LOOKED_AT or not scene.experiment.solver.makes_steps:
-        return found
+    """Return warnings that are known in less than a second, besides `quick_warnings`.
+
+    They concern supports and, for small bodies, what prevents convergence.
+    """
+    warnings = _missing_supports(scene)
+    if scene.raster.count > QUICK_PARTICLES or not scene.experiment.solver.makes_steps:
+        return warnings
     from pbdkit.stability.analysis import Analysis
 
     analysis = Analysis(scene)
-    with suppress(PbdkitError):  # where it is not known `check` says why
-        found += [*analysis.obstructions(), *_too_short(analysis)]
-    return found
+    with suppress(PbdkitError):  # `check` reports the reason
+        warnings += [*analysis.obstructions(), *_too_short(analysis)]
+    return warnings
 
 
 def refuse_too_much_output(scene: Scene) -> None:
-    """Raises ExperimentError where the records of a run cannot all be in memory at once."""
+    """Raise ExperimentError if the records of a run exceed the memory."""
     sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total)
     if sizes.output > machine_memory():
         raise scene.experiment.located(
@@ -317,24 +352,37 @@ def refuse_too_much_output(scene: Scene) -> None:
         )
 
 
-MOST_PARTICLES = 20_000
-"""Larger bodies are looked at as one part."""
-IS_ZERO, DOES_WORK = 1e-13, 1e-9
-"""Shares of the largest eigenvalue of the supports, and of the forces and their levers."""
+MAX_PARTICLES = 20_000
+"""Number of particles above which the body is taken as connected."""
+IS_ZERO = 1e-13
+"""Relative tolerance for zero eigenvalues of the supports."""
+
+DOES_WORK = 1e-9
+"""Relative tolerance for zero work of the forces."""
 
 
 @dataclass(frozen=True)
 class PushedPart:
-    """A part of the body that loads push on for ever: how many of its particles follow, and the
-    number of the first of these."""
+    """Part of the body that loads move without bound.
+
+    Parameters
+    ----------
+    particles
+        Number of its followers.
+    first
+        Number of the first of them.
+    """
 
     particles: int
     first: int
 
 
 def pushed_parts(scene: Scene) -> list[PushedPart]:
-    """Return the parts that loads push on for ever at the last step, as far as supports tell:
-    nothing is told of obstacles, and of frames and rules that resist rigid motions."""
+    """Return the parts of the body that loads move without bound at the last step.
+
+    Supports by leaders alone are considered: scenes with obstacles, and frames and rules that
+    resist rigid motions, have no such parts.
+    """
     rule, frame = scene.experiment.rule, scene.experiment.frame
     if not scene.loads or scene.axes != 2 or scene.barriers:
         return []
@@ -345,29 +393,29 @@ def pushed_parts(scene: Scene) -> list[PushedPart]:
     x = raster.reference(raster.body_rows)
     step = scene.experiment.steps
     forces = scene.loads.at(step, np.float64).reshape(2, -1)[:, place].T.astype(np.float64)
-    held = np.zeros((2, int(np.prod(raster.shape))), bool)
+    is_prescribed = np.zeros((2, int(np.prod(raster.shape))), bool)
     for leading in scene.leading:
         for axis in leading.axes if leading.group.leads(step) else ():
-            held[axis, leading.place] = True
-    # Only linear rules turn without resistance, however far; frames that copy the body resist it.
+            is_prescribed[axis, leading.place] = True
+    # Only linear rules rotate without resistance by any angle; frames that copy the body resist.
     modes = 3 if rule.linear and (scene.frame is None or frame.weighs_cells) else 2
     return [
-        PushedPart(len(following), raster.before + int(raster.body_rows[following[0]]) + 1)
+        PushedPart(len(followers), raster.before + int(raster.body_rows[followers[0]]) + 1)
         for rows in _parts(scene)
-        if _is_pushed(x[rows], held[:, place[rows]].T, forces[rows], modes)
-        and len(following := rows[~held[:, place[rows]].all(axis=0)])
+        if _is_pushed(x[rows], is_prescribed[:, place[rows]].T, forces[rows], modes)
+        and len(followers := rows[~is_prescribed[:, place[rows]].all(axis=0)])
     ]
 
 
 def _parts(scene: Scene) -> Iterator[Indices]:
-    """The body's particles, as rows of the body, of each part that bonds connect."""
+    """Yield the particles of each connected part, as rows of the body."""
     rows = scene.raster.body_rows
-    if len(rows) > MOST_PARTICLES:
+    if len(rows) > MAX_PARTICLES:
         yield np.arange(len(rows))
         return
-    of_body = np.full(scene.raster.count, -1)
-    of_body[rows] = np.arange(len(rows))
-    ends = of_body[scene.bonds.ends]
+    body_row = np.full(scene.raster.count, -1)
+    body_row[rows] = np.arange(len(rows))
+    ends = body_row[scene.bonds.ends]
     ends = ends[(ends >= 0).all(axis=1)]
     # Imported here: only bodies in several parts need it, and scipy takes long to import.
     from scipy.sparse import csr_array
@@ -379,17 +427,26 @@ def _parts(scene: Scene) -> Iterator[Indices]:
         yield np.flatnonzero(label == n)
 
 
-def _is_pushed(x: Floats, held: Mask, forces: Floats, modes: int) -> bool:
-    """Whether forces (particle, axis) do work along a rigid motion that is not `held` (particle,
-    axis) at any particle."""
+def _is_pushed(x: Floats, is_prescribed: Mask, forces: Floats, modes: int) -> bool:
+    """Return whether forces do work along a rigid motion that is not constrained.
+
+    Parameters
+    ----------
+    x, forces : (particle, axis)
+        Positions and forces.
+    is_prescribed : (particle, axis)
+        Whether the displacement is prescribed.
+    modes
+        3 with rotations, 2 without.
+    """
     middle, size = x.mean(axis=0), float(np.ptp(x, axis=0).max()) or 1.0
     lever = (x - middle) / size
     motions = np.zeros((len(x), 2, 3))
     motions[:, 0, 0] = motions[:, 1, 1] = 1.0
     motions[:, 0, 2], motions[:, 1, 2] = -lever[:, 1], lever[:, 0]
     motions = motions[:, :, :modes]
-    rows = motions[held]
+    rows = motions[is_prescribed]
     eigenvalues, vectors = np.linalg.eigh(rows.T @ rows)
-    left = vectors[:, eigenvalues <= IS_ZERO * max(1.0, float(eigenvalues[-1]))]
-    work = np.einsum("pa,pam->m", forces, motions) @ left
+    unconstrained = vectors[:, eigenvalues <= IS_ZERO * max(1.0, float(eigenvalues[-1]))]
+    work = np.einsum("pa,pam->m", forces, motions) @ unconstrained
     return bool((np.abs(work) > DOES_WORK * np.abs(forces).sum()).any())

@@ -1,9 +1,9 @@
 """Lag of a body behind its equilibrium while leaders move at a steady speed, computed from the
 influence of leaders and frame points on followers.
 
-A step places the leaders first, then followers look; frame points still stand as at the end of the
-step before, and those that follow leaders show where these stood (with the frame's lag, one step
-earlier still). With S the share of L that frame points show,
+A step moves the leaders first, then the followers. Frame points are still those of the end of the
+step before, and those that follow leaders show their earlier displacements (with the frame's lag,
+one step earlier still). With S the part of L that acts through frame points,
 
     u(t+1) = P u(t) + Q u(t-1) + (L - S) u_L(t+1) + S u_L(t - lag) + s,
 
@@ -12,7 +12,7 @@ distance e = u* - u obeys
 
     e(t+1) = P e(t) + Q e(t-1) + δ + Q δ - (L - S) v + lag · S v,
 
-and becomes steady: A e = P δ where S = 0 and Q = 0. For the barycentre on a sheet of the square
+and becomes steady: A e = P δ if S = 0 and Q = 0. For the barycentre on a sheet of the square
 lattice, l long between its ends and with spacing h, that is at most 4 v l² / (9 √3 h²).
 """
 
@@ -42,65 +42,90 @@ Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
-class Edge:
-    """The followers at flat places `place`, with ∂move/∂u of their moves, columns by flat
-    place."""
+class BoundaryCoupling:
+    """Influence of leaders and frame points on followers.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    place
+        Flat places of the followers that are influenced.
+    couplings
+        ∂move/∂u of their moves, columns by flat place.
+    """
 
     scene: Scene
     place: Indices
     couplings: Couplings
 
     def moves(self, u: Floats) -> Floats:
-        """Planes: what these followers do, relaxed, where others stand at u, planes too."""
-        found = np.zeros(u.shape)
+        """Return the relaxed moves of these followers for displacements u, both as planes."""
+        result = np.zeros(u.shape)
         table = self.couplings.times(u.reshape(len(u), -1).T)
         relaxation = self.scene.experiment.stepping.relaxation
-        found.reshape(len(u), -1)[:, self.place] = relaxation * table.T
-        return found
+        result.reshape(len(u), -1)[:, self.place] = relaxation * table.T
+        return result
 
-    def shown(self, u: Floats) -> Floats:
-        """Planes: what frame points show of u, nothing elsewhere."""
-        found = np.zeros(u.shape)
+    def frame_displacements(self, u: Floats) -> Floats:
+        """Return the displacements of frame points for displacements u, as planes that are zero
+        elsewhere."""
+        result = np.zeros(u.shape)
         if frame := self.scene.frame:
-            frame.follow(u.reshape(len(u), -1), found.reshape(len(u), -1))
-        return found
+            frame.follow(u.reshape(len(u), -1), result.reshape(len(u), -1))
+        return result
 
 
-def edge_of(scene: Scene, state: State, step: int) -> Edge:
-    """At a state, with the roles of a step; of all followers where a rule works on the moves of
-    another."""
+def boundary_coupling(scene: Scene, state: State, step: int) -> BoundaryCoupling:
+    """Linearise the moves of followers beside leaders and frame points, with the roles of a step.
+
+    All followers are included if a rule is applied to the moves of another.
+    """
     raster, guiding = scene.raster, Guiding(scene, step)
     kind = kinds_of_places(raster, scene.leading, step)
     place = np.flatnonzero(kind == FOLLOWER)
     if not scene.inner:
-        seen = np.flatnonzero((kind == LEADER) | (kind == FRAME))
-        seen = np.concatenate([seen, guiding.guided.place])
-        beside = [seen - slot_step(raster.shape, slot) for slot in scene.neighbourhood.every]
-        some = np.unique(np.concatenate([*beside, seen])).clip(0, kind.size - 1)
-        place = some[kind[some] == FOLLOWER]
+        boundary = np.flatnonzero((kind == LEADER) | (kind == FRAME))
+        boundary = np.concatenate([boundary, guiding.guided.place])
+        neighbours = [
+            boundary - slot_step(raster.shape, slot) for slot in scene.neighbourhood.every
+        ]
+        candidates = np.unique(np.concatenate([*neighbours, boundary])).clip(0, kind.size - 1)
+        place = candidates[kind[candidates] == FOLLOWER]
     _, couplings = moves_and_couplings(scene, state, place)
     couplings.parts = [
-        (rows, there, guiding.turned(place[rows], blocks))
-        for rows, there, blocks in couplings.parts
+        (rows, places, guiding.turned(place[rows], blocks))
+        for rows, places, blocks in couplings.parts
     ]
-    return Edge(scene, place, couplings)
+    return BoundaryCoupling(scene, place, couplings)
 
 
-DEAREST = 2e8
-"""Products of numbers that are made at most to know the lag at the end of an interval."""
-EARLY = 0.01
-"""Up to this share of 1 / (1 - λ) hardly anything fades that was pushed."""
-FINEST = 1e-12
-"""The finest accuracy asked for."""
+MAX_PRODUCTS = 2e8
+"""Largest number of products that are computed for the lag at the end of an interval."""
+EARLY_FRACTION = 0.01
+"""Fraction of 1 / (1 - λ) steps up to which the decay of the distance is negligible."""
+MIN_ACCURACY = 1e-12
+"""Smallest tolerance of the linear solver."""
 
 
 @dataclass(frozen=True)
 class Lag:
-    """In steps `first` to `last` the fastest leader moves by `speed` a step. The follower that
-    trails its equilibrium most does so by `steady` once that has become steady, and by `reached`
-    at the end of these steps, where they found the body in equilibrium: within 10 % where following
-    it would take too long, None where that is so and the step has a memory. Lengths in lattice
-    units; they hold for linear rules as long as no bond breaks."""
+    """Lag of the body in the steps in which a leader moves fastest.
+
+    Lengths are in lattice units. They hold for linear rules as long as no bond breaks.
+
+    Parameters
+    ----------
+    first, last
+        These steps.
+    speed
+        Displacement of the fastest leader in a step.
+    steady
+        Largest distance of a follower from its equilibrium once it has become steady.
+    reached
+        The distance at the end of these steps if the body starts in equilibrium. It is accurate to
+        10 % if a computation by steps would take too long, and None if the step has a memory, too.
+    """
 
     first: int
     last: int
@@ -110,17 +135,16 @@ class Lag:
 
     @property
     def size(self) -> float:
-        """What is reached, as far as that is known."""
+        """Return the distance that is reached, or the steady one if that is unknown."""
         return self.steady if self.reached is None else self.reached
 
     def late(self, bond: float, units: Units | None = None) -> list[str]:
-        """A warning where the body is left behind its equilibrium by more than a bond; in mm where
-        there are units."""
+        """Warn of a lag larger than a bond, in mm if the scene has units."""
         if self.size <= bond:
             return []
-        mm, word = in_lengths(units) if units else (1.0, "")
-        speed, behind, length, slower = (
-            f"{mm * number:.{digits}g} {word}".rstrip()
+        mm, unit = in_lengths(units) if units else (1.0, "")
+        speed, distance, length, bound = (
+            f"{mm * number:.{digits}g} {unit}".rstrip()
             for number, digits in (
                 *((self.speed, 4), (self.size, 3), (bond, 3)),
                 (self.speed * bond / self.steady, 2),
@@ -128,16 +152,25 @@ class Lag:
         )
         return [
             f"leaders: in steps {self.first} to {self.last} the fastest moves by {speed} a step "
-            f"and leaves the body {behind} behind its equilibrium, more than a bond ({length}): "
-            f"its speed decides how far bonds stretch; move by less than {slower} a step, or take "
+            f"and leaves the body {distance} behind its equilibrium, more than a bond ({length}): "
+            f"its speed determines the strain of bonds; move by less than {bound} a step, or take "
             "solver: {type: equilibrium}"
         ]
 
 
 @dataclass(frozen=True)
 class Trail:
-    """What drives the distance e = u* - u, planes: e gains `first` in the first step and `push` in
-    each of the others; `steady` is A⁻¹ push."""
+    """Increments of the distance e = u* - u, as planes.
+
+    Parameters
+    ----------
+    first
+        Increment of the first step.
+    push
+        Increment of each further step.
+    steady
+        A⁻¹ push.
+    """
 
     first: Floats
     push: Floats
@@ -147,40 +180,62 @@ class Trail:
     def of(
         cls, scene: Scene, system: System, state: State, step: int, slowness: float
     ) -> Trail | None:
-        """At the velocities of a step; None where nobody feels the leaders. Raises ExperimentError
-        where there is no equilibrium, and StuckError."""
-        edge, v = edge_of(scene, state, step), np.zeros((scene.axes, *scene.raster.shape))
+        """Compute the increments at the velocities of a step; None if the leaders influence no
+        follower.
+
+        Raises
+        ------
+        ExperimentError
+            If there is no equilibrium.
+        StuckError
+            If the linear solver does not converge.
+        """
+        coupling, v = (
+            boundary_coupling(scene, state, step),
+            np.zeros((scene.axes, *scene.raster.shape)),
+        )
         for leading in scene.leading:
             if leading.group.leads(step):
                 for axis in leading.axes:
                     v.reshape(scene.axes, -1)[axis, leading.place] = _velocity(leading, step)[
                         :, axis
                     ]
-        direct, shown = edge.moves(v), edge.moves(edge.shown(v))
-        if not (direct + shown).any():
+        direct, through_frame = coupling.moves(v), coupling.moves(coupling.frame_displacements(v))
+        if not (direct + through_frame).any():
             return None
         size, accuracy = float(np.abs(v).max()), 0.1
         while True:
-            # What is wrong with δ may grow by the slowness in A⁻¹ δ.
+            # The error of δ may grow by the slowness in A⁻¹ δ.
             accuracy *= ACCURACY
-            delta = system.solve(direct + shown, accuracy * size)
+            delta = system.solve(direct + through_frame, accuracy * size)
             first = delta - direct
-            push = first + scene.lag * shown - scene.experiment.stepping.memory * delta
+            push = first + scene.lag * through_frame - scene.experiment.stepping.memory * delta
             if scene.lag:
-                push += edge.moves(edge.shown(delta))
+                push += coupling.moves(coupling.frame_displacements(delta))
             steady = solved(system, push, slowness * float(np.abs(push).max()))
-            wrong = slowness * accuracy * size
-            if wrong <= ACCURACY * float(np.abs(steady).max()) or accuracy <= FINEST:
+            error = slowness * accuracy * size
+            if error <= ACCURACY * float(np.abs(steady).max()) or accuracy <= MIN_ACCURACY:
                 return cls(first, push, steady)
 
 
 def lag_of(
     scene: Scene, state: State, system_at: Callable[[int], System | None], slowness: float
 ) -> Lag | None:
-    """The lag in the fastest interval of two steps or more: a jump of one step has no speed, nor
-    has a leader that swings. None where no leader moves so, or the body has no equilibrium.
+    """Compute the lag in the fastest interval of two steps or more.
 
-    `system_at` gives the system of the scene's equilibrium with the roles of a step.
+    A displacement in a single step is no speed, and neither is an oscillation.
+
+    Parameters
+    ----------
+    system_at
+        Function that returns the equilibrium system with the roles of a step.
+    slowness
+        1 / (1 - λ) of the slowest mode.
+
+    Returns
+    -------
+    Lag or None
+        None if no leader moves steadily, or if the body has no equilibrium.
     """
     first, last, speed = fastest(scene)
     system = system_at(first) if speed else None
@@ -200,41 +255,43 @@ def lag_of(
 
 
 def _reached_exactly(scene: Scene, trail: Trail, first: int, steps: int) -> float | None:
-    """max |e| at the end of so many steps, step by step; None where that would take too long."""
-    if excess(scene) or steps * scene.raster.count > DEAREST:
+    """Compute max |e| after some steps, step by step; None if it would take too long."""
+    if excess(scene) or steps * scene.raster.count > MAX_PRODUCTS:
         return None
     operator = step_operator(scene, step=first)
-    parts = operator.couplings_now, operator.couplings_before
-    now, before = (couplings.entries().matrix() for couplings in parts)
-    if steps * (now.size if isinstance(now, np.ndarray) else now.nnz) > DEAREST:
+    parts = operator.couplings_current, operator.couplings_previous
+    current, previous = (couplings.entries().matrix() for couplings in parts)
+    if steps * (current.size if isinstance(current, np.ndarray) else current.nnz) > MAX_PRODUCTS:
         return None
     place = scene.raster.place_of(operator.followers)
     push, error = (e.reshape(len(e), -1)[:, place].T.ravel() for e in (trail.push, trail.first))
-    earlier = np.zeros_like(push)
+    last_error = np.zeros_like(push)
     for _ in range(steps - 1):
-        earlier, error = error, now @ error + before @ earlier + push
+        last_error, error = error, current @ error + previous @ last_error + push
     return _largest(error.reshape(-1, scene.axes).T)
 
 
 def _reached_about(
     scene: Scene, trail: Trail, system: System, slowness: float, steps: int
 ) -> float | None:
-    """The same where the step has no memory, e = (1 - Pⁿ) A⁻¹ push, within 10 %: at first all
-    pushes together, later with P on the span of A⁻¹ push and A⁻² push."""
+    """Compute the same to 10 % if the step has no memory, e = (1 - Pⁿ) A⁻¹ push.
+
+    At first all increments are added; later P is projected on the span of A⁻¹ push and A⁻² push.
+    """
     if scene.lag or scene.experiment.stepping.memory:
         return None
     e = trail.steady
-    most = min(_largest(e), steps * _largest(trail.push))
-    if steps <= EARLY * slowness:
-        return most
+    bound = min(_largest(e), steps * _largest(trail.push))
+    if steps <= EARLY_FRACTION * slowness:
+        return bound
     try:
-        further = solved(system, e, slowness * float(np.abs(e).max()))
+        second = solved(system, e, slowness * float(np.abs(e).max()))
     except StuckError:
         return None
-    basis, images = (np.stack([a.ravel(), b.ravel()]) for a, b in ((e, further), (trail.push, e)))
+    basis, images = (np.stack([a.ravel(), b.ravel()]) for a, b in ((e, second), (trail.push, e)))
     A = np.linalg.solve(basis @ basis.T, basis @ images.T)
-    left = np.linalg.matrix_power(np.eye(2) - A, steps)[:, 0]
-    return min(most, _largest((1.0 - left[0]) * e - left[1] * further))
+    remainder = np.linalg.matrix_power(np.eye(2) - A, steps)[:, 0]
+    return min(bound, _largest((1.0 - remainder[0]) * e - remainder[1] * second))
 
 
 def _largest(planes: Floats) -> float:
@@ -250,34 +307,35 @@ class Interval(NamedTuple):
 
 
 def fastest(scene: Scene) -> Interval:
-    """The steps, two at least, in which all leaders keep their velocities and one moves
+    """Return the interval of at least two steps of constant velocities in which a leader moves
     fastest."""
-    steps, moments = scene.experiment.steps, [_moments(each, scene) for each in scene.leading]
-    every = np.array(sorted({1, steps + 1, *chain(*moments)}))
-    speeds = np.zeros(len(every) - 1)
-    for leading, own in zip(scene.leading, moments, strict=True):
-        for first, after in pairwise(own):
+    steps, changes = scene.experiment.steps, [_changes(leading, scene) for leading in scene.leading]
+    bounds = np.array(sorted({1, steps + 1, *chain(*changes)}))
+    speeds = np.zeros(len(bounds) - 1)
+    for leading, group_changes in zip(scene.leading, changes, strict=True):
+        for first, end in pairwise(group_changes):
             speed = np.hypot(*_velocity(leading, first).T).max()
-            some = speeds[np.searchsorted(every, first) : np.searchsorted(every, after)]
-            np.maximum(some, speed, out=some)
-    speeds[np.diff(every) < 2] = 0.0
+            section = speeds[np.searchsorted(bounds, first) : np.searchsorted(bounds, end)]
+            np.maximum(section, speed, out=section)
+    speeds[np.diff(bounds) < 2] = 0.0
     n = int(np.argmax(speeds))
-    return Interval(int(every[n]), int(every[n + 1]) - 1, float(speeds[n]))
+    return Interval(int(bounds[n]), int(bounds[n + 1]) - 1, float(speeds[n]))
 
 
-def _moments(leading: Leading, scene: Scene) -> list[int]:
-    """When the group begins, ends or changes its velocity."""
+def _changes(leading: Leading, scene: Scene) -> list[int]:
+    """Return the steps in which a group starts, ends or changes its velocity."""
     group = leading.group
     last = group.last(scene.experiment.steps)
-    some = {group.from_, last + 1, *(group.from_ + n for n in group.motion.knots())}
-    return sorted(m for m in some if group.from_ <= m <= last + 1)
+    steps = {group.from_, last + 1, *(group.from_ + n for n in group.motion.knots())}
+    return sorted(step for step in steps if group.from_ <= step <= last + 1)
 
 
 def _velocity(leading: Leading, step: int) -> Floats:
-    """Of a group's particles in a step, (particle, axis); a rotation turns it on the way."""
+    """Return the velocities of a group's particles in a step, (particle, axis); rotations
+    included."""
     n, motion, at = step - leading.group.from_ + 1, leading.group.motion, leading.reference
     v = np.zeros_like(at)
     if not isinstance(motion, Oscillation):
-        before = motion.offset(n - 1, at) if n > 1 else 0.0
-        v[:, list(leading.axes)] += (motion.offset(n, at) - before)[..., list(leading.axes)]
+        previous = motion.offset(n - 1, at) if n > 1 else 0.0
+        v[:, list(leading.axes)] += (motion.offset(n, at) - previous)[..., list(leading.axes)]
     return v

@@ -2,12 +2,13 @@
 fastest, and the choice of `auto` for a scene.
 
 A mode with the eigenvalue λ of the rule's own step becomes two, μ² - (1 + b - wz) μ + b = 0 with z
-= 1 - λ: the heavy ball (Polyak 1964). For real z from m to M the optimum is where the moduli at
-both ends are equal, and both roots meet at an end.
+= 1 - λ: the heavy ball method (Polyak 1964). For real z from m to M the optimum is where the moduli
+at both ends are equal, and both roots meet at an end.
 
-The modes are those of the rule's own step at rest, with the roles of the last step. Where a group
-of unknowns is small, all are computed. Else the ends of the spectrum are found by iteration: the
-slowest mode by repeated equilibrium solutions, the fastest by moves alone.
+The modes are those of the rule's own step at rest, with the roles of the last step. All are
+computed if the groups of coupled unknowns are small. Otherwise the ends of the spectrum are
+computed by iteration: the slowest mode by repeated equilibrium solutions, the fastest by moves
+alone.
 """
 
 from __future__ import annotations
@@ -43,32 +44,45 @@ from pbdkit.scene.leaders import kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, initial_state
 
-BELOW, FINEST = 1e-6, 1e-4
-"""How near to 1 - √b and its bound w a search comes, and how fine it is."""
+SEARCH_START = 1e-6
+"""Lower end of the search for the relaxation, as a fraction of its bound."""
+
+MIN_GAP = 1e-4
+"""Lower end of the search for 1 - √b."""
 
 
 class Weights(NamedTuple):
-    """What a move is multiplied with, and the last step."""
+    """Parameters of the solver: relaxation w and memory b."""
 
     relaxation: float
     memory: float
 
     def rate(self, eigenvalues: Complex) -> float:
-        """max |μ| over modes λ, those with λ = 1 apart; 0 where there is none."""
+        """Return max |μ| over modes λ, except those with λ = 1; 0 if there is none."""
         moving = eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
         return float(np.abs(modes(moving, *self)).max(initial=0.0))
 
 
 class HopelessError(ValueError):
-    """With no such numbers do all modes shrink; says why."""
+    """No relaxation and memory let all modes decay; the message gives the reason."""
 
 
 def best_weights(
     eigenvalues: Complex, relaxation: float | None = None, memory: float | None = None
 ) -> Weights:
-    """The best w and b for modes λ, those with λ = 1 apart; a number that is given stays.
+    """Return the w and b of fastest decay for modes λ, except those with λ = 1.
 
-    Raises HopelessError where there are none.
+    Parameters
+    ----------
+    eigenvalues : (n,)
+        Eigenvalues λ of the rule's own step.
+    relaxation, memory
+        Prescribed numbers; None for numbers to be chosen.
+
+    Raises
+    ------
+    HopelessError
+        If no such numbers let all modes decay.
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z):
@@ -76,17 +90,20 @@ def best_weights(
     if z.real.min() <= 0.0:
         raise HopelessError(f"the rule has a mode with the eigenvalue {1 - z.real.min():.6g}")
     if memory is not None and abs(memory) >= 1.0:
-        raise HopelessError(f"memory {memory:g} lets every mode go on, or grow")
-    found = _of_real(float(z.real.min()), float(z.real.max()), relaxation, memory)
+        raise HopelessError(f"with memory {memory:g} no mode decays")
+    weights = _best_for_real(float(z.real.min()), float(z.real.max()), relaxation, memory)
     if np.abs(z.imag).max() > STRAIGHT:
-        found = _of_complex(eigenvalues, relaxation, memory)
-    if not found.rate(eigenvalues) < 1.0:
-        raise HopelessError(f"no memory lets all modes shrink with relaxation {found[0]:g}")
-    return found
+        weights = _best_for_complex(eigenvalues, relaxation, memory)
+    if not weights.rate(eigenvalues) < 1.0:
+        raise HopelessError(f"no memory lets all modes decay with relaxation {weights[0]:g}")
+    return weights
 
 
-def _of_real(m: float, M: float, w: float | None, b: float | None) -> Weights:
-    """Both roots are real up to (1 - √b)² / w, complex to (1 + √b)² / w and real beyond."""
+def _best_for_real(m: float, M: float, w: float | None, b: float | None) -> Weights:
+    """Return the optimum for real modes z from m to M.
+
+    Both roots are real up to z = (1 - √b)² / w, complex to (1 + √b)² / w and real beyond.
+    """
     if b is None and w is None:
         b = ((math.sqrt(M) - math.sqrt(m)) / (math.sqrt(M) + math.sqrt(m))) ** 2
     if w is None:
@@ -97,93 +114,105 @@ def _of_real(m: float, M: float, w: float | None, b: float | None) -> Weights:
     return Weights(w, b)
 
 
-def _of_complex(eigenvalues: Complex, w: float | None, b: float | None) -> Weights:
-    """By search: over 1 - √b in factors, over w for each below its bound."""
+def _best_for_complex(eigenvalues: Complex, w: float | None, b: float | None) -> Weights:
+    """Search the optimum: over 1 - √b on a logarithmic scale, and over w below its bound for each
+    b."""
     from pbdkit.linear.spectrum import largest_stable_relaxation
 
-    def at(memory: float) -> Weights:
+    def weights_for(memory: float) -> Weights:
         if w is not None:
             return Weights(w, memory)
         bound = largest_stable_relaxation(eigenvalues, memory)
         assert bound is not None
-        found = _least(lambda x: Weights(x, memory).rate(eigenvalues), BELOW * bound, bound)
-        return Weights(found, memory)
+        relaxation = _minimise(
+            lambda x: Weights(x, memory).rate(eigenvalues), SEARCH_START * bound, bound
+        )
+        return Weights(relaxation, memory)
 
-    def kept(logarithm: float) -> Weights:
-        return at((1.0 - math.exp(logarithm)) ** 2)
+    def weights_at(logarithm: float) -> Weights:
+        return weights_for((1.0 - math.exp(logarithm)) ** 2)
 
     if b is not None:
-        return at(b)
-    starts = np.linspace(math.log(FINEST), 0.0, 20)
-    rates = [kept(start).rate(eigenvalues) for start in starts]
+        return weights_for(b)
+    starts = np.linspace(math.log(MIN_GAP), 0.0, 20)
+    rates = [weights_at(start).rate(eigenvalues) for start in starts]
     n = int(np.argmin(rates))
     low, high = starts[max(0, n - 1)], starts[min(len(starts) - 1, n + 1)]
-    return kept(_least(lambda x: kept(x).rate(eigenvalues), low, high))
+    return weights_at(_minimise(lambda x: weights_at(x).rate(eigenvalues), low, high))
 
 
-def _least(function: Any, low: float, high: float) -> float:
-    """Where a function of one number with one minimum is least."""
+def _minimise(function: Any, low: float, high: float) -> float:
+    """Return the argument that minimises a function with one minimum."""
     from scipy.optimize import minimize_scalar
 
-    found = minimize_scalar(function, bounds=(low, high), method="bounded")
-    return float(found.x)
+    result = minimize_scalar(function, bounds=(low, high), method="bounded")
+    return float(result.x)
 
 
 Floats = NDArray[np.floating[Any]]
 MARGIN = 0.02
-"""By this share an iteration may take the ends of a spectrum for too near to each other."""
+"""Relative margin of the ends of a spectrum from iteration, which may be too close together."""
 ROUGH = 1e-3
-"""The relative accuracy of solutions."""
-MOVES, SOLUTIONS = 24, 10
-"""From so many the ends of a spectrum are told."""
+"""Relative accuracy of solutions."""
+MOVES = 24
+"""Number of moves from which the fastest mode is computed."""
+
+SOLUTIONS = 10
+"""Number of solutions from which the slowest mode is computed."""
 NUDGE = 1e-6
-"""Rules that are not linear are asked about displacements of this share of the spacing."""
+"""Displacement at which nonlinear rules are linearised, as a fraction of the spacing."""
 REMEDY = "give numbers, or leave them out (relaxation 1, memory 0)"
+"""Remedy in messages about `auto`."""
 
 
 def tuned(scene: Scene) -> Scene:
-    """The scene with numbers in place of `auto`; itself where there is none. Raises ExperimentError
-    where no spectrum is to be had, or where no such numbers let all modes shrink."""
-    asked = scene.experiment.stepping
-    if not asked.is_open:
+    """Return the scene with numbers in place of `auto`; the scene itself if there is none.
+
+    Raises
+    ------
+    ExperimentError
+        If there is no spectrum, or if no such numbers let all modes decay.
+    """
+    solver = scene.experiment.stepping
+    if not solver.is_open:
         return scene
     try:
-        return with_solver(scene, asked.with_weights(*chosen_weights(scene)))
+        return with_solver(scene, solver.with_weights(*chosen_weights(scene)))
     except ExperimentError as error:
         raise scene.experiment.located(error) from None
 
 
 def chosen_weights(scene: Scene) -> Weights:
-    """What stands for `auto`, beside what is given."""
+    """Choose numbers for `auto`; prescribed numbers remain."""
     _refuse(scene)
-    asked = scene.experiment.stepping
-    both = ("relaxation", asked.asked_relaxation), ("memory", asked.asked_memory)
-    given = [None if number == "auto" else getattr(asked, name) for name, number in both]
+    solver = scene.experiment.stepping
+    both = ("relaxation", solver.asked_relaxation), ("memory", solver.asked_memory)
+    prescribed = [None if number == "auto" else getattr(solver, name) for name, number in both]
     plain = with_solver(scene.bare, Stepping())
     rest = initial_state(scene)
     rest.u[...] = 0.0
     try:
-        known, is_sure = _eigenvalues(plain, rest)
-        found = best_weights(known, *given)
-        if given[1] is None and not is_sure and found.memory > LITTLE_MEMORY:
-            found = best_weights(known, given[0], LITTLE_MEMORY)
+        eigenvalues, is_sure = _eigenvalues(plain, rest)
+        weights = best_weights(eigenvalues, *prescribed)
+        if prescribed[1] is None and not is_sure and weights.memory > LITTLE_MEMORY:
+            weights = best_weights(eigenvalues, prescribed[0], LITTLE_MEMORY)
     except HopelessError as error:
         raise _refusal(f"{error}; {REMEDY}") from None
-    return found
+    return weights
 
 
 def _refuse(scene: Scene) -> None:
     if scene.experiment.courses:
-        raise _refusal(f"'auto' needs numbers that stay, and some change in time; {REMEDY}")
+        raise _refusal(f"'auto' needs constant parameters, and some depend on time; {REMEDY}")
     if scene.experiment.neighbours.nearness():
         raise _refusal(
-            "'auto' needs a spectrum, and neighbours that are found anew have none; set "
-            f"neighbours.reevaluate: false, or {REMEDY}"
+            "'auto' needs a spectrum, and there is none if neighbours are searched at every step; "
+            f"set neighbours.reevaluate: false, or {REMEDY}"
         )
     if scene.lag:
         raise _refusal(
-            "'auto' is for steps that follow from the last one alone, and a frame with lag looks "
-            f"back farther; set frame.lag: 0, or {REMEDY}"
+            "'auto' is for steps that depend on the last one alone, and a frame with lag reads "
+            f"earlier ones; set frame.lag: 0, or {REMEDY}"
         )
 
 
@@ -192,91 +221,92 @@ def _refusal(text: str) -> ExperimentError:
 
 
 def with_solver(scene: Scene, solver: Stepping) -> Scene:
-    """The scene stepped otherwise."""
+    """Return the scene with another solver."""
     experiment = scene.experiment.model_copy(update={"solver": solver})
     inner = scene.inner and with_solver(scene.inner, solver)
     return replace(scene, experiment=experiment, inner=inner)
 
 
 def _eigenvalues(scene: Scene, rest: State) -> tuple[Complex, bool]:
-    """Those of the rule's own step that matter, and whether the others surely lie between."""
+    """Return the relevant eigenvalues of the rule's own step, and whether all others surely lie
+    between."""
     kinds = kinds_at(scene.raster, scene.leading, scene.experiment.steps)
     followers = np.flatnonzero(kinds == FOLLOWER)
     if len(followers) <= scene.axes * DENSE:
         operator = step_operator(scene, rest)
-        own = operator.couplings_now.entries().without(operator.held)
-        if _largest_group(own) <= DENSE:
-            return spectrum(own.matrix()).eigenvalues, True
+        rule_entries = operator.couplings_current.entries().without(operator.prescribed_unknowns)
+        if _largest_block_size(rule_entries) <= DENSE:
+            return spectrum(rule_entries.matrix()).eigenvalues, True
     return _ends(scene, rest, scene.raster.place_of(followers))
 
 
-def _largest_group(own: Entries) -> int:
-    _, label = connected(own.sparse(), strongly=True)
+def _largest_block_size(entries: Entries) -> int:
+    _, label = connected(entries.sparse(), strongly=True)
     return int(np.bincount(label).max(initial=0))
 
 
 def _ends(scene: Scene, rest: State, place: NDArray[np.intp]) -> tuple[Complex, bool]:
-    """The largest and the smallest 1 - λ, a little farther apart than they were found; sure where
-    the stiffness is symmetric, so that all λ are real."""
+    """Return the largest and the smallest 1 - λ, moved apart by a margin, and whether all λ are
+    surely real."""
     from pbdkit.equilibrium.linearise import linearised
     from pbdkit.equilibrium.system import PUSH, Moves, one_thread
 
     system = linearised(scene, rest, scene.experiment.steps, "auto", Watch())
     moves, linear = Moves(scene), scene.experiment.rule.linear
     nudge = 1.0 if linear else NUDGE * min(min(s) for s in scene.neighbourhood.shells())
-    longest = 1.0
+    largest = 1.0
 
     def planes(v: Floats) -> Floats:
         out = np.zeros(rest.u.shape)
         out.reshape(len(out), -1)[:, place] = v.reshape(len(out), -1)
         return out
 
-    def of_followers(found: Floats) -> Floats:
-        here: Floats = found.reshape(len(found), -1)[:, place].ravel()
-        return here
+    def at_followers(field: Floats) -> Floats:
+        values: Floats = field.reshape(len(field), -1)[:, place].ravel()
+        return values
 
-    def pulled(v: Floats) -> Floats:
-        """(1 - P) v; by a central difference where the rule is not linear."""
+    def rule_operator(v: Floats) -> Floats:
+        """Apply 1 - P, by a central difference if the rule is nonlinear."""
         size, signs = nudge / np.abs(v).max(), (1.0,) if linear else (1.0, -1.0)
-        there = (replace(rest, u=planes(sign * size * v)) for sign in signs)
-        back = [of_followers(moves.at(state, scene.experiment.steps)) for state in there]
-        change: Floats = back[0] - back[1] if len(back) > 1 else 2 * back[0]
+        states = (replace(rest, u=planes(sign * size * v)) for sign in signs)
+        responses = [at_followers(moves.at(state, scene.experiment.steps)) for state in states]
+        change: Floats = responses[0] - responses[1] if len(responses) > 1 else 2 * responses[0]
         change /= -2 * size
         return change
 
-    def settled(v: Floats) -> Floats:
-        """(1 - P)⁻¹ v."""
-        nonlocal longest
+    def inverse(v: Floats) -> Floats:
+        """Apply (1 - P)⁻¹."""
+        nonlocal largest
         size = np.abs(v).max()
-        found = system.solve(planes(v / size), ROUGH * longest, rounding=PUSH)
-        longest = float(np.abs(found).max())
-        return of_followers(size * found)
+        solution = system.solve(planes(v / size), ROUGH * largest, rounding=PUSH)
+        largest = float(np.abs(solution).max())
+        return at_followers(size * solution)
 
     with one_thread():
         start = np.random.default_rng(0).uniform(-1.0, 1.0, scene.axes * len(place))
-        fastest = _largest(pulled, start, MOVES) * (1.0 + MARGIN)
-        slowest = 1.0 / _largest(settled, pulled(start), SOLUTIONS) / (1.0 + MARGIN)
+        fastest = _largest(rule_operator, start, MOVES) * (1.0 + MARGIN)
+        slowest = 1.0 / _largest(inverse, rule_operator(start), SOLUTIONS) / (1.0 + MARGIN)
     is_sure = system.how == "energy" or _is_reciprocal(scene, rest)
     return np.array([1.0 - fastest, 1.0 - slowest]), is_sure
 
 
 def _is_reciprocal(scene: Scene, rest: State) -> bool:
-    """Whether what particles do to each other is known to come from a symmetric stiffness."""
+    """Return whether the interactions are known to come from a symmetric stiffness."""
     if isinstance(scene.experiment.rule, Calibrated) and scene.frame is None:
         return True
-    return not excess(scene) and has_symmetric_rows(step_operator(scene, rest).now)
+    return not excess(scene) and has_symmetric_rows(step_operator(scene, rest).current)
 
 
-def _largest(product: Callable[[Floats], Floats], start: Floats, turns: int) -> complex:
-    """The eigenvalue of the largest modulus, as some turns of Arnoldi's iteration see it."""
-    basis, seen = [start / np.linalg.norm(start)], np.zeros((turns + 1, turns))
-    for n in range(turns):
+def _largest(product: Callable[[Floats], Floats], start: Floats, iterations: int) -> complex:
+    """Return the eigenvalue of largest modulus after some iterations of Arnoldi's method."""
+    basis, hessenberg = [start / np.linalg.norm(start)], np.zeros((iterations + 1, iterations))
+    for n in range(iterations):
         v = product(basis[-1])
-        for _ in range(2):  # twice, so that rounding leaves no share of the others
-            shares = np.array([one @ v for one in basis])
-            seen[: n + 1, n] += shares
-            v = v - shares @ np.array(basis)
-        seen[n + 1, n] = np.linalg.norm(v)
-        basis.append(v / seen[n + 1, n])
-    values = np.linalg.eigvals(seen[:turns])
+        for _ in range(2):  # twice, to remove rounding errors of the orthogonalisation
+            coefficients = np.array([vector @ v for vector in basis])
+            hessenberg[: n + 1, n] += coefficients
+            v = v - coefficients @ np.array(basis)
+        hessenberg[n + 1, n] = np.linalg.norm(v)
+        basis.append(v / hessenberg[n + 1, n])
+    values = np.linalg.eigvals(hessenberg[:iterations])
     return complex(values[np.argmax(np.abs(values))])

@@ -53,8 +53,8 @@ from pbdkit.plugin.registry import GIVEN
 from pbdkit.progress import progress_bar
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.engine_choice import processors
-from pbdkit.sweeps.combine import joined
-from pbdkit.sweeps.specification import Asked, Dimension, Job, Keep, Member, checked, named
+from pbdkit.sweeps.combine import combine_members
+from pbdkit.sweeps.specification import Dimension, Job, Keep, Member, SweepPlan, checked, named
 from pbdkit.sweeps.store import Store
 from pbdkit.sweeps.worker import (
     INTERRUPTED,
@@ -324,7 +324,7 @@ class Summary:
 
 
 def carry_out(
-    asked: Asked, folder: Path, crew: Executor, stopping: Callable[[], bool], show: Show
+    asked: SweepPlan, folder: Path, crew: Executor, stopping: Callable[[], bool], show: Show
 ) -> Summary:
     """Validates every member, runs those that the folder does not hold, and writes the dataset.
 
@@ -360,7 +360,7 @@ def carry_out(
         store.look_around()
         if run < len(todo):
             return Summary(members, ends, run, store.faults, None)
-        dataset = joined(grid, members, lambda key: passing.get(key) or store.report(key))
+        dataset = combine_members(grid, members, lambda key: passing.get(key) or store.report(key))
         dataset.attrs = _attributes(asked, versions)
         write_dataset(dataset, folder / RESULT, replace=True)
     return Summary(members, ends, run, store.faults, folder / RESULT)
@@ -384,7 +384,7 @@ def _heard(
         yield report
 
 
-def validated(asked: Asked, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
+def validated(asked: SweepPlan, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
     """The grid, the members on it, and the versions of what they use. Raises ExperimentError and
     PluginError."""
     experiment = asked.experiment()
@@ -403,7 +403,7 @@ def validated(asked: Asked, show: Show) -> tuple[list[Dimension], list[Member], 
     return grid, members, versions
 
 
-def _attributes(asked: Asked, versions: dict[str, str]) -> dict[str, str]:
+def _attributes(asked: SweepPlan, versions: dict[str, str]) -> dict[str, str]:
     experiment = asked.experiment()
     sweep = asked.sweep.model_dump(mode="json", by_alias=True)
     sweep["experiment"] = experiment.model_dump(mode="json", by_alias=True)
@@ -595,7 +595,7 @@ def called(
         )
     crew = crew_of(workers, client, given)
     sweep = checked(parts | {"experiment": base.data}, Source())
-    asked = Asked(sweep, base, Source(), given)
+    asked = SweepPlan(sweep, base, Source(), given)
     with ExitStack() as ending:
         kept = Path(folder or ending.enter_context(tempfile.TemporaryDirectory(prefix="pbdkit-")))
         with progress_bar(progress) as show:

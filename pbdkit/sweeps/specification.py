@@ -1,6 +1,5 @@
 """The sweep file: an experiment, the parameters that vary, what is kept of each run, and the
-members with the digest of each.
-"""
+members with the digest of each."""
 
 from __future__ import annotations
 
@@ -33,18 +32,19 @@ from pbdkit.plugin.component import Strict
 from pbdkit.plugin.units import TEXT as WITH_UNIT
 from pbdkit.plugin.units import Quantity
 
-MOST_MEMBERS = 100_000
-"""Each takes about a millisecond to be validated, and some kilobytes while the sweep goes on."""
+MAX_MEMBERS = 100_000
+"""Largest number of members. Each takes about a millisecond for validation, and some kilobytes
+during the sweep."""
 DIGITS = 15
-"""Of values between two ends, so that 0.6 is 0.6 and not 0.6000000000000001."""
+"""Significant digits of evenly spaced values, so that 0.6 is not 0.6000000000000001."""
 
 
 class Range(Strict):
-    """`count` values from one to another, both included, evenly spaced or by equal factors."""
+    """`count` values from one to another, both included, with equal differences or equal ratios."""
 
     from_: Annotated[int | float, Field(alias="from")]
     to: int | float
-    count: Annotated[int, Field(ge=2, le=MOST_MEMBERS)]
+    count: Annotated[int, Field(ge=2, le=MAX_MEMBERS)]
     scale: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
@@ -54,28 +54,34 @@ class Range(Strict):
         return self
 
     def values(self) -> list[int | float]:
-        """Whole numbers where both ends are whole and all between them are."""
-        between = np.linspace if self.scale == "linear" else np.geomspace
-        found = between(float(self.from_), float(self.to), self.count)
-        values = [float(f"{value:.{DIGITS}g}") for value in found.tolist()]
-        whole = isinstance(self.from_, int) and isinstance(self.to, int)
-        return [int(v) for v in values] if whole and all(v % 1 == 0 for v in values) else values
+        """Return the values, integers if both ends and all values between are integers."""
+        space = np.linspace if self.scale == "linear" else np.geomspace
+        numbers = space(float(self.from_), float(self.to), self.count)
+        values = [float(f"{value:.{DIGITS}g}") for value in numbers.tolist()]
+        are_integers = isinstance(self.from_, int) and isinstance(self.to, int)
+        return (
+            [int(number) for number in values]
+            if are_integers and all(number % 1 == 0 for number in values)
+            else values
+        )
 
 
 def _listed(value: Any) -> tuple[Any, ...]:
-    """The values of one parameter."""
+    """Return the values of one parameter."""
     value = plain(value)
     if isinstance(value, dict):
         value = Range.model_validate(value).values()
     if not isinstance(value, list) or not value:
         raise fault(f"expected a list of values or {{from, to, count}}, got {brief(value)}")
     try:
-        texts = [json.dumps(v, sort_keys=True, allow_nan=False) for v in value]
+        texts = [json.dumps(item, sort_keys=True, allow_nan=False) for item in value]
     except (TypeError, ValueError):
-        raise fault("takes what an experiment file can hold: no infinity, no objects") from None
+        raise fault(
+            "expected values that an experiment file can contain: no infinity, no objects"
+        ) from None
     if len(set(texts)) < len(texts):
-        twice = next(v for n, v in enumerate(value) if texts.index(texts[n]) < n)
-        raise fault(f"{brief(twice)} is given twice")
+        duplicate = next(item for n, item in enumerate(value) if texts.index(texts[n]) < n)
+        raise fault(f"{brief(duplicate)} is listed twice")
     return tuple(value)
 
 
@@ -86,23 +92,23 @@ Times = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, m
 
 
 class Keep(Strict):
-    """What is kept of each run: `variables` by name, all if left out; of the recorded steps all,
-    the last, or those listed, which are then recorded."""
+    """Selection of what is kept of each run: `variables` by name, default all; of the recorded
+    steps all, the last, or those listed, which are then recorded."""
 
     variables: Annotated[tuple[str, ...] | None, Field(strict=False, min_length=1)] = None
     times: Literal["all", "last"] | Times = "all"
 
 
 class Sweep(Strict):
-    """Members are the product of the values in `vary`, of the lists in `together`, which are gone
-    through at once, and of the replicates, which differ in their seed. `names` are those that
-    parameters have in the dataset, by their paths."""
+    """An experiment with varied parameters. Members are the product of the values in `vary`, of the
+    lists in `together`, which are traversed together, and of the replicates, which differ in their
+    seed. `names` are the names of parameters in the dataset, by path."""
 
     version: Version = 1
     experiment: Base
     vary: dict[str, Values] = Field(default_factory=dict)
     together: dict[str, Values] = Field(default_factory=dict)
-    replicates: Annotated[int, Field(ge=1, le=MOST_MEMBERS)] = 1
+    replicates: Annotated[int, Field(ge=1, le=MAX_MEMBERS)] = 1
     keep: Keep = Field(default_factory=Keep)
     names: dict[str, Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]] = Field(
         default_factory=dict
@@ -110,11 +116,11 @@ class Sweep(Strict):
 
     @model_validator(mode="after")
     def _of_parameters(self) -> Self:
-        varied = [*self.vary, *self.together]
+        parameters = [*self.vary, *self.together]
         for path in self.names:
-            if path not in varied:
-                hint = did_you_mean(path, varied)
-                raise fault(f"'{path}' is not varied{hint} ({', '.join(varied)})", key="names")
+            if path not in parameters:
+                hint = did_you_mean(path, parameters)
+                raise fault(f"'{path}' is not varied{hint} ({', '.join(parameters)})", key="names")
         if len({*self.names.values()}) < len(self.names):
             raise fault("two parameters have the same name", key="names")
         return self
@@ -123,30 +129,38 @@ class Sweep(Strict):
     def _together(self) -> Self:
         lengths = {path: len(values) for path, values in self.together.items()}
         if len(set(lengths.values())) > 1:
-            told = ", ".join(f"{path} has {n}" for path, n in lengths.items())
-            raise fault(f"lists of one length are wanted: {told}", key="together")
+            text = ", ".join(f"{path} has {length}" for path, length in lengths.items())
+            raise fault(f"expected lists of equal length: {text}", key="together")
         paths = [*self.vary, *self.together, *(["seed"] if self.replicates > 1 else [])]
-        for one, other in combinations(sorted(paths), 2):
-            if f"{other}.".startswith(f"{one}."):
-                whose = "replicates vary it" if one == other == "seed" else f"so does '{other}'"
-                raise fault(f"'{one}' is varied twice: {whose}", key="vary")
-        if self.count > MOST_MEMBERS:
-            raise fault(f"{self.count} members; at most {MOST_MEMBERS} are taken", key="vary")
+        for first, second in combinations(sorted(paths), 2):
+            if f"{second}.".startswith(f"{first}."):
+                reason = (
+                    "replicates vary it" if first == second == "seed" else f"so does '{second}'"
+                )
+                raise fault(f"'{first}' is varied twice: {reason}", key="vary")
+        if self.count > MAX_MEMBERS:
+            raise fault(f"{self.count} members; at most {MAX_MEMBERS} are allowed", key="vary")
         return self
 
     @property
     def cases(self) -> int:
-        """How many entries the lists of `together` have; 1 without any."""
+        """Return the length of the lists of `together`; 1 without any."""
         return max(map(len, self.together.values()), default=1)
 
     @property
     def count(self) -> int:
-        """How many members there are."""
+        """Return the number of members."""
         return prod(map(len, self.vary.values())) * self.cases * self.replicates
 
 
 def checked(data: Any, source: Source) -> Sweep:
-    """The sweep of that data; ExperimentError names what is wrong, with its place in the source."""
+    """Validate the data of a sweep.
+
+    Raises
+    ------
+    ExperimentError
+        With the place in the source if the data are invalid.
+    """
     try:
         return Sweep.model_validate(data)
     except ValidationError as error:
@@ -154,9 +168,21 @@ def checked(data: Any, source: Source) -> Sweep:
 
 
 def read_sweep(path: Path) -> tuple[Sweep, Source, Source]:
-    """The sweep in a file, the source of its experiment, and that of the file itself.
+    """Read a sweep file.
 
-    Raises ExperimentError.
+    Returns
+    -------
+    sweep
+        The sweep.
+    base
+        Source of its experiment.
+    source
+        Source of the file.
+
+    Raises
+    ------
+    ExperimentError
+        If the file is invalid.
     """
     name = path.as_posix()
     shipped = not path.is_file() and name in shipped_names()
@@ -166,20 +192,26 @@ def read_sweep(path: Path) -> tuple[Sweep, Source, Source]:
 
 
 def sweep_schema() -> dict[str, Any]:
-    """The JSON Schema of sweep files; what stands under `experiment` is left to that of
-    experiments."""
-    described = Sweep.model_json_schema(by_alias=True)
-    return {"$schema": DIALECT, **described, "title": "pbdkit sweep"}
+    """Return the JSON Schema of sweep files, without that of their experiments."""
+    model_schema = Sweep.model_json_schema(by_alias=True)
+    return {"$schema": DIALECT, **model_schema, "title": "pbdkit sweep"}
 
 
-CASE, REPLICATE, MESSAGE = "case", "replicate", "message"
-NAMELESS = (".otherwise", ".type")
-"""Ends of paths that name nothing: a number outside all regions, and the type of a part."""
+CASE = "case"
+"""Dimension of the lists of `together`."""
+
+REPLICATE = "replicate"
+"""Dimension of replicates."""
+
+MESSAGE = "message"
+"""Variable with the message of each member."""
+UNNAMED_ENDS = (".otherwise", ".type")
+"""Ends of paths that give no name: a number outside all regions, and the type of a part."""
 Array = NDArray[Any]
 
 
 class MemberSetting(NamedTuple):
-    """One parameter at one of its values; `section` is where the sweep says so."""
+    """One parameter with one of its values; `section` is the key of the sweep file."""
 
     section: str
     path: str
@@ -195,86 +227,134 @@ class Coordinate(NamedTuple):
 
 @dataclass(frozen=True)
 class Dimension:
-    """One dimension of the grid: its coordinates by name, each with its attributes, and what is set
-    at each place of it."""
+    """One dimension of the grid.
+
+    Parameters
+    ----------
+    name
+        Its name.
+    settings
+        Settings at each place.
+    coordinates
+        Coordinates by name.
+    """
 
     name: str
     settings: tuple[tuple[MemberSetting, ...], ...]
     coordinates: dict[str, Coordinate] = field(default_factory=dict)
 
 
-def dimensions(sweep: Sweep, experiment: Experiment, taken: Set[str]) -> list[Dimension]:
-    """Return those of `vary`, `case`, `replicate`, in this order; `taken` are the names that runs
-    have for other things. Raises ExperimentError where a name that is asked for is taken."""
-    names = _names(sweep, {*taken, CASE, REPLICATE, STATUS, MESSAGE})
-    found = []
+def dimensions(sweep: Sweep, experiment: Experiment, reserved: Set[str]) -> list[Dimension]:
+    """Return the dimensions of `vary`, `together` and `replicates`, in this order.
+
+    Parameters
+    ----------
+    reserved
+        Names that have other meanings in results.
+
+    Raises
+    ------
+    ExperimentError
+        If a name in the sweep file is among `taken`.
+    """
+    names = _names(sweep, {*reserved, CASE, REPLICATE, STATUS, MESSAGE})
+    result = []
     for path, values in sweep.vary.items():
         settings = tuple((MemberSetting("vary", path, value),) for value in values)
-        along = _coordinates(names[path], path, values, experiment)
-        found.append(Dimension(names[path], settings, along))
+        coordinates = _coordinates(names[path], path, values, experiment)
+        result.append(Dimension(names[path], settings, coordinates))
     if sweep.together:
-        each = ([MemberSetting("together", p, v) for v in vs] for p, vs in sweep.together.items())
-        along = {CASE: Coordinate(np.arange(sweep.cases), {})}
+        columns = (
+            [MemberSetting("together", key, v) for v in items]
+            for key, items in sweep.together.items()
+        )
+        coordinates = {CASE: Coordinate(np.arange(sweep.cases), {})}
         for path, values in sweep.together.items():
-            along[names[path]] = coordinate(path, values, experiment)
-        found.append(Dimension(CASE, tuple(zip(*each, strict=True)), along))
+            coordinates[names[path]] = coordinate(path, values, experiment)
+        result.append(Dimension(CASE, tuple(zip(*columns, strict=True)), coordinates))
     if sweep.replicates > 1:
         seeds = replicate_seeds(experiment.seed, sweep.replicates)
         settings = tuple((MemberSetting("replicates", "seed", value),) for value in seeds)
-        along = {REPLICATE: Coordinate(np.arange(sweep.replicates), {})}
-        along["seed"] = coordinate("seed", tuple(seeds), experiment)
-        found.append(Dimension(REPLICATE, settings, along))
-    return found
+        coordinates = {REPLICATE: Coordinate(np.arange(sweep.replicates), {})}
+        coordinates["seed"] = coordinate("seed", tuple(seeds), experiment)
+        result.append(Dimension(REPLICATE, settings, coordinates))
+    return result
 
 
-def _names(sweep: Sweep, taken: Set[str]) -> dict[str, str]:
-    """The names of all parameters: those that the sweep gives, and automatic ones."""
+def _names(sweep: Sweep, reserved: Set[str]) -> dict[str, str]:
+    """Return the names of all parameters: those in the sweep file, and automatic ones."""
     for path, name in sweep.names.items():
-        if name in taken:
-            text = f"names: {path}: results have a '{name}' already; give another name"
+        if name in reserved:
+            text = f"names: {path}: '{name}' has another meaning in results; choose another name"
             raise ExperimentError(text, ("names",))
-    others = [path for path in (*sweep.vary, *sweep.together) if path not in sweep.names]
-    return sweep.names | names_of(others, {*taken, *sweep.names.values()})
+    unnamed = [path for path in (*sweep.vary, *sweep.together) if path not in sweep.names]
+    return sweep.names | names_of(unnamed, {*reserved, *sweep.names.values()})
 
 
 def places(grid: list[Dimension]) -> Iterator[tuple[tuple[int, ...], tuple[MemberSetting, ...]]]:
-    """Every place on the grid, and what is set there; the last dimension goes fastest."""
-    for place in product(*(range(len(d.settings)) for d in grid)):
-        every = (d.settings[n] for d, n in zip(grid, place, strict=True))
-        yield place, tuple(setting for some in every for setting in some)
+    """Yield every place on the grid with its settings; the last dimension varies fastest."""
+    for place in product(*(range(len(dimension.settings)) for dimension in grid)):
+        groups = (dimension.settings[index] for dimension, index in zip(grid, place, strict=True))
+        yield place, tuple(setting for group in groups for setting in group)
 
 
-def words(settings: tuple[MemberSetting, ...]) -> str:
-    """What a member is called in messages: its parameters."""
-    return ", ".join(f"{s.path}={brief(s.value)}" for s in settings) or "the experiment"
+def describe(settings: tuple[MemberSetting, ...]) -> str:
+    """Return the parameters of a member as text for messages."""
+    return (
+        ", ".join(f"{setting.path}={brief(setting.value)}" for setting in settings)
+        or "the experiment"
+    )
 
 
 def replicate_seeds(seed: int, count: int) -> list[int]:
-    """The k-th is ``SeedSequence(seed).spawn(count)[k].generate_state(1)[0]``."""
-    return [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(count)]
+    """Return the seeds of replicates.
+
+    Notes
+    -----
+    The k-th seed is ``SeedSequence(seed).spawn(count)[k].generate_state(1)[0]``.
+    """
+    return [
+        int(sequence.generate_state(1)[0]) for sequence in np.random.SeedSequence(seed).spawn(count)
+    ]
 
 
-def names_of(paths: list[str], taken: Set[str]) -> dict[str, str]:
-    """Return a name for each path: its last word, or as many of the last words, with `_` between
-    them, as are needed for a name that no other path has, and nothing else.
+def names_of(paths: list[str], reserved: Set[str]) -> dict[str, str]:
+    """Return a name for each path: its last word, preceded by as many further words as make it
+    unique.
 
-    `otherwise` and `type` at the end count for nothing. A name does not begin with a position in
-    a list.
+    Words are joined by `_`. `otherwise` and `type` at the end are ignored, and a name does not
+    start with a position in a list.
+
+    Parameters
+    ----------
+    paths
+        Paths of parameters.
+    reserved
+        Names that have other meanings.
     """
     tails = {path: _tails(path) for path in paths}
     names: dict[str, str] = {}
-    for path, own in tails.items():
-        others = {tail for other, some in tails.items() if other != path for tail in some}
-        name = next((t for t in own if t not in others and t not in taken), own[-1])
-        while name in taken or name in names.values():
+    for path, candidates in tails.items():
+        tails_of_others = {
+            tail for other, others in tails.items() if other != path for tail in others
+        }
+        name = next(
+            (
+                candidate
+                for candidate in candidates
+                if candidate not in tails_of_others and candidate not in reserved
+            ),
+            candidates[-1],
+        )
+        while name in reserved or name in names.values():
             name += "_"
         names[path] = name
     return names
 
 
 def _tails(path: str) -> list[str]:
-    """The last word, the last two words and so on, as names."""
-    end = next((end for end in NAMELESS if path.endswith(end)), "")
+    """Return the last word, the last two words and so on, as names."""
+    end = next((end for end in UNNAMED_ENDS if path.endswith(end)), "")
     words = path.removesuffix(end).split(".")
     tails = ["_".join(words[n:]) for n in reversed(range(len(words)))]
     return [tail for tail in tails if not tail[:1].isdecimal()] or [f"_{tails[-1]}"]
@@ -283,18 +363,18 @@ def _tails(path: str) -> list[str]:
 def _coordinates(
     name: str, path: str, values: tuple[Any, ...], experiment: Experiment
 ) -> dict[str, Coordinate]:
-    """Numbers as they are; all else counted from 0, with the text beside it."""
-    along = coordinate(path, values, experiment)
-    if along.values.dtype.kind != "U":
-        return {name: along}
-    counted = Coordinate(np.arange(len(values)), along.attributes)
-    return {name: counted, name + TEXT: along}
+    """Return numbers unchanged; other values are numbered from 0, with their text beside."""
+    texts = coordinate(path, values, experiment)
+    if texts.values.dtype.kind != "U":
+        return {name: texts}
+    numbers = Coordinate(np.arange(len(values)), texts.attributes)
+    return {name: numbers, name + TEXT: texts}
 
 
 def coordinate(path: str, values: tuple[Any, ...], experiment: Experiment) -> Coordinate:
-    """Return the values of a parameter with its path, and their unit as far as it is known.
+    """Return the values of a parameter with its path, and its unit if that is known.
 
-    Texts that are all numbers of one unit become these numbers.
+    Texts that are numbers of one unit become numbers.
     """
     attributes = {"long_name": path, PARAMETER: path}
     parts = [WITH_UNIT.fullmatch(value) if isinstance(value, str) else None for value in values]
@@ -302,21 +382,21 @@ def coordinate(path: str, values: tuple[Any, ...], experiment: Experiment) -> Co
     if len(units) == 1 and "" not in units:
         numbers = [float(part[1]) for part in parts if part]
         return Coordinate(np.array(numbers), attributes | {"units": units.pop()})
-    along = values_along(values)
-    if along.dtype.kind != "U" and (unit := _unit(path, experiment)):
+    array = values_along(values)
+    if array.dtype.kind != "U" and (unit := _unit(path, experiment)):
         attributes["units"] = unit
-    return Coordinate(along, attributes)
+    return Coordinate(array, attributes)
 
 
 def _unit(path: str, experiment: Experiment) -> str:
-    """The unit in which a parameter is counted; empty where it is not known."""
+    """Return the unit of a parameter; empty if it is unknown."""
     part: Any = experiment
     for word in path.split("."):
         fields = getattr(type(part), "model_fields", {})
         if word in fields:
-            found = [m for m in fields[word].metadata if isinstance(m, Quantity)]
-            if found or fields[word].annotation in (int, float):
-                return found[0].lattice if found else "1"
+            quantities = [entry for entry in fields[word].metadata if isinstance(entry, Quantity)]
+            if quantities or fields[word].annotation in (int, float):
+                return quantities[0].lattice if quantities else "1"
             part = getattr(part, word)
         elif isinstance(part, tuple) and word.isdecimal() and int(word) < len(part):
             part = part[int(word)]
@@ -326,16 +406,29 @@ def _unit(path: str, experiment: Experiment) -> str:
 
 
 def values_along(values: tuple[Any, ...]) -> Array:
-    """The values of a parameter as a coordinate: numbers, or texts."""
+    """Return the values of a parameter as an array of numbers or texts."""
     if any(type(value) not in (int, float) for value in values):
-        return np.array([v if isinstance(v, str) else json.dumps(v) for v in values])
-    whole = all(type(value) is int and abs(value) < 2**63 for value in values)
-    return np.array(values, np.int64 if whole else np.float64)
+        return np.array([item if isinstance(item, str) else json.dumps(item) for item in values])
+    are_integers = all(type(value) is int and abs(value) < 2**63 for value in values)
+    return np.array(values, np.int64 if are_integers else np.float64)
 
 
 class Job(NamedTuple):
-    """What whoever runs a member is told: the experiment as JSON, with all that is not kept left
-    out of it, the variables to keep (None: all), the times, and the versions to run it with."""
+    """Everything that is needed to run a member.
+
+    Parameters
+    ----------
+    key
+        Digest of all the rest.
+    experiment
+        Experiment as JSON, without records and diagnostics that are not kept.
+    variables
+        Names of the variables to keep; None for all.
+    times
+        Recorded steps to keep.
+    versions
+        Versions of pbdkit and of plugins.
+    """
 
     key: str
     experiment: str
@@ -346,7 +439,17 @@ class Job(NamedTuple):
 
 @dataclass(frozen=True)
 class Member:
-    """One place on the grid."""
+    """One member of a sweep.
+
+    Parameters
+    ----------
+    place
+        Its place on the grid.
+    words
+        Its parameters as text.
+    job
+        The run.
+    """
 
     place: tuple[int, ...]
     words: str
@@ -354,9 +457,18 @@ class Member:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A sweep as it was asked for: of which experiment, with the classes from Python that it names,
-    and the source of the sweep itself."""
+class SweepPlan:
+    """A sweep with its experiment.
+
+    Parameters
+    ----------
+    sweep
+        The sweep file.
+    base, source
+        Sources of the experiment and of the sweep.
+    components
+        Component classes from Python that the experiment names.
+    """
 
     sweep: Sweep
     base: Source
@@ -364,30 +476,48 @@ class Asked:
     components: tuple[type[Component], ...] = ()
 
     def experiment(self) -> Experiment:
-        """What is varied, as it is without that. Raises ExperimentError and PluginError."""
+        """Build the experiment without variations.
+
+        Raises
+        ------
+        ExperimentError, PluginError
+            If it is invalid.
+        """
         return Experiment.build(self.base, self.components)
 
     def grid(self, experiment: Experiment) -> list[Dimension]:
-        """The dimensions."""
-        diagnosed = (v for d in experiment.diagnostics for v in d.variables())
-        taken = reserved_names() | {n for v in diagnosed for n in (v.name, *v.dims)}
-        return dimensions(self.sweep, experiment, taken)
+        """Return the dimensions of the sweep."""
+        variables = (
+            variable for diagnostic in experiment.diagnostics for variable in diagnostic.variables()
+        )
+        reserved = reserved_names() | {
+            name for variable in variables for name in (variable.name, *variable.dims)
+        }
+        return dimensions(self.sweep, experiment, reserved)
 
     def members(
         self, grid: list[Dimension], show: Callable[[float], None]
     ) -> Iterator[tuple[Member, Experiment]]:
-        """Each member with its experiment; `show` is told the share that has been validated.
+        """Yield each member with its experiment.
 
-        Raises ExperimentError and PluginError, which name the parameters of the member.
+        Parameters
+        ----------
+        show
+            Function that is called with the fraction of members that have been validated.
+
+        Raises
+        ------
+        ExperimentError, PluginError
+            With the parameters of the member.
         """
         installed, count = version("pbdkit"), self.sweep.count
         for n, (place, settings) in enumerate(places(grid)):
             show(n / count)
-            with named(words(settings)):
+            with named(describe(settings)):
                 experiment = self._with(settings)
                 versions = {"pbdkit": installed} | experiment.distributions()
                 job = job_of(experiment, self.sweep.keep, versions)
-            yield Member(place, words(settings), job), experiment
+            yield Member(place, describe(settings), job), experiment
 
     def _with(self, settings: Iterable[MemberSetting]) -> Experiment:
         source, defaults = self.base, Experiment.defaults()
@@ -399,7 +529,7 @@ class Asked:
 
 @contextmanager
 def named(member: str) -> Iterator[None]:
-    """What is wrong in the block is said with the words for the member."""
+    """Add the parameters of a member to errors in the block."""
     try:
         yield
     except (ExperimentError, PluginError) as error:
@@ -407,21 +537,26 @@ def named(member: str) -> Iterator[None]:
 
 
 def job_of(experiment: Experiment, keep: Keep, versions: dict[str, str]) -> Job:
-    """What is to be run: nothing is recorded or measured that nobody keeps, and on one thread where
-    the experiment does not say on how many, as other members run beside it."""
+    """Return the job of an experiment.
+
+    Records and diagnostics that are not kept are removed. The run uses one thread unless the
+    experiment sets a number, since members run in parallel.
+    """
     data = experiment.model_dump(mode="json", by_alias=True)
     steps = experiment.steps
     if keep.times != "all":
         wanted = (steps,) if keep.times == "last" else keep.times
-        kept = sorted({step for step in wanted if step <= steps}) or [0]
-        data["record"] = {k: v for k, v in data["record"].items() if k != "every"} | {"at": kept}
+        steps_kept = sorted({step for step in wanted if step <= steps}) or [0]
+        record = {key: value for key, value in data["record"].items() if key != "every"}
+        data["record"] = record | {"at": steps_kept}
     if keep.variables is not None:
-        asked = {name for kept in keep.variables for name in (kept, kept.removesuffix(IN_MM))}
+        names = {*keep.variables, *(name.removesuffix(IN_MM) for name in keep.variables)}
         measured = zip(experiment.diagnostics, data["diagnostics"], strict=True)
         data["diagnostics"] = [
             part
             for diagnostic, part in measured
-            if "bonds" in diagnostic.needs or {v.name for v in diagnostic.variables()} & asked
+            if "bonds" in diagnostic.needs
+            or {variable.name for variable in diagnostic.variables()} & names
         ]
     if data["solver"].get("threads") == "auto":
         data["solver"]["threads"] = 1

@@ -1,5 +1,8 @@
-"""What members came to, in one SQLite database of the sweep's folder; large ones are files beside
-it. Nobody writes here but the process of the sweep."""
+"""Store of the results of members: a SQLite database in the sweep's folder, with files for large
+results.
+
+Only the process of the sweep writes to it.
+"""
 
 from __future__ import annotations
 
@@ -33,33 +36,65 @@ from pbdkit.io.sqlite_file import (
 )
 from pbdkit.sweeps.worker import MemberReport, digest_of
 
-DATABASE, LOCK, LARGE, ASIDE = "sweep.sqlite", "lock", "members", "set-aside"
+DATABASE = "sweep.sqlite"
+"""File name of the database."""
+
+LOCK = "lock"
+"""File name of the lock, which contains the number of stored members."""
+
+LARGE_FOLDER = "members"
+"""Folder of large results."""
+
+DAMAGED_FOLDER = "set-aside"
+"""Beginning of the names of folders for damaged databases."""
 NEW = DATABASE + ".new"
-"""The database while it is made."""
+"""File name of a database that is being created."""
 TEMPORARY = re.compile(r"\..+\.\d+\.[0-9a-f]{32}(\.nc)?")
-"""The names of files that are being written: host, process, random number."""
+"""File names of results that are being written: host, process, random number."""
 LARGE_BYTES = 2**20
-"""What is larger is a file."""
+"""Results above this size are stored as files."""
 COMMIT_S = 1.0
-"""So much at most of what was finished is lost when the machine stops."""
-APPLICATION, FORMAT = 0x70626473, 2
-"""What SQLite keeps to tell whose database it is, and which form it has."""
+"""Interval between commits in seconds. At most the results of one interval are lost if the machine
+stops."""
+APPLICATION = 0x70626473
+"""SQLite's application_id of a store."""
+
+FORMAT = 2
+"""Version of the format of a store."""
 TABLE = (
     "CREATE TABLE member (key TEXT PRIMARY KEY, status TEXT, message TEXT, file INTEGER, "
     "digest BLOB, content BLOB)"
 )
+"""Definition of the table."""
 COLUMNS = "key, status, message, file, digest, content"
+"""Columns of the table."""
 PUT = "REPLACE INTO member VALUES (?, ?, ?, ?, ?, ?)"
+"""Statement that stores a row."""
 LOCKED = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+"""Error codes of a database that another program has locked."""
 Row = tuple[Any, ...]
 
 
 class Store:
-    """The members that are held, by key; to be used as a context manager.
+    """Results of members by key; a context manager.
 
-    A database that is damaged is set aside, not removed, and what is sound of it copied into a new
-    one; `faults` says so. Raises StorageError where another sweep writes here, where it is no store
-    of this version, and for whatever the system or SQLite refuses.
+    A damaged database is moved aside, and its intact rows are copied into a new one.
+
+    Parameters
+    ----------
+    folder
+        Folder of the sweep.
+
+    Attributes
+    ----------
+    faults
+        Messages about damage, and how it was repaired.
+
+    Raises
+    ------
+    StorageError
+        If another sweep uses the folder, if it contains no store of this version, and for errors of
+        the file system or SQLite.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -67,18 +102,17 @@ class Store:
         self._keys: set[str] = set()
         self._due = time.monotonic() + COMMIT_S
         self.faults: list[str] = []
-        """What is to be said of the store: what was found damaged, and what became of that."""
 
     def __enter__(self) -> Self:
-        """Creates the folder, locks it, and opens the database."""
-        with self._storing():
+        """Create the folder, lock it, and open the database."""
+        with self._report_errors():
             self._folder.mkdir(parents=True, exist_ok=True)
             self._place = self._folder.stat()
             self._lock = self._closing.enter_context(_locked(self._folder / LOCK))
         try:
-            with self._storing():
+            with self._report_errors():
                 self._clear()
-                self._make_sound()
+                self._repair()
                 self._open()
         except BaseException:
             self._closing.close()
@@ -86,56 +120,58 @@ class Store:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        """Keeps what was put, whatever ended the sweep."""
+        """Commit all results, whatever ended the sweep."""
         with self._closing:
             if not isinstance(raised[1], StorageError):
                 self.commit()
                 return
-            with suppress(sqlite3.Error, StorageError):  # that has waited for it long enough
+            with suppress(sqlite3.Error, StorageError):  # the error already waited for the lock
                 self._database.execute("PRAGMA busy_timeout = 0")
                 self.commit()
 
     def held(self) -> dict[str, tuple[str, str]]:
-        """Status and message of all members that are held and sound, by key. Those that are not are
-        removed, with a line in `faults`."""
-        found = {}
-        with self._storing():
-            numbers = self._database.execute("SELECT rowid FROM member").fetchall()
-            for (number,) in numbers:
+        """Return status and message of all intact results by key.
+
+        Damaged ones are removed, with a message in `faults`.
+        """
+        results = {}
+        with self._report_errors():
+            rows = self._database.execute("SELECT rowid FROM member").fetchall()
+            for (row,) in rows:
                 query = f"SELECT {COLUMNS} FROM member WHERE rowid = ?"
-                report = self._checked(self._database.execute(query, (number,)).fetchone() or ())
+                report = self._verified(self._database.execute(query, (row,)).fetchone() or ())
                 if isinstance(report, str):
-                    self.faults.append(f"{self._path}: row {number} {report}; it runs again")
+                    self.faults.append(f"{self._path}: row {row} {report}; it runs again")
                     self._begin()
-                    self._database.execute("DELETE FROM member WHERE rowid = ?", (number,))
+                    self._database.execute("DELETE FROM member WHERE rowid = ?", (row,))
                 else:
-                    found[report.key] = (report.status, report.message)
-        self._keys = {*found}
+                    results[report.key] = (report.status, report.message)
+        self._keys = {*results}
         self.commit()
-        return found
+        return results
 
     def put(self, report: MemberReport) -> None:
-        """Keeps a report; it is on the disk with the next commit."""
-        large = len(report.content) > LARGE_BYTES
-        with self._storing():
-            if large:
+        """Store a report. It is on the disk after the next commit."""
+        is_large = len(report.content) > LARGE_BYTES
+        with self._report_errors():
+            if is_large:
                 self._write(report)
-            content = None if large else report.content
+            content = None if is_large else report.content
             key, status, message = report.key, report.status, report.message
             self._begin()
-            row = (key, status, message, int(large), report.digest, content)
+            row = (key, status, message, int(is_large), report.digest, content)
             self._database.execute(PUT, row)
         self._keys.add(report.key)
         self.commit_if_due()
 
     def commit_if_due(self) -> None:
-        """About once a second: each commit waits for the disk."""
+        """Commit about once a second, since each commit waits for the disk."""
         if time.monotonic() >= self._due:
             self.commit()
 
     def commit(self) -> None:
-        """Now; then the number of members that are held is noted beside the database."""
-        with self._storing():
+        """Commit all results, and write their number beside the database."""
+        with self._report_errors():
             if self._database.in_transaction:
                 self._database.execute("COMMIT")
             self._lock.seek(0)
@@ -143,63 +179,76 @@ class Store:
         self._due = time.monotonic() + COMMIT_S
 
     def report(self, key: str) -> MemberReport:
-        """What is held of a member; StorageError where it is not what was written."""
-        with self._storing():
+        """Return the result of a member.
+
+        Raises
+        ------
+        StorageError
+            If it is missing or damaged.
+        """
+        with self._report_errors():
             query = f"SELECT {COLUMNS} FROM member WHERE key = ?"
-            report = self._checked(self._database.execute(query, (key,)).fetchone() or ())
+            report = self._verified(self._database.execute(query, (key,)).fetchone() or ())
         if not isinstance(report, str) and report.key != key:
             report = "is of another member"
         if isinstance(report, str):
             raise StorageError(
-                f"{self._path}: what is held of a member {report}; the same command runs it again"
+                f"{self._path}: the result of a member {report}; the same command runs it again"
             )
         return report
 
     def look_around(self) -> None:
-        """After the last commit: raises StorageError where the folder is gone, and adds to `faults`
-        where the database is."""
+        """Check after the last commit that folder and database still exist.
+
+        A missing database is reported in `faults`.
+
+        Raises
+        ------
+        StorageError
+            If the folder was moved or removed.
+        """
         self._refuse_moved()
         try:
-            there = os.path.samestat(self._path.stat(), self._opened)
+            exists = os.path.samestat(self._path.stat(), self._opened)
         except OSError:
-            there = False
-        if not there:
+            exists = False
+        if not exists:
             self.faults.append(
-                f"{self._path}: was removed or replaced while the sweep ran; what this call did is "
-                "in sweep.nc alone, and the next one runs the members again"
+                f"{self._path}: was removed or replaced during the sweep; its results are in "
+                "sweep.nc alone, and the next call runs the members again"
             )
 
     def _refuse_moved(self) -> None:
         try:
-            there = os.path.samestat(self._folder.stat(), self._place)
+            exists = os.path.samestat(self._folder.stat(), self._place)
         except OSError:
-            there = False
-        if not there:
+            exists = False
+        if not exists:
             raise StorageError(
-                f"{self._folder}: was moved or removed while the sweep ran; where it is there "
-                "again, the same command goes on with what it holds"
+                f"{self._folder}: was moved or removed during the sweep; once it is there again, "
+                "the same command continues with its results"
             )
 
-    def _checked(self, row: Row) -> MemberReport | str:
-        """The report in a row, or what is wrong with it."""
-        changed = "is not what was written"
-        key, status, message, large, digest, content = row or (None,) * 6
+    def _verified(self, row: Row) -> MemberReport | str:
+        """Return the report in a row, or its fault."""
+        fault = "is not what was written"
+        key, status, message, is_large, digest, content = row or (None,) * 6
         if not re.fullmatch("[0-9a-f]{32}", str(key)):
-            return changed
-        if large:
+            return fault
+        if is_large:
             try:
                 content = self._file(key).read_bytes()
             except (OSError, ValueError) as error:
                 return f"belongs to {self._file(key)}, which cannot be read: {error}"
         if not isinstance(content, bytes) or digest_of(key, status, message, content) != digest:
-            return changed
+            return fault
         return MemberReport(key, status, message, content, digest)
 
     def _file(self, key: str) -> Path:
-        return self._folder / LARGE / f"{key}.member"
+        return self._folder / LARGE_FOLDER / f"{key}.member"
 
     def _write(self, report: MemberReport) -> None:
-        """Under a name that no process on any machine has, then under its own."""
+        """Write to a name that no other process uses, then rename."""
         path = self._file(report.key)
         path.parent.mkdir(exist_ok=True)
         temporary = path.with_name(f".{socket.gethostname()}.{os.getpid()}.{uuid.uuid4().hex}")
@@ -214,106 +263,114 @@ class Store:
             raise
 
     def _clear(self) -> None:
-        """Removes what killed sweeps were writing: none runs, as this one has the lock."""
-        for folder in (self._folder, self._folder / LARGE):
+        """Remove temporary files of killed sweeps; none is running, since this one has the lock."""
+        for folder in (self._folder, self._folder / LARGE_FOLDER):
             for path in folder.glob(".*"):
                 if TEMPORARY.fullmatch(path.name):
                     path.unlink()
 
-    def _make_sound(self) -> None:
-        """Makes the database, or one of what is sound in a damaged one, which is set aside. It gets
-        its name when it is whole."""
-        new, noted = self._folder / NEW, self._noted()
-        if new.exists() and not self._path.exists():  # killed while it changed places
+    def _repair(self) -> None:
+        """Create the database, or a new one with the intact rows of a damaged one.
+
+        It gets its final name when it is complete.
+        """
+        new, count = self._folder / NEW, self._member_count()
+        if new.exists() and not self._path.exists():  # killed between both renames
             new.replace(self._path)
-        fault = self._fault(noted)
+        fault = self._fault(count)
         if fault is None:
             return
         for path in files_of(new):
             path.unlink(missing_ok=True)
         with closing(connect(new, "rwc")) as database:
             database.execute("BEGIN")
-            for setting in (f"application_id = {APPLICATION}", f"user_version = {FORMAT}"):
-                database.execute(f"PRAGMA {setting}")
+            for pragma in (f"application_id = {APPLICATION}", f"user_version = {FORMAT}"):
+                database.execute(f"PRAGMA {pragma}")
             database.execute(TABLE)
             if fault:
-                database.executemany(PUT, self._sound())
+                database.executemany(PUT, self._intact_rows())
             database.execute("COMMIT")
-            (kept,) = database.execute("SELECT COUNT(*) FROM member").fetchone()
+            (intact,) = database.execute("SELECT COUNT(*) FROM member").fetchone()
         if fault:
-            aside = self._set_aside()
-            moved = f"; what was there is in {aside}" if aside else ""
+            folder = self._set_aside()
+            remark = f"; the damaged one is in {folder}" if folder else ""
             self.faults.append(
-                f"{self._path}: {fault}; {kept} members of it are sound and stay held, in a new "
-                f"one; the others run again{moved}"
+                f"{self._path}: {fault}; {intact} members of it are intact and stay stored, in a "
+                f"new one; the others run again{remark}"
             )
         new.replace(self._path)
         sync_folder(self._folder)
 
-    def _fault(self, noted: int) -> str | None:
-        """Why the database cannot be used as it is: empty where it was never made whole, None where
-        it can be used. Raises StorageError for what may be somebody else's."""
+    def _fault(self, count: int) -> str | None:
+        """Return why the database cannot be used: empty if it was never completed, None if it can
+        be used.
+
+        Raises
+        ------
+        StorageError
+            If the file may belong to another program.
+        """
         logs = any(size_of(path) for path in files_of(self._path)[1:3])
         if not is_database(self._path):
-            if noted or logs:
-                return f"is missing, or no database, and {noted or 'some'} members were held"
+            if count or logs:
+                return f"is missing, or no database, and {count or 'some'} members were stored"
             if size_of(self._path) > ONE_PAGE or not _may_become_database(self._path):
-                raise self._stranger()
+                raise self._foreign_store()
             return ""
         try:
-            with ExitStack() as looking:
-                return self._fault_within(look(self._path, looking), noted, logs)
+            with ExitStack() as stack:
+                return self._fault_within(look(self._path, stack), count, logs)
         except sqlite3.DatabaseError as error:
             if error.sqlite_errorcode & 0xFF in LOCKED:
                 raise
             return f"is damaged: {error}"
 
-    def _fault_within(self, database: sqlite3.Connection, noted: int, logs: bool) -> str | None:
+    def _fault_within(self, database: sqlite3.Connection, count: int, logs: bool) -> str | None:
         (owner,) = database.execute("PRAGMA application_id").fetchone()
-        (form,) = database.execute("PRAGMA user_version").fetchone()
+        (version,) = database.execute("PRAGMA user_version").fetchone()
         schema = database.execute("SELECT sql FROM sqlite_master").fetchall()
-        if not noted and not schema and owner in (0, APPLICATION):
-            return "is damaged: its log is not what was written" if logs else ""
-        if (not noted and owner != APPLICATION) or (owner == APPLICATION and form > FORMAT):
-            raise self._stranger()
+        if not count and not schema and owner in (0, APPLICATION):
+            return "is damaged: its log was changed" if logs else ""
+        if (not count and owner != APPLICATION) or (owner == APPLICATION and version > FORMAT):
+            raise self._foreign_store()
         if fault := fault_of(database):
             return f"is damaged: {fault}"
-        if (owner, form) != (APPLICATION, FORMAT) or schema != [(TABLE,), (None,)]:
+        if (owner, version) != (APPLICATION, FORMAT) or schema != [(TABLE,), (None,)]:
             return "is damaged, or of an earlier pbdkit"
-        (held,) = database.execute("SELECT COUNT(*) FROM member").fetchone()
-        if held < noted:
-            return f"is damaged: it holds {held} members of {noted}, as where its log was removed"
+        (stored,) = database.execute("SELECT COUNT(*) FROM member").fetchone()
+        if stored < count:
+            return f"is damaged: it contains {stored} of {count} members, as if its log was removed"
         return None
 
-    def _stranger(self) -> StorageError:
-        return StorageError(f"{self._path}: is no store of a sweep that this pbdkit reads")
+    def _foreign_store(self) -> StorageError:
+        return StorageError(f"{self._path}: is not a store of a sweep that this pbdkit can read")
 
-    def _sound(self) -> Iterator[Row]:
-        """The rows of a damaged database that are as they were written, from both of its ends."""
+    def _intact_rows(self) -> Iterator[Row]:
+        """Yield the intact rows of a damaged database, read from both of its ends."""
         for order in ("", "ORDER BY rowid DESC"):
-            with suppress(sqlite3.Error), ExitStack() as looking:
+            with suppress(sqlite3.Error), ExitStack() as stack:
                 if not is_database(self._path):
                     return
-                database = look(self._path, looking)
+                database = look(self._path, stack)
                 database.text_factory = partial(str, encoding="utf-8", errors="replace")
                 for row in database.execute(f"SELECT {COLUMNS} FROM member {order}"):
-                    if not isinstance(self._checked(row), str):
+                    if not isinstance(self._verified(row), str):
                         yield row
 
     def _set_aside(self) -> Path | None:
-        """Moves what there is of the database to a folder of its own, which it returns."""
-        there = [path for path in files_of(self._path) if path.exists()]
-        if not there:
+        """Move the files of the database to a new folder, and return it."""
+        files = [path for path in files_of(self._path) if path.exists()]
+        if not files:
             return None
-        names = (self._folder / f"{ASIDE}-{n}" for n in count(1))
-        aside = next(path for path in names if not path.exists())
-        aside.mkdir()
-        for path in there:
-            path.replace(aside / path.name)
-        return aside
+        names = (self._folder / f"{DAMAGED_FOLDER}-{n}" for n in count(1))
+        folder = next(path for path in names if not path.exists())
+        folder.mkdir()
+        for path in files:
+            path.replace(folder / path.name)
+        return folder
 
-    def _noted(self) -> int:
-        """The number of members that were held after the last commit; 0 where nothing tells."""
+    def _member_count(self) -> int:
+        """Return the number of stored members after the last commit; 0 if it is unknown."""
         self._lock.seek(0)
         try:
             return int(self._lock.read(20))
@@ -332,7 +389,7 @@ class Store:
             self._database.execute("BEGIN IMMEDIATE")
 
     @contextmanager
-    def _storing(self) -> Iterator[None]:
+    def _report_errors(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.Error as error:
@@ -345,16 +402,22 @@ class Store:
     def _reason(self, error: sqlite3.Error) -> str:
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in LOCKED:
             return (
-                f"another program has kept it locked for {PATIENCE_S:g} s; close that, and give "
-                "the same command again: it goes on with what is held"
+                f"another program has locked it for {PATIENCE_S:g} s; close that program, and run "
+                "the same command again: it continues with the stored results"
             )
         if is_full(self._folder):
             return FULL
-        return f"{error}; what is held stays, and the same command goes on with what is sound of it"
+        return f"{error}; stored results remain, and the same command continues with intact ones"
 
 
 def _may_become_database(path: Path) -> bool:
-    """Whether a file is not there, empty, or the beginning of a database. Raises OSError."""
+    """Return whether a file is missing, empty, or the beginning of a database.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    """
     if not path.exists():
         return True
     with path.open("rb") as file:
@@ -363,13 +426,19 @@ def _may_become_database(path: Path) -> bool:
 
 
 def _locked(path: Path) -> io.FileIO:
-    """The lock file, which this process alone holds while it is open. Raises StorageError."""
+    """Open the lock file, which this process holds while it is open.
+
+    Raises
+    ------
+    StorageError
+        If another process holds it.
+    """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
     file = io.FileIO(descriptor, "r+b")
     if lock(file):
         return file
     file.close()
     raise StorageError(
-        f"{path.parent}: another sweep is running into this folder; wait for its end, or name "
+        f"{path.parent}: another sweep is running in this folder; wait for its end, or name "
         "another folder"
     )

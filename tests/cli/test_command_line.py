@@ -191,8 +191,8 @@ WRONG = {
     "file for a folder": (6, ["run", "e.json", "-o", "e.json/o.nc"], "e.json/o.nc: there is no folder e.json"),
     "closed folder": (6, ["run", "e.json", "-o", "/proc/o.nc"], "/proc/o.nc: cannot be written"),
     "long file name": (6, ["run", "e.json", "-o", "o" * 300], "File name too long"),
-    "init over a file": (2, ["init", "e.json"], "e.json: exists and is left as it is"),
-    "init of a shipped one": (2, ["init", "paper/f1"], "paper/f1: is a shipped experiment, no file to be written; `pbdkit init f1.yaml --from paper/f1` copies it"),
+    "init over a file": (2, ["init", "e.json"], "e.json: exists and is not changed"),
+    "init of a shipped one": (2, ["init", "paper/f1"], "paper/f1: is the name of a shipped experiment, not a file; `pbdkit init f1.yaml --from paper/f1` copies it"),
     "init from no shipped one": (2, ["init", "--from", "paper/f3"], "paper/f3: is no shipped experiment; did you mean 'paper/f2'?"),
     "no shipped experiment": (2, ["experiments", "f1"], "f1: is no shipped experiment; `pbdkit experiments` lists them"),
     "plot of nothing": (6, ["plot", "o.nc"], "o.nc: there is no such file"),
@@ -279,7 +279,7 @@ def test_an_interruption_keeps_all(call: Call, probing: Probing, name: str, ever
     result = call(*PROBED, "--set", f"record.every={every}")
     code = {"SIGINT": 130, "SIGTERM": 143}[name]
     assert (result.code, left()) == (code, ["tensile.nc.run", "tensile.nc.run-records"])
-    how = "`pbdkit resume tensile.nc` goes on from what was kept"
+    how = "`pbdkit resume tensile.nc` continues it"
     assert result.err == f"pbdkit: interrupted: stopped after step 3; {how}\n"
     ds = pbdkit.open(OUT)
     assert ds.attrs["status"] == "interrupted"

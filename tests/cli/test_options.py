@@ -75,7 +75,7 @@ def test_the_experiment_itself_is_not_replaced(call: Call, name: str) -> None:
 def test_a_name_that_is_no_utf_8_is_refused(call: Call) -> None:
     result = call("run", "e.json", "-o", os.fsdecode(b"o\xff.nc"))
     assert (result.code, left()) == (2, [])
-    assert "o\\xff.nc: is no UTF-8; name another file with -o" in result.err
+    assert "o\\xff.nc: the name is not UTF-8; name another file with -o" in result.err
 
 
 FAILING = {
@@ -101,7 +101,7 @@ def test_a_run_that_fails_leaves_a_good_result_as_it_is(
     for name in ("tensile-partial.nc", "tensile-partial-2.nc"):
         result = call("run", "e.json", "--force", *settings)
         assert (result.code, OUT.read_bytes() == good) == (code, True)
-        ending = f"what was recorded until then is in {name}; tensile.nc is left as it was\n"
+        ending = f"the records until then are in {name}; tensile.nc is unchanged\n"
         assert result.err.endswith(ending)
         assert pbdkit.open(name).attrs["status"] == status
     assert left() == ["tensile-partial-2.nc", "tensile-partial.nc", "tensile.nc"]
@@ -113,7 +113,7 @@ def test_a_run_that_fails_takes_its_name_where_nobody_has_it(call: Call) -> None
     code, settings = FAILING["diverged"]
     result = call("run", "e.json", "--force", *settings)
     assert (result.code, left()) == (code, ["tensile.nc"])
-    assert result.err.endswith("what was recorded until then is in tensile.nc\n")
+    assert result.err.endswith("the records until then are in tensile.nc\n")
 
 
 def test_a_result_beside_is_kept_where_there_are_no_hard_links(

@@ -21,7 +21,7 @@ class Terminal(io.StringIO):
 
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PATIENCE_S", 0.02)
+    monkeypatch.setattr(module, "DELAY_S", 0.02)
     monkeypatch.setenv("TERM", "xterm")
 
 
@@ -50,7 +50,7 @@ def test_what_takes_longer_is_told_and_what_comes_next() -> None:
 
 
 def test_what_is_quick_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PATIENCE_S", 60.0)
+    monkeypatch.setattr(module, "DELAY_S", 60.0)
     with looking(Terminal()) as shown, waiting("blinking"):
         pass
     assert shown.getvalue() == ""
@@ -81,7 +81,7 @@ def test_the_line_goes_where_something_fails() -> None:
 def test_with_json_nothing_else_is_said(
     call: Any, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(module, "DELAY_S", 0.0)
     with looking(Terminal()) as shown:
         assert call(command, "e.json", "--json").code == 0
     assert shown.getvalue() == ""

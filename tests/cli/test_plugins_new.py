@@ -164,16 +164,16 @@ def test_three_commands_lead_to_the_first_run(tmp_path: Path, interpreted: None)
 
 
 REFUSED = {
-    "pbdkit-": "'pbdkit-' is no name for a distribution: it begins with a letter, ends with",
-    "my rule": "'my rule' is no name for a distribution: ",
-    "../mine": "'../mine' is no name for a distribution: ",
-    "pbdkit": "there is a module pbdkit already; try pbdkit-my-pbdkit",
-    "json": "there is a module json already; try pbdkit-my-json",
-    "numpy": "there is a module numpy already; try pbdkit-my-numpy",
-    "if": "there is a module if already; try pbdkit-my-if",
-    "pbdkit-2d": "'pbdkit-2d' makes no name for a class; try pbdkit-my-2d",
-    "literal": "'literal' makes no name for a class; try pbdkit-my-literal",
-    "pbdkit-none": "'pbdkit-none' makes no name for a class; try pbdkit-my-none",
+    "pbdkit-": "'pbdkit-' is not a valid distribution name: it starts with a letter, ends with",
+    "my rule": "'my rule' is not a valid distribution name: ",
+    "../mine": "'../mine' is not a valid distribution name: ",
+    "pbdkit": "there is already a module pbdkit; try pbdkit-my-pbdkit",
+    "json": "there is already a module json; try pbdkit-my-json",
+    "numpy": "there is already a module numpy; try pbdkit-my-numpy",
+    "if": "there is already a module if; try pbdkit-my-if",
+    "pbdkit-2d": "'pbdkit-2d' gives no valid name for a class; try pbdkit-my-2d",
+    "literal": "'literal' gives no valid name for a class; try pbdkit-my-literal",
+    "pbdkit-none": "'pbdkit-none' gives no valid name for a class; try pbdkit-my-none",
     "pbdkit-barycentre": "'barycentre' is a built-in FollowerRule; try pbdkit-my-barycentre",
 }
 
@@ -193,7 +193,7 @@ def test_one_spelling_of_the_name_counts(call: Call) -> None:
 def test_what_is_there_is_left_as_it_is(call: Call) -> None:
     Path("pbdkit-mine").mkdir()
     result = call("plugins", "new", "pbdkit-mine")
-    message = "pbdkit: pbdkit-mine: exists and is left as it is; take another name or --dir\n"
+    message = "pbdkit: pbdkit-mine: exists and is not changed; choose another name or --dir\n"
     assert (result.code, result.err) == (2, message)
     assert list(Path("pbdkit-mine").iterdir()) == []
 

@@ -125,7 +125,7 @@ LATE = [
 
 
 @pytest.mark.parametrize("leaders", LATE, ids=["begins", "ends", "moves again"])
-@pytest.mark.filterwarnings("ignore:leaders.2. begins to lead after")
+@pytest.mark.filterwarnings("ignore:leaders.2. starts after")
 def test_it_never_ends_before_the_last_motion_and_change_of_roles(leaders):
     ds = run(sheet(5, 4, leaders=leaders, tolerance=1e-3))
     assert ds.attrs["status"] == "settled"

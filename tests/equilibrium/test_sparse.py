@@ -155,7 +155,7 @@ def test_an_interrupted_search_keeps_the_start(call, monkeypatch, what):
     assert result.code == 130
     assert result.err == (
         "pbdkit: interrupted: stopped on the way to equilibrium, after step 0; `pbdkit resume "
-        "sheet.nc` goes on from what was kept\n"
+        "sheet.nc` continues it\n"
     )
     ds = pbdkit.open("sheet.nc")
     assert ds.attrs["status"] == "interrupted"
@@ -203,7 +203,7 @@ def test_progress_is_told_in_phases_and_shares(monkeypatch):
 
 
 def test_progress_is_drawn_on_a_terminal(monkeypatch, capsys):
-    monkeypatch.setattr("pbdkit.progress.PATIENCE_S", 0.0)
+    monkeypatch.setattr("pbdkit.progress.DELAY_S", 0.0)
     monkeypatch.setattr("pbdkit.progress.REFRESH_S", 0.0)
     monkeypatch.setenv("FORCE_COLOR", "1")
     pbdkit.run(sheet(), progress=True)

@@ -72,7 +72,7 @@ def test_few_places_and_couplings_that_reach_far_are_not_dissected():
 def test_dissected_factors_solve_both_ways_and_fill_in_less(shift):
     scene = build_scene(pbdkit.Experiment(**experiment(HEXAGONAL_BAR, 40)))
     operator = step_operator(scene)
-    both = sparse.csr_array(sparse.eye_array(operator.now.shape[0]) - operator.now)
+    both = sparse.csr_array(sparse.eye_array(operator.current.shape[0]) - operator.current)
     places = scene.raster.reference(operator.followers) + shift
     plain = linear.SparseLU(both, symmetric=False)
     found = linear.SparseLU(

@@ -85,7 +85,7 @@ TRUE = {"rule.poisson_ratio": 0.3, "solver.relaxation": 0.8}
 def within(found, *, of=TRUE):
     """Within four of their standard errors, which are small."""
     for path, estimate in found.values.items():
-        assert estimate.told
+        assert estimate.identifiable
         assert estimate.error < 0.01
         assert estimate.value == pytest.approx(of[path], abs=4 * estimate.error)
 
@@ -288,7 +288,7 @@ def test_a_state_that_does_not_come_is_no_displacement_of_0(tmp_path, monkeypatc
         "_recorded",
         lambda self, run: (each for each in every(self, run) if each[0] != 8),
     )
-    with pytest.raises(pbdkit.ExperimentError, match=r"gives no state at time 7\.5"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"has no state at time 7\.5"):
         problem.at(problem.start())
 
 

@@ -364,9 +364,9 @@ def test_bonds_that_change_and_obstacles_are_refused():
     ("path", "told"),
     [
         ("rule.poison_ratio", "there is no 'poison_ratio'"),
-        ("rule", "'rule' is no number"),
+        ("rule", "'rule' is not a number"),
         ("leaders.7.motion", "there is no '7'"),
-        ("rule.type", "is no number"),
+        ("rule.type", "is not a number"),
     ],
 )
 def test_what_is_no_number_of_the_experiment_is_refused(path, told):
@@ -377,7 +377,7 @@ def test_what_is_no_number_of_the_experiment_is_refused(path, told):
 
 def test_a_number_on_its_bound_has_no_derivative():
     experiment = pbdkit.Experiment(**SHEET | {"rule": ELASTIC | {"poisson_ratio": 0.5}})
-    with pytest.raises(pbdkit.ExperimentError, match="stands on its bound"):
+    with pytest.raises(pbdkit.ExperimentError, match="is at its bound"):
         Resting.of(experiment).change(Parameter("rule.poisson_ratio"))
 
 
@@ -385,5 +385,5 @@ def test_a_number_that_decides_who_is_there_has_no_derivative():
     experiment = pbdkit.Experiment(
         **SHEET | {"rule": ELASTIC, "body": {"type": "rectangle", "width": 5.1, "height": 4.1}}
     )
-    with pytest.raises(pbdkit.ExperimentError, match="which particles there are"):
+    with pytest.raises(pbdkit.ExperimentError, match="which particles exist"):
         Resting.of(experiment).change(Parameter("body.width"))

@@ -220,7 +220,7 @@ def test_a_third_party_s_rule_is_a_candidate(fit):
         | {"unknown": rival["unknown"]},
         components=[Lazy],
     )  # fmt: skip
-    assert not own.values["rule.share"].told
+    assert not own.values["rule.share"].identifiable
 
 
 def test_wide_bounds_start_where_the_gap_is_least(tmp_path):
@@ -253,7 +253,7 @@ WRONG = {
     ),
     "a candidate without its unknown": (
         {"candidates": {"other": {"settings": {"rule": {"type": "springs"}}}}},
-        "^candidates.other: .*no number of the experiment.* of its own",
+        "^candidates.other: .*not a number of the experiment.* a separate `unknown`",
     ),
 }  # fmt: skip
 

@@ -106,7 +106,7 @@ def test_case_13_the_mode_that_never_decays_is_found_and_decays_below_relaxation
     last = np.abs(u[-1] - u[-2]).max()
     # What is left is the chequerboard, by its own invariant: the mean of (-1)^(i+j) u.
     sign = (-1.0) ** ds.site.values[ds.kind[0] != 2].sum(axis=1)
-    weight = pbdkit.analyse(given, components=[Periodic, Even]).operator.now.toarray()[::2, ::2]
+    weight = pbdkit.analyse(given, components=[Periodic, Even]).operator.current.toarray()[::2, ::2]
     values, vectors = np.linalg.eig(weight.T)
     left = vectors[:, np.argmin(values.real)].real
     share = left @ u[0] / (left @ sign)
@@ -217,7 +217,7 @@ def test_case_17_in_1e5_steps_without_a_leader_the_frame_does_not_drift():
     given = experiment(4, 3, **parts, **start, solver=solver, steps=100000)
     ds = pbdkit.run(given, progress=False)
     u = ds.u.values[:, ds.kind[0] != 2]
-    step = pbdkit.analyse(given).operator.now.toarray()[::2, ::2]
+    step = pbdkit.analyse(given).operator.current.toarray()[::2, ::2]
     values, vectors = np.linalg.eig(step.T)
     weight = vectors[:, np.argmax(values.real)].real
     invariant = weight @ u[0] / weight.sum()

@@ -209,7 +209,7 @@ def test_the_parameter_of_mixed_coordinates_is_no_poisson_ratio(axis):
     assert found.reasons == (
         f"it depends on the place: when everything moves by 1 along {axis}, the particle at (0, 0) "
         f"of the body moves 0.004 more along {across} a step than the one in the middle; no "
-        "constant of a material does that: K is no Poisson ratio",
+        "material constant does that: K is not a Poisson ratio",
     )
 
 
@@ -329,4 +329,7 @@ def test_neighbours_found_anew_are_those_at_rest():
     neighbours = {"type": "euclidean", "radius": 1.0, "reevaluate": True}
     found = identity(SQUARE, neighbours, BARYCENTRE)
     assert found.diffusivity == pytest.approx(0.25)
-    assert "neighbours are found anew: the figures hold while they are those at rest" in found.notes
+    assert (
+        "neighbours are searched at every step: the figures hold while they are those at rest"
+        in found.notes
+    )

@@ -92,26 +92,26 @@ def test_the_scale_of_the_lattice_changes_nothing():
         ),
         (
             "windy",
-            "neighbours opposite to each other do not weigh the same: a displacement is carried "
-            "along, on average by (-0.15, 0) h a step",
+            "opposite neighbours have different weights: displacements drift, "
+            "on average by (-0.15, 0) h a step",
         ),
         (
             "anchored",
-            "a rigid translation is not left alone: when everything moves by 1 along x, the rule "
+            "a rigid translation is not preserved: when everything moves by 1 along x, the rule "
             "moves a particle by -0.1 along x a step",
         ),
         (
             "restless",
-            "a body at rest does not stay: the rule moves it by 0.01 h a step",
+            "a body at rest does not stay at rest: the rule moves it by 0.01 h a step",
         ),
         (
             "bent",
-            "small displacements do not add up, however small: the rule is not differentiable at "
-            "rest, and no plane wave answers for another",
+            "small displacements do not superpose, however small: the rule is not differentiable "
+            "at rest, and plane waves do not describe it",
         ),
         (
             "idle",
-            "nothing of second order is left: long waves do not decay as diffusion does",
+            "the second-order terms vanish: long waves do not decay as in diffusion",
         ),
         (
             "growing",
@@ -166,14 +166,14 @@ def test_a_rule_at_fault_is_named():
     with pytest.raises(pbdkit.PluginError) as caught:
         identity(SQUARE, EIGHT, "failing")
     assert str(caught.value).startswith(
-        "FollowerRule 'failing' failed when asked for its answer to small displacements: "
+        "FollowerRule 'failing' failed when evaluated for small displacements: "
         "ValueError: no such neighbour (identity_cases.py, line "
     )
     with pytest.raises(pbdkit.ExperimentError) as refused:
         identity(SQUARE, EIGHT, "dividing")
     assert str(refused.value) == (
-        "'dividing' answers small displacements of a body at rest with numbers that are not "
-        "finite: look at what it divides by"
+        "'dividing' returns values that are not finite for small displacements of a body at "
+        "rest: check its divisions"
     )
     assert refused.value.where == ("rule",)
 

@@ -75,7 +75,7 @@ def test_an_intact_bond(explain):
     assert answer.out.splitlines() == [
         "bond 2-4: shell 1, rest length 1",
         "intact, strain 0.3125 in step 40, breaks above 0.5 (0.625 of the way)",
-        "longest of the recorded steps in step 20: strain 0.3125",
+        "largest strain of the recorded steps in step 20: 0.3125",
         "broken around it: none",
         f"not broken around it: 2, the most strained 3-4: intact, strain {across:.6g} in step 40, "
         f"breaks above 0.5 ({across / 0.5:.3g} of the way)",
@@ -108,7 +108,7 @@ def test_a_run_of_a_model_that_does_not_say_when_it_breaks(explain, monkeypatch)
     lines = explain(fracture={"type": "threshold", "thresholds": [1.3]}).out.splitlines()
     assert lines[3].endswith("not known")
     assert lines[6] == (
-        "threshold does not say above which strain a bond breaks: a model does by `breaking_strain`"
+        "threshold has no strain above which a bond breaks: models declare it by `breaking_strain`"
     )
 
 

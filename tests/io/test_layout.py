@@ -185,10 +185,13 @@ def test_runs_of_other_bodies_and_parts_are_concatenated(tmp_path):
 
 
 def test_what_is_no_run_is_not_concatenated(sheet):
-    for runs, said in [([], "there is no run"), ([sheet, sheet.drop_attrs()], "carries no exper")]:
+    for runs, said in [
+        ([], "there are no runs"),
+        ([sheet, sheet.drop_attrs()], "has no experiment"),
+    ]:
         with pytest.raises(pbdkit.ExperimentError, match=said):
             pbdkit.concat(runs)
-    with pytest.raises(pbdkit.ExperimentError, match="have a 'time' already"):
+    with pytest.raises(pbdkit.ExperimentError, match="variable or dimension 'time'"):
         pbdkit.concat([sheet], "time")
 
 
@@ -271,5 +274,5 @@ def test_a_file_of_version_1_is_drawn_explained_and_tried(old, call, tmp_path):
     assert explained.out.splitlines()[0] == "fracture threshold: 9 of 49 bonds broke"
     assert call("plot", str(old), "-o", str(tmp_path / "old.png")).code == 0
     refused = call("resume", str(old), "--steps", "20")
-    assert (refused.code, "is of schema_version 1" in refused.err) == (2, True)
+    assert (refused.code, "has schema_version 1" in refused.err) == (2, True)
     assert call("verify", str(old)).code == 6

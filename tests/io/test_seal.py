@@ -114,7 +114,7 @@ def test_verify_says_a_line_a_file(sound, call, tmp_path):
     result = call("verify", *map(str, (good, bad, bare, tmp_path / "none.nc")))
     assert result.code == 6
     assert result.out.splitlines() == [
-        f"{good}: is as it was written",
+        f"{good}: unchanged since it was written",
         f"{bad}: bytes {begin} to {end} of {table['stop'][-1]} are not what was written",
         f"{bare}: carries no seal: nobody can tell whether it is as it was written",
         f"{tmp_path / 'none.nc'}: there is no such file",

@@ -140,7 +140,7 @@ def test_the_warning_is_printed_by_run_and_silenced_by_quiet(call, tmp_path):
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(1, 5), (6, 1), (1, 1)])
-@pytest.mark.filterwarnings("ignore:leaders. everybody leads")
+@pytest.mark.filterwarnings("ignore:leaders. all particles are leaders")
 def test_a_body_without_a_cell_is_refused_by_the_diagnostic_and_never_inside_out(columns, rows):
     given = experiment(columns, rows, leaders=BOTH_ENDS_HELD[:1])
     asked = given | {"diagnostics": [{"type": "smallest-cell-area"}]}

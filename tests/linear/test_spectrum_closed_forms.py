@@ -170,7 +170,7 @@ def test_without_leaders_the_left_eigenvector_gives_the_invariant_mean(lattice, 
     np.testing.assert_allclose(u[-1], np.tile(weight @ start, (20, 1)), rtol=0, atol=1e-10)
 
 
-@pytest.mark.filterwarnings("ignore:leaders. everybody leads")
+@pytest.mark.filterwarnings("ignore:leaders. all particles are leaders")
 def test_a_released_translation_runs_out_as_a_geometric_series_of_the_memory():
     v, b = np.array([0.25, -0.5]), 0.5
     motion = {"type": "velocity", "velocity": v.tolist(), "steps": 3}

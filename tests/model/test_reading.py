@@ -87,9 +87,9 @@ def test_plot_takes_an_experiment_by_any_name_and_refuses_what_is_neither(told: 
     for file in ("sweep.nc", "fit.nc", "other.yaml"):
         assert told("plot", file).startswith(NO_RESULT[file])
     assert told("plot", "picture.yaml").startswith(NO_EXPERIMENT["picture.yaml"])
-    refused = "--color: is for results; e.json is an experiment, of which the set-up is drawn; `pbdkit run e.json` makes a result of it"
+    refused = "--color: applies to results; e.json is an experiment, whose set-up is drawn; `pbdkit run e.json` computes a result"
     assert told("plot", "e.json", "--color", "u") == refused
-    assert told("plot", "experiment.nc", "--time", "3").startswith("--time: is for results")
+    assert told("plot", "experiment.nc", "--time", "3").startswith("--time: applies to results")
     refused = "--set: changes an experiment, and result.yaml is a result"
     assert told("plot", "result.yaml", "--set", "steps=3") == refused
 
@@ -101,7 +101,7 @@ def test_a_folder_is_no_result(call: Any, command: str) -> None:
 
 def test_a_result_is_one_under_any_name(call: Any) -> None:
     call("run", "e.json", "-o", "result.yaml", "--quiet")
-    assert call("verify", "result.yaml").out == "result.yaml: is as it was written\n"
+    assert call("verify", "result.yaml").out == "result.yaml: unchanged since it was written\n"
     assert pbdkit.open("result.yaml").attrs["status"] == "complete"
 
 

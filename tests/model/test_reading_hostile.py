@@ -16,7 +16,7 @@ from ruamel.yaml.scanner import Scanner
 
 import pbdkit
 from pbdkit import Experiment
-from pbdkit.errors import LONGEST, PbdkitError, printable
+from pbdkit.errors import MAX_CHARACTERS, PbdkitError, printable
 from pbdkit.model.reading import MAX_DEPTH, Source, read_text
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import rehearse
@@ -58,7 +58,7 @@ def test_an_unknown_type_is_shortened_and_escaped(field: str, name: str) -> None
     ) as caught:
         Experiment.build(Source(data={"name": "x", field: {"type": name}}))
     text = str(caught.value)
-    assert len(text) < LONGEST
+    assert len(text) < MAX_CHARACTERS
     assert all(c.isprintable() or c == "\n" for c in text)
     text.encode()
 

@@ -255,7 +255,7 @@ def test_progress_in_a_notebook_is_a_line_that_changes(monkeypatch, recwarn):
     shown = io.StringIO()
     kernel = SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=1))
     monkeypatch.setitem(sys.modules, "IPython", kernel)
-    monkeypatch.setattr(progress, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(progress, "DELAY_S", 0.0)
     monkeypatch.setattr(progress, "LINE_S", 0.0)
     monkeypatch.setattr(sys, "stdout", shown)
     with progress.progress_bar(True) as show:
@@ -271,7 +271,7 @@ def test_progress_in_a_notebook_is_a_line_that_changes(monkeypatch, recwarn):
 
 def test_elsewhere_progress_is_a_bar(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: None))
-    monkeypatch.setattr(progress, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(progress, "DELAY_S", 0.0)
     with progress.progress_bar(True) as show:
         show("step 10 of 100", 0.1)
     assert "after" not in capsys.readouterr().out

@@ -109,7 +109,7 @@ def test_the_operator_is_the_step(frame):
     rows = analysis.operator.followers
     u = scene.raster.table(start.u)[rows].ravel()
     after = scene.raster.table(Stepper(scene).advance(initial_state(scene)).u)[rows].ravel()
-    predicted = analysis.operator.now @ u + analysis.operator.source
+    predicted = analysis.operator.current @ u + analysis.operator.source
     np.testing.assert_allclose(after, predicted, rtol=0, atol=1e-14)
 
 

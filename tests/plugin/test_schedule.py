@@ -364,7 +364,7 @@ WRONG = {
                    r"rule\.stiffness: 'a' should be a number: there is no field in a field"),
     "auto": ({"solver": {"type": "stepping", "relaxation": "auto",
                          "memory": course([1, 2], [0.1, 0.2])}},
-             r"'auto' needs numbers that stay"),
+             r"'auto' needs constant parameters"),
     "force": ({"loads": [{"select": {"edge": "top"}, "force": [0, course([1, 2], [0])]}],
                "frame": NATURAL}, r"loads\.0\.force\.1: 2 steps have 1 values"),
     "a motion": ({"leaders": [{"select": {"edge": "left"}, "motion":

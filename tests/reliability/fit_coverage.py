@@ -172,7 +172,7 @@ def repeat(name: str, seed: int, trial: int, loss: str) -> list[tuple[float, flo
             fit["force"] = {"group": 1, "value": true.force}
         found = pbdkit.fit(fit)
     estimates = [found.youngs_modulus if p == YOUNG else found.values[p] for p in kind.true]
-    return [(e.value, e.error) if e.told else (np.nan, np.nan) for e in estimates]
+    return [(e.value, e.error) if e.identifiable else (np.nan, np.nan) for e in estimates]
 
 
 def told(name: str, found: np.ndarray) -> bool:

@@ -27,7 +27,7 @@ from hostile_text import hostile_setting, hostile_text, to_yaml
 from isolation import Outcome, forget_peak, outcomes, report, resident, serve
 
 import pbdkit
-from pbdkit.errors import LONGEST, PbdkitError
+from pbdkit.errors import MAX_CHARACTERS, PbdkitError
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import MAX_NODES, Source, read_text
 from pbdkit.model.shipped import shipped_names, shipped_text
@@ -119,7 +119,9 @@ def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
     if how in ("hang", "crash", "undocumented error"):
         return [f"{how} {said}"]
     found = []
-    if how != "valid" and (outcome["status"] not in (2, 3) or outcome["length"] > LONGEST + 100):
+    if how != "valid" and (
+        outcome["status"] not in (2, 3) or outcome["length"] > MAX_CHARACTERS + 100
+    ):
         found.append(f"status {outcome['status']}, {outcome['length']} characters: {said}")
     at_once = "file" in how
     seconds, mb = (ERROR_S, ERROR_MB) if at_once else (VALID_S, VALID_MB)

@@ -31,7 +31,7 @@ from pbdkit.errors import PbdkitError
 from pbdkit.scene import memory_estimate as sizes
 from pbdkit.sweeps import execute as outlook
 from pbdkit.sweeps.execute import validated
-from pbdkit.sweeps.specification import Asked, read_sweep
+from pbdkit.sweeps.specification import SweepPlan, read_sweep
 
 MEMBER_S = 0.2
 """What each of the members, of which there are a few dozen, may take besides."""
@@ -97,7 +97,7 @@ def tried(content: bytes) -> Outcome:
 def _checked(path: Path) -> Outcome:
     try:
         specified, base, source = read_sweep(path)
-        members = validated(Asked(specified, base, source), lambda *said: None)[1]
+        members = validated(SweepPlan(specified, base, source), lambda *said: None)[1]
     except PbdkitError as error:
         told = {"status": error.exit_status, "length": len(str(error)), "said": str(error)[:150]}
         return {"how": f"refused ({error.exit_status}), sweep"} | told

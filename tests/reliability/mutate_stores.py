@@ -219,7 +219,7 @@ class Trial:
             self.outcome = "gone on with"
             if not self.by_design and (wrong := result_is_other(self.whole)):
                 self.found.append(f"gone on with to another result: {wrong}")
-        elif "there is no unfinished run" in said:
+        elif "there is neither an unfinished run" in said:
             self.found.append(f"forgotten: {said}")
         else:
             self.outcome = "named"

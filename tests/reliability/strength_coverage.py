@@ -239,7 +239,7 @@ def simulated(law: str, trials: int, count: int, numbers: Any) -> bool:
     source, found = Specimens.of(experiment, Peaks(peaks=(1, 1, 1), of="force"), elastic), []
     for n in range(trials):
         seeds = numbers.integers(2**31, size=count).tolist()
-        peaks = [source.torn(seeded(experiment, seed)).peak.force for seed in seeds]
+        peaks = [source.tear(seeded(experiment, seed)).peak.force for seed in seeds]
         fit = described(law, peaks, method="simulation", seed=n + 1)
         found.append(_rows(fit_strength_of(fit, experiment)))
     return told(law, found, f"{law}, {count} specimens, simulation")
@@ -252,7 +252,7 @@ class Chains:
     peaks: Peaks
     elastic: None = None
 
-    def torn(self, experiment: pbdkit.Experiment) -> Specimen:
+    def tear(self, experiment: pbdkit.Experiment) -> Specimen:
         """By the strengths of their bonds."""
         fracture, numbers = experiment.fracture, np.random.default_rng(experiment.seed)
         if fracture.type == "weibull":
@@ -268,9 +268,9 @@ def closed(law: str, trials: int, count: int, numbers: Any) -> bool:
     source = Chains(Peaks(peaks=(1, 1, 1), of="force"))
     for n in range(trials):
         seeds = numbers.integers(2**31, size=count).tolist()
-        peaks = [source.torn(seeded(experiment, seed)).peak.force for seed in seeds]
+        peaks = [source.tear(seeded(experiment, seed)).peak.force for seed in seeds]
         fit = described(law, peaks, method="simulation", seed=n + 1)
-        draws = strength_simulation.simulated(fit, experiment, source)
+        draws = strength_simulation.fit_by_simulation(fit, experiment, source)
         found.append(_rows(fitted_strength(fit, LAWS[law].paths, draws, "simulation", LAWS[law])))
     return told(law, found, f"{law}, {count} chains, simulation")
 

@@ -301,5 +301,5 @@ def test_large_bodies_are_run_without_a_look_at_their_spectrum(
 ) -> None:
     scene = build_scene(pbdkit.load("paper/a"))
     assert outlook(scene)
-    monkeypatch.setattr("pbdkit.stability.forecast.LOOKED_AT", 100)
+    monkeypatch.setattr("pbdkit.stability.forecast.QUICK_PARTICLES", 100)
     assert outlook(scene) == []

@@ -169,14 +169,16 @@ def test_the_step_operator_is_the_step(parts):
         return planes.reshape(2, -1)[:, place].T.ravel().copy()
 
     state = engine.advance(initial_state(scene))
-    step = operator.now @ table(state.u, follow) + operator.before @ table(state.previous, follow)
-    step += operator.led @ table(state.u, lead) + operator.source
+    step = operator.current @ table(state.u, follow) + operator.previous @ table(
+        state.previous, follow
+    )
+    step += operator.leader @ table(state.u, lead) + operator.source
     after = table(engine.advance(state).u, follow)
-    free = np.setdiff1d(np.arange(len(after)), operator.held)
-    assert len(operator.held) > 0
+    free = np.setdiff1d(np.arange(len(after)), operator.prescribed_unknowns)
+    assert len(operator.prescribed_unknowns) > 0
     assert np.abs(step - after)[free].max() < 1e-15
-    assert not operator.now[operator.held].nnz
-    assert not operator.now[:, operator.held].nnz
+    assert not operator.current[operator.prescribed_unknowns].nnz
+    assert not operator.current[:, operator.prescribed_unknowns].nnz
 
 
 @pytest.mark.parametrize("method", ["matrix", "stencils"])

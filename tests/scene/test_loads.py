@@ -309,4 +309,4 @@ def test_a_load_after_the_end_is_warned_of():
     from pbdkit.stability.forecast import forecast
 
     found = forecast(scene_of(loaded(TIP | {"from": 9})))
-    assert "loads.0: begins to act after the run's last step" in found.warnings
+    assert "loads.0: starts after the last step of the run" in found.warnings

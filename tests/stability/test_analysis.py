@@ -64,7 +64,12 @@ def test_the_operator_makes_the_steps_that_the_stepper_makes(experiment):
     # Frame points that follow leaders see them where they stood before the step, or one earlier.
     assume(np.array_equal(led, old_led))
     assume(np.array_equal(led, unknowns(scene, before_step[1], operator.leaders)))
-    predicted = operator.now @ now + operator.before @ before + operator.led @ led + operator.source
+    predicted = (
+        operator.current @ now
+        + operator.previous @ before
+        + operator.leader @ led
+        + operator.source
+    )
     actual = unknowns(scene, state.u, operator.followers)
     scale = max(1.0, np.abs(actual).max(initial=0.0), np.abs(before).max(initial=0.0))
     np.testing.assert_allclose(predicted, actual, rtol=0, atol=1e-12 * scale)

@@ -53,7 +53,7 @@ def test_estimates_are_near_what_is_exact(parts):
 
 def test_of_large_bodies_coarser_grids_are_enough(monkeypatch):
     """1 - λ = ½ (1 - cos(π/N)) within 1 %, without a turn on the finest grid."""
-    monkeypatch.setattr("pbdkit.stability.analysis.MANY", 0)
+    monkeypatch.setattr("pbdkit.stability.analysis.LARGE_BODY", 0)
     scene = body(240, 60)
     exact = (1 - math.cos(math.pi / 239)) / 2
     assert 1 - StabilityEstimate(scene).spectrum.largest == pytest.approx(exact, rel=0.01)
@@ -106,13 +106,15 @@ def test_a_lag_without_a_hold_is_left_out_with_a_word(monkeypatch):
     analysis = Analysis(scene_of(16, 12, **parts))
     assert analysis.spectrum
     assert analysis.trailing is None
-    assert any("the lag is left out, in their fastest steps" in w for w in analysis.warnings())
+    assert any(
+        "the lag is left out, the leaders do not constrain" in w for w in analysis.warnings()
+    )
 
 
 def test_neighbours_found_anew_are_not_analysed_and_check_says_so():
     anew = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
     (said,) = [w for w in pbdkit.analyse(experiment(neighbours=anew)).warnings() if "left out" in w]
-    assert said.endswith("are left out, neighbours are found anew in every step")
+    assert said.endswith("are left out, neighbours are searched at every step")
 
 
 def test_check_answers_for_a_body_that_is_too_large_for_a_matrix(call):

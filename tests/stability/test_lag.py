@@ -147,14 +147,14 @@ def test_a_long_motion_that_is_not_followed_to_its_end_is_estimated():
 def test_what_is_reached_is_estimated_within_10_percent(steps, monkeypatch):
     parts = pulled(40, 12, 0.01, steps=steps)
     followed = pbdkit.analyse(experiment(**parts)).trailing
-    monkeypatch.setattr("pbdkit.stability.lag.DEAREST", 0.0)
+    monkeypatch.setattr("pbdkit.stability.lag.MAX_PRODUCTS", 0.0)
     estimated = pbdkit.analyse(experiment(**parts)).trailing
     assert estimated.steady == followed.steady
     assert estimated.reached == pytest.approx(followed.reached, rel=0.1)
 
 
 def test_what_is_reached_is_not_estimated_where_the_step_has_a_memory(monkeypatch):
-    monkeypatch.setattr("pbdkit.stability.lag.DEAREST", 0.0)
+    monkeypatch.setattr("pbdkit.stability.lag.MAX_PRODUCTS", 0.0)
     solver = {"type": "stepping", "memory": 0.5}
     lag = pbdkit.analyse(experiment(**pulled(8, 6, 0.01, solver=solver))).trailing
     assert lag.reached is None
@@ -178,7 +178,7 @@ def test_check_says_the_lag_and_warns_of_a_large_one(call, speed, warned):
     ) in said
     expected = (
         "leaders: in steps 1 to 10 the fastest moves by 0.35 a step and leaves the body 2.04 "
-        "behind its equilibrium, more than a bond (1): its speed decides how far bonds stretch; "
+        "behind its equilibrium, more than a bond (1): its speed determines the strain of bonds; "
         "move by less than 0.05 a step, or take solver: {type: equilibrium}"
     )
     assert (expected in figures["warnings"]) == warned

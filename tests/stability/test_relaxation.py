@@ -118,11 +118,12 @@ def test_a_result_holds_the_numbers_and_is_made_again_from_them():
 @pytest.mark.parametrize(
     ("parts", "text"),
     [
-        ({"frame": {"type": "mean", "lag": 1}}, "a frame with lag looks back farther; set "
+        ({"frame": {"type": "mean", "lag": 1}}, "a frame with lag reads earlier ones; set "
          "frame.lag: 0, or give numbers"),
         ({"neighbours": {"type": "euclidean", "radius": 1.1, "reevaluate": True}},
-         "neighbours that are found anew have none; set neighbours.reevaluate: false"),
-        ({"solver": AUTO | {"relaxation": 4.0}}, "no memory lets all modes shrink with relaxation "
+         "there is none if neighbours are searched at every step; set "
+         "neighbours.reevaluate: false"),
+        ({"solver": AUTO | {"relaxation": 4.0}}, "no memory lets all modes decay with relaxation "
          "4; give numbers, or leave them out (relaxation 1, memory 0)"),
     ],
 )  # fmt: skip

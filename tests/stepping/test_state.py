@@ -200,8 +200,8 @@ def test_the_operator_of_a_softened_state_is_the_step():
     operator = step_operator(scene, state, 25)
     u = scene.raster.table(state.u)
     damage = state.bond_values[1].copy()
-    predicted = (operator.now @ u[operator.followers].ravel() + operator.source).reshape(-1, 2)
-    predicted += (operator.led @ u[operator.leaders].ravel()).reshape(-1, 2)
+    predicted = (operator.current @ u[operator.followers].ravel() + operator.source).reshape(-1, 2)
+    predicted += (operator.leader @ u[operator.leaders].ravel()).reshape(-1, 2)
     after = Stepper(scene).advance(state, 1)
     same = (after.bond_values[1] == damage).all()
     moved = scene.raster.table(after.u)[operator.followers]

@@ -65,7 +65,10 @@ def test_automatic_names_are_the_shortest_that_mean_something(paths, names):
     ("names", "said"),
     [
         ({"body.widht": "span"}, "names: 'body.widht' is not varied; did you mean 'body.width'?"),
-        ({"body.width": "time"}, "names: body.width: results have a 'time' already; give another"),
+        (
+            {"body.width": "time"},
+            "names: body.width: 'time' has another meaning in results; choose another",
+        ),
         ({"body.width": "2a"}, "names.body.width: "),
         ({"body.width": "w", "rule.poisson_ratio.steel": "w"}, "two parameters have the same name"),
     ],

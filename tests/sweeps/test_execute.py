@@ -24,7 +24,7 @@ from pbdkit.io import sqlite_file
 from pbdkit.model.reading import Source
 from pbdkit.sweeps import store as stores
 from pbdkit.sweeps.execute import ClusterExecutor, ProcessExecutor, SerialExecutor, carry_out
-from pbdkit.sweeps.specification import Asked, checked, replicate_seeds
+from pbdkit.sweeps.specification import SweepPlan, checked, replicate_seeds
 
 VARY = {"solver.relaxation": [0.5, 1.0], "body.columns": [4, 5]}
 
@@ -170,7 +170,7 @@ def test_failures_stop_nobody_and_are_told(call, small):
         assert "left all bounds" in str(found.message.values[1])
     again = call("sweep", "s.json", "--workers", "1")
     assert again.code == 5
-    assert "0 run now, 3 held before" in again.out
+    assert "0 run now, 3 before" in again.out
     assert call("verify", "s/sweep.nc").code == 0
     assert "holds all members of a sweep" in call("plot", "s/sweep.nc").err
 
@@ -193,7 +193,7 @@ def test_who_kills_its_worker_is_given_up_and_the_others_run(small, probing):
 
 
 def test_a_second_sweep_into_the_same_folder_is_refused(small, tmp_path):
-    running = pytest.raises(pbdkit.StorageError, match="another sweep is running into this folder")
+    running = pytest.raises(pbdkit.StorageError, match="another sweep is running in this folder")
     with stores.Store(tmp_path), running:
         swept(small, vary={"steps": [2]}, folder=tmp_path)
     swept(small, vary={"steps": [2]}, folder=tmp_path)
@@ -229,7 +229,7 @@ def test_large_members_are_files_and_a_flipped_bit_in_one_is_named(
     monkeypatch.setattr(stores, "LARGE_BYTES", 1000)
     asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
     first = swept(small, **asked)
-    one, other = (tmp_path / stores.LARGE).iterdir()
+    one, other = (tmp_path / stores.LARGE_FOLDER).iterdir()
     content = bytearray(one.read_bytes())
     content[-1] ^= 1
     one.write_bytes(content)
@@ -247,11 +247,11 @@ def test_the_store_of_somebody_else_is_left_alone(small, tmp_path):
         database.execute("CREATE TABLE ours (x)")
     database.close()
     before = path.read_bytes()
-    with pytest.raises(pbdkit.StorageError, match="is no store of a sweep"):
+    with pytest.raises(pbdkit.StorageError, match="is not a store of a sweep"):
         swept(small, vary={"steps": [2]}, folder=tmp_path)
     assert path.read_bytes() == before
     path.write_bytes(b"words " * 1000)
-    with pytest.raises(pbdkit.StorageError, match="is no store of a sweep"):
+    with pytest.raises(pbdkit.StorageError, match="is not a store of a sweep"):
         swept(small, vary={"steps": [2]}, folder=tmp_path)
     assert path.read_bytes() == b"words " * 1000
 
@@ -266,7 +266,7 @@ def test_a_database_that_is_cut_gives_no_member_the_values_of_another(small, tmp
     for left in (156, 500, 900):
         path.write_bytes(whole[: len(whole) - 4096 + left])
         damaged = path.read_bytes()
-        with pytest.warns(pbdkit.PbdkitWarning, match="is damaged: .* stay held|it runs again"):
+        with pytest.warns(pbdkit.PbdkitWarning, match="is damaged: .* stay stored|it runs again"):
             same(first, swept(small, **asked))
         for aside in tmp_path.glob("set-aside-*"):
             assert (aside / stores.DATABASE).read_bytes() == damaged
@@ -283,7 +283,7 @@ def test_of_a_damaged_database_what_is_sound_stays_held(small, tmp_path, run_onl
     data[8192:8704] = bytes(512)  # the index of the keys
     path.write_bytes(data)
     run_only.clear()
-    with pytest.warns(pbdkit.PbdkitWarning, match="3 members of it are sound and stay held"):
+    with pytest.warns(pbdkit.PbdkitWarning, match="3 members of it are intact and stay stored"):
         same(first, swept(small, **asked))
     assert run_only == []
 
@@ -298,7 +298,7 @@ def test_members_whose_log_was_lost_are_said_to_be(small, tmp_path, run_only):
         if without_log:
             (tmp_path / stores.DATABASE).write_bytes(without_log)
         run_only.clear()
-        with pytest.warns(pbdkit.PbdkitWarning, match="(0 members of|and) 2"):
+        with pytest.warns(pbdkit.PbdkitWarning, match="(0 of|and) 2"):
             same(first, swept(small, **asked))
         assert len(run_only) == 2
 
@@ -346,8 +346,8 @@ def test_a_fault_while_the_database_is_made_leaves_a_folder_to_go_on_with(
 
 
 def test_what_killed_sweeps_were_writing_is_removed(small, tmp_path):
-    (tmp_path / stores.LARGE).mkdir()
-    left = [f".host.17.{'0f' * 16}.nc", f"{stores.LARGE}/.host.17.{'0f' * 16}"]
+    (tmp_path / stores.LARGE_FOLDER).mkdir()
+    left = [f".host.17.{'0f' * 16}.nc", f"{stores.LARGE_FOLDER}/.host.17.{'0f' * 16}"]
     for name in (*left, ".notes"):
         (tmp_path / name).touch()
     swept(small, vary={"steps": [2]}, folder=tmp_path)
@@ -362,7 +362,7 @@ def test_a_locked_database_is_waited_for_and_said_to_be_locked(small, tmp_path, 
     monkeypatch.setattr(sqlite_file, "PATIENCE_S", 0.1)
     other = sqlite3.connect(tmp_path / stores.DATABASE, isolation_level=None)
     other.execute("BEGIN EXCLUSIVE")
-    with pytest.raises(pbdkit.StorageError, match="another program has kept it locked") as told:
+    with pytest.raises(pbdkit.StorageError, match="another program has locked it") as told:
         swept(small, **asked | {"vary": {"steps": [2, 3]}})
     other.close()
     assert "remove" not in str(told.value)
@@ -385,7 +385,7 @@ def meanwhile(monkeypatch, act):
 def test_a_database_that_is_removed_while_a_sweep_runs_is_said_to_be(small, tmp_path, monkeypatch):
     asked = {"vary": {"steps": [2, 3]}, "folder": tmp_path}
     meanwhile(monkeypatch, lambda: (tmp_path / stores.DATABASE).unlink())
-    with pytest.warns(pbdkit.PbdkitWarning, match="was removed or replaced while the sweep ran"):
+    with pytest.warns(pbdkit.PbdkitWarning, match="was removed or replaced during the sweep"):
         first = swept(small, **asked)
     with pytest.warns(pbdkit.PbdkitWarning, match="is missing, or no database, and 2 members"):
         same(first, swept(small, **asked))
@@ -394,7 +394,7 @@ def test_a_database_that_is_removed_while_a_sweep_runs_is_said_to_be(small, tmp_
 def test_a_folder_that_is_moved_while_a_sweep_runs_is_said_to_be(small, tmp_path, monkeypatch):
     asked = {"vary": {"steps": [2, 3]}, "folder": tmp_path / "here"}
     meanwhile(monkeypatch, lambda: (tmp_path / "here").rename(tmp_path / "there"))
-    with pytest.raises(pbdkit.StorageError, match="here: was moved or removed while"):
+    with pytest.raises(pbdkit.StorageError, match="here: was moved or removed during"):
         swept(small, **asked)
     (tmp_path / "there").rename(tmp_path / "here")
     with warnings.catch_warnings():
@@ -409,13 +409,13 @@ WRONG = [
     ({"vary": {"steps": [2, 0]}}, "member steps=0: .*steps: should be greater than or equal to 1"),
     ({"vary": {"steps": []}}, "vary.steps: expected a list of values"),
     ({"vary": {"steps": 5}}, "vary.steps: expected a list of values"),
-    ({"vary": {"steps": [2, 2]}}, "vary.steps: 2 is given twice"),
+    ({"vary": {"steps": [2, 2]}}, "vary.steps: 2 is listed twice"),
     ({"vary": {"steps": {"from": 1, "to": 2}}}, "vary.steps.count: is missing"),
     ({"vary": {"steps": {"from": 1, "til": 2, "count": 2}}}, "did you mean 'to'|unknown key"),
     ({"vary": {"solver.relaxation": {"from": 0, "to": 2, "count": 2, "scale": "log"}}}, "above 0"),
     ({"vary": {"rule": [{"type": "barycentre"}], "rule.K": [1]}}, "'rule' is varied twice"),
     ({"vary": {"seed": [1]}, "replicates": 2}, "'seed' is varied twice: replicates vary it"),
-    ({"together": {"steps": [1, 2], "seed": [1]}}, "lists of one length .*steps has 2, seed has 1"),
+    ({"together": {"steps": [1, 2], "seed": [1]}}, "equal length.*steps has 2, seed has 1"),
     ({"vary": {"leaders.7.until": [1]}}, "member leaders.7.until=1: .*'7' is no position"),
     ({"vary": {"steps": {"from": 1, "to": 10**6, "count": 10**5}}, "replicates": 9},
      "900000 members; at most 100000"),
@@ -467,7 +467,7 @@ def test_a_stopped_sweep_goes_on_where_it_was(small, tmp_path):
     os.killpg(running.pid, signal.SIGINT)
     _, told = running.communicate(timeout=60)
     assert running.returncode == 130
-    assert "the same command goes on" in told
+    assert "the same command runs the others" in told
     assert "Traceback" not in told
     held = rows(tmp_path / "out")
     assert 0 < held < 30
@@ -489,7 +489,7 @@ def test_a_worker_that_hangs_before_it_begins_is_ended(small, tmp_path, monkeypa
 def jobs_of(experiment, count):
     """Jobs of some seeds."""
     base = Source(data=experiment)
-    asked = Asked(
+    asked = SweepPlan(
         checked({"experiment": experiment, "vary": {"seed": [*range(count)]}}, base), base, base
     )
     return [
@@ -507,7 +507,11 @@ def test_a_sweep_is_stopped_while_its_members_are_validated(small, tmp_path, mon
     base = Source(data=small)
     sweep = checked({"experiment": small, "vary": {"seed": [*range(50)]}}, base)
     summary = carry_out(
-        Asked(sweep, base, base), tmp_path / "out", SerialExecutor(), stopping, lambda *told: None
+        SweepPlan(sweep, base, base),
+        tmp_path / "out",
+        SerialExecutor(),
+        stopping,
+        lambda *told: None,
     )
     assert (summary.path, summary.run, len(asked)) == (None, 0, 4)
     assert not (tmp_path / "out").exists()
@@ -590,7 +594,7 @@ def test_a_cluster_that_does_not_answer_is_one_message(call, small, monkeypatch)
     Path("s.json").write_text(json.dumps({"experiment": small}))
     done = call("sweep", "s.json", "--dask", "tcp://127.0.0.1:1")
     assert done.code == 2
-    assert "no scheduler answers" in done.err
+    assert "no scheduler responds" in done.err
 
 
 def test_the_log_is_written_ahead_on_local_file_systems_only(small, tmp_path, monkeypatch):
