@@ -2,8 +2,7 @@
 
 from typing import ClassVar, Literal
 
-import pbdkit
-from pbdkit.plugin import ParticleOperation, Vector
+from pbdkit.plugin import ParticleOperation, Vector, hookimpl
 
 
 class Drag(ParticleOperation):
@@ -30,6 +29,6 @@ class Wind(ParticleOperation):
         return Vector(new.x + p.speed, new.y)
 
 
-@pbdkit.hookimpl
+@hookimpl
 def pbdkit_components():
     return [Drag, Wind]

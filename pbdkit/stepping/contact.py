@@ -12,9 +12,10 @@ place. A guided particle goes along the axis along which it follows.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import length, vector
 from pbdkit.scene.leaders import guided_at, has_guides, kinds_at
-from pbdkit.scene.obstacles import SLACK, Outline, Walls, outlines_at
+from pbdkit.scene.obstacles import SLACK, Outline, Walls, leave, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
@@ -306,6 +307,10 @@ class PushOut(Operation):
         """Rows whose particles reach no obstacle's box, as far as their displacements go, are
         passed over."""
         kernel.over_rows("push_out", lambda out: self._write(kernel, out))
+
+    def functions(self) -> dict[str, Callable[..., Any]]:
+        """The way of a particle out of all obstacles."""
+        return {"leave": leave}
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
         """How particles give way is known for the numbers at the beginning."""

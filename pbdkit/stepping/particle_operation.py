@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -51,6 +51,22 @@ class OperateOnParticles(Operation):
             f"new = displacement{n}(u, new, Operation{n}({numbers}))",
             *kernel.each("flat_v_@[p] = new.@"),
         )
+
+    def functions(self) -> dict[str, Callable[..., Any]]:
+        """Its `displacement`."""
+        return {f"displacement{self._number}": self._operated.operation.displacement}
+
+    def numbers(self) -> dict[str, tuple[str, ...]]:
+        """Its parameters."""
+        return {f"Operation{self._number}": self._operated.parameters._fields}
+
+    def constants(self) -> dict[str, Sequence[float]]:
+        """The values of its parameters."""
+        return {f"operation{self._number}": tuple(self._operated.parameters)}
+
+    def lists(self) -> dict[str, Indices]:
+        """Its particles."""
+        return {f"operated{self._number}": self._operated.place}
 
     @cached_property
     def moved_at_rest(self) -> Indices:

@@ -8,7 +8,7 @@ other, a kernel is written by letting each of them emit its lines. The order sta
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Literal, NamedTuple, Self
@@ -103,6 +103,22 @@ class Operation(ABC):
     @abstractmethod
     def emit(self, kernel: KernelWriter) -> None:
         """Write its part of a step into a kernel."""
+
+    def functions(self) -> dict[str, Callable[..., Any]]:
+        """Return by name the elementwise functions that its lines call."""
+        return {}
+
+    def numbers(self) -> dict[str, tuple[str, ...]]:
+        """Return by name the named tuples that its lines make, with their fields."""
+        return {}
+
+    def constants(self) -> dict[str, Sequence[float]]:
+        """Return by name the constant numbers that its lines read."""
+        return {}
+
+    def lists(self) -> dict[str, Indices]:
+        """Return by name the flat places that its lines go by, where they are always the same."""
+        return {}
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
         """Return why it cannot be made in a mode; None where it can."""

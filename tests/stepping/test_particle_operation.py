@@ -16,7 +16,7 @@ from thread_ranks import on_ranks
 import pbdkit
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Run, record
+from pbdkit.simulation import Simulation, record
 from pbdkit.stepping.engine_choice import what_gpus_lack
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numba_engine.time_skewing import single_steps
@@ -101,7 +101,7 @@ def test_a_run_in_parts_is_the_whole_run(install, tensile, tmp_path):
     whole, parts = tmp_path / "whole.nc", tmp_path / "parts.nc"
     scene = build_scene(pbdkit.Experiment(**given))
     assert [len(operated.place) for operated in scene.operations] == [6]
-    record(Run(scene), NetcdfSink(whole))
+    record(Simulation.of_scene(scene), NetcdfSink(whole))
     assert run_in_parts(given, parts, count(2)) > 0
     assert_same_file(whole, parts)
 

@@ -28,6 +28,7 @@ from pbdkit.stepping.numba_engine.sweeps import (
     stress_arrays,
     tearing_arrays,
 )
+from pbdkit.stepping.program import program_of
 from pbdkit.stepping.rule_evaluation import presence
 from pbdkit.stepping.state import Floats, State
 
@@ -60,11 +61,12 @@ def constant_arrays(plan: Plan) -> Arrays:
         arrays |= tearing_arrays(scene)
     if plan.softens_cells:
         arrays |= stress_arrays(scene, real)
-    for n, operated in enumerate(scene.operations):
-        # One more, so that no array is empty.
-        arrays[f"operation{n}"] = np.array([*operated.parameters, 0.0], real)
-        order, rows = banded(plan, f"operated{n}", operated.place)
-        arrays |= {f"operated{n}": operated.place[order]} | rows
+    for operation in program_of(scene):
+        for name, values in operation.constants().items():
+            arrays[name] = np.array([*values, 0.0], real)  # one more, so that none is empty
+        for name, place in operation.lists().items():
+            order, rows = banded(plan, name, place)
+            arrays |= {name: place[order]} | rows
     if frame := scene.frame:
         arrays |= _of_frame(frame, frame_order(plan), real)
     return arrays

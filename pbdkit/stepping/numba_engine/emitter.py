@@ -21,7 +21,7 @@ from pbdkit.stepping.numba_engine.sweeps import (
     write_general,
     write_row,
 )
-from pbdkit.stepping.program import Program
+from pbdkit.stepping.program import Program, program_of
 
 Groups = Sequence[tuple[int, int]]
 """The sublattice and kind of the rows that occur."""
@@ -71,8 +71,8 @@ def module_text(
         own = level.seen
         kinds |= {f"Rule{n}": own.rule, f"Weights{n}": own.weights, f"Own{n}": own.own}
     fields = {kind: [number.name for number in numbers] for kind, numbers in kinds.items()}
-    for n, operated in enumerate(plan.scene.operations):
-        fields[f"Operation{n}"] = list(operated.parameters._fields)
+    for operation in program_of(plan.scene):
+        fields |= {kind: list(names) for kind, names in operation.numbers().items()}
     lines = ['"""Made by pbdkit for one kind of scene; not to be edited."""', ""]
     if plan.scene.axes == 3:
         lines.append("Vector = SpaceVector")

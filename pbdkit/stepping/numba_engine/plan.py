@@ -32,7 +32,6 @@ from pbdkit.plugin import (
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
-from pbdkit.scene import obstacles as outlines
 from pbdkit.scene.constants import (
     Home,
     Number,
@@ -54,6 +53,7 @@ from pbdkit.stepping.numba_engine.time_skewing import (
     exceeds_cache,
     single_steps,
 )
+from pbdkit.stepping.program import program_of
 from pbdkit.stepping.rule_evaluation import Evaluator
 from pbdkit.stepping.state import started
 from pbdkit.stepping.step import Led
@@ -428,10 +428,8 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
             found[f"loaded{number}"] = part.loaded
     if isinstance(parts.get(""), SoftensCells):
         found["stress"] = CellStresses(levels[-1].scene).stress
-    if levels[-1].scene.barriers:
-        found["leave"] = outlines.leave
-    for n, operated in enumerate(levels[-1].scene.operations):
-        found[f"displacement{n}"] = operated.operation.displacement
+    for operation in program_of(levels[-1].scene):
+        found |= operation.functions()
     return found
 
 
