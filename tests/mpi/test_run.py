@@ -302,7 +302,7 @@ def stopping_after(looks):
 @pytest.mark.parametrize("sizes", [(3, 2), (1, 3), (2, 1)])
 def test_resumed_on_another_number_of_processes(sizes, tmp_path, monkeypatch):
     """What was kept and recorded is read piece by piece."""
-    for what in ("storage.run_store.PART_BYTES", "runs.earlier_run.BLOCK_BYTES"):
+    for what in ("io.run_store.PART_BYTES", "restart.BLOCK_BYTES"):
         monkeypatch.setattr(f"pbdkit.{what}", 256)
     given_ = sheet(fracture={"type": "damage", "onset": 0.1, "failure": 0.4})
     one, several = tmp_path / "one.nc", tmp_path / "several.nc"

@@ -193,7 +193,7 @@ def test_of_those_who_want_the_same_kernel_one_makes_it(cache, monkeypatch):
         return "kernel"
 
     monkeypatch.setattr(kernel_cache, "_made", make)
-    monkeypatch.setattr(kernel_cache, "_ready", lambda *given: "kernel")
+    monkeypatch.setattr(kernel_cache, "_prepared", lambda *given: "kernel")
     with ThreadPoolExecutor(4) as several:  # each opens the lock by itself, as processes do
         found = [several.submit(kernel_cache._kept, "x = 1", "key", {}, ()) for _ in range(4)]
     assert [future.result() for future in found] == ["kernel"] * 4
