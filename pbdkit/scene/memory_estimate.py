@@ -31,14 +31,17 @@ stencils is compiled once a machine."""
 
 KERNELS = 48 * 2**20
 """Bytes of the compiled functions of grids."""
-GRIDS, OWN_STENCILS = 160, 2300
-"""Bytes a particle of grids where most particles share a stencil, and where each has its own, as
-with a rule that is not linear."""
-UNCOUPLED, UNCOUPLED_EACH, COUPLED_EACH = 900, 112, 800
-"""Bytes a particle of a matrix and what solves it: of rules that leave x and y apart, and more of
-them a neighbour; of calibrated rules a neighbour."""
-TWO = 2
-"""Matrices at a time where the rule is not linear."""
+SHARED_STENCILS = 160
+"""Bytes a particle of grids on which most particles share a stencil."""
+SINGLE_STENCILS = 2300
+"""Bytes a particle of grids on which each particle has a stencil, as with a nonlinear rule."""
+SCALAR_MATRIX, SCALAR_MATRIX_EACH = 900, 112
+"""Bytes a particle, and a neighbour besides, of a matrix and its factors where x and y are solved
+apart."""
+VECTOR_MATRIX_EACH = 800
+"""Bytes a particle and neighbour of a matrix and its factors where they are coupled."""
+NONLINEAR_MATRICES = 2
+"""Number of matrices that exist at a time where the rule is nonlinear."""
 
 
 def equilibrium_size(
@@ -47,13 +50,13 @@ def equilibrium_size(
     """Bytes of the systems of an equilibrium, on grids where these serve."""
     linear = experiment.rule.linear and not experiment.obstacles
     if grids and _on_grids(experiment, neighbourhood, particles):
-        return KERNELS + particles * (GRIDS if linear else OWN_STENCILS)
+        return KERNELS + particles * (SHARED_STENCILS if linear else SINGLE_STENCILS)
     each = len(neighbourhood.slots[0])
     if material_of(experiment.rule) is None:
-        bytes_each = UNCOUPLED + each * UNCOUPLED_EACH
+        bytes_each = SCALAR_MATRIX + each * SCALAR_MATRIX_EACH
     else:
-        bytes_each = each * COUPLED_EACH
-    return particles * bytes_each * (1 if linear else TWO)
+        bytes_each = each * VECTOR_MATRIX_EACH
+    return particles * bytes_each * (1 if linear else NONLINEAR_MATRICES)
 
 
 def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
@@ -66,11 +69,9 @@ def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
 def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> bool:
     """Whether the lattice's stencils serve."""
     method, cell = experiment.solver.sought.method, neighbourhood.cell
-    if not (asks_for_grids(experiment, method, particles) and find_spec("numba")) or isinstance(
-        experiment.rule, AppliesTwice
-    ):
+    if not (asks_for_grids(experiment, method, particles) and find_spec("numba")):
         return False
-    if experiment.obstacles:
+    if isinstance(experiment.rule, AppliesTwice) or experiment.obstacles:
         return False
     if experiment.neighbours.nearness() or len(cell.primitive) != 2:
         return False
@@ -81,19 +82,28 @@ def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: i
 
 
 MIB = 2**20
-LEAST = 6 * MIB
-"""What any scene takes, however small: tables are made in chunks."""
+SMALLEST = 6 * MIB
+"""Bytes of any scene, however small: tables are built in chunks."""
 
-WORKSPACE, BONDS, CELLS, FREE_EDGES, INNER = 20, 80, 110, 60, 130
-"""Bytes a particle, measured as the peak of the process over sheets of 90 000 to 500 000: making
-the tables besides what stays; each bond plane, in the table of bonds and the making of it; shares
-of cells; a calibrated rule under a frame with points; a rule on the moves of another."""
-
-LOADS, MATERIALS = 60, 250
-"""The same where loads act on everybody, and where cells are of several materials."""
-
+# Bytes a particle, measured as the peak of the process over sheets of 90 000 to 500 000.
+WORKSPACE = 20
+"""Building of the tables."""
+BONDS = 80
+"""Table of bonds and the building of it, for each plane of bonds."""
+CELLS = 110
+"""Shares of cells."""
+FREE_EDGES = 60
+"""A calibrated rule under a frame with points."""
+INNER = 130
+"""A rule on the moves of another."""
+LOADS = 60
+"""Loads on all particles."""
+MATERIALS = 250
+"""Cells of several materials."""
 GRADIENT, FORCES, TABLES = 250, 160, 40
-"""The same for diagnostics, the first that applies: the displacement gradient, forces, tables."""
+"""Diagnostics, the first that applies: the displacement gradient, forces, tables."""
+NEW_NEIGHBOURS, NEW_NEIGHBOURS_EACH = 150, 118
+"""Neighbours found at each step, and each of them."""
 
 CHUNK_BYTES = 2**20
 """About a chunk of a file: several entries of a column where they are small, a part of one where
@@ -103,11 +113,8 @@ batch, reading a snapshot little more than itself."""
 OPEN_CHUNK = 1024
 """Entries a chunk along a dimension whose length is known at the end only."""
 
-FRAMEWORK, VARIABLE = 40_000, 1500
+FILE_OVERHEAD, VARIABLE_OVERHEAD = 40_000, 1500
 """Bytes of a file besides values: of any, and of each variable that grows or is measured."""
-
-ANEW, ANEW_EACH = 150, 118
-"""The same where neighbours are found anew, and a neighbour."""
 
 
 class TooLargeError(ExperimentError):
@@ -141,7 +148,7 @@ def sizes_of(
     if not experiment.solver.makes_steps:
         solved = equilibrium_size(experiment, neighbourhood, particles, grids)
         memory = max(memory, math.ceil(particles * (state + table)) + solved)
-    memory += LEAST
+    memory += SMALLEST
     output = math.ceil(particles * state) + _output(experiment, particles, planes)
     return Sizes(particles, memory, output)
 
@@ -162,7 +169,7 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
     elif tables:
         made += TABLES
     if experiment.neighbours.nearness():
-        made += ANEW + each * ANEW_EACH
+        made += NEW_NEIGHBOURS + each * NEW_NEIGHBOURS_EACH
     return made
 
 
@@ -193,7 +200,7 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     if any(d.every_step for d in experiment.diagnostics):
         growing.append((steps, 8.0))
     values = sum(_in_whole_chunks(*column) for column in growing) + particles * once
-    return math.ceil(values) + FRAMEWORK + len(growing) * VARIABLE
+    return math.ceil(values) + FILE_OVERHEAD + len(growing) * VARIABLE_OVERHEAD
 
 
 def _in_whole_chunks(count: int, entry: float) -> float:
