@@ -155,7 +155,7 @@ def test_the_sampler_draws_from_it(fit):
 
 
 def test_a_sampler_that_is_missing_is_named_before_the_fit(fit, monkeypatch):
-    monkeypatch.setattr("pbdkit.plugin.discovery.find_spec", lambda library: None)
+    monkeypatch.setattr("pbdkit.errors.find_spec", lambda library: None)
     monkeypatch.setattr("pbdkit.fitting.fit.solved", None)
     with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[sample\]'"):
         pbdkit.fit(fit | {"sampler": {"walkers": 8, "steps": 24}})

@@ -330,7 +330,7 @@ def test_which_group_is_meant_is_asked(pulled):
     [lambda ds: ds.pbd.curve(), lambda ds: ds.pbd.history(particle=20), lambda ds: ds.pbd.crack()],
 )
 def test_without_matplotlib_the_extra_is_named(torn, draw, monkeypatch):
-    monkeypatch.setattr("pbdkit.plugin.discovery.find_spec", lambda name: None)
+    monkeypatch.setattr("pbdkit.errors.find_spec", lambda name: None)
     with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[plot\]'"):
         draw(torn)
 

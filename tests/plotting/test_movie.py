@@ -95,7 +95,7 @@ def test_what_makes_no_movie_is_refused(torn, name, look, message, tmp_path, mon
 
 
 def test_what_is_missing_is_named_with_its_extra(torn, tmp_path, monkeypatch):
-    monkeypatch.setattr("pbdkit.plugin.discovery.find_spec", lambda name: None)
+    monkeypatch.setattr("pbdkit.errors.find_spec", lambda name: None)
     for name, missing in {"torn.mp4": "imageio-ffmpeg", "torn.gif": "pillow"}.items():
         with pytest.raises(ExperimentError) as refused:
             torn.pbd.animate(file=tmp_path / name)

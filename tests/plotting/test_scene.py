@@ -114,7 +114,7 @@ def test_a_notebook_and_the_axes_show_the_same(name):
     ax = plot_experiment(loaded, dpi=60)
     words = {text.get_text() for legend in figure_of(ax).legends for text in legend.get_texts()}
     named = [said for _, said in picture_of(build_scene(loaded)).legend]
-    assert {w for text in words for w in text.split(", ")} == {*named}
+    assert {w for text in words for w in text.split("; ")} == {*named}
 
 
 def test_the_set_up_is_drawn_into_axes_that_are_given():
