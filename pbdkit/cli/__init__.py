@@ -28,7 +28,7 @@ FIRST = {
     "pbdkit plot paper-a.nc --color pe1": "Draws it into paper-a.png.",
     "pbdkit init": "Writes experiment.yaml to be changed.",
 }
-"""What to type first, and what it does."""
+"""First commands to type, with their purpose."""
 WELCOME = """\
 pbdkit deforms bodies on lattices. Particles follow their neighbours by rules
 instead of forces. A file says what is to be done; the result is a dataset.
@@ -36,6 +36,7 @@ instead of forces. A file says what is to be done; the result is a dataset.
 SYSTEM = dict.fromkeys(
     (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENAMETOOLONG), ""
 )
+"""Errors of the operating system that are no bug of pbdkit, with the remedy."""
 SYSTEM |= dict.fromkeys(
     (errno.EMFILE, errno.ENFILE),
     "; raise the limit (`ulimit -n`), or let fewer processes work at once",
@@ -63,7 +64,7 @@ def program(context: click.Context, debug: bool) -> None:
 
 
 def _welcome() -> str:
-    """What there is to type first, and what for."""
+    """Return the first commands to type, and all commands."""
     lines = [WELCOME, "Type this first:"]
     lines += [f"  {typed:<36} {does}" for typed, does in FIRST.items()]
     for group, commands in groupby(own_commands().values(), key=lambda command: command.group):
@@ -143,14 +144,14 @@ def _report(error: BaseException) -> int:
 
 
 def _contexts(error: BaseException | None) -> Iterator[BaseException]:
-    """The error and what it was made of: while modules are loaded, of an interrupt too."""
+    """Yield the error and the errors in whose handling it was raised."""
     while error:
         yield error
         error = error.__context__
 
 
 def _of_memory(error: BaseException) -> bool:
-    """Whether memory is what was missing, which threads and libraries say in words of their own."""
+    """Return whether memory is exhausted, which threads and libraries report in different ways."""
     words = "can't start new thread", "failed to map segment", "Cannot allocate memory"
     return isinstance(error, MemoryError) or any(word in str(error) for word in words)
 

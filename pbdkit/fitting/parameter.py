@@ -25,7 +25,8 @@ STEP = 2e-3
 """Step of differences as a fraction of the value, or of 0.1 if the value is smaller."""
 
 LARGE_STEP = 1e-2
-"""The same for parts of the experiment that may change the particles, where errors are larger."""
+"""Step of differences for parts of the experiment that may change the particles, where errors are
+larger."""
 
 MIN_STEP = 1e-7
 """The smallest such fraction, which is used near a bound."""

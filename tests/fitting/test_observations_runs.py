@@ -390,7 +390,7 @@ def test_a_curve_of_the_other_sign_is_named(measured, monkeypatch):
     np.savetxt("turned.csv", rows, delimiter=",", header="displacement,force", comments="")
     unknown = {"rule.poisson_ratio": [0.0, 0.45]}
     fit = {"experiment": bar(), "unknown": unknown, "measured": given | {"file": "turned.csv"}}
-    with pytest.raises(pbdkit.ExperimentError, match="the other sign"):
+    with pytest.raises(pbdkit.ExperimentError, match="the opposite sign"):
         pbdkit.fit(fit)
 
 
