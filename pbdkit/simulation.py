@@ -37,7 +37,7 @@ from pbdkit.stepping.state import State, initial_state, unmoved_state
 if TYPE_CHECKING:
     import xarray
 
-    from pbdkit.equilibrium.certificate import Certificate, Pace, Settling
+    from pbdkit.equilibrium.certificate import Certificate, Pace, SteadyStateMonitor
     from pbdkit.equilibrium.solve import Way
     from pbdkit.model.experiment import Experiment
     from pbdkit.model.loading import ComponentClasses, ExperimentLike
@@ -110,11 +110,13 @@ class SteppingDriver(Driver):
         self._engine, self.choice = make_engine(scene, choose(scene))
         self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.count)
         self.guard = Guard.of(scene, state)
-        self.settling: Settling | None = None
+        self.settling: SteadyStateMonitor | None = None
         if asked := scene.experiment.stepping.settle:
-            from pbdkit.equilibrium.certificate import Settling  # only where it is asked for
+            from pbdkit.equilibrium.certificate import (
+                SteadyStateMonitor,  # only where it is asked for
+            )
 
-            self.settling = Settling(scene, asked, state, watch)
+            self.settling = SteadyStateMonitor(scene, asked, state, watch)
         self.kept = -1
         """The last step that was given out to be recorded, and was not rejected."""
 
@@ -135,7 +137,7 @@ class SteppingDriver(Driver):
         if self.settling and "pace" in parts:
             self._take_up_settling(self.settling, parts["pace"], parts["obstacle"])
 
-    def _take_up_settling(self, settling: Settling, pace: Pace, obstacle: str) -> None:
+    def _take_up_settling(self, settling: SteadyStateMonitor, pace: Pace, obstacle: str) -> None:
         step, own = self.state.step, settling.pace
         if own.next_look > step:  # what is to happen by then, the other run may not have known
             return

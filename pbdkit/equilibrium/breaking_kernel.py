@@ -25,8 +25,8 @@ from pbdkit.equilibrium.sparse import SOFT
 from pbdkit.equilibrium.system import ROUNDING
 from pbdkit.errors import PluginError
 from pbdkit.lattice.raster import FOLLOWER, slot_step
+from pbdkit.linear.block_matrix import frame_matrices
 from pbdkit.linear.response import by_sublattice
-from pbdkit.linear.spectrum import frame_matrices
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import RenewsBonds, SoftensCells
 from pbdkit.plugin.discovery import blaming

@@ -148,7 +148,7 @@ BENT = "the rule bends too much between there and equilibrium for a bound"
 
 
 @dataclass(frozen=True)
-class Outlook:
+class PredictedEquilibrium:
     """`u` is the equilibrium ahead as far as it is known, and the certificate says how far at most
     any follower is from it; `obstacle` why there is no distance, where it is infinite."""
 
@@ -157,7 +157,7 @@ class Outlook:
     obstacle: str
 
 
-class Foresight:
+class ErrorBound:
     """The outlook from states of a scene with the roles of its last step.
 
     The correction c, A c = move, leads from u to the equilibrium, and what it fails to do is seen
@@ -179,7 +179,7 @@ class Foresight:
         self._at_rest: System | None = None
         self._broken = 0
 
-    def from_(self, state: State) -> Outlook:
+    def from_(self, state: State) -> PredictedEquilibrium:
         """The outlook from the end of a step, which is left as it is.
 
         The distance is infinite where no bound is known: for what is pushed on for ever, and for
@@ -188,7 +188,7 @@ class Foresight:
         with one_thread():
             return self._from(state)
 
-    def _from(self, state: State) -> Outlook:
+    def _from(self, state: State) -> PredictedEquilibrium:
         u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
         here = replace(state, u=u, previous=previous)
         if not self._scene.barriers:
@@ -208,7 +208,7 @@ class Foresight:
         at, steps = replace(state, u=u), self._scene.experiment.steps
         return linearised(self._scene, at, steps, "auto", self._watch)
 
-    def _outlook(self, here: State, known: System, *, anew: bool = False) -> Outlook:
+    def _outlook(self, here: State, known: System, *, anew: bool = False) -> PredictedEquilibrium:
         """By the system of the scene at rest, or by one that was linearised `anew` at the state."""
         moves = self._moves.at(here, self._scene.experiment.steps)
         ahead, distance = here.u.copy(), math.inf
@@ -234,7 +234,7 @@ class Foresight:
             bound=CORRECTION + known.how,
             linearised=anew,
         )
-        return Outlook(ahead, certificate, obstacle)
+        return PredictedEquilibrium(ahead, certificate, obstacle)
 
     def _correction(
         self, here: State, known: System, moves: Floats, anew: bool
@@ -347,7 +347,7 @@ def _steps_until(value: float, wanted: float, rate: float) -> float:
     return math.log(value / wanted) / rate if rate > 0.0 and math.isfinite(value) else math.inf
 
 
-class Settling:
+class SteadyStateMonitor:
     """Looks at the states of a run that is to end once it has settled: roles no longer change,
     leaders rest, no follower can be farther from equilibrium than the tolerance, and no bond is so
     near to breaking that it might on the way there.
@@ -363,7 +363,7 @@ class Settling:
         ends = not any(is_cut_short(group, steps) for group in leading)
         first = max(last_event(scene), start.step + 1) if ends else NEVER
         self.pace = Pace(first, self._tolerance, first - 1)
-        self._foresight = Foresight(scene, self._scale, watch)
+        self._foresight = ErrorBound(scene, self._scale, watch)
         self._fracturing = Fracturing.of(scene)
         self._carrying = _carrying(scene)
         unended = "leaders do not come to rest before its end"
@@ -399,7 +399,7 @@ class Settling:
         self.pace.note_distance(state.step, distance)
         return None
 
-    def _obstacle(self, state: State, outlook: Outlook, distance: float) -> str:
+    def _obstacle(self, state: State, outlook: PredictedEquilibrium, distance: float) -> str:
         at = f"at step {state.step}"
         if not math.isfinite(distance):
             return f"{at} {outlook.obstacle or 'nothing bounds the distance from equilibrium'}"

@@ -32,8 +32,8 @@ from pbdkit.equilibrium.sparse import (
     Subsystem,
 )
 from pbdkit.equilibrium.system import PUSH, Moves, NoEquilibriumError, System
+from pbdkit.linear.block_matrix import connected, one_minus
 from pbdkit.linear.operator import step_operator
-from pbdkit.linear.spectrum import connected, one_minus
 from pbdkit.plugin.frame import Indices
 from pbdkit.progress import Watch
 from pbdkit.scene.obstacles import FLAT, ROUNDING, STRAIGHTEST, Face, outlines_at

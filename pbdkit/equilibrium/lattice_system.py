@@ -27,7 +27,13 @@ from pbdkit.equilibrium.krylov import (
     Krylov,
     best_of,
 )
-from pbdkit.equilibrium.multigrid import FloatingError, Grid, Multigrid, PartedGrids, grids_of
+from pbdkit.equilibrium.multigrid import (
+    FloatingError,
+    Multigrid,
+    PartedGrids,
+    StencilGrid,
+    grids_of,
+)
 from pbdkit.equilibrium.stencil_matrix import (
     DIFFERENCED,
     EXACT,
@@ -162,7 +168,7 @@ class LatticeSystem(System):
         self._matrix, self._shape, self._watch = matrix, shape, watch
         self._has_leaders = has_leaders and matrix.at is None and matrix.held is None
         self._rows, self._symmetric = rows, symmetric
-        grid = Grid(matrix.code, matrix.kind, matrix.stencils, matrix.held)
+        grid = StencilGrid(matrix.code, matrix.kind, matrix.stencils, matrix.held)
         self._grids = grids_of(grid, rows)
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
         self._solver: Krylov = kind(self._grids, rows=rows)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pbdkit.equilibrium.amg import SparseGrids
 from pbdkit.equilibrium.system import one_thread
-from pbdkit.linear.spectrum import DENSE
+from pbdkit.linear.block_matrix import DENSE
 from pbdkit.progress import Watch
 
 Floats = NDArray[np.floating[Any]]
@@ -196,7 +196,7 @@ class SparseLU(LinearSolver):
         return x
 
 
-class Krylov(LinearSolver):
+class PreconditionedKrylov(LinearSolver):
     """Conjugate gradients for symmetric matrices, GMRES for others; `grids` makes the multigrid
     preconditioner of a matrix, None for none."""
 
@@ -248,8 +248,8 @@ class Krylov(LinearSolver):
         return (self if self._symmetric else self._transposed).solve(b, accuracy)
 
     @cached_property
-    def _transposed(self) -> Krylov:
-        return Krylov(self._matrix.T.tocsr(), False, self._watch, self._grids)
+    def _transposed(self) -> PreconditionedKrylov:
+        return PreconditionedKrylov(self._matrix.T.tocsr(), False, self._watch, self._grids)
 
 
 def linear_solver(
@@ -271,7 +271,7 @@ def linear_solver(
         method = "multigrid" if large and coordinates else "lu"
     if method != "lu":
         grids = coordinates.grids if coordinates and method == "multigrid" else None
-        return Krylov(matrix, is_symmetric(matrix), watch or Watch(), grids)
+        return PreconditionedKrylov(matrix, is_symmetric(matrix), watch or Watch(), grids)
     if size <= DENSE:
         return Dense(dense(matrix))
     if coordinates:

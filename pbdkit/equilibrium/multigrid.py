@@ -42,7 +42,7 @@ NARROW = 5
 EVERY = slice(None)
 
 
-class Grid:
+class StencilGrid:
     """One grid: its `code` and `kind` as of StencilMatrix, its `stencils`, and what kernels are
     given of them in a precision. Corrections do not reach `held` components."""
 
@@ -89,7 +89,7 @@ class Grid:
             return 1, 1
         return int(along[0] > along[1]), int(along[1] > along[0])
 
-    def coarser(self, halved: tuple[int, int], known: slice = EVERY) -> Grid:
+    def coarser(self, halved: tuple[int, int], known: slice = EVERY) -> StencilGrid:
         """The next grid, as far as it is known: some of its rows."""
         shape = [
             coarser_size(n) if half else n for n, half in zip(self.code.shape, halved, strict=True)
@@ -105,10 +105,10 @@ class Grid:
         kernels().galerkin(self.code, fine, code, halved, stencils)
         stencils[0] = _coarse_stencil(self.stencils[:1], halved)
         if self.held is None:
-            return Grid(code, kind, stencils)
+            return StencilGrid(code, kind, stencils)
         held = coarser_held(self.kind, self.held, halved, kind)
         code, stencils, _ = with_held(code, stencils, held)
-        return Grid(code, kind, stencils, held)
+        return StencilGrid(code, kind, stencils, held)
 
     def add_coarser(self, coarse: Floats, halved: tuple[int, int], x: Floats) -> None:
         """x += P coarse."""
@@ -135,16 +135,16 @@ class Grid:
         return at, K.reshape(2 * len(at[0]), -1)
 
 
-class Level:
+class GridLevel:
     """A grid with room for what a cycle does there, in single precision; `halved` tells along which
     axes the next one has half the places."""
 
-    def __init__(self, grid: Grid, halved: tuple[int, int] = (0, 0)) -> None:
+    def __init__(self, grid: StencilGrid, halved: tuple[int, int] = (0, 0)) -> None:
         self.grid, self.given, self.halved = grid, grid.given(PRECISION), halved
         self.x, self.b = grid.field(PRECISION), grid.field(PRECISION)
         self._row = np.zeros((2, grid.code.shape[1]), PRECISION)
 
-    def down(self, b: Floats, below: Level) -> None:
+    def down(self, b: Floats, below: GridLevel) -> None:
         """Relaxes K x = b from zero; what is left goes to the next grid."""
         kernel, x = kernels(), self.x
         kernel.relax(self.given, b, x, self._row, PRECISION(WEIGHT), True, False)
@@ -164,7 +164,7 @@ class Grids(ABC):
         """How many grids there are."""
 
     @abstractmethod
-    def grid(self, depth: int = 0) -> Grid:
+    def grid(self, depth: int = 0) -> StencilGrid:
         """The finest, or one so much coarser."""
 
     @abstractmethod
@@ -212,12 +212,12 @@ class Multigrid(Grids):
     Raises FloatingError where leaders leave a motion of the body free.
     """
 
-    def __init__(self, grid: Grid) -> None:
-        self._levels = [Level(grid)]
+    def __init__(self, grid: StencilGrid) -> None:
+        self._levels = [GridLevel(grid)]
         while grid.unknowns > COARSEST:
             halved = self._levels[-1].halved = grid.halved(len(grid.code))
             grid = grid.coarser(halved)
-            self._levels.append(Level(grid))
+            self._levels.append(GridLevel(grid))
         self._at, K = grid.matrix()
         try:
             inverse = np.linalg.inv(K)
@@ -238,7 +238,7 @@ class Multigrid(Grids):
         """With the coarsest."""
         return len(self._levels)
 
-    def grid(self, depth: int = 0) -> Grid:
+    def grid(self, depth: int = 0) -> StencilGrid:
         """The finest, or one so much coarser."""
         return self._levels[depth].grid
 
@@ -301,15 +301,15 @@ class PartedGrids(Grids):
     """Of a grid that each process has a strip of. Raises FloatingError where leaders leave a motion
     of the body free."""
 
-    def __init__(self, grid: Grid, rows: Rows, strip: Strip) -> None:
+    def __init__(self, grid: StencilGrid, rows: Rows, strip: Strip) -> None:
         self._rows = rows
-        self._levels, self._strips = [Level(grid)], [strip]
+        self._levels, self._strips = [GridLevel(grid)], [strip]
         while self._strips[-1].depth and self._unknowns() > SMALL:
             level, strip = self._levels[-1], self._strips[-1]
             level.halved = level.grid.halved(strip.count)
             strip = strip.coarser(level.halved[0])
             self._strips.append(strip)
-            self._levels.append(Level(level.grid.coarser(level.halved, strip.known)))
+            self._levels.append(GridLevel(level.grid.coarser(level.halved, strip.known)))
         self.whole = Multigrid(self._joined())
         """The grids that all processes have."""
 
@@ -317,7 +317,7 @@ class PartedGrids(Grids):
         own, code = self._strips[-1].own, self._levels[-1].grid.code
         return 2 * int(self._rows.communicator.sum(int(np.count_nonzero(code[own] >= 0))))
 
-    def _joined(self) -> Grid:
+    def _joined(self) -> StencilGrid:
         """The coarsest of the parted grids, with the rows of all."""
         grid, own = self._levels[-1].grid, self._strips[-1].own
         code = grid.code[own]
@@ -327,7 +327,7 @@ class PartedGrids(Grids):
         before = sum(map(len, stencils[: self._rows.communicator.rank]))
         renumbered = np.where(some, before + np.cumsum(some), used).astype(code.dtype)
         held = None if grid.held is None else self._together(grid.held[:, own], 1)
-        return Grid(
+        return StencilGrid(
             self._together(renumbered[number].reshape(code.shape), 0),
             self._together(grid.kind[own], 0),
             np.concatenate([grid.stencils[:1], *stencils]),
@@ -341,7 +341,7 @@ class PartedGrids(Grids):
         """With those that all have."""
         return len(self._levels) - 1 + len(self.whole)
 
-    def grid(self, depth: int = 0) -> Grid:
+    def grid(self, depth: int = 0) -> StencilGrid:
         """A parted one."""
         return self._levels[depth].grid
 
@@ -368,6 +368,6 @@ class PartedGrids(Grids):
         return x
 
 
-def grids_of(grid: Grid, rows: Rows) -> Multigrid | PartedGrids:
+def grids_of(grid: StencilGrid, rows: Rows) -> Multigrid | PartedGrids:
     """Those of the finest."""
     return PartedGrids(grid, rows, rows.strip) if rows.strip else Multigrid(grid)

@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 from pbdkit.equilibrium.linear_solver import (
     Coordinates,
     Dense,
-    Krylov,
     LinearSolver,
+    PreconditionedKrylov,
     SparseLU,
     dense,
     is_symmetric,
     linear_solver,
 )
 from pbdkit.equilibrium.system import PUSH, NoEquilibriumError, System
+from pbdkit.linear.block_matrix import DENSE, connected, identity_like, one_minus
 from pbdkit.linear.operator import step_operator
-from pbdkit.linear.spectrum import DENSE, connected, identity_like, one_minus
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -204,7 +204,7 @@ class ConstrainedSubsystem(Subsystem):
             assert self._solver is not None
             solve = self._solver.solve_transposed if transposed else self._solver.solve
             x = solve(b, accuracy)
-            if not isinstance(self._solver, Krylov):
+            if not isinstance(self._solver, PreconditionedKrylov):
                 break
             left = float(np.linalg.norm(b - matrix @ x))
             self._is_short = not left <= most * float(np.linalg.norm(b))
@@ -225,7 +225,7 @@ class ConstrainedSubsystem(Subsystem):
         what that leaves may lead."""
         x = self._inverted(r)
         found = float(np.abs(x).max(initial=0.0))
-        if isinstance(self._solver, Krylov) and math.isfinite(found):
+        if isinstance(self._solver, PreconditionedKrylov) and math.isfinite(found):
             left = r - self._matrix @ x
             ahead = self._inverted(left)
             found += SAFETY * float(np.abs(ahead).max(initial=0.0))

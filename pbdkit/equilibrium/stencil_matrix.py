@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from pbdkit.equilibrium.system import ALL, Moves, Rows, outside
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, slot_step
-from pbdkit.linear.response import Response, by_sublattice, respond
-from pbdkit.linear.spectrum import frame_matrices
+from pbdkit.linear.block_matrix import frame_matrices
+from pbdkit.linear.response import LinearResponse, by_sublattice, respond
 from pbdkit.plugin import Slot
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.lattice import Index
@@ -278,7 +278,7 @@ class _Assembly:
         stencils, scale = (v.reshape(*v.shape[:-2], 4) for v in (stencils, scale))
         return _on(self._grid, code.ravel(), self._kind == LEADER, stencils, scale)
 
-    def _add(self, place: Indices, responses: list[Response]) -> bool:
+    def _add(self, place: Indices, responses: list[LinearResponse]) -> bool:
         """Takes the stencils of one sublattice in; False where they do not fit."""
         moves, answers = responses[0], responses[-1]
         own = np.zeros((len(answers.centre), WINDOW, 2, 2))
@@ -301,7 +301,7 @@ class _Assembly:
         return True
 
     def _shown(
-        self, place: Indices, answers: Response, own: Floats
+        self, place: Indices, answers: LinearResponse, own: Floats
     ) -> tuple[Indices, Floats] | None:
         """Who sees frame points, and their stencils, with what these show in their places; None
         where that is too far away."""

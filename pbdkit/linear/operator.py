@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, FRAME, LEADER, slot_step
+from pbdkit.linear.block_matrix import BlockMatrix, CoordinateMatrix, frame_matrices
 from pbdkit.linear.response import by_sublattice, has_neighbours, respond
-from pbdkit.linear.spectrum import Couplings, Entries, frame_matrices
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin.frame import Indices
 from pbdkit.scene.leaders import kinds_at
@@ -77,7 +77,7 @@ class Guiding:
         return turned
 
     def put(
-        self, free: Couplings, leader: Couplings, rows: Indices, places: Indices,
+        self, free: BlockMatrix, leader: BlockMatrix, rows: Indices, places: Indices,
         numbers: tuple[Indices, Indices], blocks: Floats,
     ) -> None:  # fmt: skip
         """Add the blocks of followers to `free`, and split those of guided particles between both.
@@ -85,7 +85,7 @@ class Guiding:
         Parameters
         ----------
         free, leader
-            Couplings with free unknowns and with prescribed displacements. Both are extended.
+            BlockMatrix with free unknowns and with prescribed displacements. Both are extended.
         rows, places
             Row and flat place of each block.
         numbers
@@ -129,18 +129,20 @@ class StepOperator:
 
     followers: Indices
     leaders: Indices
-    couplings_current: Couplings
-    couplings_previous: Couplings
-    couplings_leader: Couplings
-    couplings_frame: Couplings
+    couplings_current: BlockMatrix
+    couplings_previous: BlockMatrix
+    couplings_leader: BlockMatrix
+    couplings_frame: BlockMatrix
     source: Floats
     prescribed_unknowns: Indices
 
     @property
-    def couplings_steady(self) -> Couplings:
+    def couplings_steady(self) -> BlockMatrix:
         """Return `couplings_current` + `couplings_previous`: the step of displacements at rest."""
         current = self.couplings_current
-        return Couplings(current.shape, current.axes, current.parts + self.couplings_previous.parts)
+        return BlockMatrix(
+            current.shape, current.axes, current.parts + self.couplings_previous.parts
+        )
 
     @cached_property
     def current(self) -> scipy.sparse.csr_array:
@@ -157,7 +159,7 @@ class StepOperator:
         """Assemble ∂u(t+1)/∂u_L, the derivative with respect to prescribed displacements."""
         return self.couplings_leader.entries().sparse()
 
-    def augmented(self) -> Entries:
+    def augmented(self) -> CoordinateMatrix:
         """Return the operator on (u(t), u(t-1)), or on u(t) alone if the step does not read u(t-1).
 
         Prescribed unknowns are left out.
@@ -170,8 +172,10 @@ class StepOperator:
             return current
         size = current.shape[0]
         unknowns, shape = np.arange(size), (2 * size, 2 * size)
-        upper = Entries(previous.rows, previous.columns + size, previous.values, shape)
-        return current.plus(upper).plus(Entries(unknowns + size, unknowns, np.ones(size), shape))
+        upper = CoordinateMatrix(previous.rows, previous.columns + size, previous.values, shape)
+        return current.plus(upper).plus(
+            CoordinateMatrix(unknowns + size, unknowns, np.ones(size), shape)
+        )
 
 
 def step_operator(
@@ -200,7 +204,7 @@ def step_operator(
     return _Assembly(scene, state, step).operator()
 
 
-def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Floats, Couplings]:
+def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Floats, BlockMatrix]:
     """Compute the moves of particles and their derivatives ∂move/∂u.
 
     Parameters
@@ -229,17 +233,17 @@ def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Flo
     product = (outer.entries().sparse() @ chain).tobsr((scene.axes, scene.axes))
     product.sum_duplicates()
     rows = np.repeat(np.arange(len(place)), np.diff(product.indptr))
-    couplings = Couplings(outer.shape, scene.axes)
+    couplings = BlockMatrix(outer.shape, scene.axes)
     couplings.add(rows, product.indices, product.data)
     return moves, couplings
 
 
-def _followed(scene: Scene) -> Couplings:
+def _followed(scene: Scene) -> BlockMatrix:
     """Return the map from body displacements to those of body and frame: rows by flat place,
     columns in the order of the body's particles."""
     raster = scene.raster
     body, place = raster.body_rows, raster.place_of(np.arange(raster.count))
-    followed = Couplings((raster.kind.size, len(body)), scene.axes)
+    followed = BlockMatrix((raster.kind.size, len(body)), scene.axes)
     identity = np.broadcast_to(np.eye(scene.axes), (len(body), scene.axes, scene.axes))
     followed.add(place[body], np.arange(len(body)), identity)
     if scene.frame:
@@ -249,10 +253,10 @@ def _followed(scene: Scene) -> Couplings:
     return followed
 
 
-def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, Couplings]:
+def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, BlockMatrix]:
     """Compute the same with the scene's own rule; particles without neighbours do not move."""
     kind, moves = scene.raster.kind.ravel(), np.zeros((len(place), scene.axes))
-    couplings = Couplings((len(place), kind.size), scene.axes)
+    couplings = BlockMatrix((len(place), kind.size), scene.axes)
     moving = np.flatnonzero(has_neighbours(scene, place)).astype(np.int32)
     for s, numbers in by_sublattice(scene, place[moving]):
         rows = moving[numbers]
@@ -286,9 +290,9 @@ class _Assembly:
                 self._as_leader = self._unknown.copy()
         self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
         free, leaders = len(self._followers), len(self._leaders)
-        self._current, self._previous = (Couplings((free, free), scene.axes) for _ in range(2))
+        self._current, self._previous = (BlockMatrix((free, free), scene.axes) for _ in range(2))
         self._leader, self._frame_leader = (
-            Couplings((free, leaders), scene.axes) for _ in range(2)
+            BlockMatrix((free, leaders), scene.axes) for _ in range(2)
         )
 
     def operator(self) -> StepOperator:
@@ -320,7 +324,7 @@ class _Assembly:
         )
 
     def _add_identity(
-        self, couplings: Couplings, place: Indices, rows: Indices, factor: float
+        self, couplings: BlockMatrix, place: Indices, rows: Indices, factor: float
     ) -> None:
         """Add factor · 1 along the free axes of followers."""
         numbers = self._guiding.numbers(place[rows])
@@ -365,7 +369,7 @@ class _Assembly:
         leaders = self._as_leader[places[through_frame]]
         self._frame_leader.add(rows[through_frame], leaders, blocks[through_frame])
         lags = by_frame if frame is not None and frame.map.lag else np.zeros_like(by_frame)
-        discarded = Couplings((0, 0), 0)
+        discarded = BlockMatrix((0, 0), 0)
         for couplings, leads, selected in (
             (self._current, self._leader, is_follower & ~lags),
             (self._previous, self._leader, is_follower & lags),

@@ -36,7 +36,7 @@ FEW = 200
 
 
 @dataclass(frozen=True)
-class Response:
+class LinearResponse:
     """Linearised response of followers, stored once for each kind of follower.
 
     Parameters
@@ -65,7 +65,7 @@ class Response:
 
 def respond(
     scene: Scene, state: State, sublattice: int, place: Indices, answers: Sequence[str] = ("move",)
-) -> list[Response]:
+) -> list[LinearResponse]:
     """Linearise moves, or forces, of followers at a state.
 
     Parameters
@@ -79,7 +79,7 @@ def respond(
 
     Returns
     -------
-    list of Response
+    list of LinearResponse
         One for each of `answers`.
 
     Raises
@@ -100,7 +100,7 @@ def respond(
         return [_concatenate(kinds, responses) for responses in zip(*parts, strict=True)]
 
 
-def _concatenate(kinds: Indices, parts: Sequence[Response]) -> Response:
+def _concatenate(kinds: Indices, parts: Sequence[LinearResponse]) -> LinearResponse:
     """Concatenate the responses of chunks of kinds."""
     centre, answer = (
         np.concatenate([getattr(p, of) for p in parts]) for of in ("centre", "answer")
@@ -109,7 +109,7 @@ def _concatenate(kinds: Indices, parts: Sequence[Response]) -> Response:
         slot: np.concatenate([part.neighbours[slot] for part in parts])
         for slot in parts[0].neighbours
     }
-    return Response(kinds, centre, neighbours, answer)
+    return LinearResponse(kinds, centre, neighbours, answer)
 
 
 def by_sublattice(scene: Scene, place: Indices) -> Iterator[tuple[int, Indices]]:
@@ -231,7 +231,7 @@ class _Followers:
         self._unit = scene.neighbourhood.nudge_unit
         self._shape, self._cache = (steps, len(place)), dict[complex, Contributions]()
 
-    def response(self, name: str, finite: bool) -> Response:
+    def response(self, name: str, finite: bool) -> LinearResponse:
         """Linearise one quantity; raise ValueError if `finite` is demanded and the result is
         not."""
         answer = {"move": self._evaluator.move, "force": self._evaluator.force}[name]
@@ -253,7 +253,9 @@ class _Followers:
             -1,
         ).transpose(0, 2, 3, 1)
         kinds = np.arange(self._shape[1])
-        return Response(kinds, centre, dict(zip(self._slots, neighbours, strict=True)), value.T)
+        return LinearResponse(
+            kinds, centre, dict(zip(self._slots, neighbours, strict=True)), value.T
+        )
 
     def _evaluate(self, answer: Answer, step: complex) -> Any:
         if step not in self._cache:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.certificate import Certificate, Settling
+from pbdkit.equilibrium.certificate import Certificate, SteadyStateMonitor
 from pbdkit.equilibrium.solve import Way
 from pbdkit.equilibrium.system import Rows, Strip, StuckError
 from pbdkit.errors import NotSharedError
@@ -174,13 +174,13 @@ class DividedGuard(Guard):
         return int(found[int(np.argmax([most for most, _ in found]))][1])  # NaN is largest
 
 
-class DividedSettling(Settling):
+class DividedSettling(SteadyStateMonitor):
     """The first process looks whether the whole has settled."""
 
     def __init__(self, division: Division, settle: Settle) -> None:
         self._division, self._settling = division, None
         if whole := division.whole:
-            self._settling = Settling(whole, settle, initial_state(whole), Watch())
+            self._settling = SteadyStateMonitor(whole, settle, initial_state(whole), Watch())
         self._agree(None)
 
     def _agree(self, found: Certificate | None) -> Certificate | None:

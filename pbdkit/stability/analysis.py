@@ -20,13 +20,12 @@ import numpy as np
 
 from pbdkit.equilibrium.lattice_system import SlowMode
 from pbdkit.equilibrium.system import StuckError, System, one_thread
+from pbdkit.linear.block_matrix import CoordinateMatrix, connected
 from pbdkit.linear.operator import StepOperator, step_operator
 from pbdkit.linear.spectrum import (
     NEUTRAL,
-    Entries,
     Spectrum,
     Swing,
-    connected,
     excess,
     just_below,
     largest_stable_relaxation,
@@ -155,7 +154,9 @@ class Spectra:
             1.0 / self.scene.experiment.stepping.relaxation,
             np.arange(steady.shape[0]),
         )
-        rest = Entries(unknowns, unknowns, np.full(len(unknowns), 1.0 - scale), steady.shape)
+        rest = CoordinateMatrix(
+            unknowns, unknowns, np.full(len(unknowns), 1.0 - scale), steady.shape
+        )
         return rest.plus(steady, scale).without(self.operator.prescribed_unknowns).matrix()
 
 
@@ -384,7 +385,9 @@ class Analysis:
             return []
         operator = self.operator
         steady = operator.couplings_steady.entries()
-        graph = Entries(steady.rows, steady.columns, np.ones(len(steady.rows)), steady.shape)
+        graph = CoordinateMatrix(
+            steady.rows, steady.columns, np.ones(len(steady.rows)), steady.shape
+        )
         count, label = connected(graph.matrix(), strongly=False)
         is_led = np.zeros(count, bool)
         leader_rows = operator.couplings_leader.entries().rows

@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from pbdkit.equilibrium.system import ACCURACY, StuckError, System, solved
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, slot_step
+from pbdkit.linear.block_matrix import BlockMatrix
 from pbdkit.linear.operator import Guiding, moves_and_couplings, step_operator
-from pbdkit.linear.spectrum import Couplings, excess
+from pbdkit.linear.spectrum import excess
 from pbdkit.model.motions import Oscillation
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.units import Units, in_lengths
@@ -57,7 +58,7 @@ class BoundaryCoupling:
 
     scene: Scene
     place: Indices
-    couplings: Couplings
+    couplings: BlockMatrix
 
     def moves(self, u: Floats) -> Floats:
         """Return the relaxed moves of these followers for displacements u, both as planes."""

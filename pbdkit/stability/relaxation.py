@@ -23,14 +23,12 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER
+from pbdkit.linear.block_matrix import DENSE, CoordinateMatrix, connected
 from pbdkit.linear.operator import step_operator
 from pbdkit.linear.spectrum import (
-    DENSE,
     NEUTRAL,
     STRAIGHT,
     Complex,
-    Entries,
-    connected,
     excess,
     has_symmetric_rows,
     modes,
@@ -240,7 +238,7 @@ def _eigenvalues(scene: Scene, rest: State) -> tuple[Complex, bool]:
     return _ends(scene, rest, scene.raster.place_of(followers))
 
 
-def _largest_block_size(entries: Entries) -> int:
+def _largest_block_size(entries: CoordinateMatrix) -> int:
     _, label = connected(entries.sparse(), strongly=True)
     return int(np.bincount(label).max(initial=0))
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scene_strategies import samples
 
 import pbdkit
-from pbdkit.equilibrium.certificate import Foresight
+from pbdkit.equilibrium.certificate import ErrorBound
 from pbdkit.equilibrium.linearise import linearised
 from pbdkit.equilibrium.solve import events, moments, settle
 from pbdkit.equilibrium.system import Moves
@@ -171,7 +171,7 @@ def test_bounds_to_first_order_are_doubled():
     assert certificate.linearised
     assert certificate.distance == pytest.approx(2.0 * once, rel=0.1)
     state.u[...] += moves.at(state, 1) + 1e-4 * np.sin(state.u)  # off by a little
-    found = Foresight(scene, 1.0, Watch()).from_(state)
+    found = ErrorBound(scene, 1.0, Watch()).from_(state)
     system = linearised(scene, state, 1, "auto", Watch())
     correction = found.u - state.u
     left = system.distance(moves.at(type(state)(**vars(state) | {"u": found.u}), 1),

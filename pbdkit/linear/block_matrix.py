@@ -1,0 +1,203 @@
+"""Matrices of blocks (axis, axis) between particles, and the same by their entries.
+
+Small ones are dense arrays, others scipy.sparse.csr_array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+Indices = NDArray[np.signedinteger[Any]]
+
+DENSE = 500
+"""Largest number of rows of matrices that are stored densely."""
+
+
+@dataclass(frozen=True)
+class CoordinateMatrix:
+    """Matrix in coordinate form: (row, column, value). Values at the same place are added."""
+
+    rows: NDArray[np.signedinteger[Any]]
+    columns: NDArray[np.signedinteger[Any]]
+    values: Floats
+    shape: tuple[int, int]
+
+    def plus(self, other: CoordinateMatrix, factor: float = 1.0) -> CoordinateMatrix:
+        """Return the sum with `factor` times another matrix, in the shape of the other."""
+        rows = np.concatenate([self.rows, other.rows])
+        columns = np.concatenate([self.columns, other.columns])
+        values = np.concatenate([self.values, factor * other.values])
+        return CoordinateMatrix(rows, columns, values, other.shape)
+
+    def without(self, unknowns: Indices) -> CoordinateMatrix:
+        """Return the matrix without the rows and columns of some unknowns."""
+        is_kept = np.ones(self.shape[0], bool)
+        is_kept[unknowns] = False
+        number = np.cumsum(is_kept) - 1
+        entries = is_kept[self.rows] & is_kept[self.columns]
+        size = int(np.count_nonzero(is_kept))
+        places = number[self.rows[entries]], number[self.columns[entries]]
+        return CoordinateMatrix(*places, self.values[entries], (size, size))
+
+    def matrix(self) -> Any:
+        """Return a dense matrix up to DENSE rows, else a sparse one."""
+        if self.shape[0] > DENSE:
+            return self.sparse()
+        place = self.rows * self.shape[1] + self.columns
+        return np.bincount(place, self.values, self.shape[0] * self.shape[1]).reshape(self.shape)
+
+    def sparse(self) -> Any:
+        """Return a scipy.sparse.csr_array."""
+        import scipy.sparse
+
+        return scipy.sparse.coo_array((self.values, (self.rows, self.columns)), self.shape).tocsr()
+
+
+def identity_like(matrix: Any) -> Any:
+    """Return the identity, dense or sparse as the square matrix is."""
+    if isinstance(matrix, np.ndarray):
+        return np.eye(len(matrix))
+    from scipy.sparse import eye_array
+
+    return eye_array(matrix.shape[0], format="csr")
+
+
+def one_minus(matrix: Any) -> Any:
+    """Return the identity minus a matrix, dense or sparse as the matrix is."""
+    difference = identity_like(matrix) - matrix
+    return difference if isinstance(matrix, np.ndarray) else difference.tocsr()
+
+
+def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
+    """Find the connected components of a matrix, seen as a directed graph.
+
+    Parameters
+    ----------
+    strongly
+        Whether edges count in their direction only (strongly connected components).
+
+    Returns
+    -------
+    count
+        Number of components.
+    label : (unknown,)
+        Component of each unknown.
+    """
+    if not matrix.shape[0]:
+        return 0, np.empty(0, np.intp)
+    if not isinstance(matrix, np.ndarray):
+        from scipy.sparse.csgraph import connected_components
+
+        kind = "strong" if strongly else "weak"
+        count, label = connected_components(matrix, connection=kind)
+        return count, label
+    reach = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
+    if not strongly:
+        return _undirected_components(reach | reach.T)
+    while True:
+        longer = reach.astype(np.float32) @ reach.astype(np.float32) > 0.0
+        if (longer == reach).all():
+            break
+        reach = longer
+    first = np.argmax(reach & reach.T, axis=1)  # components are labelled by their lowest unknown
+    names, label = np.unique(first, return_inverse=True)
+    return len(names), label
+
+
+def _undirected_components(reach: NDArray[np.bool_]) -> tuple[int, Indices]:
+    """Find the components of a symmetric graph by breadth-first search."""
+    count, label = 0, np.full(len(reach), -1)
+    while (unlabelled := label < 0).any():
+        front = np.flatnonzero(unlabelled)[:1]
+        count += 1
+        while len(front):
+            label[front] = count - 1
+            front = np.flatnonzero(reach[front].any(axis=0) & (label < 0))
+    return count, label
+
+
+@dataclass
+class BlockMatrix:
+    """Block matrix of (axis, axis) blocks at (row, column), counted in particles.
+
+    Parameters
+    ----------
+    shape
+        Number of rows and columns in particles.
+    axes
+        Number of axes of space.
+    parts
+        Rows, columns and blocks, (entry, axis, axis). Blocks at the same place are added. Blocks
+        that are all equal may be broadcast views of one.
+    """
+
+    shape: tuple[int, int]
+    axes: int
+    parts: list[tuple[Indices, Indices, Floats]] = field(default_factory=list)
+
+    def add(self, rows: Indices, columns: Indices, blocks: Floats) -> None:
+        """Add blocks, (entry, axis, axis)."""
+        if len(rows):
+            self.parts.append((rows, columns, blocks))
+
+    def add_scaled_identity(self, rows: Indices, factor: float) -> None:
+        """Add factor · 1 on the diagonal of some rows."""
+        block = factor * np.eye(self.axes)
+        self.add(rows, rows, np.broadcast_to(block, (len(rows), *block.shape)))
+
+    def entries(self, to: Sequence[int] = (), of: Sequence[int] = ()) -> CoordinateMatrix:
+        """Return the scalar entries of the couplings between axes.
+
+        Parameters
+        ----------
+        to, of
+            Axes of the rows and of the columns; default: all, and the same as `to`. With all axes,
+            particle n has the unknowns 2n (x) and 2n + 1 (y) in the plane.
+        """
+        to = to or range(self.axes)
+        of = of or to
+        shape = (len(to) * self.shape[0], len(of) * self.shape[1])
+        rows, columns, blocks = self._joined()
+        if len(to) + len(of) < 2 * self.axes:
+            blocks = blocks[:, np.array(to)[:, None], of]
+        entry, i, j = np.nonzero(blocks)
+        values = blocks[entry, i, j]
+        row, column = len(to) * rows[entry] + i, len(of) * columns[entry] + j
+        return CoordinateMatrix(row, column, values, shape)
+
+    def _joined(self) -> tuple[Indices, Indices, Floats]:
+        """Return all parts as one."""
+        if not self.parts:
+            nothing = np.empty(0, np.intp)
+            return nothing, nothing, np.empty((0, self.axes, self.axes))
+        rows, columns, blocks = (np.concatenate(values) for values in zip(*self.parts, strict=True))
+        return rows, columns, blocks
+
+    def couples(self, a: int, b: int) -> bool:
+        """Return whether displacements along axis b change those along axis a."""
+        return any(blocks[:, a, b].any() for _, _, blocks in self.parts)
+
+    def is_isotropic(self) -> bool:
+        """Return whether the couplings along all axes are equal."""
+        return all(
+            np.array_equal(blocks[:, 0, 0], blocks[:, a, a])
+            for _, _, blocks in self.parts
+            for a in range(1, self.axes)
+        )
+
+    def times(self, vectors: Floats) -> Floats:
+        """Return the product with vectors, (particle, axis)."""
+        rows, columns, blocks = self._joined()
+        terms = np.einsum("eab,eb->ea", blocks, vectors[columns])
+        return np.stack([np.bincount(rows, along, self.shape[0]) for along in terms.T], axis=1)
+
+
+def frame_matrices(weights: Floats, axes: int) -> Floats:
+    """Return a frame's weights as matrices, (entry, axis, axis)."""
+    return weights[:, None, None] * np.eye(axes) if weights.ndim == 1 else weights
