@@ -187,7 +187,7 @@ class SteppingDriver(Driver):
     def _advance(self) -> None:
         """To the next step at which to look. Raises FloatingPointError."""
         experiment, state = self.scene.experiment, self.state
-        stops = [experiment.next_wanted(state.step), self.guard.next_look]
+        stops = [experiment.next_recorded(state.step), self.guard.next_look]
         stops += [self.settling.pace.next_look] if self.settling else []
         stops += [self.pause] if self.pause > state.step else []
         reached = min(*stops, state.step + self._patience)

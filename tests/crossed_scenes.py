@@ -78,16 +78,20 @@ NUMBERS = {
 
 ANEW = "reevaluate"
 REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
-    ((ANEW,), (*FRACTURES, *OF_FRACTURE), "bonds cannot break where neighbours are re-evaluated"),
-    ((ANEW,), ("cuts",), "bonds cannot be cut where neighbours are re-evaluated"),
-    ((ANEW,), ("loads", "body force"), "loads: need neighbours that stay; set neighbours.reeval"),
-    ((ANEW,), ("solver: equilibrium",), "nothing tells where the steps lead; set neighbours.reev"),
-    ((ANEW,), ("solver settle",), "no distance from equilibrium is known; set neighbours.reevalu"),
+    ((ANEW,), (*FRACTURES, *OF_FRACTURE), "bonds cannot break if neighbours are re-evaluated"),
+    ((ANEW,), ("cuts",), "bonds cannot be cut if neighbours are re-evaluated"),
+    (
+        (ANEW,),
+        ("loads", "body force"),
+        "loads: loads require fixed neighbours; set neighbours.reeval",
+    ),
+    ((ANEW,), ("solver: equilibrium",), "the limit of the steps is not defined if neighbours are"),
+    ((ANEW,), ("solver settle",), "the distance from equilibrium has no bound if neighbours are"),
     ((ANEW,), FIELDS_OF_RULE[:2], "found anew; set neighbours.reevaluate: false"),
     (
         (ANEW,),
         ("frame: natural", "motion: newton", *(f"rule: {name}" for name in CALIBRATED)),
-        "weighs neighbours by their slots, which re-evaluated neighbours do not have",
+        "has weights for each slot, which re-evaluated neighbours do not have",
     ),
     (
         ("memory auto",),
@@ -96,22 +100,26 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     ),
     (("memory auto",), (ANEW,), "'auto' needs a spectrum, and neighbours that are found anew"),
     (UNCALIBRATED, ("loads", "body force"), r"loads: the rule '[a-z-]+' .* knows no forces"),
-    (UNCALIBRATED, ("motion: newton",), "leaders that move by Newton's law need forces, and '"),
-    (UNCALIBRATED, ("fracture: cohesive",), "'cohesive' needs a rule that is calibrated"),
+    (
+        UNCALIBRATED,
+        ("motion: newton",),
+        "leaders that move by Newton's law require forces, which '",
+    ),
+    (UNCALIBRATED, ("fracture: cohesive",), "'cohesive' requires a rule that is calibrated"),
     (
         ("fracture: cohesive",),
         ("frame: mean", "frame: first", "frame: none", "frame: mirror"),
         "'cohesive' softens the cells of the body, which the frame",
     ),
-    (UNCALIBRATED, ("frame: natural",), "the rule '[a-z-]+' does not work cell by cell; take a"),
+    (UNCALIBRATED, ("frame: natural",), "the rule '[a-z-]+' is not defined by cells; use a"),
     (NUMBERLESS, FIELDS_OF_RULE, "rule.stiffness: unknown key"),
     (("rule: strain-gradient",), FIELDS_OF_RULE[:2], "applies a rule to the moves of another"),
     (
         ("rule: strain-gradient",),
         (*FRACTURES, *OF_FRACTURE),
-        "applies a rule to the moves of another, which does not go with this fracture",
+        "applies a rule to the moves of another, which is incompatible with this fracture",
     ),
-    (("rule: strain-gradient",), ("cuts",), "which does not go with such cuts; take cuts:"),
+    (("rule: strain-gradient",), ("cuts",), "which is incompatible with such cuts; use cuts:"),
     (
         ("fracture: threshold",),
         ("fracture field by region",),
@@ -125,11 +133,19 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (
         ("scatter",),
         ("fracture field by region",),
-        "draws a number for each bond from it; 'failure' must be one number here",
+        "draws a random number for each bond from its parameters; 'failure' must be a single",
     ),
-    (("scatter",), ("fracture number in time",), "so that it cannot change; give one number"),
-    (SOFTENING, ("solver settle",), "remembers, so that no distance from equilibrium is known"),
-    (("motion: newton",), ("solver settle", "solver: equilibrium"), "have no place at which they"),
+    (
+        ("scatter",),
+        ("fracture number in time",),
+        "so that it cannot depend on time; give a single number",
+    ),
+    (
+        SOFTENING,
+        ("solver settle",),
+        "depends on the history, so that the distance from equilibrium has no bound",
+    ),
+    (("motion: newton",), ("solver settle", "solver: equilibrium"), "have no final position that"),
     (("solver: equilibrium",), OF_STEPS, r"solver\.[a-z]+: unknown key"),
 )
 """Features of two groups of which no two go together, and what the refusal says."""

@@ -77,8 +77,8 @@ BY_DISTANCE = (
 )  # fmt: skip
 ON_TRIANGLES = ("springs, hexagonal", "elastic, hexagonal")
 REFUSED = {
-    "natural": (BY_DISTANCE, "does not work cell by cell"),
-    "mirror": (ON_TRIANGLES, "needs a square or rectangular lattice"),
+    "natural": (BY_DISTANCE, "is not defined by cells"),
+    "mirror": (ON_TRIANGLES, "requires a square or rectangular lattice"),
 }
 """The rules that do not take a frame, and what is said then."""
 RIGHT = {"select": {"edge": "right"}}
@@ -151,7 +151,7 @@ class Plain:
         kinds = kinds_of_places(scene.raster, scene.leading, self.experiment.steps)
         free = np.stack([kinds == FOLLOWER] * 2)
         guided = guided_at(scene.raster, scene.leading, self.experiment.steps)
-        free[:, guided.place] &= ~guided.led
+        free[:, guided.place] &= ~guided.lead_axes
         self.free, self._start = np.flatnonzero(free), np.zeros(np.count_nonzero(free))
         for _ in range(MOST if not self.experiment.rule.linear else 1):  # Newton's
             self._slope = self._slope_at(scene, self._start)

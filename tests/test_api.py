@@ -107,7 +107,7 @@ MISTAKES = {
     "settings: key": (lambda ds: load(settings={"stepz": 20}), "settings: stepz", "'steps'"),
     "settings: value": (lambda ds: load(settings={"steps": -2}), "settings: steps", "equal to 1"),
     "settings: leader": (
-        lambda ds: load(settings={"leaders": {9: {"until": 3}}}), "'9' is no position in",
+        lambda ds: load(settings={"leaders": {9: {"until": 3}}}), "'9' is not an index of",
     ),
     "settings: text": (lambda ds: load(settings="steps"), "setting steps: expected PATH=VALUE"),
     "settings: number": (lambda ds: load(settings=5), "settings: expected a map", LIST, "got 5"),

@@ -152,7 +152,7 @@ def test_what_results_declare_is_within_the_bounds(call: Any) -> None:
 PACKED = [
     ({"scale_factor": "abc"}, None),
     ({"add_offset": [1.0, 2.0]}, None),
-    ({"_FillValue": 3.0}, "places and values should be finite"),
+    ({"_FillValue": 3.0}, "coordinates and values should be finite"),
     ({"scale_factor": 2.0}, ""),
     ({"units": "days since 2000-01-01"}, ""),
 ]
@@ -332,7 +332,7 @@ def test_an_experiment_in_a_result_names_no_files(call: Any, parts: Any, elsewhe
     for command in (["explain", "r.nc"], ["resume", "r.nc", "--steps", "999", "--anyway"]):
         refused = call(*command)
         assert refused.code in (2, 6)
-        assert "below/data.csv: an experiment that lies in a result" in refused.err
+        assert "below/data.csv: an experiment in a result" in refused.err
 
 
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300, "", ".", "/dev/zero", 7])
@@ -344,9 +344,9 @@ def test_names_that_are_none_are_refused_in_a_line(tensile: dict[str, Any], name
 
 
 TABLES = [
-    ("," * 3_000_000 + "\n", r"has a line of more than 65536 characters; leave out the columns"),
+    ("," * 3_000_000 + "\n", r"has a line of more than 65536 characters; remove the columns"),
     (",".join(f"ux{n}" for n in range(9000)) + "\n", "there are no 'step'"),
-    ("step,ux,uy\n1,1_0,0\n", "d.csv:2: column 'ux' needs a finite number, got '1_0'"),
+    ("step,ux,uy\n1,1_0,0\n", "d.csv:2: column 'ux' requires a finite number, got '1_0'"),
 ]
 
 

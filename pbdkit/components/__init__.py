@@ -1,4 +1,4 @@
-"""The components that come with pbdkit, offered through the same door as anybody's."""
+"""Built-in components, registered through the same hook as those of third parties."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ COMPONENTS = {
     "Strain LocalRotation Stress StrainEnergy Reaction LoadDisplacement StressStrain "
     "ContactForces",
 }
-"""By module of this folder the classes that it offers."""
+"""Names of the component classes, by the module of this package that defines them."""
 
 
 @hookimpl
 def pbdkit_components() -> list[type[Component]]:
-    """The built-in components of the seven interfaces."""
+    """Return the built-in component classes of the seven interfaces."""
     return [
         getattr(import_module(f"{__name__}.{module}"), name)
         for module, names in COMPONENTS.items()

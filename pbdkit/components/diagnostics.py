@@ -1,6 +1,7 @@
-"""Built-in diagnostics: pseudo-energies, displacements, tracks and broken bonds (model.md, section
-8); strain, rotation and stress at particles; reactions, strain energy and load curves; contact
-forces.
+"""Built-in diagnostics.
+
+Pseudo-energies, displacements, tracks and broken bonds (model.md, section 8); strain, rotation and
+stress at particles; reactions, strain energy and load curves; contact forces.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from pbdkit.plugin.units import AREA, ENERGY, FORCE, LENGTH, STRESS, FromUnits, 
 
 
 class PE1(Diagnostic):
-    """PE1_j = Σ_k (|x_j - x_k| - |X_j - X_k|)² over all reference neighbours, broken or not.
+    """Pseudo-energy PE1_j = Σ_k (|x_j - x_k| - |X_j - X_k|)² over all reference neighbours.
 
-    For every body particle, leaders included; frame points are neighbours.
+    The sum includes broken bonds and frame points. Evaluated at every particle of the body, leaders
+    included.
     """
 
     type: Literal["pe1"] = "pe1"
@@ -33,16 +35,16 @@ class PE1(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`pe1`."""
+        """Declare `pe1`."""
         return (Variable("pe1", ("particle",), "pseudo-energy PE1", AREA.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Squared length changes, summed."""
+        """Return the sum of squared extensions."""
         return (now.sum_over_neighbours(_squared_extension),)
 
 
 class PE1Intact(Diagnostic):
-    """PE1 over unbroken bonds only."""
+    """Pseudo-energy PE1 over unbroken bonds only."""
 
     type: Literal["pe1-intact"] = "pe1-intact"
 
@@ -50,50 +52,53 @@ class PE1Intact(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`pe1_intact`."""
+        """Declare `pe1_intact`."""
         name = "pseudo-energy PE1 of intact bonds"
         return (Variable("pe1_intact", ("particle",), name, AREA.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Squared length changes of intact bonds, summed."""
+        """Return the sum of squared extensions of intact bonds."""
         return (now.sum_over_neighbours(_squared_extension, intact_only=True),)
 
 
 class PE2(Diagnostic):
-    """PE2_j(t) = |x_j(t) - x_j(t-1)|, against the step before whatever is recorded; 0 at time 0."""
+    """Pseudo-energy PE2_j(t) = |x_j(t) - x_j(t-1)|, 0 at time 0.
+
+    The previous step counts even if it is not recorded.
+    """
 
     type: Literal["pe2"] = "pe2"
 
     local: ClassVar[bool] = True
 
     def variables(self) -> tuple[Variable, ...]:
-        """`pe2`."""
+        """Declare `pe2`."""
         return (Variable("pe2", ("particle",), "pseudo-energy PE2", LENGTH.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """The length of the last step."""
-        moved = now.displacement() - now.previous_displacement()
-        return (np.sqrt((moved * moved).sum(axis=1)),)
+        """Return the length of the last move."""
+        move = now.displacement() - now.previous_displacement()
+        return (np.sqrt((move * move).sum(axis=1)),)
 
 
 class Displacement(Diagnostic):
-    """u = x - X, with all its digits however far from the origin the body lies."""
+    """Displacement u = x - X, with full precision however far from the origin the body lies."""
 
     type: Literal["displacement"] = "displacement"
 
     local: ClassVar[bool] = True
 
     def variables(self) -> tuple[Variable, ...]:
-        """`u`."""
+        """Declare `u`."""
         return (Variable("u", ("particle", "axis"), "displacement", LENGTH.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """The displacements."""
+        """Return the displacements."""
         return (now.displacement(),)
 
 
 class Track(Diagnostic):
-    """The position of chosen particles at every step."""
+    """Positions of selected particles at every step."""
 
     type: Literal["track"] = "track"
     numbers: Annotated[
@@ -103,43 +108,44 @@ class Track(Diagnostic):
     every_step: ClassVar[bool] = True
 
     def variables(self) -> tuple[Variable, ...]:
-        """`track`."""
+        """Declare `track`."""
         return (
             Variable("track", ("tracked", "axis"), "position of tracked particles", LENGTH.lattice),
         )
 
     def check(self, particles: int, leader_groups: int) -> None:
-        """Refuses numbers that no particle has."""
+        """Raise ExperimentError for a number that no particle has."""
         refuse_numbers_beyond(particles, self.numbers)
 
     def coordinates(self) -> dict[str, NDArray[Any]]:
-        """`tracked`, the numbers of the particles."""
+        """Return `tracked`, the numbers of the particles."""
         return {"tracked": np.array(self.numbers, np.int64)}
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """X + u of the chosen rows."""
+        """Return X + u of the selected particles."""
         rows = now.rows(self.numbers)
         return (now.reference(rows) + now.displacement(rows),)
 
 
 class BrokenBonds(Diagnostic):
-    """The number of broken bonds."""
+    """Number of broken bonds."""
 
     type: Literal["broken"] = "broken"
 
     def variables(self) -> tuple[Variable, ...]:
-        """`broken_bonds`."""
+        """Declare `broken_bonds`."""
         return (Variable("broken_bonds", (), "number of broken bonds", "1", dtype="i8"),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """The count."""
+        """Return the number of broken bonds."""
         return (now.broken_bonds(),)
 
 
 class SmallestCellArea(Diagnostic):
-    """The smallest signed area of a cell, as a share of its area at rest: 1 at rest, 0 where a cell
-    is flat, negative where one is inside out. Cells with broken bonds count too. For cells whose
-    corners are all of the body.
+    """Smallest signed area of a cell, relative to its area at rest.
+
+    It is 1 at rest, 0 if a cell is flat and negative if a cell is inverted. Cells with broken bonds
+    are included, cells with corners outside the body are not.
     """
 
     type: Literal["smallest-cell-area"] = "smallest-cell-area"
@@ -147,18 +153,20 @@ class SmallestCellArea(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`smallest_cell_area`."""
+        """Declare `smallest_cell_area`."""
         name = "smallest signed cell area over that at rest, negative inside out"
         return (Variable("smallest_cell_area", (), name, "1"),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """The smallest of all cells."""
+        """Return the minimum over all cells."""
         return (now.cells.over(area_share).min(),)
 
 
 class CrackPath(Diagnostic):
-    """The bonds that broke, in the order in which they did: by step, and within a step the most
-    stretched first. Bonds that were cut or broken from the start come first, with no strain."""
+    """Broken bonds in the order of breaking: by step, within a step by decreasing stretch.
+
+    Bonds that were cut, or broken from the start, come first and have no strain.
+    """
 
     type: Literal["crack-path"] = "crack-path"
 
@@ -167,20 +175,20 @@ class CrackPath(Diagnostic):
     own_dimension: ClassVar[str] = "crack"
 
     def variables(self) -> tuple[Variable, ...]:
-        """`crack_bond`, `crack_step`, `crack_strain`, `crack_midpoint`."""
-        crack, no_strain = ("crack",), "NaN where it was cut, or broken from the start"
-        where = "reference position of the broken bond's middle"
+        """Declare `crack_bond`, `crack_step`, `crack_strain` and `crack_midpoint`."""
+        crack, no_strain = ("crack",), "NaN if the bond was cut, or broken from the start"
+        midpoint = "reference position of the middle of the broken bond"
         return (
             Variable("crack_bond", crack, "number of the broken bond", "1", dtype="i8"),
             Variable("crack_step", crack, "time of breaking", "step", dtype="i4"),
             Variable(
                 "crack_strain", crack, "strain at breaking", "1", attributes={"comment": no_strain}
             ),
-            Variable("crack_midpoint", (*crack, "axis"), where, LENGTH.lattice),
+            Variable("crack_midpoint", (*crack, "axis"), midpoint, LENGTH.lattice),
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """A row a broken bond."""
+        """Return number, step, strain and midpoint of each broken bond."""
         bonds = now.bonds()
         step, strain = bonds.broken_step, bonds.broken_strain
         order = breaking_order(step, strain)
@@ -193,7 +201,7 @@ def _squared_extension(d: Vector, r: Vector) -> Any:
 
 
 def refuse_numbers_beyond(particles: int, numbers: tuple[int, ...]) -> None:
-    """Raises ExperimentError for a number that no particle has."""
+    """Raise ExperimentError for a number that no particle has."""
     for n, number in enumerate(numbers):
         if number > particles:
             text = f"there is no particle {number}; they are numbered 1 to {particles}"
@@ -201,36 +209,43 @@ def refuse_numbers_beyond(particles: int, numbers: tuple[int, ...]) -> None:
 
 
 Floats = NDArray[np.floating[Any]]
+"""Type of arrays of floating-point numbers."""
 Measure = Annotated[
     Literal["small", "green-lagrange"],
     Field(
         alias="measure",
-        description="Small strain, or that of finite deformation.",
+        description="Small strain, or Green-Lagrange strain for finite deformation.",
         examples=["green-lagrange"],
     ),
 ]
+"""Type of the parameter `measure`: small or Green-Lagrange strain."""
 Modulus = Annotated[
     float,
     Field(
         gt=0.0,
-        description="E, in the units that stresses shall have, unless `units` gives it.",
+        description="Young's modulus, in the unit of the stresses; by default that of `units`.",
         examples=[210e9],
     ),
     FromUnits("youngs_modulus"),
 ]
+"""Type of Young's modulus as a parameter."""
 COMPONENTS = ("xx", "yy", "xy")
-ROOT_3, ROOT_12 = math.sqrt(3.0), math.sqrt(12.0)
+"""Names of the components of a plane symmetric tensor."""
+ROOT_3 = math.sqrt(3.0)
+"""Square root of 3."""
+ROOT_12 = math.sqrt(12.0)
+"""Square root of 12."""
 
 
 class Strain(Diagnostic):
-    """The strain of every body particle inside the outline; 0 where no cell is.
+    """Strain of the particles inside the outline of the body; 0 at a particle without cells.
 
-    From the displacement gradient H = ∂u/∂X of the cells around the particle. `measure: small` is
-    ε = (H + Hᵀ)/2, which takes rotations for strain; `green-lagrange`, for finite deformation, is
-    (FᵀF - 1)/2 = (H + Hᵀ + HᵀH)/2 with F = 1 + H, which does not. xy is the tensor's component,
-    half the angle of shear. The equivalent strain is that of von Mises where the volume stays,
-    √(2/3 ε:ε) with ε_zz = -(ε_xx + ε_yy): (2/√3) √(ε_xx² + ε_yy² + ε_xx ε_yy + ε_xy²). Principal
-    values are those in the plane.
+    The strain follows from the displacement gradient H = ∂u/∂X of the cells around the particle.
+    `measure: small` is ε = (H + Hᵀ)/2, which is not invariant under rotations; `measure:
+    green-lagrange`, for finite deformation, is (FᵀF - 1)/2 = (H + Hᵀ + HᵀH)/2 with F = 1 + H. The
+    component xy is that of the tensor, half the engineering shear strain. The equivalent strain is
+    the von Mises strain at constant volume, √(2/3 ε:ε) with ε_zz = -(ε_xx + ε_yy): (2/√3) √(ε_xx² +
+    ε_yy² + ε_xx ε_yy + ε_xy²). Principal values are those in the plane.
     """
 
     type: Literal["strain"] = "strain"
@@ -240,23 +255,25 @@ class Strain(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`strain_xx`, or `green_lagrange_xx`, and so on; `_von_mises`, `_principal`."""
+        """Declare `strain_xx` or `green_lagrange_xx`, the other components, `_von_mises` and
+        `_principal`.
+        """
         name = "strain" if self.measure_ == "small" else "green_lagrange"
         meaning = "small strain" if self.measure_ == "small" else "Green-Lagrange strain"
         return _components(name, meaning, f"equivalent {meaning}", "1")
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """(xx, yy, xy, the equivalent strain, principal strains)."""
+        """Return xx, yy, xy, the equivalent strain and the principal strains."""
         xx, yy, xy = strain(now.cells.gradient(), self.measure_)
         equivalent = 2.0 * np.hypot(np.hypot((xx + yy) / 2, (xx - yy) / ROOT_12), xy / ROOT_3)
         return _inside(now, xx, yy, xy, equivalent, principal(xx, yy, xy))
 
 
 class LocalRotation(Diagnostic):
-    """The angle by which the surroundings of every body particle inside the outline have turned,
-    counterclockwise, from -π to π; 0 where no cell is.
+    """Rotation angle of the neighbourhood of each particle inside the outline; 0 without cells.
 
-    That of R in the polar decomposition F = R U: atan2(F_yx - F_xy, F_xx + F_yy).
+    The angle of R in the polar decomposition F = R U, atan2(F_yx - F_xy, F_xx + F_yy),
+    counterclockwise from -π to π.
     """
 
     type: Literal["rotation"] = "rotation"
@@ -265,24 +282,24 @@ class LocalRotation(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`rotation`."""
+        """Declare `rotation`."""
         return (Variable("rotation", ("particle",), "angle of rotation", "rad"),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """The angle."""
+        """Return the angle."""
         H = now.cells.gradient()
         return _inside(now, np.arctan2(H[:, 1, 0] - H[:, 0, 1], 2.0 + H[:, 0, 0] + H[:, 1, 1]))
 
 
 class Stress(Diagnostic):
-    """The stress of every body particle inside the outline in the material that the rule is
-    calibrated to, in plane stress or plane strain as the rule; 0 where no cell is.
+    """Stress of the particles inside the outline of the body; 0 at a particle without cells.
 
-    Young's modulus times the rule's stiffness times the strain, less what softened bonds of the
-    cells around no longer carry. With `measure: small` it is the
-    Cauchy stress of linear elasticity; with `green-lagrange`, for finite rotation (rule `springs`),
-    the second Piola-Kirchhoff stress. The stress of von Mises counts σ_zz, which is 0 in plane
-    stress and ν (σ_xx + σ_yy) in plane strain; principal values are those in the plane.
+    The stress is Young's modulus times the stiffness of the calibrated rule times the strain, in
+    plane stress or plane strain as in the rule, minus the stress that softened bonds of the
+    surrounding cells have lost. With `measure: small` it is the Cauchy stress of linear elasticity;
+    with `measure: green-lagrange`, for finite rotation (rule `springs`), the second Piola-Kirchhoff
+    stress. The von Mises stress includes σ_zz, which is 0 in plane stress and ν (σ_xx + σ_yy) in
+    plane strain. Principal values are those in the plane.
     """
 
     type: Literal["stress"] = "stress"
@@ -293,25 +310,28 @@ class Stress(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"cells", "material"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`stress_xx`, or `piola_kirchhoff_xx`, and so on; `_von_mises`, `_principal`."""
+        """Declare `stress_xx` or `piola_kirchhoff_xx`, the other components, `_von_mises`,
+        `_principal`.
+        """
         name = "stress" if self.measure_ == "small" else "piola_kirchhoff"
         meaning = "stress" if self.measure_ == "small" else "second Piola-Kirchhoff stress"
         return _components(name, meaning, f"von Mises {meaning}", STRESS.lattice)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """(xx, yy, xy, the stress of von Mises, principal stresses)."""
+        """Return xx, yy, xy, the von Mises stress and the principal stresses."""
         c, E = now.forces.stiffness, self.youngs_modulus
         e_xx, e_yy, e_xy = strain(now.cells.gradient(), self.measure_)
         xx, yy, xy = c.xx * e_xx + c.xy * e_yy, c.xy * e_xx + c.yy * e_yy, 2 * c.shear * e_xy
-        if (lost := now.cells.lost_stress()) is not None:
-            xx, yy, xy = self._less(now, lost, xx, yy, xy)
+        if (lost_stress := now.cells.lost_stress()) is not None:
+            xx, yy, xy = self._subtract(now, lost_stress, xx, yy, xy)
         xx, yy, xy = E * xx, E * yy, E * xy
         zz = now.forces.through_thickness * (xx + yy)
-        apart = np.hypot(np.hypot(xx - yy, yy - zz), zz - xx) / math.sqrt(2.0)
-        return _inside(now, xx, yy, xy, np.hypot(apart, ROOT_3 * xy), principal(xx, yy, xy))
+        deviator = np.hypot(np.hypot(xx - yy, yy - zz), zz - xx) / math.sqrt(2.0)
+        return _inside(now, xx, yy, xy, np.hypot(deviator, ROOT_3 * xy), principal(xx, yy, xy))
 
-    def _less(self, now: Moment, lost: Floats, *stress: Floats) -> tuple[Floats, ...]:
-        """The stress without what softened bonds no longer carry, P = F S."""
+    def _subtract(self, now: Moment, lost: Floats, *stress: Floats) -> tuple[Floats, ...]:
+        """Subtract the stress that softened bonds have lost, a first Piola-Kirchhoff stress."""
+        # S = F⁻¹ P
         if self.measure_ == "green-lagrange":
             lost = np.linalg.solve(np.nan_to_num(now.cells.gradient()) + np.eye(2), lost)
         xx, yy = lost[:, 0, 0], lost[:, 1, 1]
@@ -320,7 +340,20 @@ class Stress(Diagnostic):
 
 
 def strain(H: Floats, measure: Measure) -> tuple[Floats, Floats, Floats]:
-    """(xx, yy, xy), each (particle,), of displacement gradients H (particle, component, axis)."""
+    """Compute the strain from the displacement gradient.
+
+    Parameters
+    ----------
+    H
+        Displacement gradients, (particle, component, axis).
+    measure
+        ``"small"`` for (H + Hᵀ)/2, ``"green-lagrange"`` for (H + Hᵀ + HᵀH)/2.
+
+    Returns
+    -------
+    tuple
+        Components xx, yy and xy of the tensors, each (particle,).
+    """
     tensor = H + np.swapaxes(H, 1, 2)
     if measure == "green-lagrange":
         tensor += np.einsum("nka,nkb->nab", H, H)
@@ -329,48 +362,53 @@ def strain(H: Floats, measure: Measure) -> tuple[Floats, Floats, Floats]:
 
 
 def principal(xx: Floats, yy: Floats, xy: Floats) -> Floats:
-    """The larger and the smaller principal value of plane tensors, (particle, principal)."""
+    """Return the larger and the smaller principal value of plane tensors, (particle, principal)."""
     middle, radius = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     return np.stack([middle + radius, middle - radius], axis=1)
 
 
 def _inside(now: Moment, *values: Floats) -> tuple[Floats, ...]:
-    """Values of particles, (particle, ...), NaN beyond the outline."""
-    beyond = ~now.inside
+    """Set the values of particles outside the outline to NaN; values are (particle, ...)."""
+    outside = ~now.inside
     for value in values:
-        value[beyond] = np.nan
+        value[outside] = np.nan
     return values
 
 
 def _components(name: str, meaning: str, equivalent: str, units: str) -> tuple[Variable, ...]:
     parts = {part: f"{meaning}, {part} component" for part in COMPONENTS}
     parts["von_mises"] = equivalent
-    found = [Variable(f"{name}_{n}", ("particle",), text, units) for n, text in parts.items()]
-    of_principal = ("particle", "principal"), f"principal {meaning}", units
-    return (*found, Variable(f"{name}_principal", *of_principal))
+    variables = [Variable(f"{name}_{n}", ("particle",), text, units) for n, text in parts.items()]
+    dims = ("particle", "principal")
+    return (*variables, Variable(f"{name}_principal", dims, f"principal {meaning}", units))
 
 
 Thickness = Annotated[
     float,
     Field(
         gt=0.0,
-        description="Of the body, out of its plane; 1 unless `units` gives it.",
+        description="Thickness of the body; by default that of `units`, or 1.",
         examples=[2.0],
     ),
     FromUnits("thickness", otherwise=1.0),
 ]
+"""Type of the thickness of the body as a parameter."""
 Group = Annotated[int, Field(ge=0)]
+"""Type of the index of a leader group, from 0."""
 TwoNumbers = Annotated[
     tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)
 ]
+"""Type of the numbers of two particles."""
 TwoPoints = Annotated[tuple[Place, Place], Field(strict=False)]
+"""Type of two points."""
 
 
 class StrainEnergy(Diagnostic):
-    """The strain energy of the body: ½ uᵀK u with the stiffness K that the rule is, or the energy
-    of the rule's own bonds where it is not linear ('springs').
+    """Strain energy of the body.
 
-    Under a frame with points it is -½ Σ u·force, the work of the leaders in linear elasticity.
+    It is ½ uᵀK u with the stiffness K of a linear calibrated rule, and the energy of the bonds
+    under a nonlinear rule ('springs'). Under a frame with points it is -½ Σ u·f with the forces f,
+    which in linear elasticity is the work of the leaders.
     """
 
     type: Literal["strain-energy"] = "strain-energy"
@@ -380,23 +418,23 @@ class StrainEnergy(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`strain_energy`."""
+        """Declare `strain_energy`."""
         return (Variable("strain_energy", (), "strain energy", ENERGY.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """E t times the rule's."""
+        """Return E t times the energy of the rule."""
         return (self.youngs_modulus * self.thickness * now.forces.energy(),)
 
 
 class Reaction(Diagnostic):
-    """The resultant force that each leader group must exert; 0 while it does not lead.
+    """Reaction force of each leader group; 0 while the group is inactive.
 
-    Minus the forces of the neighbours on its particles, and the loads on them; a particle of two
-    groups counts half with each. A group that leads along some axes exerts nothing along the
-    others, and bears what obstacles that its particles touch exert along its own. Under the natural
-    frame all groups together exert nothing, or minus the loads and what obstacles exert. Frame
-    points pull too: at the corners of held edges that is no force of the body, and a warning says
-    so.
+    The reaction is minus the sum of neighbour forces and loads on the particles of the group; a
+    particle of two groups counts half in each. A group that leads along some axes only has no
+    reaction along the others; forces from obstacles on its particles are included along its own
+    axes. Under the natural frame the reactions of all groups sum to zero, or to minus the loads and
+    the forces of obstacles. Frame points exert forces too; at the corners of prescribed edges these
+    are artefacts of the frame, of which a warning informs.
     """
 
     type: Literal["reaction"] = "reaction"
@@ -406,24 +444,25 @@ class Reaction(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`reaction`."""
+        """Declare `reaction`."""
         name = "force that the leader group exerts"
         return (Variable("reaction", ("leader_group", "axis"), name, FORCE.lattice),)
 
     def check(self, particles: int, leader_groups: int) -> None:
-        """Refuses experiments without leaders."""
+        """Raise ExperimentError if the experiment has no leaders."""
         if leader_groups == 0:
-            raise ExperimentError(f"'{self.type}' is of leader groups, and there is none")
+            raise ExperimentError(f"'{self.type}' requires leader groups; the experiment has none")
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """E t times the sums."""
+        """Return E t times the reactions."""
         return (self.youngs_modulus * self.thickness * reactions(now),)
 
 
 class LoadDisplacement(Diagnostic):
-    """The load-displacement curve of each load: its resultant, 0 while it does not act, and the
-    mean displacement of its particles, each counted by what it bears of the load, so that the area
-    under the curve is the work of the load.
+    """Load-displacement curve of each load.
+
+    Its resultant, 0 while the load does not act, and the mean displacement of its particles
+    weighted by their shares of the load, so that the area under the curve is the work of the load.
     """
 
     type: Literal["load-displacement"] = "load-displacement"
@@ -433,7 +472,7 @@ class LoadDisplacement(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"loads"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`load_resultant`, `load_displacement`."""
+        """Declare `load_resultant` and `load_displacement`."""
         dims, mean = ("load", "axis"), "mean displacement of the load's particles"
         return (
             Variable("load_resultant", dims, "resultant of the load", FORCE.lattice),
@@ -441,7 +480,7 @@ class LoadDisplacement(Diagnostic):
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """E t times the sums, and the means."""
+        """Return E t times the resultants, and the mean displacements."""
         loads = now.loads()
         resultant = np.stack([load.share.sum() * load.force for load in loads])
         means = [load.share @ now.displacement(load.rows) / load.share.sum() for load in loads]
@@ -449,26 +488,27 @@ class LoadDisplacement(Diagnostic):
 
 
 class StressStrain(Diagnostic):
-    """The stress-strain curve of a tensile test along `axis`.
+    """Stress-strain curve of a tensile test along `axis`.
 
-    Nominal stress is the reaction of the leader group `group` (its place among the experiment's
-    leaders, from 0) along the axis over the initial cross-section, `width` times thickness, which
-    cancels. Nominal strain is the elongation of the gauge along the axis over its initial length;
-    the gauge lies between the body particles nearest to two `points`, or between two particles by
-    their `numbers`, or, where neither is given, between the mean places of `group` and `against`.
+    Nominal stress is the reaction of the leader group `group` (its index among the leaders of the
+    experiment, from 0) along the axis, divided by the initial cross-section, `width` times
+    thickness; the thickness cancels. Nominal strain is the elongation of the gauge along the axis,
+    divided by its initial length. The gauge lies between the body particles nearest to two
+    `points`, or between two particles given by `numbers`, or by default between the mean positions
+    of `group` and `against`.
     """
 
     type: Literal["stress-strain"] = "stress-strain"
     youngs_modulus: Modulus = Field(default_factory=unset)
     width: Annotated[float, Field(gt=0.0), LENGTH] = Field(
-        description="Of the initial cross-section (lattice units).", examples=[2.5]
+        description="Width of the initial cross-section (lattice units).", examples=[2.5]
     )
-    axis: Literal["x", "y"] = Field("x", description="The axis of the pull.", examples=["x"])
-    group: Group = Field(1, description="The leader group that pulls, from 0.", examples=[1])
-    against: Group = Field(0, description="The group that it pulls away from.", examples=[0])
+    axis: Literal["x", "y"] = Field("x", description="The axis of loading.", examples=["x"])
+    group: Group = Field(1, description="Index of the pulling leader group.", examples=[1])
+    against: Group = Field(0, description="Index of the opposite leader group.", examples=[0])
     points: TwoPoints | None = Field(
         None,
-        description="Ends of the gauge length; the nearest particles count.",
+        description="Ends of the gauge length; the nearest particles are used.",
         examples=[((0.0, 0.0), (1.0, 0.0))],
     )
     numbers: TwoNumbers | None = Field(
@@ -480,43 +520,43 @@ class StressStrain(Diagnostic):
     @model_validator(mode="after")
     def _one_gauge(self) -> StressStrain:
         if self.points and self.numbers:
-            raise ValueError("give the gauge by points or by numbers, not by both")
+            raise ValueError("the gauge has both points and numbers; give one of them")
         return self
 
     def variables(self) -> tuple[Variable, ...]:
-        """`nominal_stress`, `nominal_strain`."""
+        """Declare `nominal_stress` and `nominal_strain`."""
         return (
             Variable("nominal_stress", (), "nominal stress", STRESS.lattice),
             Variable("nominal_strain", (), "nominal strain", "1"),
         )
 
     def check(self, particles: int, leader_groups: int) -> None:
-        """Refuses numbers and groups that are not there."""
+        """Raise ExperimentError for numbers and leader groups that do not exist."""
         refuse_numbers_beyond(particles, self.numbers or ())
         by_leaders = not (self.points or self.numbers)
         for name in ("group", "against") if by_leaders else ("group",):
             if (group := getattr(self, name)) >= leader_groups:
-                known = f"they are numbered from 0, and there are {leader_groups}"
-                raise ExperimentError(f"there is no leader group {group}; {known}", (name,))
+                numbers = f"they are numbered from 0, and there are {leader_groups}"
+                raise ExperimentError(f"there is no leader group {group}; {numbers}", (name,))
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Stress and strain."""
+        """Return nominal stress and nominal strain."""
         axis = "xy".index(self.axis)
         start, end = self._ends(now)
         first, last = (now.reference(rows)[:, axis].mean() for rows in (start, end))
         if abs(last - first) <= 1e-9 * max(abs(first), abs(last)):
             raise ExperimentError(
-                f"the gauge has no length along {self.axis}: both ends lie at {first:g}; give two "
-                "points apart"
+                f"the gauge has no length along {self.axis}: both ends lie at {first:g}; choose "
+                "two points at a distance"
             )
         u, v = (now.displacement(rows)[:, axis].mean() for rows in (start, end))
-        pulled = now.reference(now.leader_groups()[self.group].rows)[:, axis].mean()
-        outwards = np.sign(pulled - (first + last) / 2)
+        group_position = now.reference(now.leader_groups()[self.group].rows)[:, axis].mean()
+        outwards = np.sign(group_position - (first + last) / 2)
         pull = outwards * reactions(now)[self.group, axis]
         return self.youngs_modulus * pull / self.width, (v - u) / (last - first)
 
     def _ends(self, now: Moment) -> tuple[Any, Any]:
-        """The rows at the start of the gauge and at its end."""
+        """Return the rows at the start and at the end of the gauge."""
         if self.points or self.numbers:
             rows = now.nearest(self.points) if self.points else now.rows(self.numbers or ())
             return rows[:1], rows[1:]
@@ -524,32 +564,39 @@ class StressStrain(Diagnostic):
         return groups[self.against].rows, groups[self.group].rows
 
 
-FLAT = 1e-6
-"""Sine of an angle below which normals count as parallel, or as without a share along an axis."""
-AS_GOOD = 1e-9
-"""Relative difference of residuals below which pushes balance a force equally well."""
+MIN_SINE = 1e-6
+"""Sine of an angle below which normals count as parallel, or as perpendicular to an axis."""
+RESIDUAL_RTOL = 1e-9
+"""Relative difference of residuals below which contact forces balance a force equally well."""
 
 
 def reactions(now: Moment) -> Floats:
-    """What each leader group exerts over Young's modulus and thickness, (leader group, axis): along
-    axes along which it leads."""
+    """Compute the reaction of each leader group over Young's modulus and thickness.
+
+    Returns
+    -------
+    NDArray
+        Reactions, (leader group, axis); 0 along axes along which the group does not lead.
+    """
     forces, groups = forces_on_particles(now), now.leader_groups()
     touching = now.touching()
     pushes = contact_pushes(now, touching, forces)
-    for each, own in zip(touching, pushes, strict=True):
-        np.add.at(forces, each.rows, own)
-    times, found = np.zeros(forces.shape), np.zeros((len(groups), forces.shape[1]))
-    leading = [(n, each.rows, list(each.axes)) for n, each in enumerate(groups) if each.leads]
-    for _, rows, axes in leading:
-        times[rows[:, None], axes] += 1
-    for n, rows, axes in leading:
-        share = forces[rows] / np.maximum(times[rows], 1)
-        found[n, axes] = 0.0 - share.sum(axis=0)[axes]
-    return found
+    for contact, push in zip(touching, pushes, strict=True):
+        np.add.at(forces, contact.rows, push)
+    counts, result = np.zeros(forces.shape), np.zeros((len(groups), forces.shape[1]))
+    active = [(n, group.rows, list(group.axes)) for n, group in enumerate(groups) if group.leads]
+    for _, rows, axes in active:
+        counts[rows[:, None], axes] += 1
+    for n, rows, axes in active:
+        share = forces[rows] / np.maximum(counts[rows], 1)
+        result[n, axes] = 0.0 - share.sum(axis=0)[axes]
+    return result
 
 
 def forces_on_particles(now: Moment) -> Floats:
-    """The forces of neighbours and loads over Young's modulus and thickness, (particle, axis)."""
+    """Return the forces of neighbours and loads over Young's modulus and thickness, (particle,
+    axis).
+    """
     forces = np.array(now.forces.on_particles())
     for load in now.loads():
         forces[load.rows] += np.outer(load.share, load.force)
@@ -557,59 +604,77 @@ def forces_on_particles(now: Moment) -> Floats:
 
 
 def contact_pushes(now: Moment, touching: tuple[TouchingRows, ...], forces: Floats) -> list[Floats]:
-    """What each obstacle exerts on the rows that touch it, (row, axis), where `forces` act on
-    particles: pushes along the normals that balance the forces best, along the axes along which a
-    particle follows."""
+    """Compute the contact forces of each obstacle on the rows that touch it.
+
+    Parameters
+    ----------
+    now
+        State of the run at the step.
+    touching
+        Rows that touch each obstacle, with the normals of the obstacle there.
+    forces
+        Forces on particles over Young's modulus and thickness, (particle, axis).
+
+    Returns
+    -------
+    list
+        Contact forces of each obstacle, (row, axis): nonnegative multiples of the normals that
+        balance the forces in the least-squares sense, along the axes along which a particle
+        follows.
+    """
     if not touching:
         return []
-    rows = np.concatenate([each.rows for each in touching])
-    normals = np.concatenate([each.normals for each in touching])
+    rows = np.concatenate([contact.rows for contact in touching])
+    normals = np.concatenate([contact.normals for contact in touching])
     follows = np.ones((len(rows), 2))
     for group in now.leader_groups():
         if group.leads:
             follows[np.isin(rows, group.rows)[:, None] & np.isin([0, 1], group.axes)] = 0.0
-    needs, ways = -forces[rows] * follows, normals * follows
-    sizes = _single_pushes(needs, ways)
+    targets, directions = -forces[rows] * follows, normals * follows
+    sizes = _single_pushes(targets, directions)
     order, count = np.unique(rows, return_inverse=True, return_counts=True)[1:]
     for n in np.flatnonzero(count > 1).tolist():
-        some = np.flatnonzero(order == n)
-        sizes[some] = _joint_pushes(needs[some[0]], ways[some])
-    ends = np.cumsum([len(each.rows) for each in touching])[:-1]
+        entries = np.flatnonzero(order == n)
+        sizes[entries] = _joint_pushes(targets[entries[0]], directions[entries])
+    ends = np.cumsum([len(contact.rows) for contact in touching])[:-1]
     return np.split(sizes[:, None] * normals, ends)
 
 
-def _single_pushes(needs: Floats, ways: Floats) -> Floats:
-    """λ ≥ 0 of which λ · way comes nearest to each of some vectors."""
-    squares = (ways * ways).sum(axis=-1)
-    is_pushed = squares > FLAT * FLAT
-    sizes = np.maximum(0.0, (needs * ways).sum(axis=-1)) / np.where(is_pushed, squares, 1.0)
+def _single_pushes(targets: Floats, directions: Floats) -> Floats:
+    """Return λ ≥ 0 that minimises |λ · direction - target|, for each target."""
+    squares = (directions * directions).sum(axis=-1)
+    is_pushed = squares > MIN_SINE * MIN_SINE
+    sizes = np.maximum(0.0, (targets * directions).sum(axis=-1)) / np.where(is_pushed, squares, 1.0)
     return np.where(is_pushed, sizes, 0.0)
 
 
-def _joint_pushes(need: Floats, ways: Floats) -> Floats:
-    """λ ≥ 0 of which Σ λ · way comes nearest to a vector; the mean of all with at most two that
-    are not 0 and that come as near as any, so that their order does not matter."""
-    singles = _single_pushes(need[None], ways)
-    found = [size * one for size, one in zip(singles, np.eye(len(ways)), strict=True)]
-    for a, b in combinations(range(len(ways)), 2):
-        pair = ways[[a, b]].T
-        if abs(np.linalg.det(pair)) > FLAT:
-            sizes = np.linalg.solve(pair, need)
+def _joint_pushes(target: Floats, directions: Floats) -> Floats:
+    """Return λ ≥ 0 that minimises |Σ λ · direction - target|.
+
+    The result is the mean over all minimisers with at most two nonzero entries, so that it does not
+    depend on the order of the directions.
+    """
+    singles = _single_pushes(target[None], directions)
+    candidates = [size * unit for size, unit in zip(singles, np.eye(len(directions)), strict=True)]
+    for a, b in combinations(range(len(directions)), 2):
+        pair = directions[[a, b]].T
+        if abs(np.linalg.det(pair)) > MIN_SINE:
+            sizes = np.linalg.solve(pair, target)
             if (sizes >= 0.0).all():
-                found.append(np.zeros(len(ways)))
-                found[-1][[a, b]] = sizes
-    left = np.array([math.hypot(*(sizes @ ways - need)) for sizes in found])
-    best = left <= left.min() + AS_GOOD * math.hypot(*need)
-    return np.asarray(np.array(found)[best].mean(axis=0))
+                candidates.append(np.zeros(len(directions)))
+                candidates[-1][[a, b]] = sizes
+    residuals = np.array([math.hypot(*(sizes @ directions - target)) for sizes in candidates])
+    best = residuals <= residuals.min() + RESIDUAL_RTOL * math.hypot(*target)
+    return np.asarray(np.array(candidates)[best].mean(axis=0))
 
 
 class ContactForces(Diagnostic):
-    """The force that each obstacle exerts on the body, and on every particle.
+    """Force of each obstacle on the body and on every particle.
 
-    On a follower that touches an obstacle, f = max(0, -F·n) n: what balances the force F of its
-    neighbours and of loads along the normal n out of the obstacle. On one that touches several, or
-    lies where two sides of one meet, the pushes along all normals balance F together. On a guided
-    particle they balance it along the axis along which it follows.
+    On a follower that touches one obstacle, f = max(0, -F·n) n balances the force F of neighbours
+    and loads along the outward normal n of the obstacle. On a follower that touches several
+    obstacles, or an edge where two sides of one meet, contact forces along all normals balance F
+    together. On a particle that leads along one axis they balance F along the other.
     """
 
     type: Literal["contact"] = "contact"
@@ -619,20 +684,20 @@ class ContactForces(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """`contact_force`, `contact`."""
+        """Declare `contact_force` and `contact`."""
         name = "force that the obstacle exerts"
-        here = "force that obstacles exert on the particle"
+        on_particle = "force that obstacles exert on the particle"
         return (
             Variable("contact_force", ("obstacle", "axis"), name, FORCE.lattice),
-            Variable("contact", ("particle", "axis"), here, FORCE.lattice),
+            Variable("contact", ("particle", "axis"), on_particle, FORCE.lattice),
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """E t times the parts along normals."""
+        """Return E t times the contact forces, by obstacle and by particle."""
         forces, touching = forces_on_particles(now), now.touching()
-        each, sums = 0.0 * forces, np.zeros((len(touching), 2))  # NaN at frame points
+        on_particles, sums = 0.0 * forces, np.zeros((len(touching), 2))  # NaN at frame points
         size = self.youngs_modulus * self.thickness
         for n, pushes in enumerate(contact_pushes(now, touching, forces)):
-            np.add.at(each, touching[n].rows, size * pushes)
+            np.add.at(on_particles, touching[n].rows, size * pushes)
             sums[n] = size * pushes.sum(axis=0)
-        return sums, each
+        return sums, on_particles

@@ -1,5 +1,7 @@
-"""Rules of linear elasticity, calibrated to a material: bond coefficients derived from the
-stiffness of the lattice's cells, rectangles and equilateral triangles.
+"""Rules of linear elasticity, calibrated to a material.
+
+The coefficients of bonds derive from the stiffness of the cells of the lattice, which are
+rectangles or equilateral triangles.
 """
 
 from __future__ import annotations
@@ -36,25 +38,42 @@ from pbdkit.plugin.lattice import Tiling
 from pbdkit.plugin.units import LENGTH
 
 Floats = NDArray[np.float64]
+"""Type of arrays of double precision."""
 
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-"""Of a rectangular cell from its middle, counterclockwise, in units of half its sides."""
+"""Corners of a rectangular cell relative to its centre, counterclockwise, in half side lengths."""
 
 
 @cache
 def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
-    """The stiffness of a cell a × b over modulus and thickness, (corner, axis, corner, axis)."""
+    """Assemble the stiffness matrix of a rectangular cell.
+
+    Parameters
+    ----------
+    c
+        Stiffness of the material over the modulus.
+    a, b
+        Side lengths of the cell.
+
+    Returns
+    -------
+    NDArray
+        Stiffness over modulus and thickness, (corner, axis, corner, axis); read-only.
+    """
     # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
     K = _of_mean_strain(c, CORNERS / (2 * np.array([a, b])), a * b)
     stiffness = c.shear * (a / b + b / a) / 4
-    hourglass = CORNERS.prod(axis=1)  # the displacement that no mean strain knows
+    hourglass = CORNERS.prod(axis=1)  # the mode with zero mean strain
     K += stiffness * np.einsum("m,n,ab->manb", hourglass, hourglass, np.eye(2))
     K.flags.writeable = False
     return K
 
 
 def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
-    """∫ Bᵀ C B over a cell of constant strain, gradient (corner, axis) of its shape functions."""
+    """Integrate Bᵀ C B over a cell of constant strain.
+
+    `gradient` holds the gradients of the shape functions, (corner, axis).
+    """
     B = np.zeros((3, len(gradient), 2))
     B[0, :, 0] = B[2, :, 1] = gradient[:, 0]
     B[1, :, 1] = B[2, :, 0] = gradient[:, 1]
@@ -66,21 +85,52 @@ def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
 
 
 def bond_weights(slot: Slot, c: Stiffness, cells: Tiling) -> dict[str, float]:
-    """xx, xy, yx, yy: of the cell to the left of a slot [[xx, xy], [yx, yy]], of that to the right
-    the transpose; a cell on both sides counts half on each."""
+    """Compute the weights of the cells on both sides of a bond.
+
+    Parameters
+    ----------
+    slot
+        The bond.
+    c
+        Stiffness of the material over the modulus.
+    cells
+        Cells of the lattice.
+
+    Returns
+    -------
+    dict
+        `xx`, `xy`, `yx`, `yy`: the weight of the left cell is [[xx, xy], [yx, yy]], that of the
+        right cell its transpose. A cell on both sides counts half on each.
+    """
     left, right = _on_both_sides(slot, c, cells)
     mean = (left + right.T) / 2
     return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
 
 
 def bond_springs(slot: Slot, c: Stiffness, cells: Tiling) -> float:
-    """The spring along a slot in the cell on either side of it, over modulus and the squared length
-    of the bond; a cell on both sides counts half on each.
+    """Compute the stiffness of the spring along a bond in the cell on either side of it.
 
-    The springs of a cell are as stiff as they can be without exceeding the cell: what they leave of
-    its stiffness is positive semidefinite. On squares of an isotropic material with 0 ≤ ν ≤ 1/3
-    what they leave is shear alone, so that the edges beside a straight cut carry the stress along
-    it as half a cell does.
+    Parameters
+    ----------
+    slot
+        The bond.
+    c
+        Stiffness of the material over the modulus.
+    cells
+        Cells of the lattice.
+
+    Returns
+    -------
+    float
+        Stiffness over the modulus and the squared length of the bond. A cell on both sides counts
+        half on each.
+
+    Notes
+    -----
+    The springs of a cell are as stiff as possible without exceeding the stiffness of the cell: the
+    remainder is positive semidefinite. On squares of an isotropic material with 0 ≤ ν ≤ 1/3 the
+    remainder is pure shear, so that the edges beside a straight cut carry the stress along the cut
+    as half a cell does.
     """
     x, y = slot.rest
     if cells.regular == 3:
@@ -95,11 +145,25 @@ def bond_springs(slot: Slot, c: Stiffness, cells: Tiling) -> float:
 
 @cache
 def rectangle_springs(c: Stiffness, a: float, b: float) -> tuple[float, float, float]:
-    """Stiffnesses over modulus and thickness of the springs along an edge a, an edge b, and a
-    diagonal of a cell a × b.
+    """Compute the stiffnesses of the springs of a rectangular cell.
 
-    The two diagonals have C_xy = C_shear = g, C_xx = g a²/b² and C_yy = g b²/a²; edges add to C_xx
-    and C_yy alone. Hourglass motions stretch edges only.
+    Parameters
+    ----------
+    c
+        Stiffness of the material over the modulus.
+    a, b
+        Side lengths of the cell.
+
+    Returns
+    -------
+    tuple
+        Stiffnesses over modulus and thickness of the springs along an edge a, along an edge b, and
+        along a diagonal.
+
+    Notes
+    -----
+    The two diagonals contribute C_xy = C_shear = g, C_xx = g a²/b² and C_yy = g b²/a²; edges
+    contribute to C_xx and C_yy only. Hourglass modes stretch only the edges.
     """
     square = (a / b) ** 2
     spare = (c.xx * c.yy - c.xy**2) / (c.xx / square + c.yy * square - 2 * c.xy)
@@ -113,8 +177,25 @@ def rectangle_springs(c: Stiffness, a: float, b: float) -> tuple[float, float, f
 
 
 def springs_in(stiffness: Floats, c: Stiffness, cells: Tiling) -> Floats:
-    """(cell,): how many times the springs of material c cells of a stiffness over the modulus,
-    (cell, 3, 3), have: the most that their stiffness exceeds, in uniform and hourglass motions."""
+    """Compute the largest multiple of the springs of a material that the stiffness of cells
+    exceeds.
+
+    Uniform strains and hourglass modes are considered.
+
+    Parameters
+    ----------
+    stiffness
+        Stiffness of cells over the modulus, (cell, 3, 3).
+    c
+        Stiffness over the modulus of the material of the springs.
+    cells
+        Cells of the lattice.
+
+    Returns
+    -------
+    NDArray
+        Multiples, (cell,).
+    """
     if cells.regular == 3:
         share = min(2 / 3 * (c.xx + c.xy), 8 / 3 * c.shear)
         springs = share * np.array([[9, 3, 0], [3, 9, 0], [0, 0, 3]]) / 8
@@ -132,8 +213,8 @@ def springs_in(stiffness: Floats, c: Stiffness, cells: Tiling) -> Floats:
     root = np.linalg.inv(np.linalg.cholesky(stiffness))
     largest = np.linalg.eigvalsh(root @ springs @ np.swapaxes(root, 1, 2))[:, -1]
     with np.errstate(divide="ignore"):
-        found: Floats = np.minimum(np.where(largest > 0.0, 1.0 / largest, np.inf), caps)
-    return np.where(np.isfinite(found), found, 0.0)
+        multiples: Floats = np.minimum(np.where(largest > 0.0, 1.0 / largest, np.inf), caps)
+    return np.where(np.isfinite(multiples), multiples, 0.0)
 
 
 Sums = tuple[Vector, Number, Number, Number]
@@ -141,8 +222,11 @@ Sums = tuple[Vector, Number, Number, Number]
 
 
 def torn_pull(d: Vector, r: Vector, w: Weights, t: Torn) -> Vector:
-    """The pull of a bond in damaged cells: of K = (1 - m) K_whole + Σ_b (m - D_b) K_b, with the
-    damage D_b of each bond b in the cell, the largest of them m, and the cell's springs K_b."""
+    """Return the force of a bond in damaged cells.
+
+    The stiffness of a cell is K = (1 - m) K_whole + Σ_b (m - D_b) K_b with the damage D_b of each
+    of its bonds b, the maximum m of these, and the springs K_b of the cell.
+    """
     left, right = w.left * (1.0 - t.left), w.right * (1.0 - t.right)
     whole = left + right
     xy, yx = w.xy * left + w.yx * right, w.yx * left + w.xy * right
@@ -154,7 +238,7 @@ def torn_pull(d: Vector, r: Vector, w: Weights, t: Torn) -> Vector:
 
 
 def pulled(d: Vector, w: Weights) -> Sums:
-    """W d with the weight of a bond, and the entries xx, xy, yy of W."""
+    """Return W d with the weight W of a bond, and the entries xx, xy, yy of W."""
     whole = w.left + w.right
     xx, yy = w.xx * whole, w.yy * whole
     xy, yx = w.xy * w.left + w.yx * w.right, w.yx * w.left + w.xy * w.right
@@ -162,17 +246,20 @@ def pulled(d: Vector, w: Weights) -> Sums:
 
 
 def mean_move(total: Sums) -> Vector:
-    """(Σ W)⁻¹ Σ W d from the sums; zero where there is no cell."""
+    """Return (Σ W)⁻¹ Σ W d from the sums, or zero if there is no cell."""
     pull, xx, xy, yy = total
     det = xx * yy - xy * xy
-    some = det > 0.0
-    move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(some, det, 1.0)
-    return Vector(where(some, move.x, 0.0), where(some, move.y, 0.0))
+    is_regular = det > 0.0
+    move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(
+        is_regular, det, 1.0
+    )
+    return Vector(where(is_regular, move.x, 0.0), where(is_regular, move.y, 0.0))
 
 
 def _on_both_sides(slot: Slot, c: Stiffness, cells: Tiling) -> list[Floats]:
-    """-K_jk in the cell to the left and in that to the right of a slot, half of it in each where
-    both are one cell."""
+    """Return -K_jk of the cells to the left and right of a slot, half of it each if they are one
+    cell.
+    """
     if not cells.rectangle:
         return [_in_triangle(slot, c, turn) for turn in (1, -1)]
     K, share = rectangle_matrix(c, *cells.rectangle), 2 if cells.is_diagonal(slot) else 1
@@ -190,18 +277,20 @@ def _in_triangle(slot: Slot, c: Stiffness, turn: int) -> Floats:
 
 Factor = Annotated[
     float,
-    Field(ge=1e-9, le=1e9, description="Stiffness over that of the material.", examples=[10.0]),
+    Field(ge=1e-9, le=1e9, description="Factor on the material's stiffness.", examples=[10.0]),
 ]
+"""Type of a factor on the stiffness of the material."""
 
 
 class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
-    """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
-    cells on both sides of each bond, -K_jk of the cells' matrices.
+    """Base class of the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k with weights from the stiffness of cells.
 
-    A rectangle has the energy of its mean strain, and against hourglassing the shear stiffness
-    G (a/b + b/a)/4; a triangle is the linear one of finite elements. Inside the body of a square
-    lattice the isotropic weights are W_E = W_W = diag(3 - ν, 1 - 3ν)/(2(5 - 3ν)), W_N = W_S with
-    the entries exchanged, and (1 + ν)/(4(5 - 3ν)) [[1, s], [s, 1]] on the diagonals (s = ±1).
+    The 2 × 2 weights are the stiffness of the cells on both sides of each bond, -K_jk of the
+    matrices of these cells. A rectangle has the energy of its mean strain and the hourglass
+    stiffness G (a/b + b/a)/4; a triangle is the linear finite element. In the interior of a body on
+    a square lattice the isotropic weights are W_E = W_W = diag(3 - ν, 1 - 3ν)/(2(5 - 3ν)), W_N =
+    W_S with the entries exchanged, and (1 + ν)/(4(5 - 3ν)) [[1, s], [s, 1]] on the diagonals (s =
+    ±1).
     """
 
     linear: ClassVar[bool] = True
@@ -211,91 +300,105 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
 
     @abstractmethod
     def material(self) -> tuple[float, Stiffness]:
-        """A modulus over Young's, and the stiffness over that modulus: its ratios are finite for
-        every material that the rule takes."""
+        """Return a modulus over Young's modulus, and the stiffness over that modulus.
+
+        The ratios in the stiffness are finite for every admissible material.
+        """
 
     def elasticity(self) -> Stiffness | None:
-        """Ratios times modulus and `stiffness`, where the modulus is finite."""
+        """Return the stiffness over Young's modulus, or None if the modulus is not finite."""
         modulus, ratios = self.material()
         modulus *= self.stiffness
         finite = math.isfinite(modulus)
         return Stiffness(*(modulus * ratio for ratio in ratios)) if finite else None
 
     def parameters(self, setting: Setting) -> dict[str, float]:
-        """The modulus; ExperimentError where the lattice has no such cells."""
+        """Return the modulus.
+
+        Raises
+        ------
+        ExperimentError
+            If the rule does not support the cells of the lattice.
+        """
         modulus, ratios = self.material()
         if not (setting.cells.rectangle or setting.cells.regular == 3):
             raise ExperimentError(
-                f"'{self.type}' works on the square and the rectangular lattice with 8 neighbours "
-                "({type: chebyshev, shells: 1}) and, where it is isotropic, on the hexagonal "
-                "lattice with 6 ({type: coordination, shells: 1})"
+                f"'{self.type}' requires the square or the rectangular lattice with 8 neighbours "
+                "({type: chebyshev, shells: 1}) or, if it is isotropic, the hexagonal lattice with "
+                "6 ({type: coordination, shells: 1})"
             )
         xx, yy, xy, shear = ratios[:4]
         isotropic = xx == yy and math.isclose(xx, xy + 2 * shear, rel_tol=1e-12)
         if setting.cells.regular == 3 and not isotropic:
             raise ExperimentError(
-                f"'{self.type}' is not isotropic and goes with the square or rectangular lattice"
+                f"'{self.type}' is not isotropic and requires the square or rectangular lattice"
             )
         return {"modulus": self.stiffness * modulus}
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """xx, xy, yx, yy: the weight of the cell to the left is [[xx, xy], [yx, yy]], of that
-        to the right the transpose; a cell on both sides counts half on each. `spring` is what
-        remains along the bond where the cell is torn, over its squared length."""
+        """Return the weights xx, xy, yx, yy of the cells beside a bond, and `spring`.
+
+        The weight of the left cell is [[xx, xy], [yx, yy]], that of the right cell its transpose; a
+        cell on both sides counts half on each. `spring` is the stiffness that remains along the
+        bond in a torn cell, over the squared length of the bond.
+        """
         material, cells = self.material()[1], setting.cells
         springs = {"spring": bond_springs(slot, material, cells)}
         return bond_weights(slot, material, cells) | springs
 
     def cell_weights(self, slot: Slot, setting: Setting, c: Stiffness) -> dict[str, float]:
-        """The same of cells of that stiffness."""
+        """Return the weights for cells of the stiffness `c`, without springs."""
         modulus = self.stiffness * self.material()[0]
         whole = bond_weights(slot, Stiffness(*(value / modulus for value in c)), setting.cells)
         return whole | {"spring": 0.0}
 
     def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """`spring` alone."""
+        """Return the weights with `spring` alone."""
         weights = self.weights(slot, setting)
         return dict.fromkeys(weights, 0.0) | {"spring": weights["spring"]}
 
     def spring_share(self, c: NDArray[np.float64], setting: Setting) -> NDArray[np.float64]:
-        """The most that a stiffness exceeds."""
+        """Return the largest multiple of the springs that the stiffnesses exceed."""
         modulus, material = self.material()
         return springs_in(c / (self.stiffness * modulus), material, setting.cells)
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> Sums:
-        """W d, and entries of W, of which the sum is symmetric."""
+        """Return W d, and the entries xx, xy, yy of W; the sum of W is symmetric."""
         return pulled(d, w)
 
     @staticmethod
     def torn(d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters) -> Sums:
-        """The same with what torn cells pull in place of W d; the entries of W stay, so that moves
-        are no larger for a given force, whatever is broken."""
+        """Return the force in torn cells in place of W d, and the entries of W.
+
+        The entries of W are not reduced, so that moves for a given force do not increase with
+        damage.
+        """
         _, xx, xy, yy = pulled(d, w)
         return torn_pull(d, r, w, t), xx, xy, yy
 
     @staticmethod
     def apply(total: Sums, here: Here, p: Parameters) -> Vector:
-        """(Σ W)⁻¹ Σ W d; no move where there is no cell."""
+        """Return (Σ W)⁻¹ Σ W d, or no move where there is no cell."""
         return mean_move(total)
 
     @staticmethod
     def force(total: Sums, here: Here, p: Parameters) -> Vector:
-        """Modulus · Σ W d."""
+        """Return the modulus times Σ W d."""
         return p.modulus * total[0]
 
     @staticmethod
     def loaded(total: Sums, load: Vector, p: Parameters) -> Sums:
-        """The load over the modulus, besides Σ W d."""
+        """Add the load over the modulus to Σ W d."""
         pull, xx, xy, yy = total
         return pull + load / p.modulus, xx, xy, yy
 
 
 class IsotropicElastic(CellElastic):
-    """Common to the isotropic rules: a Poisson ratio, in plane stress or plane strain."""
+    """Base class of the isotropic rules: a Poisson ratio, in plane stress or plane strain."""
 
     poisson_ratio: Annotated[float, Field(ge=-1.0, le=0.5)] = Field(
-        description="ν, from -1 to 0.5.", examples=[0.3, -1.0]
+        description="Poisson's ratio ν, from -1 to 0.5.", examples=[0.3, -1.0]
     )
     plane: Literal["stress", "strain"] = Field(
         "stress", description="Plane stress or plane strain.", examples=["strain"]
@@ -308,38 +411,42 @@ class IsotropicElastic(CellElastic):
         return self
 
     def material(self) -> tuple[float, Stiffness]:
-        """1/(1 - ν²) in plane stress, in plane strain ν' = ν/(1 - ν) for ν and all over 1 - ν²;
-        1, 1, ν', (1 - ν')/2."""
+        """Return the modulus over Young's modulus, and the ratios 1, 1, ν', (1 - ν')/2.
+
+        In plane stress ν' = ν and the modulus is 1/(1 - ν²). In plane strain ν' = ν/(1 - ν) and the
+        modulus is 1/((1 - ν²)(1 - ν'²)).
+        """
         nu, in_plane, out_of_plane = self.poisson_ratio, self.poisson_ratio, 1.0
         if self.plane == "strain":
             in_plane, out_of_plane = nu / (1 - nu), 1 - nu * nu
         ratios = Stiffness(1.0, 1.0, in_plane, (1 - in_plane) / 2)
         if nu == -1.0:
-            return math.nan, ratios  # no positive stiffness belongs to it
+            return math.nan, ratios  # the stiffness is singular
         return 1 / (out_of_plane * (1 - in_plane * in_plane)), ratios
 
     def through_thickness(self) -> float:
-        """ν in plane strain."""
+        """Return ν in plane strain, 0 in plane stress."""
         return self.poisson_ratio if self.plane == "strain" else 0.0
 
 
 class Elastic(IsotropicElastic):
-    """Isotropic linear elasticity with a Poisson ratio, in plane stress or plane strain.
+    """Isotropic linear elasticity, in plane stress or plane strain.
 
-    On the square and rectangular lattice with 8 neighbours, and on the hexagonal one with 6, where
-    it is linear triangles. At ν = -1 it is the barycentre, of the four nearest or all six.
-    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
+    Requires the square or rectangular lattice with 8 neighbours, or the hexagonal lattice with 6,
+    where the rule is that of linear triangles. At ν = -1 the rule is the barycentre, of the four
+    nearest or of all six neighbours. Stable for a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or
+    3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
     """
 
     type: Literal["elastic"] = "elastic"
 
 
 class Orthotropic(CellElastic):
-    """Orthotropic linear elasticity in plane stress along the axes of the square or rectangular
-    lattice with 8 neighbours.
+    """Orthotropic linear elasticity in plane stress along the axes of the lattice.
 
-    `poisson_ratio` is ν_xy, the contraction along y under tension along x; `modulus_ratio` E_y/E_x;
-    `shear_ratio` G_xy/E_x. Young's modulus, where forces ask for it, is E_x.
+    Requires the square or rectangular lattice with 8 neighbours. `poisson_ratio` is ν_xy, the
+    contraction along y under tension along x; `modulus_ratio` is E_y/E_x and `shear_ratio`
+    G_xy/E_x. Young's modulus in forces and stresses is E_x.
     """
 
     has_axes: ClassVar[bool] = True
@@ -359,27 +466,30 @@ class Orthotropic(CellElastic):
     def _positive(self) -> Self:
         if self.poisson_ratio**2 * self.modulus_ratio >= 1.0:
             raise ValueError(
-                "no elastic material: poisson_ratio² · modulus_ratio must be below 1, and is "
-                f"{self.poisson_ratio**2 * self.modulus_ratio:g}"
+                "the stiffness is not positive definite: poisson_ratio² · modulus_ratio must be "
+                f"below 1, and is {self.poisson_ratio**2 * self.modulus_ratio:g}"
             )
         return self
 
     def material(self) -> tuple[float, Stiffness]:
-        """1/(1 - ν_xy ν_yx); 1, E_y/E_x, ν_xy E_y/E_x, and the shear ratio over the modulus."""
+        """Return 1/(1 - ν_xy ν_yx), and the ratios 1, E_y/E_x, ν_xy E_y/E_x and G_xy over the
+        modulus.
+        """
         modulus = 1 / (1 - self.poisson_ratio**2 * self.modulus_ratio)
         coupled = self.poisson_ratio * self.modulus_ratio
         return modulus, Stiffness(1.0, self.modulus_ratio, coupled, self.shear_ratio / modulus)
 
 
 class StrainGradient(AppliesTwice, IsotropicElastic):
-    """Elasticity with an internal length l: the elastic move z, less c = l²/D times the elastic
-    move that is made of z.
+    """Strain-gradient elasticity with an internal length l.
 
-    D is the diffusion of longitudinal waves in a move, 2h²/(5 - 3ν') on the square lattice and
-    h²/(3 - ν') on the hexagonal one. Along an axis it is u'' - l² u'''' = 0; the length of shear
-    waves is √((1 - ν')/2) l. Where leaders hold an edge they hold the slope too. For cells of equal
-    sides, with the natural frame. Stable with a relaxation below 2/(λ + cλ²) where the elastic
-    rule's bound is 2/λ: mostly very small, so that solver: {type: equilibrium} serves it best.
+    The move is the elastic move z minus c = l²/D times the elastic move evaluated on z. D is the
+    diffusion coefficient of longitudinal waves, 2h²/(5 - 3ν') on the square lattice and h²/(3 - ν')
+    on the hexagonal lattice. Along an axis the equilibrium is u'' - l² u'''' = 0; the internal
+    length of shear waves is √((1 - ν')/2) l. Leaders on an edge prescribe its displacement and its
+    slope. Requires cells of equal sides and the natural frame. Stable for a relaxation below 2/(λ +
+    cλ²), where 2/λ is the bound of the elastic rule. This bound is mostly very small, so that
+    solver: {type: equilibrium} is more efficient.
     """
 
     type: Literal["strain-gradient"] = "strain-gradient"
@@ -388,17 +498,23 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
     )
 
     def inner(self) -> Elastic:
-        """The elastic rule."""
+        """Return the elastic rule."""
         return Elastic(poisson_ratio=self.poisson_ratio, plane=self.plane)
 
     def parameters(self, setting: Setting) -> dict[str, float]:
-        """The modulus and c."""
+        """Return the modulus and c.
+
+        Raises
+        ------
+        ExperimentError
+            If the sides of the cells differ, or the rule does not support the cells of the lattice.
+        """
         parameters = super().parameters(setting)
         sides = setting.cells.rectangle
         if sides and not math.isclose(*sides):
             raise ExperimentError(
-                f"'{self.type}' works on cells of equal sides, and these are {sides[0]:g} by "
-                f"{sides[1]:g}; take a square or a hexagonal lattice"
+                f"'{self.type}' requires cells of equal sides, but these are {sides[0]:g} by "
+                f"{sides[1]:g}; use a square or a hexagonal lattice"
             )
         weights = [(slot.rest.x, self.weights(slot, setting)["xx"]) for slot in setting.slots[0]]
         diffusion = sum(w * x * x for x, w in weights) / sum(w for _, w in weights) / 2
@@ -406,30 +522,32 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> Sums:
-        """c W d, and entries of W."""
+        """Return c W d, and the entries xx, xy, yy of W."""
         pull, xx, xy, yy = pulled(d, w)
         return p.c * pull, xx, xy, yy
 
     @staticmethod
     def torn(d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters) -> Sums:
-        """The same with what torn cells pull in place of W d."""
+        """Return c times the force in torn cells, and the entries xx, xy, yy of W."""
         _, xx, xy, yy = pulled(d, w)
         return p.c * torn_pull(d, r, w, t), xx, xy, yy
 
     @staticmethod
     def apply(total: Sums, here: Here, p: Parameters) -> Vector:
-        """z - (Σ W)⁻¹ c Σ W (z_k - z_j)."""
+        """Return z - (Σ W)⁻¹ c Σ W (z_k - z_j)."""
         return here.u - mean_move(total)
 
     @staticmethod
     def force(total: Sums, here: Here, p: Parameters) -> Vector:
-        """Modulus · (Σ W z_j - c Σ W (z_k - z_j))."""
+        """Return the modulus times (Σ W z_j - c Σ W (z_k - z_j))."""
         pull, xx, xy, yy = total
         x, y = here.u
         return p.modulus * (Vector(xx * x + xy * y, xy * x + yy * y) - pull)
 
     @staticmethod
     def loaded(total: Sums, load: Vector, p: Parameters) -> Sums:
-        """Less the load over the modulus, besides c Σ W d: that counts against z."""
+        """Subtract the load over the modulus from c Σ W d, which enters the move with the opposite
+        sign.
+        """
         pull, xx, xy, yy = total
         return pull - load / p.modulus, xx, xy, yy

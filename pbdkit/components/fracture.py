@@ -1,6 +1,8 @@
-"""Built-in fracture models: none, a threshold on length (model.md, section 6), a threshold on
-strain with or without gradual damage, and cohesive bonds that dissipate a given energy per crack
-area on every lattice (docs/fracture.md).
+"""Built-in fracture models.
+
+None; a threshold on length (model.md, section 6); a limit of strain without or with gradual damage;
+and cohesive cells that dissipate a given energy per crack length on every lattice
+(docs/fracture.md).
 """
 
 from __future__ import annotations
@@ -45,125 +47,128 @@ from pbdkit.plugin.schedule import COURSE, PLAIN, Course, at, form_of, last
 from pbdkit.plugin.units import LENGTH, STRESS
 
 Limit = Annotated[float, Field(gt=0.0, le=1e150), LENGTH]
+"""Type of the length at which a bond breaks."""
 
 
 class LimitCourse(Course[Limit]):
-    """Of a threshold."""
+    """Time-dependent threshold."""
 
 
 LimitInTime = Annotated[
     Annotated[Limit, Tag(PLAIN)] | Annotated[LimitCourse, Tag(COURSE)], Discriminator(form_of)
 ]
+"""Type of a threshold, constant or time-dependent."""
 Thresholds = Annotated[tuple[LimitInTime, ...], Field(strict=False)]
+"""Type of the thresholds, one for each shell."""
 
 Cracks = Annotated[tuple[Annotated[Segment, Field(strict=False)], ...], Field(strict=False)]
+"""Type of the cracks that exist from the start."""
 
 
 class NoFracture(FractureModel):
-    """Nothing breaks; the scene has no bond state."""
+    """No fracture: bonds never break, and the scene has no bond state."""
 
     type: Literal["none"] = "none"
 
     can_break: ClassVar[bool] = False
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """None."""
+        """Return no constants."""
         return {}
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
-        """Never."""
+        """Return False."""
         return False
 
     @staticmethod
     def fictitious(u: Vector, r: Vector, p: Parameters) -> Vector:
-        """The undeformed cell."""
+        """Return a zero difference, the undeformed cell."""
         return 0.0 * r
 
 
 class Parting(StartsCracked, FractureModel):
-    """What models share whose fictitious points stand at m_j + λ R or at X_k.
+    """Base class of the models with fictitious points at m_j + λ R or at X_k.
 
-    The fictitious point that takes the lost neighbour's place stands at m_j + λ R
-    (`fictitious: cell`, `placement` λ: 1 recovers the undeformed cell, above it loosens, below it
-    contracts) or at X_k (`fictitious: reference`). `frame_bonds: false` spares the bonds to the
-    frame. `cracks` are segments [[x, y], [x, y]]; the bonds that cross them are broken from the
-    start.
+    The fictitious point in place of a lost neighbour lies at m_j + λ R (`fictitious: cell`;
+    `placement` λ = 1 is the undeformed cell, λ > 1 expands and λ < 1 contracts it) or at X_k
+    (`fictitious: reference`). With `frame_bonds: false` bonds to frame points do not break.
+    `cracks` are segments [[x, y], [x, y]]; bonds that cross them are broken from the start.
     """
 
     placement: float = Field(
-        1.0, description="λ: the fictitious point stands at m_j + λ R.", examples=[1.2]
+        1.0, description="λ: the fictitious point lies at m_j + λ R.", examples=[1.2]
     )
     fictitious_at: Literal["cell", "reference"] = Field(
         "cell",
         alias="fictitious",
-        description="Where the fictitious point stands: at m_j + λ R, or at X_k.",
+        description="Position of the fictitious point: m_j + λ R, or X_k.",
         examples=["reference"],
     )
     frame_bonds: bool = Field(
-        True, description="Whether bonds to frame points break too.", examples=[False]
+        True, description="Allow bonds to frame points to break.", examples=[False]
     )
     cracks: Cracks = Field((), description="Segments whose bonds are broken from the start.")
 
     def parameters(self) -> dict[str, float]:
-        """λ - 1, and whether the reference position counts."""
+        """Return λ - 1, and whether fictitious points lie at the reference position."""
         return {
             "excess": self.placement - 1.0,
             "at_reference": float(self.fictitious_at == "reference"),
         }
 
     def breaks_frame_bonds(self) -> bool:
-        """As `frame_bonds` says."""
+        """Return `frame_bonds`."""
         return self.frame_bonds
 
     def segments(self) -> tuple[Segment, ...]:
-        """The `cracks`."""
+        """Return the `cracks`."""
         return self.cracks
 
     @staticmethod
     def fictitious(u: Vector, r: Vector, p: Parameters) -> Vector:
-        """(λ - 1) r: the point at m_j + λ r; or -u_j: the point at X_k."""
+        """Return (λ - 1) r for a point at m_j + λ r, or -u_j for a point at X_k."""
         return where(p.at_reference, -u, p.excess * r)
 
 
 class Threshold(BreaksAtStrain, Parting):
-    """A bond breaks when |r + d|² > threshold², one threshold a shell (the paper's section 5).
+    """A bond breaks when |r + d|² > threshold², with one threshold for each shell.
 
-    The fictitious point that takes the lost neighbour's place stands at m_j + λ R
-    (`fictitious: cell`, `placement` λ: 1 recovers the undeformed cell, above it loosens, below it
-    contracts) or at X_k (`fictitious: reference`). `frame_bonds: false` spares the bonds to the
-    frame. `cracks` are segments [[x, y], [x, y]]; the bonds that cross them are broken from the
-    start.
+    This is the model of the paper's section 5. The fictitious point in place of a lost neighbour
+    lies at m_j + λ R (`fictitious: cell`; `placement` λ = 1 is the undeformed cell, λ > 1 expands
+    and λ < 1 contracts it) or at X_k (`fictitious: reference`). With `frame_bonds: false` bonds to
+    frame points do not break. `cracks` are segments [[x, y], [x, y]]; bonds that cross them are
+    broken from the start.
     """
 
     type: Literal["threshold"] = "threshold"
-    asked_thresholds: Thresholds = Field(
+    limits: Thresholds = Field(
         alias="thresholds",
-        description="The length at which bonds break, one a shell (lattice units).",
+        description="Length at which bonds break, one for each shell (lattice units).",
         examples=[[1.6], [1.6, 2.4]],
     )
 
     @property
     def thresholds(self) -> tuple[float, ...]:
-        """One a shell, in the end."""
-        return tuple(map(last, self.asked_thresholds))
+        """Threshold of each shell, at the end of its time dependence."""
+        return tuple(map(last, self.limits))
 
     @property
     def courses(self) -> Mapping[str, Course[float]]:
-        """Those of thresholds by the number of the shell, from 0 as a file's places are."""
-        limits = enumerate(self.asked_thresholds)
-        own = {f"thresholds.{n}": limit for n, limit in limits if isinstance(limit, Course)}
-        return {**super().courses, **own}
+        """Time-dependent thresholds and other parameters, by their path in the file."""
+        limits = enumerate(self.limits)
+        courses = {f"thresholds.{n}": limit for n, limit in limits if isinstance(limit, Course)}
+        return {**super().courses, **courses}
 
     def at(self, moment: float) -> Any:
-        """With the thresholds of a moment."""
-        now = [at(limit, moment) for limit in self.asked_thresholds]
-        return super().at(moment).with_more(thresholds=now)
+        """Return the model with the thresholds of a moment."""
+        thresholds = [at(limit, moment) for limit in self.limits]
+        return super().at(moment).with_more(thresholds=thresholds)
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """The squared threshold of the slot's shell, `limit`.
+        """Return `limit`, the squared threshold of the shell of the slot.
 
-        A threshold that equals the rest length up to rounding breaks nothing at rest.
+        A threshold that equals the rest length within rounding breaks no bond at rest.
         """
         threshold, rest = self.thresholds[slot.shell - 1], squared_length(slot.rest)
         at_rest = threshold >= math.sqrt(rest) * (1 - 1e-12)
@@ -171,19 +176,26 @@ class Threshold(BreaksAtStrain, Parting):
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
-        """|r + d|² > threshold²."""
+        """Return |r + d|² > threshold²."""
         return squared_length(r + d) > c.limit
 
     @staticmethod
     def breaking_strain(r: Vector, c: Constants, p: Parameters) -> Number:
-        """The threshold as a strain."""
+        """Return the threshold as a strain."""
         return np.sqrt(c.limit) / length(r) - 1.0
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
-        """Refuses a wrong number of thresholds, and thresholds below every rest length."""
+        """Return a warning for each threshold below some rest length of its shell.
+
+        Raises
+        ------
+        ExperimentError
+            If the number of thresholds is not that of the shells, or a threshold is below every
+            rest length of its shell.
+        """
         if len(self.thresholds) != len(shells):
             raise ExperimentError(
-                f"one threshold a shell is needed: {len(self.thresholds)} given for "
+                f"one threshold for each shell is required: there are {len(self.thresholds)} for "
                 f"{len(shells)} shell(s)",
                 ("thresholds",),
             )
@@ -192,7 +204,7 @@ class Threshold(BreaksAtStrain, Parting):
             if threshold < min(lengths) * (1 - 1e-12):
                 raise ExperimentError(
                     f"{threshold:g} is below the rest length {min(lengths):g} of shell {n + 1}: "
-                    "every bond would break at rest; raise it",
+                    "every bond would break at rest; increase it",
                     ("thresholds", n),
                 )
             if threshold < max(lengths) * (1 - 1e-12):
@@ -204,15 +216,17 @@ class Threshold(BreaksAtStrain, Parting):
 
 
 StrainLimit = Annotated[float, Field(gt=0.0, le=1e75), STRESS]
-"""A strain; with a unit a stress, which is divided by Young's modulus."""
+"""Type of a strain; with a unit a stress, which is divided by Young's modulus."""
 Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
+"""Type of the relative scatter of strengths."""
 PERCENT = 1.0
-"""Strains from which on it is likely that per cent are meant."""
-SCATTER = "s: strengths are drawn from 1 ± s, uniformly, by the seed."
+"""Strain from which on a warning suggests that the value is in per cent."""
+SCATTER = "Scatter s: strengths are multiplied by random factors, uniform in 1 ± s."
+"""Description of the parameter `scatter`."""
 
 
 def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strains: float) -> Drawn:
-    """Each strain times one number a bond, by name; nothing where there is no scatter."""
+    """Multiply each strain by one random factor for each bond; empty without scatter."""
     if not scatter:
         return {}
     factors = 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
@@ -220,7 +234,7 @@ def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strai
 
 
 def _in_percent(**strains: float) -> list[str]:
-    """A warning for each strain, by its field, that is so large that it may be in per cent."""
+    """Return a warning for each strain, by its field, that may be given in per cent."""
     return [
         f"fracture.{name}: {strain:g} is a strain of {100 * strain:g} %; {strain:g} % is written "
         f"{strain / 100:g}"
@@ -230,97 +244,99 @@ def _in_percent(**strains: float) -> list[str]:
 
 
 class StrainFracture(Draws, BreaksAtStrain, Parting):
-    """A bond breaks when its strain |r + d| / |r| - 1 exceeds `failure`, whatever its shell; bonds
-    that are pressed together never break.
+    """A bond of any shell breaks when its strain |r + d| / |r| - 1 exceeds `failure`.
 
-    With `scatter` s the failure strain of each bond is drawn from `failure` (1 ± s), uniformly, by
-    the experiment's seed.
+    Bonds under compression do not break. With `scatter` s the failure strain of each bond is drawn
+    from the uniform distribution over `failure` (1 ± s), by the seed of the experiment.
     """
 
     type: Literal["strain"] = "strain"
     failure: StrainLimit = Field(
-        description="The strain above which a bond breaks, or the stress where it is uniaxial, "
-        "along a bond, over Young's modulus.",
+        description="Failure strain of a bond; with a unit the uniaxial stress along a bond, "
+        "divided by Young's modulus.",
         examples=[0.1],
     )
     scatter: Scatter = Field(0.0, description=SCATTER, examples=[0.2])
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """`square` = |r|² and the `failure_strain` of the bond, remembered where it is scattered;
-        or, where all are alike, (1 + failure)² |r|² and 0, one multiplication less to round."""
+        """Return `square` = |r|², and the `failure_strain` of the bond unless it has scatter.
+
+        Without scatter they are (1 + failure)² |r|² and 0, which saves one rounded multiplication.
+        """
         rest = squared_length(slot.rest)
         if self.scatter:
             return {"square": rest}
         return {"square": (1.0 + self.failure) ** 2 * rest, "failure_strain": 0.0}
 
     def remembered(self) -> tuple[Remembered, ...]:
-        """`failure_strain` where it is not the same for all."""
+        """Declare `failure_strain` if it has scatter."""
         return (_FAILURE_STRAIN,) if self.scatter else ()
 
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
-        """One number a bond."""
+        """Draw one factor for each bond."""
         return _drawn(owners, self.scatter, generator, failure_strain=self.failure)
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
-        """A warning where the strain may be in per cent."""
+        """Return a warning if the strain may be given in per cent."""
         return _in_percent(failure=self.failure)
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
-        """|r + d|² > (1 + failure)² |r|²."""
+        """Return |r + d|² > (1 + failure)² |r|²."""
         stretch = 1.0 + c.failure_strain
         return squared_length(r + d) > c.square * (stretch * stretch)
 
     @staticmethod
     def breaking_strain(r: Vector, c: Constants, p: Parameters) -> Number:
-        """The failure strain of the bond."""
+        """Return the failure strain of the bond."""
         return np.sqrt(c.square) * (1.0 + c.failure_strain) / length(r) - 1.0
 
 
 class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
-    """A bond softens from strain `onset` on and is broken at strain `failure`.
+    """A bond softens above the strain `onset` and breaks at the strain `failure`.
 
-    Its damage is the largest so far of D = failure / (failure - onset) (1 - onset / ε), from 0 at
-    the onset to 1 at failure; it never heals, and compression does none. The rule sees the bond as
-    (1 - D) d + D lost, lost being the difference to the fictitious point: under the barycentre
-    the bond's pull (1 - D) ε falls along a straight line from the onset to zero at failure.
+    Its damage is the maximum over time of D = failure / (failure - onset) (1 - onset / ε), 0 at the
+    onset and 1 at failure. Damage is irreversible and does not increase under compression. The rule
+    is evaluated with the difference (1 - D) d + D lost, where `lost` is the difference to the
+    fictitious point. Under the barycentre the force (1 - D) ε of the bond decreases linearly from
+    the onset to zero at failure.
 
-    With `scatter` s both strains of each bond are multiplied by one number, drawn from 1 ± s,
-    uniformly, by the experiment's seed.
+    With `scatter` s both strains of each bond are multiplied by one random factor from the uniform
+    distribution over 1 ± s, by the seed of the experiment.
     """
 
     type: Literal["damage"] = "damage"
     onset: StrainLimit = Field(
-        description="The strain at which a bond begins to soften.", examples=[0.05]
+        description="Strain at which a bond begins to soften.", examples=[0.05]
     )
-    failure: StrainLimit = Field(description="The strain at which it is broken.", examples=[0.2])
+    failure: StrainLimit = Field(description="Strain at which a bond breaks.", examples=[0.2])
     scatter: Scatter = Field(0.0, description=SCATTER, examples=[0.2])
 
     @model_validator(mode="after")
     def _onset_comes_first(self) -> Self:
         if self.onset >= self.failure:
             text = (
-                f"onset {self.onset:g} is not below failure {self.failure:g}: nothing softens; "
-                "lower it, or take {type: strain}, which breaks at once"
+                f"onset {self.onset:g} is not below failure {self.failure:g}: bonds would not "
+                "soften; decrease the onset, or use {type: strain}, where bonds break at once"
             )
             raise PydanticCustomError("fault", "{text}", {"text": text, "key": "onset"})
         return self
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """`per_rest` = 1/|r|; `onset_strain` and `failure_strain` unless each bond has its own."""
-        own = {} if self.scatter else self._strains()
-        return {"per_rest": 1.0 / length(slot.rest)} | own
+        """Return `per_rest` = 1/|r|, and without scatter `onset_strain` and `failure_strain`."""
+        strains = {} if self.scatter else self._strains()
+        return {"per_rest": 1.0 / length(slot.rest)} | strains
 
     def remembered(self) -> tuple[Remembered, ...]:
-        """`damage`, after `onset_strain` and `failure_strain` where they are scattered."""
+        """Declare `damage`, and with scatter first `onset_strain` and `failure_strain`."""
         return (_ONSET_STRAIN, _FAILURE_STRAIN, _DAMAGE) if self.scatter else (_DAMAGE,)
 
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
-        """One number a bond."""
+        """Draw one factor for each bond."""
         return _drawn(owners, self.scatter, generator, **self._strains())
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
-        """A warning where strains may be in per cent."""
+        """Return a warning for each strain that may be given in per cent."""
         return _in_percent(onset=self.onset, failure=self.failure)
 
     def _strains(self) -> dict[str, float]:
@@ -328,29 +344,44 @@ class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
 
     @staticmethod
     def update(d: Vector, r: Vector, c: Constants, p: Parameters) -> tuple[Number, ...]:
-        """The damage, where there is more than before."""
+        """Return the damage, which does not decrease."""
         strain = length(r + d) * c.per_rest - 1.0
         return (softened(strain, c.onset_strain, c.failure_strain, c.damage),)
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
-        """D = 1."""
+        """Return whether D = 1."""
         return c.damage >= 1.0
 
     @staticmethod
     def seen(d: Vector, lost: Vector, r: Vector, c: Constants, p: Parameters) -> Vector:
-        """(1 - D) d + D lost."""
+        """Return (1 - D) d + D lost."""
         return (1.0 - c.damage) * d + c.damage * lost
 
     @staticmethod
     def breaking_strain(r: Vector, c: Constants, p: Parameters) -> Number:
-        """The failure strain of the bond."""
+        """Return the failure strain of the bond."""
         return c.failure_strain
 
 
 def softened(strain: Any, onset: Any, failure: Any, damage: Any) -> Any:
-    """D = failure / (failure - onset) (1 - onset / strain), where it is more than the damage
-    before: the pull (1 - D) strain falls along a straight line from the onset to 0 at failure."""
+    """Evaluate the linear softening law.
+
+    Parameters
+    ----------
+    strain
+        Strain of a bond.
+    onset, failure
+        Strains at which softening begins and ends.
+    damage
+        Damage so far.
+
+    Returns
+    -------
+    Any
+        D = failure / (failure - onset) (1 - onset / strain), or `damage` if that is larger. The
+        force (1 - D) strain decreases linearly from the onset to 0 at failure.
+    """
     softens = strain > onset
     law = failure * (strain - onset) / ((failure - onset) * where(softens, strain, 1.0))
     law = where(strain < failure, law, 1.0)
@@ -365,53 +396,59 @@ _DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is brok
 
 
 CROSSED = 0.09
-"""The least square of the cosine between a bond and the normal of a crack that crosses it."""
+"""Smallest squared cosine between a bond and the normal of a crack that crosses it."""
 DIRECTIONS = 360
-"""So many directions are looked at for the crack that the spacing suits least."""
+"""Number of crack directions at which the bound on the spacing is evaluated."""
 
 
 class Cohesive(KnowsStiffness, SoftensCells, Parting):
-    """A cell softens from the principal stress `onset` times its Young's modulus on, in a band one
-    cell wide, and is torn where the band has taken up `energy` for each unit of the crack's length.
+    """A cell softens once its largest principal stress exceeds `onset` times Young's modulus.
 
-    The stress is that which the cell would have without damage. Where its largest principal value
-    reaches the onset, the direction of that is the normal e of the cell's crack, for good. Bonds of
-    the cell that cross the crack, |n · e| > 0.3, lose their pull in the cell by the largest stress
-    κ over Young's modulus since: D = failure / (failure - onset) (1 - onset / κ); the others do
-    not. The failure strain is such that a band of cells which a straight crack crosses, and which
-    does not contract along it, takes up the energy: its width is that of the cell along e (Bažant
-    and Oh 1983, Oliver 1989). A bond is broken where D is 1 in all cells beside it. Cracks do not
-    close under pressure.
+    Softening localises in a band one cell wide. The band is torn when it has dissipated `energy`
+    per unit length of the crack. The stress is the effective stress, that of the undamaged cell.
+    When its largest principal value reaches the onset, the principal direction becomes the fixed
+    normal e of the crack in the cell. Bonds of the cell that cross the crack, |n · e| > 0.3, lose
+    force in the cell according to the maximum κ over time of the stress over Young's modulus: D =
+    failure / (failure - onset) (1 - onset / κ). Other bonds are not damaged. The failure strain is
+    chosen such that a band of cells that a straight crack crosses, without contraction along it,
+    dissipates the energy: its width is that of the cell along e (Bažant and Oh 1983, Oliver 1989).
+    A bond is broken where D = 1 in all cells beside it. Cracks do not close under compression.
     """
 
     type: Literal["cohesive"] = "cohesive"
     placement: Annotated[float, Field(ge=1.0, le=1.0)] = Field(
-        1.0, description="Lost bonds of a material exert nothing: 1."
+        1.0, description="Always 1: broken bonds of a material exert no force."
     )
     fictitious_at: Literal["cell"] = Field(
-        "cell", alias="fictitious", description="As `placement`: `cell`."
+        "cell", alias="fictitious", description="Always `cell`: broken bonds exert no force."
     )
     energy: Annotated[float, Field(gt=0.0, le=1e75), FRACTURE_ENERGY] = Field(
-        description="G_c over Young's modulus: a length (lattice units); with a unit also G_c.",
+        description="Fracture energy G_c over Young's modulus, a length (lattice units); with a "
+        "unit also G_c.",
         examples=[0.05],
     )
     onset: StrainLimit = Field(
-        description="The tensile strength over Young's modulus: the largest principal stress over "
-        "it at which a cell begins to soften.",
+        description="Tensile strength over Young's modulus: the largest principal stress at which "
+        "a cell begins to soften.",
         examples=[0.1],
     )
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """`onset_strain`."""
+        """Return `onset_strain`."""
         return {"onset_strain": self.onset}
 
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
-        """`release`, 2 energy / onset times the stiffness along x over the squared modulus along x,
-        a length; the compliances `along_y` and `across` over that along x, and the stiffnesses
-        `stiff_y` and `stiff_across`; and the bonds of a cell, `x0` to `y2`.
+        """Return the constants of the softening law and of the bonds of a cell.
 
-        ExperimentError where the failure strain of some crack is not above the onset, since the
-        spacing is too large for so little energy.
+        `release` is 2 energy / onset times the stiffness along x over the squared modulus along x,
+        a length; `along_y` and `across` are compliances over that along x, `stiff_y` and
+        `stiff_across` stiffnesses over that along x; `x0` to `y2` are the bonds of a cell.
+
+        Raises
+        ------
+        ExperimentError
+            If the failure strain of a crack in some direction does not exceed the onset, because
+            the spacing is too large for the energy.
         """
         release, ratios = _material(rule)
         bonds = _bonds_of_a_cell(setting)
@@ -423,52 +460,55 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
         room = 2.0 * self.energy * release / (size * self.onset**2)
         if np.any(room <= 1.0):
             raise ExperimentError(
-                f"{self.energy:g} is too little for this spacing: a cell would have to be torn "
-                f"{1.0 / room:.3g} times before its onset, and the crack snaps from cell to cell; "
-                f"make the spacing smaller than {room:.3g} of what it is, or set fracture.onset "
-                f"below {self.onset * room**0.5:.3g} or fracture.energy above "
+                f"{self.energy:g} is too small for this spacing: at the onset a cell stores "
+                f"{1.0 / room:.3g} times the energy that it dissipates, and the crack snaps from "
+                f"cell to cell; multiply the spacing by less than {room:.3g}, or set "
+                f"fracture.onset below {self.onset * room**0.5:.3g} or fracture.energy above "
                 f"{self.energy / room:.3g}",
                 ("energy",),
             )
         cell = {f"x{n}": float(r.x) for n, r in enumerate(bonds)}
         cell |= {f"y{n}": float(r.y) for n, r in enumerate(bonds)}
-        known = dict(zip(("along_y", "across", "stiff_y", "stiff_across"), ratios, strict=True))
-        return {"release": 2.0 * self.energy * release / self.onset, **known, **cell}
+        names = ("along_y", "across", "stiff_y", "stiff_across")
+        anisotropy = dict(zip(names, ratios, strict=True))
+        return {"release": 2.0 * self.energy * release / self.onset, **anisotropy, **cell}
 
     def remembered(self) -> tuple[Remembered, ...]:
-        """`damage_left` and `damage_right`, and the strains at which the cells are torn, negative
-        where the crack of a cell does not cross the bond."""
+        """Declare the damage and the failure strain of each bond in the cells on both sides.
+
+        A negative failure strain marks a cell whose crack does not cross the bond.
+        """
         return _NUMBERS
 
     @staticmethod
-    def update(  # type: ignore[override]  # SoftensCells: it is given the cells
+    def update(  # type: ignore[override]  # models of SoftensCells receive the cells
         d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
     ) -> tuple[Number, ...]:
-        """Those of both cells; where there is one alone they are the same."""
-        here, fails = _of_cell(left, c.damage_left, c.failure_left, r, c)
-        there, parts = _of_cell(right, c.damage_right, c.failure_right, r, c)
-        on_left, on_right = left.share > 0.0, right.share > 0.0
+        """Return damage and failure strain in both cells; a single cell counts for both sides."""
+        left_damage, left_failure = _of_cell(left, c.damage_left, c.failure_left, r, c)
+        right_damage, right_failure = _of_cell(right, c.damage_right, c.failure_right, r, c)
+        has_left, has_right = left.share > 0.0, right.share > 0.0
         return (
-            where(on_left, here, there),
-            where(on_right, there, here),
-            where(on_left, fails, parts),
-            where(on_right, parts, fails),
+            where(has_left, left_damage, right_damage),
+            where(has_right, right_damage, left_damage),
+            where(has_left, left_failure, right_failure),
+            where(has_right, right_failure, left_failure),
         )
 
     @staticmethod
     def load(stress: CellStress, c: Constants, p: Parameters) -> Number:
-        """κ over the onset."""
+        """Return κ over the onset."""
         largest, cos, sin = _principal(stress)
         return largest * _along(cos, sin, c.along_y, c.across) / c.onset_strain
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
-        """D = 1 on both sides."""
+        """Return whether D = 1 in both cells."""
         return (c.damage_left >= 1.0) & (c.damage_right >= 1.0)
 
 
 def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> Any:
-    """The damage of a bond in a cell under a stress, and the failure strain, from those before."""
+    """Return damage and failure strain of a bond in a cell under a stress."""
     largest, cos, sin = _principal(stress)
     flexibility = _along(cos, sin, c.along_y, c.across)
     strain = largest * flexibility
@@ -478,39 +518,46 @@ def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> A
     other = _projection(Vector(c.x2, c.y2), cos, sin)
     size = np.sqrt(where(other > size, other, size))
     stiffness = _along(cos, sin, c.stiff_y, c.stiff_across)
-    fails = c.release * flexibility * flexibility * stiffness / size
+    crack_failure = c.release * flexibility * flexibility * stiffness / size
     crossed = _projection(r, cos, sin) > CROSSED * squared_length(r)
     begins = (failure == 0.0) & (strain > c.onset_strain) & (stress.share > 0.0)
-    failure = where(begins, where(crossed, fails, -fails), failure)
+    failure = where(begins, where(crossed, crack_failure, -crack_failure), failure)
     crosses = failure > 0.0
     law = softened(strain, c.onset_strain, where(crosses, failure, 2.0 * c.onset_strain), damage)
     return where(crosses, law, damage), failure
 
 
 def _principal(stress: CellStress) -> tuple[Number, Number, Number]:
-    """The largest principal stress, and cosine and sine of twice the angle of its direction."""
+    """Return the largest principal stress, and cos and sin of twice the angle of its direction."""
     mean, half = 0.5 * (stress.xx + stress.yy), 0.5 * (stress.xx - stress.yy)
     radius = np.sqrt(half * half + stress.xy * stress.xy)
-    some = radius > 0.0
-    size = where(some, radius, 1.0)
-    return mean + radius, where(some, half / size, 1.0), where(some, stress.xy / size, 0.0)
+    has_direction = radius > 0.0
+    size = where(has_direction, radius, 1.0)
+    return (
+        mean + radius,
+        where(has_direction, half / size, 1.0),
+        where(has_direction, stress.xy / size, 0.0),
+    )
 
 
 def _projection(r: Any, cos: Any, sin: Any) -> Any:
-    """(r · e)² along the direction of which twice the angle has this cosine and sine."""
+    """Return (r · e)² along the direction given by cos and sin of twice its angle."""
     x, y = r.x * r.x, r.y * r.y
     return 0.5 * (x + y + cos * (x - y)) + sin * r.x * r.y
 
 
 def _along(cos: Number, sin: Number, along_y: Number, across: Number) -> Number:
-    """A compliance or a stiffness along that direction, over that along x."""
+    """Return a compliance or stiffness along a direction, over that along x."""
     x, y = 0.5 * (1.0 + cos), 0.5 * (1.0 - cos)
     return x * x + along_y * y * y + across * 0.25 * sin * sin
 
 
 def _material(rule: Calibrated) -> tuple[float, tuple[float, float, float, float]]:
-    """Of a rule's material the stiffness along x over the squared modulus along x; and S_yy and
-    2 S_xy + S_shear over S_xx, C_yy and 2 C_xy + 4 C_shear over C_xx, in its plane."""
+    """Return the release factor of a material, and its anisotropy ratios.
+
+    The release factor is the stiffness along x over the squared modulus along x. The ratios are
+    S_yy and 2 S_xy + S_shear over S_xx, and C_yy and 2 C_xy + 4 C_shear over C_xx, in the plane.
+    """
     material = rule.elasticity()
     assert material is not None
     xx, yy, xy, shear, *_ = material
@@ -520,18 +567,21 @@ def _material(rule: Calibrated) -> tuple[float, tuple[float, float, float, float
 
 
 def _bonds_of_a_cell(setting: Setting) -> tuple[Vector, Vector, Vector]:
-    """Those that are longest in some direction: the sides of a triangle, the diagonals of a
-    rectangle."""
-    origin, one, other, *more = setting.cells.polygons[0].rest
-    if more:
-        return other - origin, more[0] - one, more[0] - one
-    return one - origin, other - origin, other - one
+    """Return the sides of a triangle, or the diagonals of a rectangle.
+
+    These are the bonds that are longest in some direction.
+    """
+    a, b, c, *rest = setting.cells.polygons[0].rest
+    if rest:
+        return c - a, rest[0] - b, rest[0] - b
+    return b - a, c - a, c - b
 
 
 def _pair(name: str, text: str) -> tuple[Remembered, Remembered]:
-    sides = ("left", "right")
-    one, other = (Remembered(f"{name}_{side}", f"{text} on its {side}", "1") for side in sides)
-    return one, other
+    left, right = (
+        Remembered(f"{name}_{side}", f"{text} on its {side}", "1") for side in ("left", "right")
+    )
+    return left, right
 
 
 _NUMBERS = (

@@ -1,4 +1,4 @@
-"""Frames that copy or mirror (model.md, section 7), and bodies without one."""
+"""Frame policies (model.md, section 7): copying and mirroring frames, and bodies without frame."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pbdkit.plugin import Anchors, Cell, FrameMap, FramePolicy, FrameSites
 
 
 class Frameless(FramePolicy):
-    """Common to bodies without frame points."""
+    """Base class of the frame policies without frame points."""
 
     local: ClassVar[bool] = True
 
     def depth(self, reach: int) -> int:
-        """No layer."""
+        """Return 0, the number of frame layers."""
         return 0
 
     def follow(self, frame: FrameSites) -> FrameMap:
-        """Nothing follows."""
-        nothing = np.empty(0, np.intp)
-        return FrameMap(nothing, nothing, np.empty(0))
+        """Return an empty map."""
+        empty = np.empty(0, np.intp)
+        return FrameMap(empty, empty, np.empty(0))
 
 
 class NoFrame(Frameless):
@@ -33,78 +33,87 @@ class NoFrame(Frameless):
 
 
 class LayeredFrame(FramePolicy):
-    """Common to all frames; `layers` defaults to what the neighbour metric reaches."""
+    """Base class of the frame policies with frame points in layers around the body.
+
+    `layers` defaults to the reach of the neighbour metric.
+    """
 
     local: ClassVar[bool] = True
     layers: Annotated[int, Field(ge=1, le=64)] | None = Field(
-        None, description="Layers of points; by default what the neighbours reach.", examples=[3]
+        None, description="Number of layers; by default the reach of the neighbours.", examples=[3]
     )
 
     def depth(self, reach: int) -> int:
-        """`layers`, or the reach of the neighbours."""
+        """Return `layers`, or the reach of the neighbours if `layers` is not set."""
         return reach if self.layers is None else self.layers
 
 
 class CopyingFrame(LayeredFrame):
-    """Common to the frames that copy the body particles nearest to them."""
+    """Base class of the frame policies whose points copy the nearest body particles."""
 
     lag: Annotated[int, Field(ge=0, le=1)] = Field(
-        0, description="1 copies the displacements of the step before.", examples=[1]
+        0, description="Delay in steps; 1 copies displacements of the last step.", examples=[1]
     )
 
 
 class MeanFrame(CopyingFrame):
-    """u_f is the mean of the displacements of the nearest body particles, all that tie."""
+    """Frame points move by the mean displacement of the nearest body particles, ties included."""
 
     type: Literal["mean"] = "mean"
 
     def follow(self, frame: FrameSites) -> FrameMap:
-        """Weight 1/n for each of n ties."""
+        """Return a map with the weight 1/n for each of n nearest particles."""
         point, body = frame.nearest()
         return FrameMap(point, body, 1.0 / np.bincount(point)[point], self.lag)
 
 
 class FirstFrame(CopyingFrame):
-    """u_f is the displacement of the nearest body particle, the lowest number on ties (case g)."""
+    """Frame points move with the nearest body particle, of several the one of lowest number.
+
+    Case g of the paper.
+    """
 
     type: Literal["first"] = "first"
 
     def follow(self, frame: FrameSites) -> FrameMap:
-        """The first entry of each frame point."""
+        """Return a map from each frame point to its first nearest particle."""
         point, body = frame.nearest()
         points, first = np.unique(point, return_index=True)
         return FrameMap(points, body[first], np.ones(len(points)), self.lag)
 
 
 class MirrorFrame(Anchors, LayeredFrame):
-    """u_f = R u_b, b the site reflected in the outermost body row or column and R flipping the
-    component normal to it, both at corners: the paper's mirroring to obtain an infinite sample.
+    """Frame points mirror the displacement of body particles: u_f = R u_b.
 
-    The planes of reflection stand in space. For bodies that fill a rectangle of a square or
-    rectangular lattice.
+    The particle b is the site reflected in the outermost row or column of the body. R changes the
+    sign of the component normal to that row or column, at corners of both. This is the paper's
+    mirroring to represent an infinite sample. The planes of reflection are fixed in space. Requires
+    a body that fills a rectangle of a square or rectangular lattice.
     """
 
     type: Literal["mirror"] = "mirror"
 
     def follow(self, frame: FrameSites) -> FrameMap:
-        """One entry a point, with the matrix R."""
+        """Return a map with one particle and one matrix R for each frame point."""
         if not is_upright(frame.cell):
-            raise ExperimentError("a mirror frame needs a square or rectangular lattice")
+            raise ExperimentError("a mirror frame requires a square or rectangular lattice")
         edge = np.clip(frame.site, frame.low, frame.high)
         outside, body = frame.site != edge, frame.body_at(2 * edge - frame.site)
         if (body < 0).any() or not outside.any(axis=1).all():
             raise ExperimentError(
-                "a mirror frame needs a body that fills a rectangle of sites wider than the frame"
+                "a mirror frame requires a body that fills a rectangle of sites wider than the "
+                "frame"
             )
         flips = np.where(outside, -1.0, 1.0)
         return FrameMap(np.arange(len(body)), body, flips[:, :, None] * np.eye(2))
 
 
 class Natural(Frameless):
-    """No frame: the body is the lattice's cells, and what is not there is dropped.
+    """No frame points; the body consists of the cells of the lattice.
 
-    Cells that the outline cuts count with the share of their area inside, and all their corners are
-    particles of the body, so that curved bodies converge at second order. Edges are free of stress.
+    A cell that the outline cuts is weighted by the share of its area inside, and all its corners
+    are particles of the body, so that curved bodies converge at second order. Free edges are free
+    of traction.
     """
 
     type: Literal["natural"] = "natural"
@@ -114,6 +123,6 @@ class Natural(Frameless):
 
 
 def is_upright(cell: Cell) -> bool:
-    """Whether it is that of a square or rectangular lattice along the axes."""
+    """Return whether the cell is that of a square or rectangular lattice along the axes."""
     a, b = cell.vectors
     return cell.period == (1, 1) and a.y == b.x == 0.0

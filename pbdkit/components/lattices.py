@@ -11,37 +11,39 @@ from pbdkit.plugin import BasisSite, Cell, Lattice, Vector
 from pbdkit.plugin.units import LENGTH
 
 Spacing = Annotated[float, Field(ge=1e-100, le=1e100), LENGTH]
-"""A lattice constant; the range keeps squared lengths finite."""
+"""Type of a lattice constant. The bounds keep squared lengths finite."""
 
 A = Field(description="Distance of the sites along a row (lattice units).", examples=[1.0])
+"""Field of the lattice constant along a row."""
 B = Field(description="The other edge of the rectangle (lattice units).", examples=[1.3])
+"""Field of the second edge of a rectangular cell."""
 
 
 class Square(Lattice):
-    """Sites at (i·a, j·a)."""
+    """Square lattice with sites at (i·a, j·a)."""
 
     type: Literal["square"] = "square"
     a: Spacing = A
 
     def cell(self) -> Cell:
-        """One site."""
+        """Return a cell with one site."""
         return Cell((Vector(self.a, 0.0), Vector(0.0, self.a)))
 
 
 class Rectangular(Lattice):
-    """Sites at (i·a, j·b)."""
+    """Rectangular lattice with sites at (i·a, j·b)."""
 
     type: Literal["rectangular"] = "rectangular"
     a: Spacing = A
     b: Spacing = B
 
     def cell(self) -> Cell:
-        """One site."""
+        """Return a cell with one site."""
         return Cell((Vector(self.a, 0.0), Vector(0.0, self.b)))
 
 
 class Oblique(Lattice):
-    """Sites at i·(a, 0) + j·b·(cos angle, sin angle); the angle is in degrees."""
+    """Oblique lattice with sites at i·(a, 0) + j·b·(cos angle, sin angle), the angle in degrees."""
 
     type: Literal["oblique"] = "oblique"
     a: Spacing = A
@@ -53,32 +55,35 @@ class Oblique(Lattice):
     )
 
     def cell(self) -> Cell:
-        """One site."""
+        """Return a cell with one site."""
         angle = math.radians(self.angle)
         slanted = Vector(self.b * math.cos(angle), self.b * math.sin(angle))
         return Cell((Vector(self.a, 0.0), slanted))
 
 
 class CentredRectangular(Lattice):
-    """Rows b/2 apart, the odd ones shifted by a/2."""
+    """Centred rectangular lattice: rows at the distance b/2, every second one shifted by a/2."""
 
     type: Literal["centred-rectangular"] = "centred-rectangular"
     a: Spacing = A
     b: Spacing = B
 
     def cell(self) -> Cell:
-        """A rectangle a × b with a site in its centre."""
+        """Return a rectangular cell a × b with a second site in its centre."""
         return _rows(self.a, self.b)
 
 
 class Hexagonal(Lattice):
-    """Rows a·√3/2 apart, the odd ones shifted by a/2: six neighbours at distance a."""
+    """Hexagonal lattice: rows at the distance a·√3/2, every second one shifted by a/2.
+
+    Each site has six neighbours at the distance a.
+    """
 
     type: Literal["hexagonal"] = "hexagonal"
     a: Spacing = A
 
     def cell(self) -> Cell:
-        """A rectangle a × a√3 with a site in its centre."""
+        """Return a rectangular cell a × a√3 with a second site in its centre."""
         return _rows(self.a, self.a * math.sqrt(3.0))
 
 

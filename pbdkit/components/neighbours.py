@@ -1,4 +1,4 @@
-"""Who is whose neighbour: by shells or by weighted distance (model.md, section 4)."""
+"""Neighbour metrics: shells of the lattice, or a weighted distance (model.md, section 4)."""
 
 from __future__ import annotations
 
@@ -15,82 +15,89 @@ from pbdkit.errors import ExperimentError
 from pbdkit.plugin import Cell, Nearness, NeighbourMetric, Offset, Vector
 from pbdkit.plugin.units import LENGTH
 
-MOST_NEIGHBOURS = 4224
-"""As many as 32 shells of chebyshev neighbours."""
+MAX_NEIGHBOURS = 4224
+"""Largest number of neighbours of a particle: 32 shells of chebyshev neighbours."""
 BALL = {2: math.pi, 3: 4 * math.pi / 3}
 """Area or volume of the unit ball, by the number of axes."""
 Shells = Annotated[int, Field(ge=1, le=32)]
+"""Type of the number of shells."""
 Weight = Annotated[float, Field(gt=0.0)]
+"""Type of a weight of the squared distance along an axis."""
 
 
 class LatticeNeighbours(NeighbourMetric):
-    """Common to neighbours in shells of the lattice, which stay as they are."""
+    """Base class of metrics by shells of the lattice, which are not re-evaluated."""
 
-    shells: Shells = Field(1, description="How many shells count, from the nearest.", examples=[2])
-    reevaluate: bool = Field(False, description="Always false: these neighbours stay.")
+    shells: Shells = Field(1, description="Number of shells, from the nearest.", examples=[2])
+    reevaluate: bool = Field(False, description="Always false: these neighbours do not change.")
 
     @model_validator(mode="after")
     def _stay(self) -> LatticeNeighbours:
         if self.reevaluate:
             raise ValueError(
                 f"{self.type} neighbours are defined on the lattice and cannot be re-evaluated; "
-                "take euclidean ones, which have a radius"
+                "use {type: euclidean}, which has a radius"
             )
         return self
 
 
 class Coordination(LatticeNeighbours):
-    """Shells of distinct distance on the infinite lattice, equal within 1e-6 relative."""
+    """Neighbours by shells of equal distance on the infinite lattice, within 1e-6 relative."""
 
     type: Literal["coordination"] = "coordination"
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
-        """The `shells` smallest distances between any two sites. A sublattice may have no neighbour
-        in some of them."""
-        ranks: list[list[Offset]] = []
+        """Return the offsets within the `shells` smallest distances between any two sites.
+
+        A sublattice may have no neighbour in some of these shells.
+        """
+        groups: list[list[Offset]] = []
         room = 8 * self.shells * size_of(cell) / len(cell.sites)
         radius = (room / BALL[cell.axes]) ** (1 / cell.axes)
-        while len(ranks) <= self.shells:  # with one more, the shells before it are complete
-            around = [cell.offsets(s, radius) for s in range(len(cell.sites))]
-            everywhere = sorted((o for own in around for o in own), key=lambda o: o.length)
-            ranks = _ranked(everywhere, [o.length for o in everywhere])
+        while len(groups) <= self.shells:  # with one more, the shells before it are complete
+            offsets = [cell.offsets(s, radius) for s in range(len(cell.sites))]
+            sorted_offsets = sorted((o for ends in offsets for o in ends), key=lambda o: o.length)
+            groups = _ranked(sorted_offsets, [o.length for o in sorted_offsets])
             radius *= 1.5
-        lengths = [(shell[0].length, shell[-1].length) for shell in ranks[: self.shells]]
-        return [[o for o in around[sublattice] if a <= o.length <= b] for a, b in lengths]
+        lengths = [(shell[0].length, shell[-1].length) for shell in groups[: self.shells]]
+        return [[o for o in offsets[sublattice] if a <= o.length <= b] for a, b in lengths]
 
 
 class Chebyshev(LatticeNeighbours):
-    """Index distance max(|Δp|, |Δq|) in the primitive basis; shell n is distance exactly n."""
+    """Neighbours by index distance max(|Δp|, |Δq|) in the primitive basis, one shell a distance."""
 
     type: Literal["chebyshev"] = "chebyshev"
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
-        """Every offset up to index distance `shells`, grouped by it."""
+        """Return every offset up to the index distance `shells`, grouped by that distance."""
         shells: list[list[Offset]] = [[] for _ in range(self.shells)]
         m, n = self._cells(cell)
         ends = product(range(len(cell.sites)), product(range(-m, m + 1), range(-n, n + 1)))
-        near = [cell.offset(sublattice, target, step) for target, step in ends]
-        for offset in sorted(near, key=lambda o: (o.length, o.site)):
+        candidates = [cell.offset(sublattice, target, step) for target, step in ends]
+        for offset in sorted(candidates, key=lambda o: (o.length, o.site)):
             distance = max(abs(offset.primitive[0]), abs(offset.primitive[1]))
             if offset.site != (0, 0) and distance <= self.shells:
                 shells[distance - 1].append(offset)
         return shells
 
     def _cells(self, cell: Cell) -> tuple[int, int]:
-        """How many repeat cells on a site of index distance `shells` can lie: (m, n) for which
-        m (pa, qa) + n (pb, qb) is no larger than that, and what basis sites differ by."""
+        """Return bounds on |m| and |n| of the repeat cells with neighbours.
+
+        These are the (m, n) for which m (pa, qa) + n (pb, qb) does not exceed `shells` plus the
+        largest difference between basis sites.
+        """
         (pa, qa), (pb, qb) = cell.primitive
         basis = max(abs(p) for site in cell.sites for p in site.primitive)
-        most, det = self.shells + 2 * basis, abs(pa * qb - qa * pb)
-        return most * (abs(pb) + abs(qb)) // det, most * (abs(pa) + abs(qa)) // det
+        bound, det = self.shells + 2 * basis, abs(pa * qb - qa * pb)
+        return bound * (abs(pb) + abs(qb)) // det, bound * (abs(pa) + abs(qa)) // det
 
 
 class Euclidean(NeighbourMetric):
-    """All within √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9); a shell is a distinct distance.
+    """Neighbours within a weighted distance: √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9).
 
-    Unequal weights make the neighbourhood, and with it the body, anisotropic. With `reevaluate`
-    the neighbours are found anew at every step, in the intermediate configuration. More than
-    MOST_NEIGHBOURS are refused.
+    A shell consists of the offsets at one distance. Unequal weights make the neighbourhood, and
+    with it the body, anisotropic. With `reevaluate` the neighbours are determined again at every
+    step, in the intermediate configuration. More than `MAX_NEIGHBOURS` neighbours are an error.
     """
 
     type: Literal["euclidean"] = "euclidean"
@@ -102,45 +109,55 @@ class Euclidean(NeighbourMetric):
         (1.0, 1.0), description="w_x and w_y of the distance.", examples=[[1.0, 1.7]]
     )
     reevaluate: bool = Field(
-        False, description="Whether neighbours are found anew at every step.", examples=[True]
+        False, description="Determine the neighbours again at every step.", examples=[True]
     )
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
-        """Ranked by weighted distance: by distance, where the plane is stretched by √w."""
-        near, (wx, wy) = self.radius * (1 + 1e-9), map(math.sqrt, self.weights)
+        """Return the offsets within the radius, grouped by weighted distance.
+
+        The weighted distance is the Euclidean distance in a plane stretched by √w along each axis.
+
+        Raises
+        ------
+        ExperimentError
+            If the radius contains more than `MAX_NEIGHBOURS` neighbours.
+        """
+        radius, (wx, wy) = self.radius * (1 + 1e-9), map(math.sqrt, self.weights)
         vectors = tuple(Vector(wx * v.x, wy * v.y) for v in cell.vectors)
         sites = tuple(replace(s, at=Vector(wx * s.at.x, wy * s.at.y)) for s in cell.sites)
         stretched = replace(cell, vectors=vectors, sites=sites)
-        if not (count := cells_within(stretched, near) * len(cell.sites)) <= MOST_NEIGHBOURS:
+        if not (count := cells_within(stretched, radius) * len(cell.sites)) <= MAX_NEIGHBOURS:
             raise ExperimentError(
-                f"a radius of {self.radius:g} holds some {count:.3g} neighbours on this lattice, "
-                f"and {MOST_NEIGHBOURS} is the most; take a smaller one",
+                f"a radius of {self.radius:g} contains about {count:.3g} neighbours on this "
+                f"lattice; the maximum is {MAX_NEIGHBOURS}; decrease the radius",
                 ("radius",),
             )
-        found = stretched.offsets(sublattice, near)
-        rest = [cell.offset(sublattice, o.target, o.cell) for o in found]
-        return _ranked(rest, [o.length for o in found])
+        offsets = stretched.offsets(sublattice, radius)
+        rest = [cell.offset(sublattice, o.target, o.cell) for o in offsets]
+        return _ranked(rest, [o.length for o in offsets])
 
     def nearness(self) -> Nearness | None:
-        """The same distance in the current configuration, if `reevaluate`."""
+        """Return the distance in the current configuration if `reevaluate` is set, else None."""
         return Nearness(self.radius, self.weights) if self.reevaluate else None
 
 
 def size_of(cell: Cell) -> float:
-    """The area of the repeat cell, in space its volume."""
+    """Return the area of the repeat cell, in space its volume."""
     return abs(float(np.linalg.det(np.array(cell.vectors))))
 
 
 def cells_within(cell: Cell, radius: float) -> float:
-    """About how many repeat cells lie within a radius, or in lines across it where these are
-    more."""
+    """Estimate the number of repeat cells within a radius.
+
+    A cell longer than the radius counts along the whole of its longest vector.
+    """
     longest, ball = max(math.hypot(*v) for v in cell.vectors), BALL[cell.axes]
-    around = max(ball * radius, 2 * longest) * radius ** (cell.axes - 1)
-    return around / max(size_of(cell), 5e-324)
+    region = max(ball * radius, 2 * longest) * radius ** (cell.axes - 1)
+    return region / max(size_of(cell), 5e-324)
 
 
 def _ranked(offsets: Sequence[Offset], distances: Sequence[float]) -> list[list[Offset]]:
-    """Shells of equal distance, within 1e-6 relative; the distances come sorted."""
+    """Group sorted offsets into shells of equal distance, within 1e-6 relative."""
     shells: list[list[Offset]] = []
     first = -1.0
     for offset, distance in zip(offsets, distances, strict=True):

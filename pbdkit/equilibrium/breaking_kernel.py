@@ -192,7 +192,7 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
     """For a scene whose rule is linear; None where compiling would take longer than numpy, where
     nothing compiles, or where the solver's method is not direct. Decided by the experiment alone,
     so that what is resumed goes on as it began."""
-    solver = scene.experiment.solver.sought
+    solver = scene.experiment.solver.equilibrium
     direct = solver.method == "lu" or (
         solver.method == "auto" and scene.raster.count <= LARGEST_ANEW
     )
@@ -221,7 +221,7 @@ def _is_plain(scene: Scene) -> bool:
 def _seconds(scene: Scene) -> float:
     """What numpy would take."""
     renews = isinstance(scene.experiment.fracture, RenewsBonds)
-    settlings = scene.experiment.solver.sought.increments * (
+    settlings = scene.experiment.solver.equilibrium.increments * (
         LITTLE_BY_LITTLE if renews else AT_ONCE
     )
     return settlings * (SETTLING_S + PARTICLE_S * scene.raster.count)
@@ -469,7 +469,7 @@ class Settler:
     """
 
     def __init__(self, scene: Scene, tolerance: float, watch: Watch) -> None:
-        solver = scene.experiment.solver.sought
+        solver = scene.experiment.solver.equilibrium
         self._scene, self._watch, self._tolerance = scene, watch, tolerance
         self._share = solver.tolerance
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)

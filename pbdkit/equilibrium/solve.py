@@ -46,7 +46,7 @@ def finder_of(
 ) -> Finder:
     """What finds the equilibrium that a scene asks for, from its initial state. Whoever asks for
     many that differ by numbers compiles none of their moves."""
-    asked, scale = scene.experiment.solver.sought, scale_of(scene, start, rows)
+    asked, scale = scene.experiment.solver.equilibrium, scale_of(scene, start, rows)
     length = asked.tolerance * scale
     return Finder(scene, length, scale, asked.method, watch or Watch(), compiles, rows)
 
@@ -184,7 +184,7 @@ def increments(
     Raises ExperimentError where there is no equilibrium, UnconvergedError, SeparatedError, and
     StoppedError where the watch says so: then the state is the last that had been reached.
     """
-    asked, steps = scene.experiment.solver.sought, scene.experiment.steps
+    asked, steps = scene.experiment.solver.equilibrium, scene.experiment.steps
     for n, driven in enumerate(scene.driven):
         if driven.group.leads(steps) and driven.group.motion.rests_after() is None:
             count = len(scene.leading)
@@ -544,7 +544,7 @@ def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int)
     fracturing.break_bonds(state.u, state, step, in_turn=True)
     if broken_bonds(state) > broken:
         return True
-    tolerance = scene.experiment.solver.sought.tolerance
+    tolerance = scene.experiment.solver.equilibrium.tolerance
     pairs = list(zip(before, state.bond_values, strict=True))
     if any((abs(b - a) > tolerance * np.maximum(1.0, abs(a))).any() for a, b in pairs):
         return True

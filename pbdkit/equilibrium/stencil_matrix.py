@@ -366,7 +366,7 @@ def held_components(scene: Scene, step: int, rows: Rows = ALL) -> Held | None:
     if grid is None or not rows.communicator.any(len(guided.place) > 0):
         return None
     held = np.zeros((2, *grid.shape), bool)
-    held.reshape(2, -1)[:, grid.places(guided.place)] = guided.led
+    held.reshape(2, -1)[:, grid.places(guided.place)] = guided.lead_axes
     for unknown in outside(rows.known, grid.shape[0]):
         held[:, unknown] = False
     return held

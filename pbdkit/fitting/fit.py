@@ -173,8 +173,8 @@ def _with_settings(
     if not settings:
         return experiment
     source = experiment.as_written()
-    if source.beside.folder is None:
-        source.beside = fit.beside
+    if source.files.folder is None:
+        source.files = fit.files
     for path, value in settings.items():
         source = with_value(source, path, value, f"{place}: {path}", Experiment.defaults())
     return Experiment.build(source, components)

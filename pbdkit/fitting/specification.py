@@ -33,7 +33,15 @@ from pbdkit.fitting.observations import (
 from pbdkit.fitting.problem import Loss
 from pbdkit.model.experiment import Experiment, Version
 from pbdkit.model.motions import read_columns
-from pbdkit.model.reading import FIT, OF_PROGRAM, Beside, Source, beside, of_kind, read_file
+from pbdkit.model.reading import (
+    FIT,
+    OF_PROGRAM,
+    FileResolver,
+    Source,
+    file_resolver,
+    of_kind,
+    read_file,
+)
 from pbdkit.model.shipped import Base, base_source
 from pbdkit.model.solver import Equilibrium
 from pbdkit.model.validation import closed_part, report
@@ -341,16 +349,16 @@ class Fit(Strict):
     candidates: dict[str, Rival] = Field(default_factory=dict)
     folds: Annotated[int, Field(ge=2, le=20)] = 5
 
-    _beside: Beside = Beside()
+    _files: FileResolver = FileResolver()
 
     @property
-    def beside(self) -> Beside:
+    def files(self) -> FileResolver:
         """Return the folder of files that the fit may name."""
-        return self._beside
+        return self._files
 
     @model_validator(mode="after")
     def _fits_together(self, info: ValidationInfo) -> Self:
-        object.__setattr__(self, "_beside", beside(info))
+        object.__setattr__(self, "_files", file_resolver(info))
         if len(self.measured) > 1 and any(
             measurement.noise is None for measurement in self.measured
         ):
@@ -423,10 +431,8 @@ def described_fit(
             f"{source.name}: is a fit of strength; use pbdkit.fit_strength", ("kind",)
         )
     if given and isinstance(source.data, dict):
-        source = Source(
-            source.name, {"experiment": "", **source.data}, source.places, source.beside
-        )
-    context: dict[str, Any] = {"beside": source.beside}
+        source = Source(source.name, {"experiment": "", **source.data}, source.places, source.files)
+    context: dict[str, Any] = {"files": source.files}
     if measured is not None:
         source, context[DATASET] = _with_dataset(source), measured
     try:
@@ -443,7 +449,7 @@ def _with_dataset(source: Source) -> Source:
     if not isinstance(file, Mapping):
         raise ExperimentError("measured: a dataset takes the place of one measurement, not several")
     data["measured"] = {**file, "file": DATASET}
-    return Source(source.name, data, source.places, source.beside)
+    return Source(source.name, data, source.places, source.files)
 
 
 def shipped_fits() -> list[str]:

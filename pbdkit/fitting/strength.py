@@ -223,9 +223,9 @@ def described_strength_fit(
         source = of_kind(FIT, read_file(path))
     if given and isinstance(source.data, dict):
         data = {"experiment": "", **source.data}
-        source = Source(source.name, data, source.places, source.beside)
+        source = Source(source.name, data, source.places, source.files)
     try:
-        fit = StrengthFit.model_validate(source.data, context={"beside": source.beside})
+        fit = StrengthFit.model_validate(source.data, context={"files": source.files})
     except ValidationError as error:
         raise report(error, source) from None
     return fit, source if given else base_source(path, fit.experiment, source)
@@ -602,7 +602,7 @@ class Specimens:
         """Return the ends of all increments but the last, with the load factor."""
         assert self.elastic is not None
         assert self.elastic.pull is not None
-        count, path = self.scene.experiment.solver.sought.increments, []
+        count, path = self.scene.experiment.solver.equilibrium.increments, []
         for moment in moments(self.scene, count)[:-1]:
             state = unmoved_state(self.scene, self.scene.raster.shape[1:])
             leaders, _ = prescribe(self.scene, state, moment)

@@ -169,7 +169,7 @@ class RecordedVariables:
                             f"'{variable.name}' has the shape {np.shape(value)}, not {shape}"
                         )
                     if when is not When.END:
-                        _refuse_infinite(variable, value, now, self._scene.raster.before)
+                        _refuse_infinite(variable, value, now, self._scene.raster.particle_offset)
                     values[variable.name] = (
                         np.array(value) if factor == 1.0 else np.multiply(value, factor)
                     )
@@ -228,7 +228,7 @@ class Recorder:
     def known(self) -> Iterator[Values]:
         """What is known before the first step; made one after the other, and not all at once."""
         raster, scene = self._scene.raster, self._scene
-        numbers = raster.before + np.arange(1, raster.count + 1)
+        numbers = raster.particle_offset + np.arange(1, raster.count + 1)
         yield {"particle": numbers, "number": numbers}
         yield {"axis": np.array(list("xyz"[: scene.axes]))}
         site = raster.site_table()
@@ -241,7 +241,7 @@ class Recorder:
             yield {"bond": np.arange(1, len(bonds.ends) + 1, dtype=np.int32), "shell": bonds.shell}
             yield {
                 "bond_ends": np.add(
-                    bonds.ends, 1 + raster.before, dtype=np.int32, casting="same_kind"
+                    bonds.ends, 1 + raster.particle_offset, dtype=np.int32, casting="same_kind"
                 )
             }
         if self._measured.shows_leaders:
@@ -282,7 +282,7 @@ class Recorder:
         if recorded:
             position = moment.position()
             if not np.isfinite(position).all():
-                before = self._scene.raster.before
+                before = self._scene.raster.particle_offset
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {before + row + 1} at step {state.step}")
             values = {"time": now, "position": position, "kind": moment.kind()}

@@ -687,4 +687,4 @@ class StateForces(ForceValues):
         return self._state.u.astype(float, copy=False)
 
     def _blaming_rule(self) -> AbstractContextManager[None]:
-        return blaming(self._rule, f"when asked for forces at step {self._state.step}", "rule")
+        return blaming(self._rule, f"to return forces at step {self._state.step}", "rule")

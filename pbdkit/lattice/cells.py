@@ -1,6 +1,4 @@
-"""The cells of a lattice on the raster, and for each bond the cells around a particle that
-determine its damage.
-"""
+"""Cells of a lattice on the raster, and the cells around particles for the damage of bonds."""
 
 from __future__ import annotations
 
@@ -21,70 +19,94 @@ from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.lattice import CellPolygon, Index, Side, Tiling
 
 Slots = tuple[tuple[Slot, ...], ...]
+"""Type of the slots, by sublattice."""
 Step = tuple[int, int, Index]
+"""Type of a step between sites: source sublattice, target sublattice, repeat cells."""
 Share = NDArray[np.floating[Any]] | float
+"""Type of shares of cells; a single number where all are equal."""
 CELLS_AT_ONCE = 65536
-"""So many are looked at together, so that temporaries stay small."""
+"""Number of cells processed together, which bounds the size of temporaries."""
 LEVEL = 1e-9
-"""Corners whose heights differ by less than this share of their distance lie level."""
+"""Relative difference of height up to which two corners lie at one level."""
 
 
 @lru_cache(maxsize=32)
 def tiling_of(cell: Cell, slots: Slots) -> Tiling:
-    """The polygons of a lattice, each once a repeat cell, and those beside its slots; none but
-    in the plane."""
+    """Compute the polygons of a plane lattice, each once for a repeat cell, and those beside its
+    slots.
+
+    Returns
+    -------
+    Tiling
+        Empty for a lattice in space.
+    """
     if len(cell.vectors) != 2:
         return Tiling()
-    polygons = tuple(found for s, own in enumerate(slots) for found in _polygons(cell, s, own))
+    sources = enumerate(slots)
+    polygons = tuple(polygon for s, ends in sources for polygon in _polygons(cell, s, ends))
     return Tiling(polygons, _beside(polygons, slots))
 
 
 @dataclass(frozen=True)
 class Patch:
-    """The cells of one shape on a rectangle of the raster: `corners[k]` is the block of their k-th
-    corners, `whole` tells of which all corners are particles of the body."""
+    """Cells of one shape on a rectangle of the raster.
+
+    Parameters
+    ----------
+    polygon
+        Shape of the cells.
+    corners
+        Blocks of the k-th corners.
+    whole
+        Mask of the cells whose corners are all particles of the body, (cell, cell).
+    """
 
     polygon: CellPolygon
     corners: tuple[Block, ...]
     whole: Mask
 
     def differences(self, u: NDArray[Any]) -> tuple[Vector, ...]:
-        """u_k - u_0 of the corners, from planes u, (axis, sublattice, cell, cell)."""
+        """Return the differences u_k - u_0 of the corners, from planes u, (axis, sublattice, cell,
+        cell).
+        """
         corners = [u[(slice(None), *block.slices())] for block in self.corners]
         return tuple(Vector(*(plane - corners[0])) for plane in corners)
 
     def bonds(self, slots: Slots) -> list[tuple[Block, Slot]]:
-        """The bonds between corners: the block where they start, and their slot."""
-        corners, found = self.polygon.corners, []
+        """Return the bonds between corners, each as the block of its starts and its slot."""
+        corners, bonds = self.polygon.corners, []
         for k, a in enumerate(corners):
-            ahead = {_step(a, b) for b in corners[k + 1 :]}
-            own = [s for s in slots[a.target] if (s.source, s.target, s.cell) in ahead]
-            found += [(self.corners[k], slot) for slot in own]
-        return found
+            steps = {_step(a, b) for b in corners[k + 1 :]}
+            ends = [s for s in slots[a.target] if (s.source, s.target, s.cell) in steps]
+            bonds += [(self.corners[k], slot) for slot in ends]
+        return bonds
 
     def rows(self, raster: Raster, place: int) -> Indices:
-        """The rows of the corners of the cell at a flat place of the patch."""
+        """Return the rows of the corners of the cell at a flat place of the patch."""
         s = np.array([block.sublattice for block in self.corners])
         start = np.array([block.start for block in self.corners])
         return raster.rows_at(s, *np.add(start, np.unravel_index(place, self.whole.shape)).T)
 
 
 def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
-    """The places with cells whose corners are all of the body, some at a time."""
-    found = []
+    """Divide the cells whose corners are all in the body into patches."""
+    result = []
     for polygon in tiling.polygons:
         block = _within(raster, polygon)
         for part in _bands(raster, block) if block else ():
             corners = tuple(part.seen_through(corner) for corner in polygon.corners)
             inside = [raster.kind[corner.slices()] == FOLLOWER for corner in corners]
             patch = Patch(polygon, corners, np.logical_and.reduce(inside))
-            found += [patch] if patch.whole.any() else []
-    return tuple(found)
+            result += [patch] if patch.whole.any() else []
+    return tuple(result)
 
 
 def _bands(raster: Raster, block: Block) -> Iterator[Block]:
-    """A block cut at rows that are the same whatever part of the lattice a raster holds: the order
-    of sums at a particle depends on where it is cut."""
+    """Divide a block into bands of rows.
+
+    The cuts do not depend on the part of the lattice that a raster holds, because the order of sums
+    at a particle depends on them.
+    """
     (first, *start), (last, *stop) = block.start, block.stop
     step = max(1, CELLS_AT_ONCE // math.prod(raster.shape[2:]))
     cuts = [row for row in range(first + 1, last) if (raster.first[0] + row) % step == 0]
@@ -94,12 +116,28 @@ def _bands(raster: Raster, block: Block) -> Iterator[Block]:
 
 @dataclass(frozen=True)
 class WeighedCells:
-    """The body's cells, weighed: `share` (kind, sublattice, cell, cell) of the cell whose first
-    corner is at that place of the raster, 0 to 1, None where all are whole; `weight` is the same
-    times its stiffness over that of the rule. Cells whose stiffness is no multiple of that have the
-    weight 0, and in `mixed` their share of each of some stiffnesses, whose `weights` by slot are
-    those of the rule for it. `phase` tells materials apart by a number, -1 where a cell is of
-    several; None where there is one. `names` are the components of those stiffnesses, one each."""
+    """Cells of the body with their weights.
+
+    Parameters
+    ----------
+    tiling
+        Cells of the lattice.
+    share
+        Share of each cell inside the outline, 0 to 1, (kind, sublattice, cell, cell), at the place
+        of its first corner. None if all cells are whole.
+    weight
+        The share times the stiffness of the cell over that of the rule, 0 for the cells in `mixed`.
+    mixed
+        Shares of the cells whose stiffness is not a multiple of that of the rule, one array for
+        each of several stiffnesses.
+    weights
+        Weights of the rule by slot, for each stiffness of `mixed`.
+    phase
+        Number of the material of each cell, -1 for a cell of several materials. None if there is
+        one material.
+    names
+        Names of the components of the stiffnesses, one each.
+    """
 
     tiling: Tiling
     share: Floats | None
@@ -110,7 +148,7 @@ class WeighedCells:
     names: tuple[str, ...] = ()
 
     def of(self, patch: Patch) -> Floats | float:
-        """The shares of the cells of a patch."""
+        """Return the shares of the cells of a patch."""
         if self.share is None:
             return 1.0
         return patch.corners[0].of(self.share[patch.polygon.kind])
@@ -118,17 +156,33 @@ class WeighedCells:
     def beside(
         self, slot: Slot, where: Where, precision: str, shares: Floats | None = None
     ) -> tuple[Share, Share]:
-        """The weights, or other `shares`, of the cells to the left and the right of a slot; 1 where
-        all are."""
-        of = self.weight if shares is None else shares
-        left, right = (_seen(of, side, where, precision) for side in self.tiling.beside[slot])
+        """Return the weights of the cells to the left and right of a slot.
+
+        Parameters
+        ----------
+        slot
+            The bond.
+        where
+            Particles at which the bond starts.
+        precision
+            Floating-point type of the result.
+        shares
+            Shares in place of the weights.
+
+        Returns
+        -------
+        tuple
+            Weights on the left and on the right; the number 1 if all are 1.
+        """
+        values = self.weight if shares is None else shares
+        left, right = (_seen(values, side, where, precision) for side in self.tiling.beside[slot])
         return left, right
 
 
 def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:
-    """Of the cell on one side of a slot."""
-    there = where if side.first is None else where.seen_through(side.first)
-    share = there.of(shares[side.kind])
+    """Return the shares of the cells on one side of a slot."""
+    first_corners = where if side.first is None else where.seen_through(side.first)
+    share = first_corners.of(shares[side.kind])
     if (share == 1.0).all():
         return 1.0
     share = share.astype(precision)
@@ -137,7 +191,7 @@ def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:
 
 
 def whole_cells(raster: Raster, tiling: Tiling) -> WeighedCells:
-    """The cells whose corners are all of the body, each with a share of 1."""
+    """Return the cells whose corners are all in the body, each with a share of 1."""
     share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *raster.shape))
     for patch in patches(raster, tiling):
         patch.corners[0].of(share[patch.polygon.kind])[...] = patch.whole
@@ -145,31 +199,33 @@ def whole_cells(raster: Raster, tiling: Tiling) -> WeighedCells:
 
 
 def _within(raster: Raster, polygon: CellPolygon) -> Block | None:
-    """The block of first corners in the body whose other corners lie on the raster."""
+    """Return the block of first corners in the body whose other corners lie on the raster."""
     block = raster.body_block(polygon.source)
     if not block:
         return None
     steps = np.array([corner.cell for corner in polygon.corners])
     start = np.maximum(block.start, -steps.min(axis=0))
     stop = np.minimum(block.stop, raster.shape[1:] - steps.max(axis=0))
-    there = Block(polygon.source, tuple(start.tolist()), tuple(stop.tolist()))
-    return there if (start < stop).all() else None
+    inner = Block(polygon.source, tuple(start.tolist()), tuple(stop.tolist()))
+    return inner if (start < stop).all() else None
 
 
 def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[CellPolygon]:
-    """Those whose first corner is of sublattice `source`, counter-clockwise; corners that are
-    neighbours lie where the slots say, to the last bit."""
+    """Return the polygons whose first corner is of sublattice `source`, counterclockwise.
+
+    Corners that are neighbours have exactly the rest offsets of the slots.
+    """
     exact = {(slot.target, slot.cell): slot.rest for slot in slots}
     around = [replace(offset, rest=exact.get((offset.target, offset.cell), offset.rest))
               for offset in cell.offsets(source, _reach(cell))]  # fmt: skip
-    found = []
+    polygons = []
     for places in _around_the_origin(np.array([offset.rest for offset in around])):
-        others = tuple(around[k] for k in places)
-        # It is met from each of its corners: kept is the first.
-        if all(_is_ahead(offset.rest) for offset in others):
-            found.append((cell.offset(source, source, (0, 0)), *others))
-    found.sort(key=lambda corners: math.atan2(*corners[1].rest[::-1]))
-    return (CellPolygon(source, kind, corners) for kind, corners in enumerate(found))
+        corners = tuple(around[k] for k in places)
+        # Each polygon occurs once for each of its corners; only one occurrence is used.
+        if all(_is_ahead(offset.rest) for offset in corners):
+            polygons.append((cell.offset(source, source, (0, 0)), *corners))
+    polygons.sort(key=lambda polygon: math.atan2(*polygon[1].rest[::-1]))
+    return (CellPolygon(source, kind, polygon) for kind, polygon in enumerate(polygons))
 
 
 def _is_ahead(r: Vector[float]) -> bool:
@@ -178,8 +234,9 @@ def _is_ahead(r: Vector[float]) -> bool:
 
 
 def _beside(polygons: tuple[CellPolygon, ...], slots: Slots) -> dict[Slot, tuple[Side, Side]]:
-    """The cells beside every slot, where the neighbours are the corners of simple cells."""
-    slot_of = {(slot.source, slot.target, slot.cell): slot for own in slots for slot in own}
+    """Return the cells beside every slot; empty unless neighbours are corners of simple cells."""
+    all_slots = (slot for ends in slots for slot in ends)
+    slot_of = {(slot.source, slot.target, slot.cell): slot for slot in all_slots}
     left: dict[Step, Side] = {}
     right: dict[Step, Side] = {}
     for polygon in polygons:
@@ -195,13 +252,13 @@ def _beside(polygons: tuple[CellPolygon, ...], slots: Slots) -> dict[Slot, tuple
     return {slot: (left[step], right[step]) for step, slot in slot_of.items()}
 
 
-def _step(here: Offset, there: Offset) -> Step:
-    """(sublattice, sublattice, repeat cells) from one corner of a polygon to another."""
-    return here.target, there.target, tuple(map(sub, there.cell, here.cell))
+def _step(start: Offset, end: Offset) -> Step:
+    """Return the step from one corner of a polygon to another."""
+    return start.target, end.target, tuple(map(sub, end.cell, start.cell))
 
 
 def _is_simple(polygon: CellPolygon) -> bool:
-    """Whether it is a triangle or a parallelogram, whose triangles around the middle are equal."""
+    """Return whether the polygon is a triangle or a parallelogram."""
     r = polygon.rest
     if len(r) != 4:
         return len(r) == 3
@@ -209,8 +266,11 @@ def _is_simple(polygon: CellPolygon) -> bool:
 
 
 def _reach(cell: Cell) -> float:
-    """No side and no diagonal is longer: twice the radius of the largest circle without a site is
-    at most the sum of two cell vectors, made short by Gauss's reduction."""
+    """Return an upper bound on the length of sides and diagonals of polygons.
+
+    Twice the radius of the largest empty circle is at most the sum of the lengths of two cell
+    vectors, reduced by Gauss's algorithm.
+    """
     a, b = (np.array(v) for v in cell.vectors)
     while True:
         if a @ a > b @ b:
@@ -222,20 +282,23 @@ def _reach(cell: Cell) -> float:
 
 
 def _around_the_origin(x: Floats) -> Iterator[list[int]]:
-    """The polygons that meet in the origin, each by its other corners among x, counter-clockwise;
-    x are the sites around it, the nearest first: that one is always a corner.
+    """Generate the polygons that meet at the origin, by their other corners among x,
+    counterclockwise.
 
-    On the left of a side (0, p) lies the polygon whose corners q see the side under the largest
-    angle, of cotangent q·(q - p) / p×q.
+    x are the surrounding sites, sorted by distance; the nearest site is always a corner. To the
+    left of a side (0, p) lies the polygon whose corners q see the side under the largest angle, of
+    cotangent q·(q - p) / p×q.
     """
     side = 0
     for _ in range(len(x)):
         p = x[side]
         turn = p[0] * x[:, 1] - p[1] * x[:, 0]
-        left = turn > 1e-12 * math.hypot(*p) * np.hypot(*x.T)
-        cotangent = np.where(left, (x * (x - p)).sum(axis=1) / np.where(left, turn, 1.0), np.inf)
-        least = cotangent.min()
-        (circle,) = np.nonzero(cotangent <= least + 1e-9 * (1.0 + abs(least)))
+        on_left = turn > 1e-12 * math.hypot(*p) * np.hypot(*x.T)
+        cotangent = np.where(
+            on_left, (x * (x - p)).sum(axis=1) / np.where(on_left, turn, 1.0), np.inf
+        )
+        smallest = cotangent.min()
+        (circle,) = np.nonzero(cotangent <= smallest + 1e-9 * (1.0 + abs(smallest)))
         ahead = sorted(circle.tolist(), key=lambda k: math.atan2(turn[k], float(x[k] @ p)))
         yield [side, *ahead]
         side = ahead[-1]
@@ -244,14 +307,26 @@ def _around_the_origin(x: Floats) -> Iterator[list[int]]:
 
 
 Key = tuple[int, int, Index]
-"""A cell around a particle: its kind, and the sublattice and repeat cell of its first corner."""
+"""Key of a cell around a particle: its kind, and the sublattice and repeat cell of its first
+corner.
+"""
 
 
 @dataclass(frozen=True)
 class CellBond:
-    """A bond of a cell around a particle: the `plane` on which it is kept, along `slot`, at the
-    neighbour `home` (None: the particle itself); and whether the cell lies to its left and to its
-    right, that of a diagonal on both sides."""
+    """Bond of a cell around a particle.
+
+    Parameters
+    ----------
+    plane
+        Index of the plane that stores the bond.
+    slot
+        Slot of the plane.
+    home
+        Slot of the neighbour at which the bond is stored; None for the particle itself.
+    on_left, on_right
+        Whether the cell lies to the left and to the right of the bond; both for a diagonal.
+    """
 
     plane: int
     slot: Slot
@@ -261,14 +336,17 @@ class CellBond:
 
     @property
     def side(self) -> int:
-        """0 where the cell lies to its left, 1 where to its right alone."""
+        """Side of the bond on which the cell lies: 0 for left or both, 1 for right."""
         return 0 if self.on_left else 1
 
 
 @dataclass(frozen=True)
 class CellsAround:
-    """The bonds of the cells around the particles of one sublattice, and by slot the numbers of
-    the cells to its left and right."""
+    """Bonds of the cells around the particles of a sublattice.
+
+    `cells` holds the bonds of each cell; `beside` the indices of the cells to the left and right of
+    each slot.
+    """
 
     cells: tuple[tuple[CellBond, ...], ...]
     beside: dict[Slot, tuple[int, int]]
@@ -277,39 +355,54 @@ class CellsAround:
 def cells_around(
     tiling: Tiling, slots: Sequence[Sequence[Slot]], planes: Sequence[Slot]
 ) -> tuple[CellsAround, ...]:
-    """Those of every sublattice, with the slots along which bonds are kept, one a plane; none where
-    neighbours are not the corners of the cells."""
-    return tuple(_around(tiling, own, planes) for own in slots) if tiling.beside else ()
+    """Return the cells around the particles of every sublattice.
+
+    Parameters
+    ----------
+    tiling
+        Cells of the lattice.
+    slots
+        Slots of every sublattice.
+    planes
+        Slots along which bonds are stored, one for each plane.
+
+    Returns
+    -------
+    tuple
+        One entry for each sublattice; empty unless neighbours are the corners of the cells.
+    """
+    return tuple(_around(tiling, ends, planes) for ends in slots) if tiling.beside else ()
 
 
-def _around(tiling: Tiling, own: Sequence[Slot], planes: Sequence[Slot]) -> CellsAround:
+def _around(tiling: Tiling, slots: Sequence[Slot], planes: Sequence[Slot]) -> CellsAround:
     numbers: dict[Key, int] = {}
-    beside = {}
-    for slot in own:
+    sides = {}
+    for slot in slots:
         keys = (_key(slot.source, (0,) * len(slot.cell), side) for side in tiling.beside[slot])
-        left, right = (numbers.setdefault(key, len(numbers)) for key in keys)
-        beside[slot] = left, right
-    return CellsAround(tuple(_bonds(tiling, own, planes, key) for key in numbers), beside)
+        left_cell, right_cell = (numbers.setdefault(key, len(numbers)) for key in keys)
+        sides[slot] = left_cell, right_cell
+    return CellsAround(tuple(_bonds(tiling, slots, planes, key) for key in numbers), sides)
 
 
 def _key(start: int, at: Index, side: Side) -> Key:
-    """Of a cell beside a bond that starts on a sublattice in a repeat cell."""
+    """Return the key of a cell beside a bond that starts on a sublattice in a repeat cell."""
     if side.first is None:
         return side.kind, start, at
     return side.kind, side.first.target, tuple(map(add, at, side.first.cell))
 
 
 def _bonds(
-    tiling: Tiling, own: Sequence[Slot], planes: Sequence[Slot], key: Key
+    tiling: Tiling, slots: Sequence[Slot], planes: Sequence[Slot], key: Key
 ) -> tuple[CellBond, ...]:
     kind, source, first = key
     polygon = next(p for p in tiling.polygons if (p.source, p.kind) == (source, kind))
     corners = [(c.target, tuple(map(add, first, c.cell))) for c in polygon.corners]
-    neighbours = {(slot.target, slot.cell): slot for slot in own}
-    found = []
+    neighbours = {(slot.target, slot.cell): slot for slot in slots}
+    bonds = []
     for plane, slot in enumerate(planes):
         for (a, start), (b, end) in permutations(corners, 2):
             if (slot.source, slot.target, slot.cell) == (a, b, tuple(map(sub, end, start))):
-                left, right = (_key(a, start, side) == key for side in tiling.beside[slot])
-                found.append(CellBond(plane, slot, neighbours.get((a, start)), left, right))
-    return tuple(found)
+                on_left, on_right = (_key(a, start, side) == key for side in tiling.beside[slot])
+                home = neighbours.get((a, start))
+                bonds.append(CellBond(plane, slot, home, on_left, on_right))
+    return tuple(bonds)

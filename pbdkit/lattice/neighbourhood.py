@@ -1,5 +1,5 @@
-"""Neighbours of every sublattice as constant slots in exactly opposite pairs, and the bonds between
-them, those that cross a crack or a cut included.
+"""Neighbours of every sublattice, as constant slots in exactly opposite pairs, and the bonds
+between particles.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.lattice import Index, Tiling
 from pbdkit.plugin.vector import vector
 
-FLATTEST = 1e-3
-"""Cells flatter than this are refused: within a cell vector of a site lie π/flatness others."""
-SAME_PLACE = 1e-9
-"""Sites nearer than this share of a cell vector lie at one place."""
-
-BALANCED = 1e-9
-"""How far a site may lie from the barycentre of its neighbours, as a share of their distance."""
+MIN_FLATNESS = 1e-3
+"""Smallest accepted flatness of a cell. Within a cell vector of a site lie π/flatness sites."""
+COINCIDENCE_RTOL = 1e-9
+"""Distance up to which two sites coincide, relative to the first cell vector."""
+BARYCENTRE_RTOL = 1e-9
+"""Distance of a site from the barycentre of its neighbours, relative to their distance, up to which
+both coincide."""
 
 
 @dataclass(frozen=True)
 class BondPlane:
-    """The bonds along one slot and its opposite: they live on the slot's source sublattice."""
+    """Bonds along one slot and its opposite, stored on the source sublattice of the slot."""
 
     slot: Slot
     opposite: Slot
@@ -52,8 +52,17 @@ class BondPlane:
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """`slots[s]` are the neighbours of sublattice s of `cell`, the nearest shells first and
-    inversion partners side by side; `planes` holds each pair of opposite slots once."""
+    """Neighbours on a lattice.
+
+    Parameters
+    ----------
+    cell
+        Repeat cell of the lattice.
+    slots
+        Neighbours of each sublattice, by shell, with opposite slots side by side.
+    planes
+        Pairs of opposite slots, each once.
+    """
 
     cell: Cell
     slots: tuple[tuple[Slot, ...], ...]
@@ -61,116 +70,135 @@ class Neighbourhood:
 
     @cached_property
     def tiling(self) -> Tiling:
-        """The cells of the lattice, and which of them lie beside the slots."""
+        """Cells of the lattice, and which of them lie beside the slots."""
         return tiling_of(self.cell, self.slots)
 
     @cached_property
     def cells_around(self) -> tuple[CellsAround, ...]:
-        """By sublattice the cells around a particle with their bonds; none where neighbours are not
-        the corners of cells."""
+        """Cells around the particles of each sublattice; empty unless neighbours are corners of
+        cells.
+        """
         return cells_around(self.tiling, self.slots, [plane.slot for plane in self.planes])
 
     @cached_property
     def every(self) -> tuple[Slot, ...]:
-        """The slots of all sublattices, one after the other."""
-        return tuple(slot for own in self.slots for slot in own)
+        """Slots of all sublattices, in order."""
+        return tuple(slot for slots in self.slots for slot in slots)
 
     @property
     def reach(self) -> int:
-        """The largest difference of site index, max(|Δi|, |Δj|)."""
+        """Largest difference of site index, max(|Δi|, |Δj|)."""
         return max(abs(n) for slot in self.every for n in slot.site)
 
     @property
     def reach_in_cells(self) -> Index:
-        """The largest difference of repeat cell along each axis."""
+        """Largest difference of repeat cell along each axis."""
         return tuple(np.abs([slot.cell for slot in self.every]).max(axis=0).tolist())
 
     @cached_property
     def home(self) -> dict[Slot, tuple[int, bool]]:
-        """By slot the plane on which its bonds live, and whether they do at this end: it is the end
-        of the plane's own slot."""
+        """Plane that stores the bonds of each slot, and whether they are stored at the start of the
+        slot.
+        """
         ends = enumerate(self.planes)
         return {slot: (n, slot is p.slot) for n, p in ends for slot in (p.slot, p.opposite)}
 
     @property
     def home_reach(self) -> tuple[Index, Index]:
-        """How many cells before and after a particle's own, along each axis, its bonds may live."""
-        steps = [slot.cell for slot, (_, here) in self.home.items() if not here]
+        """Largest differences of repeat cell, backward and forward, at which bonds of a particle
+        are stored.
+        """
+        steps = [slot.cell for slot, (_, at_start) in self.home.items() if not at_start]
         cells = np.array([(0,) * self.cell.axes, *steps])
         return tuple((-cells.min(axis=0)).tolist()), tuple(cells.max(axis=0).tolist())
 
     def shells(self) -> list[list[float]]:
-        """The rest lengths of each shell, the first shell first."""
-        found: list[list[float]] = [[] for _ in range(max(slot.shell for slot in self.every))]
+        """Return the rest lengths of each shell, from the first shell."""
+        lengths: list[list[float]] = [[] for _ in range(max(slot.shell for slot in self.every))]
         for slot in self.every:
-            found[slot.shell - 1].append(math.hypot(*slot.rest))
-        return found
+            lengths[slot.shell - 1].append(math.hypot(*slot.rest))
+        return lengths
 
     @cached_property
     def nudge_unit(self) -> float:
-        """A power of two near the shortest rest length: what is moved by a share of it moves as far
-        in all units, and scaling back rounds nothing."""
+        """Power of two near the shortest rest length.
+
+        Perturbations proportional to it scale with the unit of length without rounding.
+        """
         return float(2.0 ** round(math.log2(min(map(min, self.shells())))))
 
     def spans_space(self) -> bool:
-        """Whether steps between neighbours reach in all directions; else rows do not feel each
-        other."""
+        """Return whether bonds point in all directions of space; otherwise rows are not coupled."""
         rests = np.array([slot.rest for slot in self.every])
         directions = rests / np.linalg.norm(rests, axis=1)[:, None]
         return bool(np.linalg.matrix_rank(directions, tol=1e-9) == self.cell.axes)
 
 
 def checked_cell(lattice: Lattice) -> Cell:
-    """The lattice's cell; ExperimentError where it is degenerate, its sites share an index or a
-    place, or lie so far off that positions would."""
+    """Return the repeat cell of a lattice after validation.
+
+    Raises
+    ------
+    ExperimentError
+        If the cell is degenerate, two of its sites share an index or a position, or the origin is
+        so far away that positions would coincide.
+    """
     cell = lattice.cell()
-    named = " and ".join(str(tuple(v)) for v in cell.vectors)
+    vectors = " and ".join(str(tuple(v)) for v in cell.vectors)
     indices = [site.index for site in cell.sites]
     inside = all(0 <= n < p for index in indices for n, p in zip(index, cell.period, strict=True))
     if not np.isfinite(cell.vectors).all() or flatness(cell) == 0.0:
-        raise ExperimentError(f"the cell vectors {named} span no area")
-    if flatness(cell) < FLATTEST:
+        raise ExperimentError(f"the cell vectors {vectors} span no area; choose independent ones")
+    if flatness(cell) < MIN_FLATNESS:
         raise ExperimentError(
-            f"the cell vectors {named} are nearly degenerate: sites lie {1 / flatness(cell):.3g} "
-            f"times closer along one line than the longer is long, and {1 / FLATTEST:g} times is "
-            "the most; open their angle, or make their lengths more alike"
+            f"the cell vectors {vectors} are nearly degenerate: the longer vector is "
+            f"{1 / flatness(cell):.3g} times the smallest distance of sites, and the maximum is "
+            f"{1 / MIN_FLATNESS:g}; increase their angle, or choose more similar lengths"
         )
     far = max(map(abs, lattice.origin))
-    apart = min(math.hypot(*v) for v in cell.vectors)
-    if 4 * math.ulp(far) > apart:
+    spacing = min(math.hypot(*v) for v in cell.vectors)
+    if 4 * math.ulp(far) > spacing:
         raise ExperimentError(
-            f"at {far:g} double precision does not tell sites apart that lie {apart:g} from each "
-            "other; move the origin nearer to zero",
+            f"at {far:g} double precision cannot resolve the distance {spacing:g} between sites; "
+            "move the origin nearer to zero",
             ("origin",),
         )
     if len(set(indices)) < len(indices) or not inside:
         raise ExperimentError(
-            f"the basis sites have the indices {indices}: they must differ and lie within the "
+            f"the basis sites have the indices {indices}: these must differ and lie within the "
             f"period {cell.period}"
         )
     for s, site in enumerate(cell.sites):
-        for near in cell.offsets(s, SAME_PLACE * math.hypot(*cell.vectors[0])):
+        for near in cell.offsets(s, COINCIDENCE_RTOL * math.hypot(*cell.vectors[0])):
             raise ExperimentError(
                 f"the sites with the indices {site.index} and {cell.sites[near.target].index} lie "
-                f"at one place, {tuple(site.at)}; give each its own"
+                f"at one place, {tuple(site.at)}; choose different positions"
             )
     return cell
 
 
 def flatness(cell: Cell) -> float:
-    """How much less room than a square or cube a cell has: sites · area / (longest vector)², the
-    sine of the angle for one site and vectors of one length in the plane."""
+    """Return the area of a cell relative to the largest possible area.
+
+    sites · area / (longest vector)², the sine of the angle for one site and vectors of equal
+    length; in space the volume relative to that of a cube.
+    """
     scaled = np.array(cell.vectors) / max(math.hypot(*v) for v in cell.vectors)
     return len(cell.sites) * abs(float(np.linalg.det(scaled)))
 
 
 def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
-    """The slots that the metric chooses; ExperimentError unless neighbourhood is mutual and
-    balanced."""
+    """Build the slots that a metric selects.
+
+    Raises
+    ------
+    ExperimentError
+        If neighbourhood is not mutual, or a site is not the barycentre of its neighbours.
+    """
     exact = _ExactVectors()
     sublattices = range(len(cell.sites))
     slots = tuple(_slots_of(s, metric.shells_around(cell, s), exact) for s in sublattices)
-    by_key = {(s.source, s.target, s.cell): s for own in slots for s in own}
+    by_key = {(s.source, s.target, s.cell): s for ends in slots for s in ends}
     _refuse_gaps(slots, len(by_key))
     planes = []
     for slot in by_key.values():
@@ -182,29 +210,32 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
             )
         if slot.site > (0,) * cell.axes:
             planes.append(BondPlane(slot, opposite))
-    for own in slots:
-        _refuse_lopsided(own, metric)
+    for ends in slots:
+        _refuse_unbalanced(ends, metric)
     return Neighbourhood(cell, slots, tuple(planes))
 
 
-def _refuse_lopsided(own: tuple[Slot, ...], metric: NeighbourMetric) -> None:
-    """On lattices whose sites are no centres of inversion, mutual is not enough."""
-    sums = [math.fsum(along) for along in zip(*(slot.rest for slot in own), strict=True)]
-    if math.hypot(*sums) > BALANCED * math.fsum(math.hypot(*slot.rest) for slot in own):
+def _refuse_unbalanced(slots: tuple[Slot, ...], metric: NeighbourMetric) -> None:
+    """Raise ExperimentError if a site is not the barycentre of its neighbours.
+
+    Mutual neighbourhood does not imply this on lattices whose sites are not centres of inversion.
+    """
+    sums = [math.fsum(along) for along in zip(*(slot.rest for slot in slots), strict=True)]
+    if math.hypot(*sums) > BARYCENTRE_RTOL * math.fsum(math.hypot(*slot.rest) for slot in slots):
+        distance = ", ".join(f"{s / len(slots):.3g}" for s in sums)
         raise ExperimentError(
-            f"'{metric.type}' is lopsided on this lattice: the {len(own)} neighbours of a site "
-            f"have their barycentre ({', '.join(f'{s / len(own):.3g}' for s in sums)}) away from "
-            "it, and a body at rest would drift; choose whole shells of equal distance, "
-            "{type: coordination}"
+            f"'{metric.type}' is unbalanced on this lattice: the barycentre of the {len(slots)} "
+            f"neighbours of a site differs from the site by ({distance}), and a body at rest would "
+            "drift; choose whole shells of equal distance, {type: coordination}"
         )
 
 
-def _refuse_gaps(slots: tuple[tuple[Slot, ...], ...], different: int) -> None:
+def _refuse_gaps(slots: tuple[tuple[Slot, ...], ...], count: int) -> None:
     if not all(slots):
-        raise ExperimentError("some sites have no neighbour at all: more shells, a larger radius")
-    if sum(map(len, slots)) > different:
+        raise ExperimentError("some sites have no neighbour; increase the shells or the radius")
+    if sum(map(len, slots)) > count:
         raise ExperimentError("a neighbour is listed in two shells, or twice in one")
-    shells = {slot.shell for own in slots for slot in own}
+    shells = {slot.shell for ends in slots for slot in ends}
     if shells != set(range(1, max(shells) + 1)):
         raise ExperimentError(f"a shell is empty: only shells {sorted(shells)} have neighbours")
 
@@ -213,17 +244,18 @@ def _slots_of(
     source: int, shells: Sequence[Sequence[Offset]], exact: _ExactVectors
 ) -> tuple[Slot, ...]:
     offsets = [(shell, offset) for shell, near in enumerate(shells, 1) for offset in near]
-    found = [(shell, *exact.of(offset.rest), offset) for shell, offset in offsets]
-    found.sort(key=lambda entry: entry[:3])
+    entries = [(shell, *exact.of(offset.rest), offset) for shell, offset in offsets]
+    entries.sort(key=lambda entry: entry[:3])
     return tuple(
-        Slot(source, to.target, to.cell, to.site, rest, shell) for shell, _, _, rest, to in found
+        Slot(source, to.target, to.cell, to.site, rest, shell) for shell, _, _, rest, to in entries
     )
 
 
 class _ExactVectors:
-    """Gives vectors that are equal or opposite up to rounding one value and its exact negative.
+    """Replace vectors that are equal or opposite within rounding by one value and its exact
+    negative.
 
-    Sums over a body at rest then cancel exactly, whatever the order of magnitude.
+    Sums over a body at rest then cancel exactly, independent of the magnitude.
     """
 
     def __init__(self) -> None:
@@ -231,7 +263,7 @@ class _ExactVectors:
         self._near: dict[Index, int] = {}
 
     def of(self, v: Vector[float]) -> tuple[int, bool, Vector[float]]:
-        """(which known vector, whether negated, the value to use)."""
+        """Return the index of a stored vector, whether it is negated, and the exact value."""
         if (number := self._near.get(self._key(v))) is not None:
             return number, False, self._known[number]
         if (number := self._near.get(self._key(-v))) is not None:
@@ -243,27 +275,42 @@ class _ExactVectors:
         return number, False, self._known[number]
 
     def _key(self, v: Vector[float]) -> Index:
-        """The place on a grid much finer than any lattice and much coarser than rounding."""
+        """Return the place on a grid much coarser than rounding errors."""
         unit = 1e-6 * math.hypot(*(self._known[0] if self._known else v))
         return tuple(math.floor(component / unit) for component in v)
 
 
 def crosses(start: Vector, end: Vector, a: Vector, b: Vector) -> Mask:
-    """Whether each bond from `start` to `end` crosses the crack from a to b.
+    """Return whether each bond from `start` to `end` crosses the crack from a to b.
 
-    A particle exactly on the crack's line counts to its left side, so that a crack along a row of
-    particles parts the row from those on its right; a bond that a tip touches is crossed.
+    A particle exactly on the line of the crack counts to its left side, so that a crack along a row
+    of particles separates the row from those on its right. A bond that touches a tip is crossed.
     """
-    parted = (_side(a, b, start) >= 0) ^ (_side(a, b, end) >= 0)
-    return parted & (_side(start, end, a) * _side(start, end, b) <= 0)
+    is_separated = (_side(a, b, start) >= 0) ^ (_side(a, b, end) >= 0)
+    return is_separated & (_side(start, end, a) * _side(start, end, b) <= 0)
 
 
 def crossed_bonds(
     raster: Raster, neighbourhood: Neighbourhood, segments: Iterable[Segment]
 ) -> Iterator[tuple[int, Block, Mask]]:
-    """Plane by plane its number, the block of its bonds, and which of them, those to the frame too,
-    cross one of the segments."""
-    # As the rasters count: from the lattice's site (0, 0).
+    """Generate the bonds that cross one of several segments, plane by plane.
+
+    Parameters
+    ----------
+    raster
+        Particles of the scene.
+    neighbourhood
+        Neighbours on the lattice.
+    segments
+        Pairs of end points.
+
+    Yields
+    ------
+    tuple
+        Index of the plane, block of its bonds, and mask of those that cross, bonds to frame points
+        included.
+    """
+    # Positions on rasters are relative to site (0, 0) of the lattice.
     origin = Vector(*raster.lattice.origin[:2])
     local = [(Vector(*a) - origin, Vector(*b) - origin) for a, b in segments]
     for n, plane in enumerate(neighbourhood.planes if local else ()):
@@ -275,15 +322,24 @@ def crossed_bonds(
 
 
 def _side(a: Vector, b: Vector, c: Vector) -> Floats:
-    """Twice the signed area of a, b, c: positive where c lies left of the line from a to b."""
+    """Return twice the signed area of a, b, c: positive if c lies left of the line from a to b."""
     return np.asarray((b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x))
 
 
 @dataclass(frozen=True)
 class BondTable:
-    """A row a bond, sorted: `ends` (bond, 2) are rows of the particle table, lower first, `shell`
-    counts from 1. `plane` and `place` tell where its state lives: plane[bond] of the
-    neighbourhood's planes, at the flat place of the plane's source within its sublattice."""
+    """Bonds of the body, sorted.
+
+    Parameters
+    ----------
+    ends
+        Rows of both particles in the particle table, lower first, (bond, 2).
+    shell
+        Shell of each bond, from 1.
+    plane, place
+        Position of the state of each bond: the index of its plane in the neighbourhood, and the
+        flat place of its source within the sublattice.
+    """
 
     ends: NDArray[np.int64]
     shell: NDArray[np.int8]
@@ -292,11 +348,13 @@ class BondTable:
 
 
 def plane_block(raster: Raster, plane: BondPlane, *, inside: bool = False) -> Block | None:
-    """The block of source places of every bond of a plane with an end in the body, or of those with
-    both."""
+    """Return the block of the starts of all bonds of a plane with an end in the body.
+
+    With `inside`, only bonds with both ends in the body.
+    """
     forward = raster.body_block(plane.slot.source)
-    landed = raster.body_block(plane.slot.target)
-    backward = landed.seen_through(plane.opposite) if landed else None
+    target = raster.body_block(plane.slot.target)
+    backward = target.seen_through(plane.opposite) if target else None
     if inside:
         return common(forward, backward) if forward and backward else None
     corners = [(block.start, block.stop) for block in (forward, backward) if block]
@@ -304,24 +362,26 @@ def plane_block(raster: Raster, plane: BondPlane, *, inside: bool = False) -> Bl
 
 
 def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) -> Mask:
-    """Where in the block of a plane a bond starts: both ends are particles, at least one of the
-    body, or both where bonds to the frame are left out."""
-    here = raster.kind[block.slices()]
-    there = raster.kind[block.seen_through(plane.slot).slices()]
-    found: Mask = (here == FOLLOWER) & (there == FOLLOWER)
+    """Return a mask of the places of a block where a bond starts.
+
+    Both ends are particles, at least one of them in the body; without `frame_too` both.
+    """
+    start = raster.kind[block.slices()]
+    end = raster.kind[block.seen_through(plane.slot).slices()]
+    mask: Mask = (start == FOLLOWER) & (end == FOLLOWER)
     if frame_too:
-        found = (here == FOLLOWER) & (there != EMPTY) | (here != EMPTY) & (there == FOLLOWER)
-    return found
+        mask = (start == FOLLOWER) & (end != EMPTY) | (start != EMPTY) & (end == FOLLOWER)
+    return mask
 
 
 def count_bonds(raster: Raster, neighbourhood: Neighbourhood) -> int:
-    """The number of bonds with at least one end in the body."""
+    """Return the number of bonds with at least one end in the body."""
     blocks = ((plane, plane_block(raster, plane)) for plane in neighbourhood.planes)
     return sum(int(bonds_in(raster, b, plane, True).sum()) for plane, b in blocks if b)
 
 
 def build_bond_table(raster: Raster, neighbourhood: Neighbourhood) -> BondTable:
-    """The table of all bonds."""
+    """Build the table of all bonds."""
     parts = [
         _bonds_of_plane(raster, n, plane, block)
         for n, plane in enumerate(neighbourhood.planes)
@@ -335,42 +395,42 @@ def build_bond_table(raster: Raster, neighbourhood: Neighbourhood) -> BondTable:
 def _bonds_of_plane(
     raster: Raster, number: int, plane: BondPlane, block: Block
 ) -> tuple[Indices, NDArray[np.int8], Indices, Indices]:
-    """(rows of both ends, shell, number of the plane, place in it) of its bonds."""
-    found = np.nonzero(bonds_in(raster, block, plane, frame_too=True))
-    cells, slot = list(map(add, found, block.start)), plane.slot
+    """Return rows of both ends, shell, index of the plane and place of the bonds of a plane."""
+    starts = np.nonzero(bonds_in(raster, block, plane, frame_too=True))
+    cells, slot = list(map(add, starts, block.start)), plane.slot
     a = raster.rows_at(slot.source, *cells)
     b = raster.rows_at(slot.target, *map(add, cells, slot.cell))
-    within = np.ravel_multi_index(tuple(cells), raster.shape[1:])
+    places = np.ravel_multi_index(tuple(cells), raster.shape[1:])
     shell, of_plane = np.full(len(a), slot.shell, np.int8), np.full(len(a), number)
     ends = np.stack([np.minimum(a, b), np.maximum(a, b)], axis=1)
-    return ends, shell, of_plane, within
+    return ends, shell, of_plane, places
 
 
 def missing_segments(
     raster: Raster, neighbourhood: Neighbourhood, segments: Mapping[str, Segment]
 ) -> list[str]:
-    """A warning for each segment, by its field, that crosses nothing."""
+    """Return a warning for each segment, by its field, that crosses no bond."""
     return [
-        f"{field}: it crosses no bond of the body; look where it goes from and to"
+        f"{field}: it crosses no bond of the body; check its end points"
         for field, segment in segments.items()
         if not raster.communicator.any(
-            any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [segment]))
+            any(crossed.any() for *_, crossed in crossed_bonds(raster, neighbourhood, [segment]))
         )
     ]
 
 
 def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
-    """What a rule may derive its constants from."""
+    """Return the lattice context from which a rule may derive constants."""
     lower, upper = (end.each(add, raster.lattice.origin) for end in body_box(raster))
     cell, slots = raster.lattice.cell(), neighbourhood.slots
     return Setting(cell, slots, lower, upper, neighbourhood.tiling)
 
 
 def body_box(raster: Raster) -> tuple[Vector[float], Vector[float]]:
-    """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
+    """Return the corners (lower, upper) of the body, from site (0, 0) of the lattice."""
     ends = (raster.ends_of_rows(s) for s in range(raster.shape[0]))
     at = [positions(raster.lattice.cell(), s, *cells) for s, cells in enumerate(ends)]
     lower, upper = raster.hull_of_all(
-        (tuple(x.min() for x in here), tuple(x.max() for x in here)) for here in at if here[0].size
+        (tuple(x.min() for x in ends), tuple(x.max() for x in ends)) for ends in at if ends[0].size
     )
     return vector(map(float, lower)), vector(map(float, upper))

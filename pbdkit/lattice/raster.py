@@ -1,5 +1,6 @@
-"""Particles on padded rasters, one raster a sublattice, in the order of their numbers; blocks and
-lists of places on them.
+"""Particles on padded rasters, one for each sublattice, and blocks and lists of places on them.
+
+Rows of the particle table are in the order of the particle numbers.
 """
 
 from __future__ import annotations
@@ -21,61 +22,73 @@ from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.vector import vector
 
 Floats = NDArray[np.float64]
+"""Type of arrays of double precision."""
 Mask = NDArray[np.bool_]
+"""Type of arrays of truth values."""
 
 
 def distinct(numbers: NDArray[np.integer[Any]]) -> Indices:
-    """Those that occur, from 0 on, sorted: np.unique loads numpy.ma, a tenth of a small `check`."""
+    """Return the distinct numbers, which are not negative, sorted.
+
+    np.unique would import numpy.ma, which takes a tenth of the time of a small `check`.
+    """
     ordered = np.sort(numbers).astype(np.intp, copy=False)
     return ordered[np.diff(ordered, prepend=-1) > 0]
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Cells left out because they would connect two sides of a void: their `count`, and the site of
-    the first corner of the `first` of them, in the order of sites."""
+    """Cells omitted because they would connect two sides of a void.
+
+    Parameters
+    ----------
+    count
+        Number of cells.
+    first
+        Site of the first corner of the first cell, in the order of sites.
+    """
 
     count: int = 0
     first: Index | None = None
 
     @classmethod
     def of(cls, sites: Indices) -> LeftOut:
-        """Those with some first corners, (cell, axis)."""
+        """Create from the sites of the first corners, (cell, axis)."""
         return cls(len(sites), min(map(tuple, sites.tolist()), default=None))
 
     def __add__(self, other: LeftOut) -> LeftOut:
-        """All of both."""
-        first = min((one.first for one in (self, other) if one.first), default=None)
-        return LeftOut(self.count + other.count, first)
+        """Return the union of both."""
+        sites = [cells.first for cells in (self, other) if cells.first]
+        return LeftOut(self.count + other.count, min(sites, default=None))
 
 
 @dataclass(frozen=True)
 class Block:
-    """A rectangle of repeat cells of one sublattice; `stop` is excluded."""
+    """Rectangle of repeat cells of one sublattice, from `start` to below `stop`."""
 
     sublattice: int
     start: Index
     stop: Index
 
     def slices(self) -> tuple[Any, ...]:
-        """Where it lies in an array (sublattice, cell, cell)."""
+        """Return the index of the block in an array (sublattice, cell, cell)."""
         return (self.sublattice, *map(slice, self.start, self.stop))
 
     def seen_through(self, slot: Slot | Offset) -> Block:
-        """The block of the neighbours at that slot, or of the sites at that offset."""
+        """Return the block of the neighbours at a slot, or of the sites at an offset."""
         start, stop = (tuple(map(add, end, slot.cell)) for end in (self.start, self.stop))
         return Block(slot.target, start, stop)
 
     def of(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The values of (..., sublattice, cell, cell) here, as a view."""
+        """Return the values of (..., sublattice, cell, cell) on the block, as a view."""
         return values[(..., *self.slices())]
 
     def within(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The values of (..., cell, cell) here, as a view."""
+        """Return the values of (..., cell, cell) on the block, as a view."""
         return values[(..., *self.slices()[1:])]
 
     def rows(self, cells: int) -> list[Block]:
-        """The block cut along its first axis into parts of about so many cells."""
+        """Divide the block along its first axis into parts of about `cells` cells."""
         (first, *start), (last, *stop) = self.start, self.stop
         step = max(1, cells // max(1, math.prod(map(sub, stop, start))))
         return [
@@ -86,57 +99,65 @@ class Block:
 
 @dataclass(frozen=True)
 class Places:
-    """Some particles of one sublattice by their flat place on rasters of a shape; they can be asked
-    as a Block can."""
+    """Particles of one sublattice by their flat places on rasters of a shape.
+
+    Has the methods of Block.
+    """
 
     shape: tuple[int, ...]
     place: Indices
 
     def of(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The values of (..., sublattice, cell, cell) here."""
+        """Return the values of (..., sublattice, cell, cell) at the places."""
         flat = values.reshape(*values.shape[: values.ndim - len(self.shape)], -1)
-        found: NDArray[Any] = flat[..., self.place]
-        return found
+        result: NDArray[Any] = flat[..., self.place]
+        return result
 
     def within(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The values of (..., cell, cell) here."""
+        """Return the values of (..., cell, cell) at the places."""
         flat = values.reshape(*values.shape[: values.ndim - len(self.shape) + 1], -1)
-        found: NDArray[Any] = flat[..., self.place % math.prod(self.shape[1:])]
-        return found
+        result: NDArray[Any] = flat[..., self.place % math.prod(self.shape[1:])]
+        return result
 
     def seen_through(self, slot: Slot | Offset) -> Places:
-        """The neighbours at that slot; `step` away."""
+        """Return the places of the neighbours at a slot, or of the sites at an offset."""
         return Places(self.shape, self.place + slot_step(self.shape, slot))
 
 
 def bounds(mask: Mask) -> tuple[Index, Index] | None:
-    """(start, stop) of the smallest rectangle around all that is true; None where nothing is."""
+    """Return (start, stop) of the smallest rectangle around all true entries, or None if there is
+    none.
+    """
     axes = range(mask.ndim)
-    some = [np.flatnonzero(mask.any(axis=tuple({*axes} - {axis}))) for axis in axes]
-    if not len(some[0]):
+    indices = [np.flatnonzero(mask.any(axis=tuple({*axes} - {axis}))) for axis in axes]
+    if not len(indices[0]):
         return None
-    return tuple(int(n[0]) for n in some), tuple(int(n[-1]) + 1 for n in some)
+    return tuple(int(n[0]) for n in indices), tuple(int(n[-1]) + 1 for n in indices)
 
 
 def hull(boxes: Iterable[tuple[Sequence[Any], Sequence[Any]]]) -> tuple[Any, Any]:
-    """The smallest and the largest number along each axis over some (low, high), as tuples."""
+    """Return the smallest and the largest number along each axis over several (low, high), as
+    tuples.
+    """
     low, high = zip(*boxes, strict=True)
     return tuple(map(min, zip(*low, strict=True))), tuple(map(max, zip(*high, strict=True)))
 
 
-def common(one: Block, other: Block) -> Block | None:
-    """The places of one sublattice that two blocks share, if any."""
-    start = tuple(map(max, one.start, other.start))
-    stop = tuple(map(min, one.stop, other.stop))
-    return Block(one.sublattice, start, stop) if all(map(lt, start, stop)) else None
+def common(block: Block, other: Block) -> Block | None:
+    """Return the intersection of two blocks of one sublattice, or None if it is empty."""
+    start = tuple(map(max, block.start, other.start))
+    stop = tuple(map(min, block.stop, other.stop))
+    return Block(block.sublattice, start, stop) if all(map(lt, start, stop)) else None
 
 
 Where = Block | Places
-"""Some particles of one sublattice."""
+"""Type of a set of particles of one sublattice."""
 
 
 def slot_step(shape: tuple[int, ...], slot: Slot | Offset) -> int:
-    """From a flat place of rasters to that of the neighbour at a slot."""
+    """Return the difference of flat places on rasters between a particle and its neighbour at a
+    slot.
+    """
     source = slot.source if isinstance(slot, Slot) else slot.target
     step = slot.target - source
     for size, cells in zip(shape[1:], slot.cell, strict=True):
@@ -145,19 +166,33 @@ def slot_step(shape: tuple[int, ...], slot: Slot | Offset) -> int:
 
 
 Box = tuple[tuple[Any, ...], tuple[Any, ...]]
+"""Type of a box, (low, high)."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Some `lines` of sites of a lattice, from the first to below the second; `before` particles
-    are before them. What of the body is near lies from the site `low` to below `high`. `rows` are
-    the particles of each row of repeat cells of the lattice, padding included, from the cells
-    `first` on. `left_out` are the cells left out at narrow voids, of the whole."""
+    """Range of lines of sites of a lattice that a process builds.
+
+    Parameters
+    ----------
+    lines
+        First line, and end of the range.
+    low, high
+        Sites from `low` to below `high` contain the nearby particles of the body.
+    particle_offset
+        Number of particles before the range.
+    rows
+        Number of particles of each row of repeat cells of the whole lattice, padding included.
+    first
+        Repeat cell of the first of these rows.
+    left_out
+        Cells of the whole lattice that are omitted at narrow voids.
+    """
 
     lines: tuple[int, int]
     low: Index
     high: Index
-    before: int
+    particle_offset: int
     rows: NDArray[np.int64]
     first: int
     left_out: LeftOut
@@ -165,44 +200,85 @@ class Stretch:
 
 @dataclass(frozen=True)
 class RowRange:
-    """The part of a lattice that one of several processes builds: a `stretch` of it, of which the
-    lines of sites in `own` are its own, and those in `framed` have frame points that it needs."""
+    """Part of a lattice that one of several processes builds.
+
+    Parameters
+    ----------
+    stretch
+        Range of lines of sites.
+    own
+        Range of the lines that belong to this process.
+    framed
+        Range of the lines whose frame points this process resolves.
+    """
 
     stretch: Stretch
     own: tuple[int, int]
     framed: tuple[int, int]
 
 
-EMPTY, LEADER, FOLLOWER, FRAME = -1, 0, 1, 2
+EMPTY = -1
+"""Kind of a place without a particle."""
+LEADER = 0
+"""Kind of a leader."""
+FOLLOWER = 1
+"""Kind of a follower."""
+FRAME = 2
+"""Kind of a frame point."""
 NOWHERE = np.iinfo(np.int64).max
-"""Beyond all site indices."""
+"""Site index larger than any that occurs."""
 CHUNK_ROWS = 65536
-"""Rows of the table that are made at a time, so that temporaries stay small."""
+"""Number of table rows processed together, which bounds the size of temporaries."""
 
 
 @dataclass(frozen=True)
 class RowLayout:
-    """How many particles each row of repeat cells of a lattice has, padding included, and how many
-    rows are `before` those of a raster."""
+    """Size of the whole lattice of which a raster holds a part.
+
+    Parameters
+    ----------
+    rows
+        Number of particles of each row of repeat cells, padding included.
+    row_offset
+        Number of rows before those of the raster.
+    """
 
     rows: NDArray[np.int64]
-    before: int
+    row_offset: int
 
     @cached_property
     def particles(self) -> int:
-        """In all."""
+        """Number of particles of the whole lattice."""
         return int(self.rows.sum())
 
 
 @dataclass(frozen=True)
 class Raster:
-    """Every particle twice over: as a row of the table, and as a place on a raster.
+    """Particles of a lattice, as rows of a table and as places on a raster.
 
-    `shape` is (sublattices, cells, cells), `first` the repeat cell at place (0, 0), `kind` the kind
-    at each place with EMPTY where no particle is (leaders count as followers here). `sites` is the
-    same by site index (i, j) from `low` on; its particles, i then j, are the rows of the table in
-    the order of their numbers, which count from 1 and those `before` the first row. Where it has
-    some rows of a lattice alone, `extent` is that of the whole, and `row_range` what is built.
+    Parameters
+    ----------
+    lattice
+        The lattice.
+    shape
+        Shape of the raster, (sublattices, cells, cells).
+    first
+        Repeat cell at place (0, 0).
+    kind
+        Kind at each place: EMPTY, FOLLOWER or FRAME. Leaders count as followers.
+    low
+        Site index (i, j) of the first entry of `sites`.
+    sites
+        Kind by site index. The particles in the order i, then j are the rows of the table.
+    particle_offset
+        Number of particles of the whole lattice before the first row. Row k has the number
+        `particle_offset` + k + 1.
+    extent
+        Size of the whole lattice if the raster holds a part of it.
+    communicator
+        Processes that hold the other parts.
+    row_range
+        Part of the lattice that this process builds; None for the whole.
     """
 
     lattice: Lattice
@@ -211,117 +287,119 @@ class Raster:
     kind: NDArray[np.int8]
     low: Index
     sites: NDArray[np.int8]
-    before: int = 0
+    particle_offset: int = 0
     extent: RowLayout | None = None
     communicator: Communicator = SERIAL
     row_range: RowRange | None = None
 
     @cached_property
     def count(self) -> int:
-        """The number of particles, frame included."""
+        """Number of particles, frame included."""
         return int(np.count_nonzero(self.sites != EMPTY))
 
     @property
     def total(self) -> int:
-        """The same of the whole lattice."""
+        """Number of particles of the whole lattice, frame included."""
         return self.extent.particles if self.extent else self.count
 
     @property
     def whole_shape(self) -> tuple[int, ...]:
-        """The shape of the raster of the whole lattice."""
+        """Shape of the raster of the whole lattice."""
         rows = len(self.extent.rows) if self.extent else self.shape[1]
         return (self.shape[0], rows, *self.shape[2:])
 
     @property
     def row_counts(self) -> NDArray[np.int64]:
-        """(row,): the particles in each row of repeat cells of the whole lattice."""
+        """Number of particles in each row of repeat cells of the whole lattice, (row,)."""
         if self.extent:
             return self.extent.rows
-        others = (0, *range(2, self.kind.ndim))
-        return np.asarray(np.count_nonzero(self.kind != EMPTY, axis=others))
+        axes = (0, *range(2, self.kind.ndim))
+        return np.asarray(np.count_nonzero(self.kind != EMPTY, axis=axes))
 
     def is_own(self, lines: Indices) -> Mask:
-        """Return which lines of sites are this process's own; each is that of one process."""
+        """Return which lines of sites belong to this process; each belongs to one process."""
         low, high = self.row_range.own if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
     def sees_frame(self, lines: Indices) -> Mask:
-        """Return on which lines of sites this process needs to know whom frame points follow."""
+        """Return the lines of sites whose frame points this process resolves."""
         low, high = self.row_range.framed if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
     def hull_of_all(self, boxes: Iterable[Box]) -> Box:
         """Return the smallest and the largest number along each axis, over the boxes of all
         processes."""
-        return hull(box for own in self.communicator.allgather(list(boxes)) for box in own)
+        return hull(box for part in self.communicator.allgather(list(boxes)) for box in part)
 
     @cached_property
     def _full(self) -> bool:
-        """Whether every site of the window is a particle: rows then follow from indices."""
+        """Whether every site of the window is a particle, so that rows follow from indices."""
         return self.count == self.sites.size
 
     @cached_property
     def _flat_sites(self) -> Indices:
-        """(particle,): the place in the window of each row, where that is not the row itself."""
+        """Place of each row in the window, (particle,); used if the window has gaps."""
         return np.flatnonzero(self.sites != EMPTY)
 
     @cached_property
     def table_kind(self) -> NDArray[np.int8]:
-        """(particle,): FOLLOWER or FRAME."""
+        """Kind of each particle, FOLLOWER or FRAME, (particle,)."""
         flat = self.sites.ravel()
         return flat if self._full else flat[self._flat_sites]
 
     @property
     def body_rows(self) -> Indices:
-        """The rows of leaders and followers."""
+        """Rows of leaders and followers."""
         return np.flatnonzero(self.table_kind == FOLLOWER)
 
     def body_ends(self) -> NDArray[np.float64]:
-        """X, (end, axis), of the first and the last of them, without a table of all."""
+        """Return X of the first and the last particle of the body, (end, axis)."""
         body = self.table_kind == FOLLOWER
         ends = self.reference(np.array([body.argmax(), len(body) - 1 - body[::-1].argmax()]))
-        every = self.communicator.allgather(ends)
-        return np.stack([every[0][0], every[-1][1]])
+        parts = self.communicator.allgather(ends)
+        return np.stack([parts[0][0], parts[-1][1]])
 
     def chunks(self) -> Iterator[Indices]:
-        """All rows, some at a time."""
+        """Generate all rows in chunks."""
         for begin in range(0, self.count, CHUNK_ROWS):
             yield np.arange(begin, min(begin + CHUNK_ROWS, self.count))
 
     def site_of(self, rows: Indices) -> NDArray[np.int64]:
-        """(row, index): the site (i, j) of some rows."""
+        """Return the sites (i, j) of rows, (row, index)."""
         place = rows if self._full else self._flat_sites[rows]
         return np.stack(np.unravel_index(place, self.sites.shape), axis=1) + self.low
 
     def _of_all(self, values: Callable[[Indices], Any], columns: int, dtype: Any) -> NDArray[Any]:
-        """(particle, column): what is told of some rows at a time."""
+        """Evaluate a function of rows chunk by chunk, into an array (particle, column)."""
         out = np.empty((self.count, columns), dtype)
         for rows in self.chunks():
             out[rows[0] : rows[-1] + 1] = values(rows)
         return out
 
     def site_table(self) -> NDArray[np.int32]:
-        """(particle, index): the sites (i, j) of all rows."""
+        """Return the sites (i, j) of all rows, (particle, index)."""
         return self._of_all(self.site_of, self.sites.ndim, np.int32)
 
     def cells_of(self, rows: Indices) -> tuple[Indices, ...]:
-        """(sublattice, repeat cell, repeat cell) of some rows."""
+        """Return sublattice and repeat cell of rows."""
         return cells_of_sites(self.lattice.cell(), *self.site_of(rows).T)
 
     def place_of(self, rows: Indices) -> Indices:
-        """The flat place of some rows on the raster."""
+        """Return the flat places of rows on the raster."""
         s, *cells = self.cells_of(rows)
         return np.ravel_multi_index((s, *map(sub, cells, self.first)), self.shape)
 
     def rows_at(self, s: int | Indices, *cells: Indices) -> Indices:
-        """The rows of the particles at (sublattice, raster cell, raster cell); -1 where none is."""
+        """Return the rows of the particles at (sublattice, raster cell, raster cell); -1 if there
+        is none.
+        """
         cell = self.lattice.cell()
         index = np.array([site.index for site in cell.sites])
         whole = np.stack(cells, axis=-1) + self.first
         return self.rows_of_sites(whole * cell.period + index[s])
 
     def rows_of_sites(self, site: NDArray[Any]) -> Indices:
-        """The row of the particle at each site (i, j), (entry, index); -1 where there is none."""
+        """Return the row of the particle at each site, (entry, index); -1 if there is none."""
         place = site.astype(np.intp) - self.low
         inside = ((place >= 0) & (place < self.sites.shape)).all(axis=-1)
         rows = np.full(inside.shape, -1, np.intp)
@@ -329,19 +407,19 @@ class Raster:
         if self._full:
             rows[inside] = flat
         else:
-            there = self.sites.ravel()[flat] != EMPTY
-            rows[inside] = np.where(there, np.searchsorted(self._flat_sites, flat), -1)
+            occupied = self.sites.ravel()[flat] != EMPTY
+            rows[inside] = np.where(occupied, np.searchsorted(self._flat_sites, flat), -1)
         return rows
 
     def reference(self, rows: Indices | None = None) -> NDArray[np.float64]:
-        """X, (particle, axis), of all particles or of some rows."""
+        """Return X of all particles or of the given rows, (particle, axis)."""
         if rows is None:
             return self._of_all(self.reference, self.sites.ndim, np.float64)
         offsets = positions(self.lattice.cell(), *self.cells_of(rows))
         return np.stack(offsets, axis=1) + self.lattice.origin
 
     def reference_planes(self, where: Where) -> Any:
-        """X from the lattice's site (0, 0), a plane a component."""
+        """Return X relative to site (0, 0) of the lattice, as one plane for each component."""
         s: Any
         if isinstance(where, Places):
             s, *cells = np.unravel_index(where.place, self.shape)
@@ -351,7 +429,9 @@ class Raster:
         return positions(self.lattice.cell(), s, *cells)
 
     def table(self, u: NDArray[Any]) -> NDArray[Any]:
-        """(particle, axis): the values of planes u, (axis, sublattice, cell, cell), by number."""
+        """Return the values of planes u, (axis, sublattice, cell, cell), by particle, (particle,
+        axis).
+        """
         if not self._full:
             flat = u.reshape(len(u), -1)
             return self._of_all(lambda rows: flat.take(self.place_of(rows), 1).T, len(u), u.dtype)
@@ -359,59 +439,66 @@ class Raster:
         cell = self.lattice.cell()
         for s, site in enumerate(cell.sites):
             skip = np.subtract(site.index, self.low) % cell.period
-            own = out[tuple(slice(n, None, p) for n, p in zip(skip, cell.period, strict=True))]
+            target = out[tuple(slice(n, None, p) for n, p in zip(skip, cell.period, strict=True))]
             begin = np.add(self.low, skip) // cell.period - self.first
-            there = tuple(map(slice, begin, begin + own.shape[:-1]))
+            source = tuple(map(slice, begin, begin + target.shape[:-1]))
             for axis, plane in enumerate(u):
-                own[..., axis] = plane[s][there]
+                target[..., axis] = plane[s][source]
         return out.reshape(-1, len(u))
 
     def ends_of_lines(self, axis: int, *, last: bool) -> Indices:
-        """The rows of the body's first or last particles on every line of sites along an axis."""
+        """Return the rows of the first or last particles of the body on every line of sites along
+        an axis.
+        """
         body = np.moveaxis(self.sites == FOLLOWER, axis, 0)
         end = (body[::-1] if last else body).argmax(axis=0)
         end = self.low[axis] + (len(body) - 1 - end if last else end)
-        if axis == 0:  # other processes have other places on these lines
+        if axis == 0:  # other processes hold other places of these lines
             far = np.where(body.any(axis=0), -end if last else end, NOWHERE)
             far = self.communicator.smallest(far)
-            some, end = far < NOWHERE, -far if last else far
+            occupied, end = far < NOWHERE, -far if last else far
         else:
-            some = body.any(axis=0)
-        lines = np.argwhere(some) + np.delete(self.low, axis)
-        rows = self.rows_of_sites(np.insert(lines, axis, end[some], axis=1))
+            occupied = body.any(axis=0)
+        lines = np.argwhere(occupied) + np.delete(self.low, axis)
+        rows = self.rows_of_sites(np.insert(lines, axis, end[occupied], axis=1))
         return rows[rows >= 0]
 
     def ends_of_rows(self, sublattice: int) -> list[Indices]:
-        """The repeat cells, index by index, of the body's first and last particle of a sublattice
-        in every row of cells along the last axis: places rise or fall between them."""
+        """Return the repeat cells of the first and last particle of the body in every row of cells.
+
+        One array for each index, for particles of one sublattice. Rows run along the last axis,
+        along which positions are monotonic.
+        """
         body = self.kind[sublattice] == FOLLOWER
-        some = np.nonzero(body.any(axis=-1))
-        first = body.argmax(axis=-1)[some]
-        last = body.shape[-1] - 1 - body[..., ::-1].argmax(axis=-1)[some]
-        cells = [*(np.tile(index, 2) for index in some), np.concatenate([first, last])]
+        rows = np.nonzero(body.any(axis=-1))
+        first = body.argmax(axis=-1)[rows]
+        last = body.shape[-1] - 1 - body[..., ::-1].argmax(axis=-1)[rows]
+        cells = [*(np.tile(index, 2) for index in rows), np.concatenate([first, last])]
         return [c + n for c, n in zip(cells, self.first, strict=True)]
 
     def body_block(self, sublattice: int) -> Block | None:
-        """The smallest block that holds the body's particles of that sublattice, if any."""
-        found = bounds(self.kind[sublattice] == FOLLOWER)
-        return Block(sublattice, *found) if found else None
+        """Return the smallest block with all particles of the body of a sublattice, or None."""
+        ends = bounds(self.kind[sublattice] == FOLLOWER)
+        return Block(sublattice, *ends) if ends else None
 
 
 def positions(cell: Cell, s: int | Indices, *cells: Indices) -> Any:
-    """Sublattice s in the repeat cell (m, n), from site (0, 0): at + m·a + n·b."""
+    """Return the positions of sublattice s in repeat cells (m, n), at + m·a + n·b, from site (0,
+    0).
+    """
     at = np.array([site.at for site in cell.sites])
     return vector(at[s, axis] + part for axis, part in enumerate(cell.shift(cells)))
 
 
 def cells_of_sites(cell: Cell, *site: Indices) -> tuple[Indices, ...]:
-    """(sublattice, repeat cell, repeat cell) of the sites (i, j); sublattice -1 at a hole."""
-    within = tuple(i % p for i, p in zip(site, cell.period, strict=True))
-    return sublattices(cell)[within], *(i // p for i, p in zip(site, cell.period, strict=True))
+    """Return sublattice and repeat cell of the sites (i, j); sublattice -1 at a hole."""
+    remainder = tuple(i % p for i, p in zip(site, cell.period, strict=True))
+    return sublattices(cell)[remainder], *(i // p for i, p in zip(site, cell.period, strict=True))
 
 
 def sublattices(cell: Cell) -> Indices:
-    """(period, period): the sublattice of each index of the cell, -1 where it has no site."""
-    found = np.full(cell.period, -1, np.intp)
+    """Return the sublattice of each index of the cell, (period, period), -1 at a hole."""
+    result = np.full(cell.period, -1, np.intp)
     for s, site in enumerate(cell.sites):
-        found[site.index] = s
-    return found
+        result[site.index] = s
+    return result

@@ -52,7 +52,7 @@ class Guiding:
     def __init__(self, scene: Scene, step: int) -> None:
         guidance = Guidance(scene)
         self.guided = guided = guidance.at(step)
-        self.free = np.eye(scene.axes) * ~guided.led.T[:, None]
+        self.free = np.eye(scene.axes) * ~guided.lead_axes.T[:, None]
         self.turns = self.free + guidance.shares(guided)
 
     def __bool__(self) -> bool:
@@ -316,7 +316,7 @@ class _Assembly:
         if scene.loads:
             moves = moves + self._load_moves(place)
         source, members = (solver.relaxation * moves).ravel(), (self._followers, self._leaders)
-        axis, guided_number = np.nonzero(self._guiding.guided.led)
+        axis, guided_number = np.nonzero(self._guiding.guided.lead_axes)
         unknown = self._unknown[self._guiding.guided.place[guided_number]]
         couplings_by_source = self._current, self._previous, self._leader, self._frame_leader
         return StepOperator(

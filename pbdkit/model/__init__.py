@@ -1,3 +1,3 @@
-"""The experiment: read, checked, and kept with the places where it was written."""
+"""Experiments: reading and validating files, with the position of every value in its file."""
 
 from __future__ import annotations

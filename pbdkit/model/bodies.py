@@ -1,8 +1,7 @@
-"""Bodies: a signed distance to an outline, and the sites inside; the family of shapes with an
-outline of their own and of those made of others.
+"""Shapes of bodies, by the signed distance from an outline.
 
-A site belongs to the body where the signed distance is at most 1e-9 of a lattice constant, so that
-sites on the outline belong whatever the rounding (model.md, section 3).
+A site belongs to a body if its signed distance is at most 1e-9 of a lattice constant, so that sites
+on the outline are included independent of rounding (model.md, section 3).
 """
 
 from __future__ import annotations
@@ -23,14 +22,18 @@ from pbdkit.plugin import Component
 from pbdkit.plugin.units import LENGTH, Place
 
 Floats = NDArray[np.float64]
+"""Type of arrays of double precision."""
 Count = Annotated[int, Field(ge=1, le=2**31)]
+"""Type of a number of sites along an axis."""
 Positive = Annotated[float, Field(gt=0.0, le=1e100), LENGTH]
+"""Type of a positive length."""
 Vertices = Annotated[tuple[Place, ...], Field(strict=False, min_length=3, max_length=100_000)]
+"""Type of the vertices of a polygon."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """The rectangle around a body: in coordinates, or in site indices for a grid."""
+    """Bounding box of a body, in coordinates or, for a grid, in site indices."""
 
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -39,52 +42,60 @@ class Box:
 
 @dataclass(frozen=True)
 class Sites:
-    """Sites by `index` (i, j) and by the place where they lie, `at`; arrays of one shape."""
+    """Sites by `index` (i, j) and position `at`, as arrays of one shape."""
 
     index: Sequence[NDArray[np.signedinteger[Any]]]
     at: Sequence[Floats]
 
 
 class Body(Component):
-    """An outline that is filled with the sites of a lattice."""
+    """Body that is filled with the sites of a lattice."""
 
     @abstractmethod
     def boxes(self) -> list[Box]:
-        """Rectangles that hold the body together."""
+        """Return boxes whose union contains the body."""
 
     @abstractmethod
     def distance(self, sites: Sites) -> Floats:
-        """The signed distance to the outline, negative inside; only its sign and its value near
-        zero need be right."""
+        """Return the signed distance from the outline, negative inside.
+
+        Only the sign and the values near zero need to be exact.
+
+        Parameters
+        ----------
+        sites
+            Sites at which the distance is evaluated.
+        """
 
     def exaggerates(self) -> bool:
-        """Whether `distance` can be more than the way to the outline."""
+        """Return whether `distance` can exceed the distance from the outline."""
         return False
 
 
 CORNER = dict.fromkeys(("centre", "center"), "`origin` is its lower left corner")
+"""Hints for keys of bodies that are placed by their lower left corner."""
 
 
 class Grid(Body):
-    """`columns` × `rows` sites from (0, 0)."""
+    """Grid of `columns` × `rows` sites from site (0, 0)."""
 
     type: Literal["grid"] = "grid"
     columns: Count
     rows: Count
 
     def boxes(self) -> list[Box]:
-        """Site (0, 0) to (columns - 1, rows - 1)."""
+        """Return the box from site (0, 0) to site (columns - 1, rows - 1)."""
         return [Box((0, 0), (self.columns - 1, self.rows - 1), in_sites=True)]
 
     def distance(self, sites: Sites) -> Floats:
-        """-∞ for its sites, ∞ for others: it has no outline, near which rounding would decide."""
+        """Return -∞ at the sites of the grid and ∞ elsewhere; a grid has no outline."""
         i, j = sites.index
         inside = (i >= 0) & (i < self.columns) & (j >= 0) & (j < self.rows)
         return np.where(inside, -np.inf, np.inf)
 
 
 class Rectangle(Body):
-    """`width` × `height` from `origin`, its lower left corner."""
+    """Rectangle `width` × `height` with the lower left corner `origin`."""
 
     type: Literal["rectangle"] = "rectangle"
     width: Positive
@@ -94,34 +105,34 @@ class Rectangle(Body):
     _elsewhere: ClassVar[Mapping[str, str]] = CORNER
 
     def boxes(self) -> list[Box]:
-        """Itself."""
+        """Return the rectangle."""
         x, y = self.origin
         return [Box((x, y), (x + self.width, y + self.height))]
 
     def distance(self, sites: Sites) -> Floats:
-        """The larger of the distances to the middle, less half the side."""
+        """Return the larger of the distances from both centre lines minus half the sides."""
         (x, y), (left, low), w, h = sites.at, self.origin, self.width / 2, self.height / 2
         return np.maximum(np.abs(x - (left + w)) - w, np.abs(y - (low + h)) - h)
 
 
 class Disc(Body):
-    """All within `radius` of `centre`."""
+    """Disc of `radius` around `centre`."""
 
     type: Literal["disc"] = "disc"
     radius: Positive
     centre: Place
 
     def boxes(self) -> list[Box]:
-        """The square around it."""
+        """Return the square around the disc."""
         return [_square(self.centre, self.radius)]
 
     def distance(self, sites: Sites) -> Floats:
-        """The distance from the centre, less the radius."""
+        """Return the distance from the centre minus the radius."""
         return _from(self.centre, sites) - self.radius
 
 
 class Ring(Body):
-    """All from `inner` to `outer` of `centre`."""
+    """Ring between the radii `inner` and `outer` around `centre`."""
 
     type: Literal["ring"] = "ring"
     inner: Positive
@@ -135,17 +146,17 @@ class Ring(Body):
         return self
 
     def boxes(self) -> list[Box]:
-        """The square around it."""
+        """Return the square around the ring."""
         return [_square(self.centre, self.outer)]
 
     def distance(self, sites: Sites) -> Floats:
-        """To the nearer of both circles."""
+        """Return the signed distance from the nearer circle."""
         r = _from(self.centre, sites)
         return np.maximum(r - self.outer, self.inner - r)
 
 
 class Polygon(Body):
-    """The inside of a simple polygon, given by its `vertices` in order."""
+    """Interior of a simple polygon with the `vertices` in order."""
 
     type: Literal["polygon"] = "polygon"
     vertices: Vertices
@@ -168,12 +179,12 @@ class Polygon(Body):
         return Outline(self.vertices)
 
     def boxes(self) -> list[Box]:
-        """From the smallest to the largest coordinates."""
+        """Return the box from the smallest to the largest coordinates."""
         x, y = zip(*self.vertices, strict=True)
         return [Box((min(x), min(y)), (max(x), max(y)))]
 
     def distance(self, sites: Sites) -> Floats:
-        """To the boundary, with the sign of containment."""
+        """Return the distance from the boundary, with the sign of containment."""
         import shapely
 
         outline = self._outline()
@@ -185,8 +196,11 @@ class Polygon(Body):
 
 
 class Dogbone(Body):
-    """A tensile specimen along x: heads of `width`, a gauge of `gauge_length` × `gauge_width` in
-    the middle, and fillets of `radius` between them. `origin` is the lower left corner."""
+    """Tensile specimen along x.
+
+    Heads of `width`, a gauge of `gauge_length` × `gauge_width` in the middle, and fillets of
+    `radius` between them. `origin` is the lower left corner of the specimen.
+    """
 
     type: Literal["dogbone"] = "dogbone"
     length: Positive
@@ -205,33 +219,33 @@ class Dogbone(Body):
         if self.gauge_length + 2 * self._fillet() > self.length:
             raise ValueError(
                 f"gauge_length and two fillets of {self._fillet():g} exceed the length "
-                f"{self.length:g}: lengthen it, or make the radius smaller"
+                f"{self.length:g}; increase the length, or decrease the radius"
             )
         return self
 
     def _fillet(self) -> float:
-        """The length along x over which the width grows from the gauge's to the heads'."""
+        """Return the length of a fillet along x."""
         rise = min((self.width - self.gauge_width) / 2, self.radius)
         return math.sqrt(self.radius**2 - (self.radius - rise) ** 2)
 
     def boxes(self) -> list[Box]:
-        """`length` × `width`."""
+        """Return the box `length` × `width`."""
         x, y = self.origin
         return [Box((x, y), (x + self.length, y + self.width))]
 
     def distance(self, sites: Sites) -> Floats:
-        """Above half the width at that x, or beyond the ends."""
+        """Return the distance along y from the outline, or the distance beyond the ends."""
         (x, y), (left, low) = sites.at, self.origin
         x, y = np.abs(x - (left + self.length / 2)), np.abs(y - (low + self.width / 2))
         along = np.clip(x - self.gauge_length / 2, 0.0, self.radius)
         arc = self.gauge_width / 2 + self.radius - np.sqrt(self.radius**2 - along**2)
-        past = x - self.gauge_length / 2 >= self._fillet() * (1 - 1e-12)
-        half = np.where(past, self.width / 2, np.minimum(arc, self.width / 2))
-        beyond: Floats = np.maximum(y - half, x - self.length / 2)
-        return beyond
+        is_head = x - self.gauge_length / 2 >= self._fillet() * (1 - 1e-12)
+        half = np.where(is_head, self.width / 2, np.minimum(arc, self.width / 2))
+        distance: Floats = np.maximum(y - half, x - self.length / 2)
+        return distance
 
     def exaggerates(self) -> bool:
-        """It is taken along y, across steep fillets too."""
+        """Return True: distances are measured along y, also at steep fillets."""
         return True
 
 
@@ -247,71 +261,78 @@ def _from(centre: Place, sites: Sites) -> Floats:
 
 
 class Composed(Body):
-    """Common to the bodies that are made of others."""
+    """Base class of bodies that are composed of others."""
 
     of: Bodies
 
     def exaggerates(self) -> bool:
-        """Where a part does."""
+        """Return whether the distance of a part can exceed the distance from its outline."""
         return any(part.exaggerates() for part in self.of)
 
 
 class Union(Composed):
-    """All that lies in one of its parts."""
+    """Union of bodies."""
 
     type: Literal["union"] = "union"
 
     def boxes(self) -> list[Box]:
-        """Those of all parts."""
+        """Return the boxes of all parts."""
         return [box for part in self.of for box in part.boxes()]
 
     def distance(self, sites: Sites) -> Floats:
-        """The smallest."""
+        """Return the smallest distance."""
         return reduce(np.minimum, (part.distance(sites) for part in self.of))
 
 
 class Intersection(Composed):
-    """All that lies in every part."""
+    """Intersection of bodies."""
 
     type: Literal["intersection"] = "intersection"
 
     def boxes(self) -> list[Box]:
-        """A grid's own where a part is one; else what the boxes of all parts share."""
-        every = [part.boxes() for part in self.of]
-        grids = [boxes for boxes in every if len(boxes) == 1 and boxes[0].in_sites]
-        outlines = [_hull(boxes) for boxes in every if not any(box.in_sites for box in boxes)]
+        """Return the box of a grid if one is a part, otherwise the intersection of the boxes of all
+        parts.
+        """
+        boxes_of_parts = [part.boxes() for part in self.of]
+        grids = [boxes for boxes in boxes_of_parts if len(boxes) == 1 and boxes[0].in_sites]
+        outlines = [
+            _hull(boxes) for boxes in boxes_of_parts if not any(box.in_sites for box in boxes)
+        ]
         if grids or not outlines:
-            return (grids or every)[0]
+            return (grids or boxes_of_parts)[0]
         low = np.max([box.low for box in outlines], axis=0)
         high = np.min([box.high for box in outlines], axis=0)
         return [Box(tuple(low), tuple(np.maximum(low, high)))]
 
     def distance(self, sites: Sites) -> Floats:
-        """The largest."""
+        """Return the largest distance."""
         return reduce(np.maximum, (part.distance(sites) for part in self.of))
 
 
 class Difference(Composed):
-    """The first part less the others; sites on the outline of what is cut out stay."""
+    """First body without the others; sites on the outline of the others remain."""
 
     type: Literal["difference"] = "difference"
 
     def boxes(self) -> list[Box]:
-        """Those of the first part."""
+        """Return the boxes of the first part."""
         return self.of[0].boxes()
 
     def distance(self, sites: Sites) -> Floats:
-        """The largest of the first distance and the others' negatives."""
-        first, *others = (part.distance(sites) for part in self.of)
-        return reduce(np.maximum, (-other for other in others), first)
+        """Return the maximum of the first distance and the negative distances of the others."""
+        first, *rest = (part.distance(sites) for part in self.of)
+        return reduce(np.maximum, (-other for other in rest), first)
 
 
 def _hull(boxes: list[Box]) -> Box:
-    """The box around some boxes."""
+    """Return the box around several boxes."""
     low = np.min([box.low for box in boxes], axis=0)
     return Box(tuple(low), tuple(np.max([box.high for box in boxes], axis=0)))
 
 
 BODIES = (Grid, Rectangle, Disc, Ring, Polygon, Dogbone, Union, Intersection, Difference)
+"""Classes of bodies."""
 AnyBody = Annotated[SerializeAsAny[Body], closed_part(Body, *BODIES)]
+"""Type of a body in an experiment."""
 Bodies = Annotated[tuple[AnyBody, ...], Field(strict=False, min_length=1)]
+"""Type of the parts of a composed body."""

@@ -1,5 +1,7 @@
-"""Boundary and initial conditions of an experiment: leader groups and their selections (model.md,
-section 1), loads, obstacles, cuts in time, and the initial state.
+"""Boundary and initial conditions of an experiment.
+
+Leader groups and their selections (model.md, section 1), loads, obstacles, cuts, and the initial
+state.
 """
 
 from __future__ import annotations
@@ -32,47 +34,72 @@ from pbdkit.plugin.units import LENGTH, Place
 
 
 class Cut(Strict):
-    """A straight cut: the bonds that cross it are broken at the beginning of step `at`, those to
-    the frame too; 0 is before the first step."""
+    """Straight cut: bonds that cross it are broken at the beginning of step `at`.
+
+    Bonds to frame points are included. `at: 0` is before the first step.
+    """
 
     from_: Place = Field(alias="from", description="One end of the cut.", examples=[[0.0, 4.5]])
-    to: Place = Field(description="Its other end.", examples=[[5.0, 4.5]])
+    to: Place = Field(description="Other end of the cut.", examples=[[5.0, 4.5]])
     at: Annotated[int, Field(ge=0, lt=2**31)] = Field(
-        0, description="The step at whose beginning it is made; 0: before the first."
+        0, description="Step at whose beginning the cut is made; 0 is before the first step."
     )
 
     @model_validator(mode="after")
     def _has_length(self) -> Self:
         if self.from_ == self.to:
-            raise fault("is the point that the cut comes from; move one of the two", key="to")
+            raise fault("both ends of the cut are the same point; move one of them", key="to")
         return self
 
     @property
     def segment(self) -> Segment:
-        """Its two ends."""
+        """End points of the cut."""
         return self.from_, self.to
 
 
 Floats = NDArray[np.floating[Any]]
+"""Type of arrays of floating-point numbers."""
 Flags = NDArray[np.bool_]
+"""Type of arrays of truth values."""
 Share = Annotated[float, Field(ge=-1e100, le=1e100)]
+"""Type of a component of a displacement gradient."""
 Shares = Annotated[tuple[Share, Share], Field(strict=False)]
+"""Type of a row of a displacement gradient."""
 Shift = Annotated[tuple[Annotated[Share, LENGTH], Annotated[Share, LENGTH]], Field(strict=False)]
+"""Type of a displacement."""
 Gradient = Annotated[tuple[Shares, Shares], Field(strict=False)]
+"""Type of a displacement gradient."""
 
 
 class Initial(Component):
-    """The displacements of the body at time 0; nothing has moved before, and the frame follows."""
+    """Initial displacements of the body at time 0.
+
+    Initial velocities are zero, and frame points follow the body.
+    """
 
     at_rest: ClassVar[bool] = False
-    """Whether everything starts where it rests; `displacement` is then not asked."""
+    """Whether the body starts at rest in the reference configuration."""
     is_drawn: ClassVar[bool] = False
-    """Whether it takes numbers from the generator."""
+    """Whether the displacements are random."""
 
     @abstractmethod
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
-        """u of the body particles at X, (particle, axis), in the order of their numbers; `leads`
-        marks the leaders of step 1."""
+        """Return the initial displacements of the body particles.
+
+        Parameters
+        ----------
+        X
+            Reference positions in the order of the particle numbers, (particle, axis).
+        leads
+            Mask of the leaders of step 1, (particle,).
+        generator
+            Random number generator.
+
+        Returns
+        -------
+        NDArray
+            Displacements, (particle, axis).
+        """
 
 
 class Reference(Initial):
@@ -83,13 +110,16 @@ class Reference(Initial):
     at_rest: ClassVar[bool] = True
 
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
-        """Zeros."""
+        """Return zeros."""
         return np.zeros_like(X)
 
 
 class Noise(Initial):
-    """Every follower starts off its site by up to ±`amplitude` along each axis, uniformly, drawn
-    from the experiment's seed in the order of the numbers; leaders of step 1 start on theirs."""
+    """Followers start with a random displacement within ±`amplitude` along each axis.
+
+    Displacements are uniform, drawn from the seed of the experiment in the order of the particle
+    numbers. Leaders of step 1 start at their sites.
+    """
 
     type: Literal["noise"] = "noise"
     amplitude: Annotated[float, Field(ge=0.0, le=1e100), LENGTH]
@@ -97,33 +127,35 @@ class Noise(Initial):
     is_drawn: ClassVar[bool] = True
 
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
-        """Uniform in [-amplitude, amplitude)."""
+        """Return random displacements, uniform in [-amplitude, amplitude)."""
         drawn = generator.uniform(-self.amplitude, self.amplitude, X.shape)
         return np.where(leads[:, None], 0.0, drawn)
 
 
 class Affine(Initial):
-    """The body starts deformed: u = gradient · X + shift, leaders included."""
+    """The body starts with the deformation u = gradient · X + shift, leaders included."""
 
     type: Literal["affine"] = "affine"
     gradient: Gradient
     shift: Shift = (0.0, 0.0)
 
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
-        """u_a = Σ_b gradient[a][b] X_b + shift_a."""
+        """Return u_a = Σ_b gradient[a][b] X_b + shift_a."""
         (xx, xy), (yx, yy) = self.gradient
         x, y = X.T
         return np.stack([xx * x + xy * y + self.shift[0], yx * x + yy * y + self.shift[1]], axis=1)
 
 
 AnyInitial = Annotated[SerializeAsAny[Initial], closed_part(Initial, Reference, Noise, Affine)]
+"""Type of the initial state in an experiment."""
 
 
 Axes = Annotated[tuple[Literal["x", "y"], ...], Field(strict=False, min_length=1)]
+"""Type of a list of axes."""
 
 
 class Driven(Strict):
-    """Common to what a motion drives from step `from` to step `until`, both included."""
+    """Base class of what moves by a motion from step `from` to step `until`, both included."""
 
     motion: AnyMotion
     from_: Annotated[int, Field(ge=1, alias="from")] = 1
@@ -136,20 +168,21 @@ class Driven(Strict):
         return self
 
     def leads(self, step: int) -> bool:
-        """Whether it is driven during that step."""
+        """Return whether the motion is active during a step."""
         return self.from_ <= step and (self.until is None or step <= self.until)
 
     def last(self, steps: int) -> int:
-        """The last step of a run of `steps` in which it is driven."""
+        """Return the last step of a run of `steps` in which the motion is active."""
         return steps if self.until is None else min(self.until, steps)
 
 
 class LeaderGroup(Driven):
     """Particles that lead from step `from` to step `until`, both included, and follow otherwise.
 
-    The motion counts its steps from `from` and starts where the particle then is. With `axes` the
-    particles lead along these, and follow along the others. `clamped` leaders prescribe their
-    directions too, which turn with the motion; others turn freely.
+    The motion counts its steps from `from` and starts at the current positions of the particles.
+    With `axes` the particles lead along these axes only, and follow along the others. Leaders that
+    are `clamped` have prescribed directions, which rotate with the motion; otherwise directions are
+    free.
     """
 
     select: Selection
@@ -159,25 +192,25 @@ class LeaderGroup(Driven):
     @model_validator(mode="after")
     def _axes_once(self) -> Self:
         if self.axes and len({*self.axes}) < len(self.axes):
-            raise ValueError(f"axes name one twice: {', '.join(self.axes)}")
+            raise ValueError(f"axes has an axis twice: {', '.join(self.axes)}; list each once")
         return self
 
     @model_serializer(mode="wrap")
     def _as_written(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Who leads along all axes says nothing of them."""
-        found: dict[str, Any] = serialize(self)
+        """Serialize without `axes` if the group leads along all axes."""
+        result: dict[str, Any] = serialize(self)
         if self.axes is None:
-            found.pop("axes", None)
-        return found
+            result.pop("axes", None)
+        return result
 
 
 class Load(Strict):
     """Forces on selected particles from step `from` to step `until`, both included.
 
-    `force` is what acts on all of them together, in units of Young's modulus, thickness and lattice
-    unit. Particles on a line share it by the length that falls to each, others equally.
-    `body_force` acts on a unit of area, in units of Young's modulus and thickness over lattice
-    unit. Each of the two may be a course in time. Followers are moved by it; leaders carry it.
+    `force` is the total force, in units of Young's modulus, thickness and lattice unit. Particles
+    on a line share it by tributary length, other particles equally. `body_force` is a force per
+    area, in units of Young's modulus and thickness over lattice unit. Either can be time-dependent.
+    Loads act on followers; leaders transmit them to their support.
     """
 
     select: Selection
@@ -199,43 +232,46 @@ class Load(Strict):
         return self
 
     def force_at(self, moment: float) -> NDArray[np.float64]:
-        """(axis,): the force at a moment, in all or of a unit of area."""
-        forces = [at(each, moment) for each in self.force or self.body_force or ()]
+        """Return the total force, or the force per area, at a moment, (axis,)."""
+        forces = [at(component, moment) for component in self.force or self.body_force or ()]
         return 0.0 + self.amplitude(moment) * np.array(forces)
 
     @property
     def courses(self) -> list[Course[float]]:
-        """Of the forces that change while it acts."""
+        """Time-dependent components of the force."""
         forces = self.force or self.body_force or ()
-        return [each for each in forces if isinstance(each, Course)]
+        return [component for component in forces if isinstance(component, Course)]
 
     def amplitude(self, moment: float) -> float:
-        """The share of the force that acts at the end of a step, or at a moment within it, where it
-        comes and goes little by little; linear between whole steps."""
-        come = min(max(moment - self.from_ + 1, 0.0), 1.0)
-        gone = 0.0 if self.until is None else min(max(moment - self.until, 0.0), 1.0)
-        return come - gone
+        """Return the fraction of the force at the end of a step, or at a moment within it.
+
+        Within the steps in which the load begins and ends it is linear.
+        """
+        start = min(max(moment - self.from_ + 1, 0.0), 1.0)
+        end = 0.0 if self.until is None else min(max(moment - self.until, 0.0), 1.0)
+        return start - end
 
     def last(self, steps: int) -> int:
-        """The last step of a run of `steps` in which it acts."""
+        """Return the last step of a run of `steps` in which the load acts."""
         return steps if self.until is None else min(self.until, steps)
 
     def changes(self) -> tuple[int, ...]:
-        """The steps in which it begins and ceases to act."""
+        """Return the steps in which the load begins and ceases to act."""
         return (self.from_,) if self.until is None else (self.from_, self.until + 1)
 
 
 NO_OBSTACLES = {
-    "grid": "a grid is sites of the body's lattice and has no outline; take a rectangle",
-    "dogbone": "a dogbone is no obstacle; take a polygon along its outline",
-    "union": "a union is no obstacle; give each of its parts as an obstacle of its own",
-    "intersection": "an intersection is no obstacle; take a polygon along its outline",
-    "difference": "a difference is no obstacle; take a polygon along its outline",
+    "grid": "a grid has no outline and cannot be an obstacle; use a rectangle",
+    "dogbone": "a dogbone cannot be an obstacle; use a polygon along its outline",
+    "union": "a union cannot be an obstacle; use one obstacle for each part",
+    "intersection": "an intersection cannot be an obstacle; use a polygon along its outline",
+    "difference": "a difference cannot be an obstacle; use a polygon along its outline",
 }
+"""Messages for shapes that cannot be obstacles, by type."""
 
 
 class HalfPlane(Strict):
-    """All behind the line through `point`, seen along `normal`, which points into free space."""
+    """Half-plane behind the line through `point` with the `normal`, which points outward."""
 
     point: Place
     normal: Pair
@@ -243,12 +279,12 @@ class HalfPlane(Strict):
     @model_validator(mode="after")
     def _has_direction(self) -> Self:
         if not 1e-100 < math.hypot(*self.normal) < 1e100:
-            raise ValueError("the normal has no direction: give a vector that is not [0, 0]")
+            raise ValueError("the normal has no direction; give a vector other than [0, 0]")
         return self
 
 
 class Facing(Strict):
-    """A half-plane as a shape."""
+    """Half-plane as the shape of an obstacle."""
 
     half_plane: HalfPlane
 
@@ -263,7 +299,7 @@ def _shape(value: Any, info: ValidationInfo) -> Any:
         return Facing.model_validate(value, context=info.context)
     if isinstance(value, dict) and (kind := str(value.get("type"))) in NO_OBSTACLES:
         raise fault(NO_OBSTACLES[kind], key="type")
-    build: Any = _bodies.func  # pydantic's type allows for a function that is given no info
+    build: Any = _bodies.func  # pydantic's type includes functions without `info`
     return build(value, info)
 
 
@@ -271,11 +307,14 @@ AnyShape = Annotated[
     SerializeAsAny[Disc | Ring | Rectangle | Polygon | Facing],
     BeforeValidator(_shape, json_schema_input_type=Disc | Ring | Rectangle | Polygon | Facing),
 ]
+"""Type of the shape of an obstacle."""
 
 
 class Obstacle(Driven):
-    """A rigid body that is there from step `from` to step `until`, both included, and moves as its
-    motion says, counted from `from` and from where the shape is given."""
+    """Rigid obstacle that exists from step `from` to step `until`, both included.
+
+    Its motion counts steps from `from` and starts at the position of the shape.
+    """
 
     shape: AnyShape
     motion: AnyMotion = Field(default_factory=Hold)
@@ -284,9 +323,8 @@ class Obstacle(Driven):
     def _rigid(self) -> Self:
         if isinstance(self.motion, (Measured, Newton)):
             raise fault(
-                f"an obstacle is rigid and goes as prescribed, and '{self.motion.type}' moves each "
-                "particle by itself; take hold, velocity, displace, path, table, rotation or "
-                "oscillation",
+                f"an obstacle is rigid, but '{self.motion.type}' moves each particle individually; "
+                "use hold, velocity, displace, path, table, rotation or oscillation",
                 key="motion",
             )
         return self

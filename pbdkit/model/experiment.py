@@ -1,5 +1,6 @@
-"""The experiment: a validated description of a scene and of the run, with the checks that span
-several of its parts.
+"""Experiment: a validated description of a scene and of the run.
+
+Includes the checks that involve several parts.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ from pbdkit.plugin import (
 from pbdkit.plugin.component import Strict, as_values
 from pbdkit.plugin.discovery import Retired, blaming, retired_parts, with_successors
 from pbdkit.plugin.fields import (
-    MOST_VALUES,
+    MAX_VALUES,
     RESERVED,
     OfPlace,
     RandomField,
@@ -67,18 +68,19 @@ from pbdkit.plugin.schedule import Course
 from pbdkit.plugin.units import Scales, Units, given_by_units, of_one_material
 
 Key = str | tuple[str, ...]
+"""Type of a field, or of the path of a field."""
 
 
-def clashes_of(asked: Any) -> Iterator[tuple[Key, str]]:
-    """The fields of an experiment at which parts clash, each with a message."""
-    yield from ((key, text) for key, clashes, text in _looked_at(asked) if clashes)
+def clashes_of(experiment: Any) -> Iterator[tuple[Key, str]]:
+    """Generate the fields at which parts of an experiment are incompatible, each with a message."""
+    yield from ((key, text) for key, clashes, text in _checks(experiment) if clashes)
     for field in ("rule", "fracture"):
-        for name, region, text in unknown_regions(getattr(asked, field), asked.regions):
+        for name, region, text in unknown_regions(getattr(experiment, field), experiment.regions):
             yield (field, name, region), text
-        yield from _drawn_from(field, getattr(asked, field))
-    for name, region in asked.regions.items():
+        yield from _drawn_from(field, getattr(experiment, field))
+    for name, region in experiment.regions.items():
         if any(box.in_sites for box in region.boxes()):
-            yield ("regions", name), "counts sites, and a region is a place: take a rectangle"
+            yield ("regions", name), "a grid counts sites and cannot be a region; use a rectangle"
 
 
 def _drawn_from(field: str, part: Any) -> Iterator[tuple[Key, str]]:
@@ -86,84 +88,86 @@ def _drawn_from(field: str, part: Any) -> Iterator[tuple[Key, str]]:
     for name in part.courses if draws else ():
         yield (
             (field, name),
-            f"'{part.type}' draws numbers from it before the first step, so that it cannot change; "
-            "give one number, or draw none",
+            f"'{part.type}' draws random numbers from it before the first step, so that it cannot "
+            "depend on time; give a single number, or remove the randomness",
         )
 
 
-def _looked_at(asked: Any) -> Iterator[tuple[Key, bool, str]]:
-    yield from _of_neighbours(asked)
-    yield from _of_events(asked)
-    yield from _of_forces(asked)
+def _checks(experiment: Any) -> Iterator[tuple[Key, bool, str]]:
+    yield from _neighbour_checks(experiment)
+    yield from _event_checks(experiment)
+    yield from _force_checks(experiment)
 
 
-def _of_neighbours(asked: Any) -> list[tuple[Key, bool, str]]:
-    """What needs bonds that last."""
-    anew, jumps = asked.neighbours.nearness() is not None, not asked.solver.makes_steps
-    settles = asked.stepping.settle is not None
+def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
+    """Check what requires permanent bonds."""
+    reevaluates = experiment.neighbours.nearness() is not None
+    jumps = not experiment.solver.makes_steps
+    settles = experiment.stepping.settle is not None
     return [
-        ("fracture", anew and asked.fracture.can_break,
-         "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
+        ("fracture", reevaluates and experiment.fracture.can_break,
+         "bonds cannot break if neighbours are re-evaluated, because bonds are not permanent; "
          "set neighbours.reevaluate: false or fracture: {type: none}"),
-        ("cuts", anew and bool(asked.cuts),
-         "bonds cannot be cut where neighbours are re-evaluated: there are no lasting bonds; "
-         "set neighbours.reevaluate: false, or leave cuts out"),
-        ("solver", anew and jumps,
-         "where neighbours are re-evaluated nothing tells where the steps lead; "
+        ("cuts", reevaluates and bool(experiment.cuts),
+         "bonds cannot be cut if neighbours are re-evaluated, because bonds are not permanent; "
+         "set neighbours.reevaluate: false, or remove cuts"),
+        ("solver", reevaluates and jumps,
+         "the limit of the steps is not defined if neighbours are re-evaluated; "
          "set neighbours.reevaluate: false or solver: {type: stepping}"),
-        ("solver", anew and settles,
-         "where neighbours are re-evaluated no distance from equilibrium is known; "
-         "set neighbours.reevaluate: false, or leave solver.settle out"),
-        ("loads", anew and bool(asked.loads),
-         "need neighbours that stay; set neighbours.reevaluate: false"),
+        ("solver", reevaluates and settles,
+         "the distance from equilibrium has no bound if neighbours are re-evaluated; "
+         "set neighbours.reevaluate: false, or remove solver.settle"),
+        ("loads", reevaluates and bool(experiment.loads),
+         "loads require fixed neighbours; set neighbours.reevaluate: false"),
     ]  # fmt: skip
 
 
-def _of_events(asked: Any) -> list[tuple[Key, bool, str]]:
-    """What comes after the run's last step, and where steps do not tell their end."""
-    last, late = max(asked.record.at or (0,)), max((cut.at for cut in asked.cuts), default=0)
-    jumps, settles = not asked.solver.makes_steps, asked.stepping.settle is not None
+def _event_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
+    """Check events after the last step, and components whose limit depends on the steps."""
+    last = max(experiment.record.at or (0,))
+    last_cut = max((cut.at for cut in experiment.cuts), default=0)
+    jumps, settles = not experiment.solver.makes_steps, experiment.stepping.settle is not None
     remembers, softens = (
-        isinstance(asked.rule, RenewsParticles),
-        isinstance(asked.fracture, (Softens, SoftensCells)),
+        isinstance(experiment.rule, RenewsParticles),
+        isinstance(experiment.fracture, (Softens, SoftensCells)),
     )
+    steps, rule = experiment.steps, experiment.rule
     return [
-        ("record", last > asked.steps, f"step {last} is beyond the run's {asked.steps}"),
-        ("record", asked.record.increments and not jumps,
-         "increments of load are those of an equilibrium; take solver: {type: equilibrium}, or "
-         "leave record.increments out"),
-        ("cuts", late > asked.steps, f"step {late} is beyond the run's {asked.steps}"),
+        ("record", last > steps, f"step {last} exceeds the number of steps, {steps}"),
+        ("record", experiment.record.increments and not jumps,
+         "increments of load exist only for an equilibrium; use solver: {type: equilibrium}, or "
+         "remove record.increments"),
+        ("cuts", last_cut > steps, f"step {last_cut} exceeds the number of steps, {steps}"),
         ("solver", settles and (remembers or softens),
-         f"'{(asked.rule if remembers else asked.fracture).type}' remembers, so that no distance "
-         "from equilibrium is known; leave solver.settle out"),
+         f"'{(rule if remembers else experiment.fracture).type}' depends on the history, so that "
+         "the distance from equilibrium has no bound; remove solver.settle"),
         ("solver", jumps and remembers,
-         f"the rule '{asked.rule.type}' remembers, so that where the steps lead depends on "
-         "all of them; take solver: {type: stepping}"),
+         f"the rule '{rule.type}' depends on the history, so that the limit of the steps depends "
+         "on all of them; use solver: {type: stepping}"),
         *(("solver", (jumps or settles) and not operation.rests,
-           f"'{operation.type}' may move particles that their rule leaves where they are, so that "
-           "no equilibrium is known; take solver: {type: stepping} without settle")
-          for operation in asked.operations),
+           f"'{operation.type}' can move particles at rest, so that the equilibrium is not known; "
+           "use solver: {type: stepping} without settle")
+          for operation in experiment.operations),
     ]  # fmt: skip
 
 
-def _of_forces(asked: Any) -> list[tuple[Key, bool, str]]:
-    """What masses, obstacles and loads ask for."""
-    rests = not asked.solver.makes_steps or asked.stepping.settle is not None
-    masses = any(isinstance(group.motion, Newton) for group in asked.leaders)
-    knows_forces = material_of(asked.rule) is not None
+def _force_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
+    """Check the requirements of masses and loads."""
+    rests = not experiment.solver.makes_steps or experiment.stepping.settle is not None
+    masses = any(isinstance(group.motion, Newton) for group in experiment.leaders)
+    has_forces, rule = material_of(experiment.rule) is not None, experiment.rule
     return [
         ("solver", masses and rests,
-         "leaders that move by Newton's law have no place at which they rest beforehand; take "
-         "solver: {type: stepping} without settle, or a load on followers"),
-        ("rule", masses and not knows_forces,
-         f"leaders that move by Newton's law need forces, and '{asked.rule.type}' knows none "
-         "with these parameters; take a calibrated rule: elastic with poisson_ratio above -1, or "
-         "springs"),
-        ("loads", bool(asked.loads) and not (knows_forces and isinstance(asked.rule, Loadable)),
-         f"the rule '{asked.rule.type}' with these parameters knows no forces: it says where a "
-         "particle goes, and of no material how far a force would move it; take a calibrated "
-         "rule ('elastic' or 'strain-gradient' with poisson_ratio above -1, 'orthotropic', "
-         "'springs')"),
+         "leaders that move by Newton's law have no final position that is known before the run; "
+         "use solver: {type: stepping} without settle, or a load on followers"),
+        ("rule", masses and not has_forces,
+         f"leaders that move by Newton's law require forces, which '{rule.type}' with these "
+         "parameters does not define; use a calibrated rule: elastic with poisson_ratio above -1, "
+         "or springs"),
+        ("loads", bool(experiment.loads) and not (has_forces and isinstance(rule, Loadable)),
+         f"the rule '{rule.type}' with these parameters defines moves, but no forces and no "
+         "stiffness; use a calibrated rule ('elastic' or 'strain-gradient' with poisson_ratio "
+         "above -1, 'orthotropic', 'springs')"),
     ]  # fmt: skip
 
 
@@ -171,15 +175,15 @@ def _valid_name(name: str) -> str:
     words = name.split("/")
     if len(name) > 200 or ".." in name or not all(re.fullmatch(_WORD, word) for word in words):
         raise fault(
-            "may hold letters, digits, '.', '_', '-' and '/', no '..', and no part between slashes "
-            f"that is empty or begins with a dot; got {brief(name)}"
+            "may contain letters, digits, '.', '_', '-' and '/', but no '..', and no part between "
+            f"slashes that is empty or begins with a dot; got {brief(name)}"
         )
     return name
 
 
-def _known_version(version: int) -> int:
+def _supported_version(version: int) -> int:
     if version != 1:
-        raise fault(f"this pbdkit reads version 1, got {brief(version)}")
+        raise fault(f"this pbdkit supports version 1, got {brief(version)}")
     return version
 
 
@@ -187,48 +191,74 @@ _WORD = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
 Name = Annotated[
     str, AfterValidator(_valid_name), Field(json_schema_extra={"pattern": f"^{_WORD}(/{_WORD})*$"})
 ]
-Version = Annotated[int, AfterValidator(_known_version), Field(json_schema_extra={"const": 1})]
+"""Type of the name of an experiment."""
+Version = Annotated[int, AfterValidator(_supported_version), Field(json_schema_extra={"const": 1})]
+"""Type of the version of the format."""
 
 
 def _region(name: str) -> str:
     if name in RESERVED or not re.fullmatch(_WORD, name):
         raise fault(
-            f"a region's name may hold letters, digits, '.', '_' and '-', and be none of "
-            f"{', '.join(RESERVED)}; got {brief(name)}"
+            f"the name of a region may contain letters, digits, '.', '_' and '-', and must not be "
+            f"one of {', '.join(RESERVED)}; got {brief(name)}"
         )
     return name
 
 
 RegionName = Annotated[str, AfterValidator(_region)]
+"""Type of the name of a region."""
 
 
 Floats = NDArray[np.float64]
+"""Type of arrays of double precision."""
 SLACK = 1e-9
-"""Of spacings: so far a body reaches beyond a place by rounding."""
+"""Rounding error of the extent of a body, relative to the spacing."""
 
 
 def sampled(part: TakesFields, lattice: Lattice, body: Body, seed: int, field: str) -> Any:
-    """The part at a field of the experiment with values in place of functions, and of random fields
-    from the seed, half a spacing apart: on the square and the rectangular lattice particles,
-    middles of bonds and of cells are places of the grid.
+    """Replace functions and random fields of a component by values on a grid of half the spacing.
 
-    Raises ValidationError where the part does not take a value, PydanticCustomError where none can
-    be drawn.
+    On the square and the rectangular lattice, particles and the midpoints of bonds and of cells are
+    points of the grid.
+
+    Parameters
+    ----------
+    part
+        Component with spatially varying parameters.
+    lattice, body
+        Lattice and body of the experiment.
+    seed
+        Seed of random fields.
+    field
+        Field of the component in the experiment.
+
+    Raises
+    ------
+    ValidationError
+        If the component does not accept a value.
+    PydanticCustomError
+        If a random field cannot be generated.
     """
-    found: dict[str, Varying] = {}
+    values: dict[str, Varying] = {}
     for name, varying in part.varying.items():
         try:
             if isinstance(varying, OfPlace):
-                found[name] = varying.sampled(*_grid(lattice, body))
+                values[name] = varying.sampled(*_grid(lattice, body))
             elif isinstance(varying, RandomField):
-                found[name] = varying.drawn_at(*_grid(lattice, body), seed, field)
+                values[name] = varying.drawn_at(*_grid(lattice, body), seed, field)
         except ValueError as error:
             raise fault(str(error), key=(field, name)) from None
-    return part.with_more(**found) if found else part
+    return part.with_more(**values) if values else part
 
 
 def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:
-    """Raises ValueError for more places than a field takes, before they are made."""
+    """Return the coordinates of the grid along both axes.
+
+    Raises
+    ------
+    ValueError
+        If the grid has more points than a parameter can have values.
+    """
     cell = lattice.cell()
     steps = np.array(cell.vectors) / np.array(cell.period)[:, None]
     spacing = np.abs(np.diag(steps))
@@ -236,8 +266,8 @@ def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:
     origin = np.array(lattice.origin)
     low = np.floor((corners.min(axis=0) - origin) / spacing + SLACK)
     high = np.ceil((corners.max(axis=0) - origin) / spacing - SLACK)
-    if not (count := np.prod(2 * (high - low) + 1)) <= MOST_VALUES:
-        raise ValueError(f"{count:.3g} values are more than {MOST_VALUES}; make the body smaller")
+    if not (count := np.prod(2 * (high - low) + 1)) <= MAX_VALUES:
+        raise ValueError(f"{count:.3g} values exceed {MAX_VALUES}; use a smaller body")
     x, y = (
         o + s / 2 * np.arange(2 * a, 2 * b + 1)
         for o, s, a, b in zip(origin, spacing, low, high, strict=True)
@@ -246,14 +276,19 @@ def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:
 
 
 def _corners(box: Box, steps: Floats, lattice: Lattice) -> Floats:
-    """Of a rectangle around a body, in coordinates."""
+    """Return the corners of a box in coordinates."""
     corners = np.array(list(product(*zip(box.low, box.high, strict=True))), float)
     return corners @ steps + lattice.origin if box.in_sites else corners
 
 
 def renewed(parts: dict[str, Any], source: Source) -> tuple[dict[str, Any], Source, list[Retired]]:
-    """Return the parts with successors of what is retired, a source that holds them, and what was
-    retired."""
+    """Replace retired components by their successors.
+
+    Returns
+    -------
+    tuple
+        The parts, the source with these parts, and the retired components.
+    """
     retired = retired_parts(parts)
     if retired:
         parts = with_successors(parts)
@@ -262,27 +297,30 @@ def renewed(parts: dict[str, Any], source: Source) -> tuple[dict[str, Any], Sour
 
 
 def announce(retired: Iterable[Retired], source: Source, fields: Mapping[str, Any]) -> None:
-    """Warn of retired components that an experiment with these fields named.
+    """Warn of the retired components of an experiment.
 
-    Raises ExperimentError where particles are chosen by numbers, which are those of other
-    particles under the successor.
+    Raises
+    ------
+    ExperimentError
+        If particles are selected by numbers that a successor changes.
     """
-    for one in retired:
-        where = next(_numbered(fields), None) if one.renumbers else None
+    for component in retired:
+        where = next(_numbered(fields), None) if component.renumbers else None
+        field, successor = component.field, component.successor
         if where:
             text = (
-                f"its numbers are those of particles under {one.field} '{one.type}', which is "
-                f"retired; under '{one.successor}' particles have others: choose them by place, "
-                f"or by their new numbers with {one.field}: {{type: {one.successor}}}"
+                f"the numbers refer to particles under {field} '{component.type}', which is "
+                f"retired; under '{successor}' particles have other numbers: select them by "
+                f"position, or by their new numbers with {field}: {{type: {successor}}}"
             )
             error = ExperimentError(source.message(where, text), where)
             error.located = True
             raise error
-        warn_caller(source.message((one.field, "type"), one.advice), RetirementWarning)
+        warn_caller(source.message((field, "type"), component.advice), RetirementWarning)
 
 
 def _numbered(fields: Mapping[str, Any]) -> Iterator[tuple[str | int, ...]]:
-    """The fields that choose particles by their numbers."""
+    """Generate the fields that select particles by number."""
     for field in ("leaders", "loads"):
         for n, group in enumerate(fields[field]):
             if group.select.numbers:
@@ -293,7 +331,7 @@ def _numbered(fields: Mapping[str, Any]) -> Iterator[tuple[str | int, ...]]:
 
 
 def _declares_variables(part: Diagnostic) -> Diagnostic:
-    with blaming(part, "when asked what it measures"):
+    with blaming(part, "to declare what it measures"):
         as_values(part.variables(), "variables")
     return part
 
@@ -304,13 +342,14 @@ AnyDiagnostic = Annotated[
     AfterValidator(of_one_material),
     AfterValidator(_declares_variables),
 ]
+"""Type of a diagnostic in an experiment."""
 
 
 AnyOperation = Annotated[SerializeAsAny[ParticleOperation], open_part(ParticleOperation)]
 
 
 def _each(field: str, parts: Any) -> list[Any]:
-    """The components at a field, of which some list any number."""
+    """Return the components at a field, which can be a list."""
     return list(parts) if field in LISTS else [parts]
 
 
@@ -320,10 +359,16 @@ def _default(part: str) -> Any:
 
 
 class Experiment(Strict):
-    """A scene and what to do with it, checked as a whole: the same from a file, dict or objects.
+    """Experiment: a scene and its run, validated as a whole.
 
-    Raises ExperimentError, which names the field and the remedy, for anything that is not right,
-    and PluginError where a part is asked of a distribution that is missing or broken.
+    The same from a file, a dict or objects.
+
+    Raises
+    ------
+    ExperimentError
+        If the experiment is invalid; the message names the field and the remedy.
+    PluginError
+        If a component belongs to a distribution that is missing or broken.
     """
 
     version: Version = 1
@@ -351,15 +396,15 @@ class Experiment(Strict):
     solver: AnySolver = _default("stepping")
 
     @classmethod
-    def found_elsewhere(cls, key: str) -> str:
-        """Return the part that has the key."""
+    def key_hint(cls, key: str) -> str:
+        """Return a hint if the key belongs to a part of the experiment."""
         registry, closed = Registry(), {"body": BODIES, "solver": (Stepping, Equilibrium)}
-        known = {**closed, "record": (Record,)} | {
+        classes_by_field = {**closed, "record": (Record,)} | {
             field: tuple(registry.spellings(interface, installed=False))
             for field, interface in INTERFACES.items()
         }
-        for field, classes in known.items():
-            if key != "type" and any(key in each.known_keys() for each in classes):
+        for field, classes in classes_by_field.items():
+            if key != "type" and any(key in part.known_keys() for part in classes):
                 below = f"[{{{key}: ...}}]" if field in LISTS else f"{{{key}: ...}}"
                 return f"write it under `{field}`, as in `{field}: {below}`"
         return ""
@@ -379,21 +424,21 @@ class Experiment(Strict):
 
     @property
     def stepping(self) -> Stepping:
-        """How a step of it is made, whatever the solver."""
+        """Settings of a single step, for every solver."""
         return self.solver.stepping
 
     def records(self, step: int) -> bool:
-        """Whether that step is recorded."""
+        """Return whether a step is recorded."""
         return self.record.keeps(step, self.steps)
 
     @property
     def record_count(self) -> int:
-        """The number of recorded states, with an estimate of those at increments of load."""
-        between = self.solver.sought.increments if self.record.increments else 0
-        return self.record.count(self.steps) + between
+        """Number of recorded states, with an estimate of those at increments of load."""
+        increments = self.solver.equilibrium.increments if self.record.increments else 0
+        return self.record.count(self.steps) + increments
 
-    def next_wanted(self, step: int) -> int:
-        """The next step after `step` of which something is recorded."""
+    def next_recorded(self, step: int) -> int:
+        """Return the next step after `step` with a recorded state or diagnostic."""
         if any(d.every_step and not d.at_end for d in self.diagnostics):
             return step + 1
         return self.record.next_after(step, self.steps)
@@ -403,36 +448,44 @@ class Experiment(Strict):
     _registry: Registry = PrivateAttr()
 
     def __init__(self, **parts: Any) -> None:
-        self._validate(parts, Registry(), Source(beside=OF_PROGRAM))
+        self._validate(parts, Registry(), Source(files=OF_PROGRAM))
 
     @model_serializer(mode="wrap")
     def _with_origins(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Types that several distributions offer keep the name of theirs."""
-        found: dict[str, Any] = serialize(self)
-        if not found.keys() >= INTERFACES.keys():
-            return found  # of some fields alone
-        written = [each for field in INTERFACES for each in _each(field, found[field])]
-        for part, dumped in zip(self.components(), written, strict=True):
+        """Serialize with the distribution of types that several distributions provide."""
+        result: dict[str, Any] = serialize(self)
+        if not result.keys() >= INTERFACES.keys():
+            return result  # only some fields are serialized
+        parts = [part for field in INTERFACES for part in _each(field, result[field])]
+        for part, dumped in zip(self.components(), parts, strict=True):
             dumped["type"] = self._registry.name_of(part)
             if isinstance(part, TakesFields):
                 dumped |= part.in_place_of_numbers()
             for name in given_by_units(part):
                 if self.units and self.units.value(name):
-                    del dumped[name]  # there it is said
+                    del dumped[name]  # it is given by `units`
         for name in ("units", "regions", "operations"):
-            if not found[name]:
-                del found[name]
-        return found
+            if not result[name]:
+                del result[name]
+        return result
 
     @classmethod
     def build(cls, source: Source, components: Iterable[type[Component]] = ()) -> Self:
-        """The experiment of a source, with components handed over besides the installed ones."""
+        """Create an experiment from a source.
+
+        Parameters
+        ----------
+        source
+            Raw data with their places in a file.
+        components
+            Component classes in addition to the installed ones.
+        """
         experiment = cls.__new__(cls)
         experiment._validate(source.data, Registry(components), source)
         return experiment
 
     def of_parts(self, parts: dict[str, Any]) -> Self:
-        """The experiment of other parts, with the same components at hand."""
+        """Create an experiment from other parts, with the same component classes."""
         experiment = type(self).__new__(type(self))
         experiment._validate(parts, self._registry, Source())
         return experiment
@@ -443,17 +496,17 @@ class Experiment(Strict):
         Parameters
         ----------
         settings : mapping, or iterable of str
-            ``{"steps": 20, "rule": {"relaxation": 0.3}}`` changes these values and leaves all
-            others; a map with a `type` replaces the whole part. ``["steps=20"]`` does the same.
+            ``{"steps": 20, "rule": {"relaxation": 0.3}}`` changes these values only; a map with a
+            `type` replaces the whole part. ``["steps=20"]`` is equivalent.
 
         Raises
         ------
         ExperimentError
-            For a path that leads nowhere, and a value that is not right.
+            If a path does not exist, or a value is invalid.
         """
         source = replace(self.as_written(), name=self._source.name)
-        if source.beside.folder is None:
-            source.beside = OF_PROGRAM
+        if source.files.folder is None:
+            source.files = OF_PROGRAM
         changed = with_settings(source, settings, self.defaults())
         experiment = type(self).__new__(type(self))
         experiment._validate(changed.data, self._registry, changed)
@@ -461,17 +514,19 @@ class Experiment(Strict):
 
     @property
     def is_as_validated(self) -> bool:
-        """Whether its parts are those that were validated: `model_copy` replaces them unseen."""
+        """Whether all parts are those that were validated; `model_copy` replaces parts without
+        validation.
+        """
         return all(self._validated.get(name) is part for name, part in self.__dict__.items())
 
     def refuse_unvalidated(self) -> None:
-        """Raise ExperimentError where it is a copy with a part that is not right."""
+        """Raise ExperimentError if the experiment is a copy with an invalid part."""
         if not self.is_as_validated:
             self.of_parts(self.model_dump(mode="json", by_alias=True, warnings=False))
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
-        """The parts that a file may leave out, as it would write them."""
+        """Return the default parts, as a file would contain them."""
         fields = cls.model_fields.items()
         return {name: f.default for name, f in fields if isinstance(f.default, dict)}
 
@@ -483,71 +538,81 @@ class Experiment(Strict):
 
     @property
     def parts_bonds(self) -> bool:
-        """Whether bonds can come to be broken: torn by fracture, or cut."""
+        """Whether bonds can be torn by fracture, or cut."""
         return self.fracture.can_break or bool(self.cuts)
 
     @property
     def shows_bonds(self) -> bool:
-        """Whether the dataset has a table of bonds: fracture, a cut or a diagnostic uses it."""
+        """Whether the dataset has a table of bonds, for fracture, cuts or a diagnostic."""
         return self.parts_bonds or any("bonds" in d.needs for d in self.diagnostics)
 
     def materials(self) -> dict[str, Experiment]:
-        """The experiment with the rule as it is at each place that its fields tell apart, the same
-        everywhere; itself under no name where it has no field."""
+        """Return the experiment with each combination of spatially varying parameters of the rule.
+
+        Returns
+        -------
+        dict
+            Uniform experiments by label; the experiment itself with an empty label if no parameter
+            varies.
+        """
         fields = self.rule.varying
-        found: dict[str, Experiment] = {}
+        result: dict[str, Experiment] = {}
         for label in dict.fromkeys(label for field in fields.values() for label in field.samples):
             values = {n: f.samples.get(label, getattr(self.rule, n)) for n, f in fields.items()}
             rule = self.rule.with_values(**values)
-            found[label] = self.model_copy(update={"rule": rule})
-        return found or {"": self}
+            result[label] = self.model_copy(update={"rule": rule})
+        return result or {"": self}
 
     @property
     def courses(self) -> dict[tuple[str, str], Course[float]]:
-        """What changes in the course of the steps, by part and parameter; loads say it themselves.
-        In its field each parameter stands as it is in the end."""
+        """Time-dependent parameters, by part and parameter, without those of loads.
+
+        The fields of the experiment have the values at the end.
+        """
         parts = {"rule": self.rule, "fracture": self.fracture, "solver": self.solver}
         return {(f, n): course for f, part in parts.items() for n, course in part.courses.items()}
 
     def at(self, moment: float) -> Experiment:
-        """The experiment with its numbers as they are at the end of a step, or within it."""
+        """Return the experiment with its parameters at the end of a step, or within it."""
         return self.model_copy(update={f: getattr(self, f).at(moment) for f, _ in self.courses})
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the scene before it runs, and what is known of it."""
+        """Return the scene and its stability analysis for notebooks."""
         return str(import_module("pbdkit.plotting.notebook").experiment_html(self))
 
     def components(self) -> list[Component]:
-        """Every part of an open interface."""
-        return [each for field in INTERFACES for each in _each(field, getattr(self, field))]
+        """Return the parts of open interfaces."""
+        return [part for field in INTERFACES for part in _each(field, getattr(self, field))]
 
     def distributions(self) -> dict[str, str]:
-        """The distributions that the parts come from, with their versions."""
+        """Return the versions of the distributions of the components, by name."""
         return self._registry.versions(self.components())
 
     def as_written(self) -> Source:
-        """Return what can be changed and built again. With `units` that is what it was made of,
-        whose lengths may name a unit, where that holds plain values; else all of it in lattice
-        units."""
+        """Return the data from which the experiment can be created again.
+
+        With `units` these are the original data, whose lengths may have units, if they consist of
+        plain values; otherwise all parts in lattice units.
+        """
         if self.units and self._source.data is not None and self.is_as_validated:
             with suppress(TypeError, ValueError):
                 data = dict(json.loads(json.dumps(self._source.data)))
-                return Source(self.name, data, beside=self._source.beside)
+                return Source(self.name, data, files=self._source.files)
         return Source(self.name, self.model_dump(mode="json", by_alias=True))
 
     def located(self, error: ExperimentError) -> ExperimentError:
-        """The error with the place of its field in the file, once."""
+        """Return the error with the place of its field in the file."""
         if error.located:
             return error
-        found = type(error)(self._source.message(error.where, str(error)), error.where)
-        found.located = True
-        return found
+        result = type(error)(self._source.message(error.where, str(error)), error.where)
+        result.located = True
+        return result
 
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
         parts, source, retired = renewed(parts, source)
         try:
             units = Scales.model_validate({"units": parts.get("units")}).units
-            context = {"registry": registry, "beside": source.beside, "units": units}
+            context = {"registry": registry, "files": source.files, "units": units}
             self.__pydantic_validator__.validate_python(parts, self_instance=self, context=context)
         except ValidationError as error:
             raise report(error, source) from None
@@ -558,6 +623,6 @@ class Experiment(Strict):
 
 
 def given_classes(experiment: Experiment) -> tuple[type[Component], ...]:
-    """Those that the parts of an experiment are of."""
+    """Return the classes of components that were passed as Python objects."""
     types = experiment.distributions().get(GIVEN, "").split(", ")
     return tuple({type(part): None for part in experiment.components() if part.type in types})

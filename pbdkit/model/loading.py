@@ -1,6 +1,6 @@
-"""Experiments from what users give: a file, the name of a shipped one, a dict of parts, an object.
+"""Load experiments from a file, a shipped name, a dict of parts, or an object.
 
-Reading a file imports little, validating an experiment much: a wrong name is answered without.
+Modules for validation are imported only after the file is read.
 """
 
 from __future__ import annotations
@@ -29,9 +29,26 @@ def load_experiment(
     *,
     allow_outside: bool = False,
 ) -> Experiment:
-    """Return the experiment in a file, or the shipped one of that name, with settings applied.
+    """Return the experiment in a file, or the shipped experiment of that name, with settings
+    applied.
 
-    Raises ExperimentError and PluginError.
+    Parameters
+    ----------
+    name
+        Path of a file, or name of a shipped experiment.
+    settings
+        Values to change, as for `Experiment.with_settings`.
+    components
+        Component classes in addition to the installed ones.
+    allow_outside
+        Whether the experiment may refer to files outside its folder.
+
+    Raises
+    ------
+    ExperimentError
+        If the experiment is invalid.
+    PluginError
+        If a component is missing or fails.
     """
     source = read_experiment(name, allow_outside=allow_outside)
     from pbdkit.model.experiment import Experiment
@@ -59,7 +76,7 @@ def as_experiment(
         return load_experiment(str(given), settings, components)
     if _is_dataset(given) or not isinstance(given, Mapping):
         raise ExperimentError(f"expected an experiment, {but_got(given)}")
-    source = Source(data=dict(given), beside=OF_PROGRAM)
+    source = Source(data=dict(given), files=OF_PROGRAM)
     source = with_settings(source, settings, Experiment.defaults())
     return Experiment.build(source, components)
 

@@ -1,5 +1,6 @@
-"""Prescribed motions, a closed family: displacement of a leader group by step (model.md, section
-1), by formula, from columns of a CSV file, from scattered measurements, or by Newton's law.
+"""Prescribed motions of leader groups (model.md, section 1).
+
+By formula, from columns of a CSV file, from scattered measurements, or by Newton's law.
 """
 
 from __future__ import annotations
@@ -19,19 +20,22 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, SerializeAsAny, ValidationInfo, model_validator
 
 from pbdkit.errors import did_you_mean
-from pbdkit.model.reading import beside
+from pbdkit.model.reading import file_resolver
 from pbdkit.model.validation import brief, closed_part, fault
 from pbdkit.plugin import Component
 from pbdkit.plugin.schedule import Force, at
 from pbdkit.plugin.units import Place
 
-MOST_BYTES, MOST_ROWS = 2**26, 200_000
-LONGEST_LINE = 2**16
+MAX_BYTES = 2**26
+"""Maximum size of a table in bytes."""
+MAX_ROWS = 200_000
+"""Maximum number of rows of a table."""
+MAX_LINE = 2**16
 """Maximum number of characters in a line."""
 
 
 def or_a_file(*names: str) -> Callable[[dict[str, Any]], None]:
-    """For a model's JSON Schema: these fields are needed, or `file` in their place."""
+    """Return an update of a JSON Schema that requires the fields `names` or `file`."""
 
     def either(schema: dict[str, Any]) -> None:
         schema["required"] = [name for name in schema.get("required", ()) if name not in names]
@@ -41,35 +45,54 @@ def or_a_file(*names: str) -> Callable[[dict[str, Any]], None]:
 
 
 def in_place_of(
-    given: Any, info: ValidationInfo, columns: Sequence[str], names: Sequence[str]
+    parameters: Any, info: ValidationInfo, columns: Sequence[str], names: Sequence[str]
 ) -> tuple[dict[str, Any], list[list[float]]] | None:
-    """What is given besides `file`, and the rows of these columns in it, which take the place of
-    the fields of these names; None where no file is given."""
-    if not isinstance(given, dict) or given.get("file") is None:
+    """Read the columns of `file` if one is given in place of fields.
+
+    Parameters
+    ----------
+    given
+        Raw parameters.
+    info
+        Validation context.
+    columns
+        Names of the columns.
+    names
+        Names of the fields that the columns replace.
+
+    Returns
+    -------
+    tuple or None
+        The other parameters and the rows of the columns; None if no file is given.
+    """
+    if not isinstance(parameters, dict) or parameters.get("file") is None:
         return None
-    if given.keys() & {*names}:
+    if parameters.keys() & {*names}:
         raise fault(f"give either a file, or {' and '.join(names)}", key="file")
-    rest = {key: value for key, value in given.items() if key != "file"}
-    return rest, read_columns(given["file"], info, columns)
+    rest = {key: value for key, value in parameters.items() if key != "file"}
+    return rest, read_columns(parameters["file"], info, columns)
 
 
-def read_columns(given: Any, info: ValidationInfo, names: Sequence[str]) -> list[list[float]]:
-    """The rows of a file, relative to the experiment's, numbers in the order of the names.
+def read_columns(file: Any, info: ValidationInfo, names: Sequence[str]) -> list[list[float]]:
+    """Return the rows of a CSV file, with numbers in the order of `names`.
 
-    Raises a fault of the key `file` that says what is wrong in it, where, and the remedy.
+    The path is relative to the experiment file.
+
+    Raises
+    ------
+    PydanticCustomError
+        For the key `file`, with the place and the remedy, if the file cannot be read.
     """
     try:
-        path = beside(info).path(given, "CSV")
-        if path.stat().st_size > MOST_BYTES:
-            raise fault(f"{path}: is larger than 64 MiB; leave out points", key="file")
+        path = file_resolver(info).path(file, "CSV")
+        if path.stat().st_size > MAX_BYTES:
+            raise fault(f"{path}: is larger than 64 MiB; remove points", key="file")
         return list(_rows(path, names))
     except UnicodeDecodeError as error:
-        raise fault(
-            f"{given}: is not UTF-8: {error.reason}; save it as UTF-8", key="file"
-        ) from None
+        raise fault(f"{file}: is not UTF-8: {error.reason}; save it as UTF-8", key="file") from None
     except (OSError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
-        raise fault(f"{given}: cannot be read: {reason}", key="file") from None
+        raise fault(f"{file}: cannot be read: {reason}", key="file") from None
     except ValueError as error:
         raise fault(str(error), key="file") from None
 
@@ -83,107 +106,120 @@ def _rows(path: FilePath, names: Sequence[str]) -> Iterator[list[float]]:
             if not row:
                 continue
             count += 1
-            if count > MOST_ROWS:
-                raise fault(f"{path}: has more than {MOST_ROWS} rows; leave out some", key="file")
+            if count > MAX_ROWS:
+                raise fault(f"{path}: has more than {MAX_ROWS} rows; remove some", key="file")
             place = f"{path}:{lines.line_num}"
             yield [_number(row[n : n + 1], name, place) for name, n in columns.items()]
         if not count:
-            raise fault(f"{path}: holds no row of numbers below its first line", key="file")
+            raise fault(f"{path}: has no row of numbers below its first line", key="file")
 
 
 def _bounded(file: TextIO, path: FilePath) -> Iterator[str]:
-    """Yield the lines of a table. Raises a fault where one is longer than those of a table are."""
-    while line := file.readline(LONGEST_LINE + 1):
-        if len(line) > LONGEST_LINE:
-            text = f"{path}: has a line of more than {LONGEST_LINE} characters"
-            raise fault(f"{text}; leave out the columns that are not needed", key="file")
+    """Yield the lines of a table, up to the maximum length of a line."""
+    while line := file.readline(MAX_LINE + 1):
+        if len(line) > MAX_LINE:
+            text = f"{path}: has a line of more than {MAX_LINE} characters"
+            raise fault(f"{text}; remove the columns that are not required", key="file")
         yield line
 
 
 def _columns(header: list[str], names: Sequence[str], path: FilePath) -> dict[str, int]:
-    """Return where the columns stand. Raises a fault where one is missing, or there twice."""
+    """Return the index of each column, which must occur once."""
     for name in names:
         if header.count(name) != 1:
-            found = f"two '{name}'" if name in header else f"no '{name}'"
-            text = f"needs columns {', '.join(names)}, named in its first line; there are"
+            problem = f"two '{name}'" if name in header else f"no '{name}'"
+            text = f"requires columns {', '.join(names)}, named in its first line; there are"
             hint = _separators(header) or did_you_mean(name, {*header} - {*names})
-            raise fault(f"{path}:1: {text} {found}{hint}", key="file")
+            raise fault(f"{path}:1: {text} {problem}{hint}", key="file")
     return {name: header.index(name) for name in names}
 
 
 def _separators(header: list[str]) -> str:
-    """A hint where something else than commas stands between the columns."""
+    """Return a hint if columns are not separated by commas."""
     for separator, name in ((";", "';'"), ("\t", "tabs")):
         if any(separator in column for column in header):
             return (
-                f"; the columns of this file are separated by {name}: save it with commas between "
+                f"; the columns of this file are separated by {name}; save it with commas between "
                 "columns, and points in numbers"
             )
     return ""
 
 
 def _number(cell: list[str], name: str, place: str) -> float:
-    """The number in a cell, empty where the row is too short. Python would take 1_0 for 10."""
+    """Return the number in a cell, which is empty if the row is too short."""
     text = "".join(cell)
     try:
-        number = math.nan if "_" in text else float(text)
+        number = math.nan if "_" in text else float(text)  # Python would read 1_0 as 10
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
         got = repr(text)[:40] if text else "nothing"
-        raise fault(f"{place}: column '{name}' needs a finite number, got {got}", key="file")
+        raise fault(f"{place}: column '{name}' requires a finite number, got {got}", key="file")
     return number
 
 
 Floats = NDArray[np.floating[Any]]
+"""Type of arrays of floating-point numbers."""
 Steps = Annotated[int, Field(ge=1, le=2**62)]
+"""Type of a number of steps."""
 
 
 class Motion(Component):
-    """A prescribed motion, counted from the position at which it starts."""
+    """Prescribed motion, relative to the position at its start."""
 
     rests: ClassVar[bool] = True
     """Whether the motion ends, at the last of its knots."""
 
     of_reference: ClassVar[bool] = False
-    """Whether `start` is where particles lie at rest, wherever the motion finds them."""
+    """Whether `start` is the reference position rather than the current position."""
 
     @abstractmethod
     def offset(self, n: float, start: Floats) -> Floats:
-        """How far from their start the leaders stand at the end of the motion's n-th step, n ≥ 1;
-        on the way to an equilibrium also between two steps, n > 0.
+        """Return the displacement from the start at the end of the n-th step of the motion.
 
-        `start` are the positions at which the motion found them, (particle, axis); so is what is
-        returned, or (axis,) where it is the same for all.
+        Parameters
+        ----------
+        n
+            Number of the step, n ≥ 1; between the increments of an equilibrium also n > 0.
+        start
+            Positions at the start of the motion, (particle, axis).
+
+        Returns
+        -------
+        NDArray
+            Displacements, (particle, axis), or (axis,) if they are the same for all particles.
         """
 
     def knots(self) -> tuple[int, ...]:
-        """The steps n between which, and after which, the offset changes as one formula in n; by
-        default it always does."""
+        """Return the steps n between and after which the displacement is one formula in n.
+
+        Empty by default: the displacement is one formula throughout.
+        """
         return ()
 
     def turned(self, n: float) -> float:
-        """By what angle the motion has turned at the end of its n-th step, radians."""
+        """Return the rotation angle at the end of the n-th step, radians."""
         return 0.0
 
     def rests_after(self) -> int | None:
-        """The step n from which on the offset stays as it is; None where it never does."""
+        """Return the step n after which the displacement is constant, or None."""
         return max((1, *self.knots())) if self.rests else None
 
 
-Pairs = Annotated[tuple[Place, ...], Field(strict=False, min_length=2, max_length=MOST_ROWS)]
-ON_EDGE = 1e-7
-"""By what share of a triangle, or of a line's length, a place outside counts as on the edge."""
+Pairs = Annotated[tuple[Place, ...], Field(strict=False, min_length=2, max_length=MAX_ROWS)]
+"""Type of the points or displacements of a measurement."""
+EDGE_RTOL = 1e-7
+"""Distance up to which a place outside counts as on the edge, relative to a triangle or line."""
 
 
 class Measured(Motion):
-    """Moves each particle by the displacement measured where it lies at rest, from where it then
-    is: linear on the Delaunay triangles of the points, or along the line on which they lie; within
-    `ramp` steps.
-    `outside` says what of particles beyond the points: they are refused, or take the value of the
-    nearest point.
+    """Moves each particle by the displacement measured at its reference position, within `ramp`
+    steps.
 
-    `file`: a CSV with columns x, y, ux, uy; its content takes its place.
+    Displacements are linear on the Delaunay triangles of the points, or along the line through all
+    points. `outside`: particles outside the points are an error (`refuse`), or have the value of
+    the nearest point. `file`: a CSV with columns x, y, ux, uy in place of `points` and
+    `displacements`.
     """
 
     model_config = ConfigDict(json_schema_extra=or_a_file("points", "displacements"))
@@ -198,11 +234,12 @@ class Measured(Motion):
 
     @model_validator(mode="before")
     @classmethod
-    def _read(cls, given: Any, info: ValidationInfo) -> Any:
-        read = in_place_of(given, info, ("x", "y", "ux", "uy"), ("points", "displacements"))
-        if read is None:
-            return given
-        rest, rows = read
+    def _read(cls, parameters: Any, info: ValidationInfo) -> Any:
+        columns = ("x", "y", "ux", "uy")
+        content = in_place_of(parameters, info, columns, ("points", "displacements"))
+        if content is None:
+            return parameters
+        rest, rows = content
         points, displacements = ([tuple(row[n : n + 2]) for row in rows] for n in (0, 2))
         return rest | {"points": points, "displacements": displacements}
 
@@ -210,33 +247,33 @@ class Measured(Motion):
     def _each_once(self) -> Measured:
         if len(self.points) != len(self.displacements):
             raise ValueError(
-                f"as many displacements as points are needed: {len(self.displacements)} given for "
+                f"the numbers of displacements and points differ: {len(self.displacements)} and "
                 f"{len(self.points)}"
             )
         if len(set(self.points)) < len(self.points):
-            twice = next(p for p, times in Counter(self.points).items() if times > 1)
-            raise ValueError(f"({twice[0]:g}, {twice[1]:g}) is measured twice; keep one of them")
+            x, y = next(p for p, count in Counter(self.points).items() if count > 1)
+            raise ValueError(f"({x:g}, {y:g}) is measured twice; remove one of them")
         return self
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """The measured displacement of each, min(n / ramp, 1) of it; NaN outside the points."""
+        """Return min(n / ramp, 1) of the measured displacements; NaN outside the points."""
         return self.at(start) * min(n / self.ramp, 1.0)
 
     def knots(self) -> tuple[int, ...]:
-        """The end of the ramp."""
+        """Return the end of the ramp."""
         return (self.ramp,)
 
     def at(self, places: Floats) -> Floats:
-        """The measured displacements at places, (place, axis), NaN outside."""
+        """Return the measured displacements at places, (place, axis); NaN outside the points."""
         key = places.tobytes()
-        if key not in self._known:
-            self._known.clear()
-            self._known[key] = self._beyond(places, self._interpolated(places))
-        return self._known[key]
+        if key not in self._cache:
+            self._cache.clear()
+            self._cache[key] = self._extrapolated(places, self._interpolated(places))
+        return self._cache[key]
 
     @cached_property
-    def _known(self) -> dict[bytes, Floats]:
-        """The last that were asked for."""
+    def _cache(self) -> dict[bytes, Floats]:
+        """Displacements of the last call."""
         return {}
 
     @cached_property
@@ -245,10 +282,10 @@ class Measured(Motion):
 
     @cached_property
     def _triangles(self) -> Any:
-        """None where all points lie on a line."""
+        """Delaunay triangulation of the points; None if all lie on a line."""
         at = np.array(self.points)
         _, sizes, _ = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)
-        if sizes[1] <= ON_EDGE * sizes[0]:
+        if sizes[1] <= EDGE_RTOL * sizes[0]:
             return None
         from scipy.spatial import Delaunay
 
@@ -257,43 +294,45 @@ class Measured(Motion):
     def _interpolated(self, places: Floats) -> Floats:
         if self._triangles is None:
             return self._on_line(places)
-        found = self._triangles.find_simplex(places, tol=ON_EDGE)
-        transform, corners = self._triangles.transform[found], self._triangles.simplices[found]
+        triangles = self._triangles.find_simplex(places, tol=EDGE_RTOL)
+        transform = self._triangles.transform[triangles]
+        corners = self._triangles.simplices[triangles]
         part = np.einsum("pab,pb->pa", transform[:, :2], places - transform[:, 2])
         shares = np.concatenate([part, 1.0 - part.sum(axis=1, keepdims=True)], axis=1)
         values = np.einsum("pc,pca->pa", shares, self._values[corners])
-        return np.where((found >= 0)[:, None], values, np.nan)
+        return np.where((triangles >= 0)[:, None], values, np.nan)
 
-    def _beyond(self, places: Floats, found: Floats) -> Floats:
-        beyond = np.isnan(found[:, 0])
-        if self.outside == "refuse" or not beyond.any():
-            return found
+    def _extrapolated(self, places: Floats, values: Floats) -> Floats:
+        outside = np.isnan(values[:, 0])
+        if self.outside == "refuse" or not outside.any():
+            return values
         from scipy.spatial import KDTree
 
-        _, nearest = KDTree(np.array(self.points)).query(places[beyond])
-        found[beyond] = self._values[nearest]
-        return found
+        _, nearest = KDTree(np.array(self.points)).query(places[outside])
+        values[outside] = self._values[nearest]
+        return values
 
     def _on_line(self, places: Floats) -> Floats:
         at = np.array(self.points)
         ends = at[[np.lexsort(at.T[::-1])[k] for k in (0, -1)]]
-        way = (ends[1] - ends[0]) / np.square(ends[1] - ends[0]).sum()
-        along, order = (places - ends[0]) @ way, np.argsort((at - ends[0]) @ way)
-        known, values = ((at - ends[0]) @ way)[order], self._values[order]
+        direction = (ends[1] - ends[0]) / np.square(ends[1] - ends[0]).sum()
+        along, order = (places - ends[0]) @ direction, np.argsort((at - ends[0]) @ direction)
+        positions, values = ((at - ends[0]) @ direction)[order], self._values[order]
         aside = places - ends[0] - along[:, None] * (ends[1] - ends[0])
-        off = np.linalg.norm(aside, axis=1) > ON_EDGE * np.linalg.norm(ends[1] - ends[0])
-        off |= (along < -ON_EDGE) | (along > 1.0 + ON_EDGE)
-        found = np.stack([np.interp(along, known, value) for value in values.T], axis=1)
-        return np.where(off[:, None], np.nan, found)
+        off = np.linalg.norm(aside, axis=1) > EDGE_RTOL * np.linalg.norm(ends[1] - ends[0])
+        off |= (along < -EDGE_RTOL) | (along > 1.0 + EDGE_RTOL)
+        result = np.stack([np.interp(along, positions, value) for value in values.T], axis=1)
+        return np.where(off[:, None], np.nan, result)
 
 
 class Newton(Motion):
-    """Each particle is a mass that its neighbours and a force move; a step is the unit of time:
+    """Each particle is a mass that moves by Newton's law, with the step as the unit of time:
 
-    mass · a = its share of `force` + what its neighbours exert - damping · v,
+    mass · a = share of `force` + force of the neighbours - damping · v.
 
-    forces over Young's modulus and thickness, in lattice units; `mass` and `damping` of each. By
-    the symplectic Euler method, v += a, u += v, with the forces at the end of the last step.
+    Forces are over Young's modulus and thickness, in lattice units; `mass` and `damping` are those
+    of each particle. Integrated by the symplectic Euler method, v += a, u += v, with the forces at
+    the end of the last step.
     """
 
     type: Literal["newton"] = "newton"
@@ -304,29 +343,42 @@ class Newton(Motion):
     velocity: Place = (0.0, 0.0)
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """Nothing is known beforehand."""
+        """Return zeros; the motion is not known before the run."""
         return np.zeros(start.shape[1])
 
     def faster(self, step: int, velocity: Floats, pull: Floats, share: Floats) -> Floats:
-        """The velocities (particle, axis) at the end of a step, with what neighbours exert and each
-        one's share of the force."""
-        force = share[:, None] * np.array([at(each, step) for each in self.force])
+        """Return the velocities at the end of a step, (particle, axis).
+
+        Parameters
+        ----------
+        step
+            Number of the step.
+        velocity
+            Velocities at its start, (particle, axis).
+        pull
+            Forces of the neighbours, (particle, axis).
+        share
+            Share of each particle in the force, (particle,).
+        """
+        force = share[:, None] * np.array([at(component, step) for component in self.force])
         force += pull - self.damping * velocity
         return np.asarray(velocity + force / self.mass)
 
     def lightest(self, stiffness: float) -> float:
-        """The mass below which a particle held by such a spring swings ever farther: steps are
-        stable for k ≤ 4 m - 2 c, which without damping is ω ≤ 2."""
+        """Return the mass below which a particle on a spring of this stiffness is unstable.
+
+        Steps are stable for k ≤ 4 m - 2 c, which without damping is ω ≤ 2.
+        """
         return stiffness / 4.0 + self.damping / 2.0
 
 
 class Hold(Motion):
-    """Stays where it is."""
+    """Keeps the particles at their positions."""
 
     type: Literal["hold"] = "hold"
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """None."""
+        """Return zeros."""
         return np.zeros(start.shape[1])
 
 
@@ -338,11 +390,11 @@ class Velocity(Motion):
     steps: Steps
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """velocity · min(n, steps)."""
+        """Return velocity · min(n, steps)."""
         return np.array(self.velocity) * min(n, self.steps)
 
     def knots(self) -> tuple[int, ...]:
-        """The end of the motion."""
+        """Return the end of the motion."""
         return (self.steps,)
 
 
@@ -353,54 +405,61 @@ class Displace(Motion):
     displacement: Place
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """The displacement, from the first step on."""
+        """Return the displacement, from the first step on."""
         return np.array(self.displacement) * min(n, 1)
 
     def knots(self) -> tuple[int, ...]:
-        """The first step."""
+        """Return the first step."""
         return (1,)
 
 
 class Tabulated(Motion):
-    """Stands `displacements[k]` from its start at its step `steps[k]`; linear between, from no
-    displacement at its step 0, and the last is kept."""
+    """Displacement of `displacements[k]` from the start at step `steps[k]` of the motion.
 
-    steps: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=MOST_ROWS)]
+    Linear between these steps, from zero at step 0; the last displacement is kept.
+    """
+
+    steps: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=MAX_ROWS)]
     displacements: Annotated[
-        tuple[Place, ...], Field(strict=False, min_length=1, max_length=MOST_ROWS)
+        tuple[Place, ...], Field(strict=False, min_length=1, max_length=MAX_ROWS)
     ]
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
         if len(self.steps) != len(self.displacements):
             raise ValueError(
-                f"as many displacements as steps are needed: {len(self.displacements)} given "
-                f"for {len(self.steps)}"
+                f"the numbers of displacements and steps differ: {len(self.displacements)} and "
+                f"{len(self.steps)}"
             )
         if any(a >= b for a, b in zip(self.steps, self.steps[1:], strict=False)):
             raise ValueError(f"steps must increase, got {brief(self.steps)}")
         return self
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """Linear interpolation; beyond the last step its displacement."""
+        """Return the interpolated displacement, after the last step that of the last step."""
         k = min(bisect_left(self.steps, n), len(self.steps) - 1)
-        begin, before = (self.steps[k - 1], self.displacements[k - 1]) if k else (0, (0.0, 0.0))
-        ways = zip(before, self.displacements[k], strict=True)
-        return np.array([np.interp(n, (begin, self.steps[k]), way) for way in ways])
+        begin, previous = (self.steps[k - 1], self.displacements[k - 1]) if k else (0, (0.0, 0.0))
+        components = zip(previous, self.displacements[k], strict=True)
+        return np.array(
+            [np.interp(n, (begin, self.steps[k]), component) for component in components]
+        )
 
     def knots(self) -> tuple[int, ...]:
-        """Its steps."""
+        """Return the steps."""
         return self.steps
 
 
 class Path(Tabulated):
-    """Along `displacements`, at its steps `steps`."""
+    """Moves along `displacements` at the steps `steps` of the motion."""
 
     type: Literal["path"] = "path"
 
 
 class Table(Tabulated):
-    """The same from a `file`, a CSV with columns step, ux, uy; its content takes its place."""
+    """Moves along displacements from a `file`, a CSV with columns step, ux, uy.
+
+    The content of the file replaces `steps` and `displacements`.
+    """
 
     model_config = ConfigDict(json_schema_extra=or_a_file("steps", "displacements"))
 
@@ -409,22 +468,23 @@ class Table(Tabulated):
 
     @model_validator(mode="before")
     @classmethod
-    def _read(cls, given: Any, info: ValidationInfo) -> Any:
-        read = in_place_of(given, info, ("step", "ux", "uy"), ("steps", "displacements"))
-        if read is None:
-            return given
-        rest, rows = read
-        if rows[0] == [0.0, 0.0, 0.0]:  # where every motion starts
+    def _read(cls, parameters: Any, info: ValidationInfo) -> Any:
+        columns = ("step", "ux", "uy")
+        content = in_place_of(parameters, info, columns, ("steps", "displacements"))
+        if content is None:
+            return parameters
+        rest, rows = content
+        if rows[0] == [0.0, 0.0, 0.0]:  # the start of every motion
             del rows[0]
         if wrong := [row[0] for row in rows if row[0] < 1 or row[0] % 1]:
-            text = f"{given['file']}: steps are whole numbers from 1 on, got {wrong[0]:g}"
-            raise fault(f"{text}; at step 0 nothing is displaced yet", key="file")
+            text = f"{parameters['file']}: steps are whole numbers from 1, got {wrong[0]:g}"
+            raise fault(f"{text}; the displacement at step 0 is zero", key="file")
         steps, displacements = [int(row[0]) for row in rows], [tuple(row[1:]) for row in rows]
         return rest | {"steps": steps, "displacements": displacements}
 
 
 class Rotation(Motion):
-    """Turns about `centre` by `angle` degrees a step, counterclockwise, for `steps` steps."""
+    """Rotates around `centre` by `angle` degrees in each of `steps` steps, counterclockwise."""
 
     type: Literal["rotation"] = "rotation"
     centre: Place
@@ -432,24 +492,24 @@ class Rotation(Motion):
     steps: Steps
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """(Q - 1)(start - centre), Q the rotation by angle · min(n, steps)."""
-        turned = self.turned(n)
-        # 1 - cos without cancellation, so that small turns keep their digits.
-        less, sine = 2 * math.sin(turned / 2) ** 2, math.sin(turned)
+        """Return (Q - 1)(start - centre) with the rotation Q by angle · min(n, steps)."""
+        angle = self.turned(n)
+        # 1 - cos without cancellation, which is exact for small angles.
+        versine, sine = 2 * math.sin(angle / 2) ** 2, math.sin(angle)
         x, y = (np.asarray(start) - self.centre).T
-        return np.stack([-less * x - sine * y, sine * x - less * y], axis=-1)
+        return np.stack([-versine * x - sine * y, sine * x - versine * y], axis=-1)
 
     def turned(self, n: float) -> float:
-        """angle · min(n, steps)."""
+        """Return angle · min(n, steps), radians."""
         return math.radians(self.angle * min(n, self.steps))
 
     def knots(self) -> tuple[int, ...]:
-        """The end of the motion."""
+        """Return the end of the motion."""
         return (self.steps,)
 
 
 class Oscillation(Motion):
-    """Swings about its start: amplitude · sin(2πn / period), for ever."""
+    """Oscillates around the start: amplitude · sin(2πn / period), without end."""
 
     type: Literal["oscillation"] = "oscillation"
     rests: ClassVar[bool] = False
@@ -457,7 +517,7 @@ class Oscillation(Motion):
     period: Annotated[float, Field(ge=1e-6, le=1e12)]
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """amplitude · sin(2πn / period)."""
+        """Return amplitude · sin(2πn / period)."""
         return np.array(self.amplitude) * math.sin(2 * math.pi * n / self.period)
 
 
@@ -467,3 +527,4 @@ AnyMotion = Annotated[
         Motion, Hold, Velocity, Displace, Path, Rotation, Oscillation, Table, Measured, Newton
     ),
 ]
+"""Type of a motion in an experiment."""

@@ -1,8 +1,8 @@
-"""Read and write experiment files: YAML 1.2 with the position of every value, and changes by path
-as `--set` and sweeps make them.
+"""Read and write experiment files: YAML 1.2 with the position of every value.
 
-The limits on size, depth, aliases, merge keys and tags act on the events of the parser, before
-anything is built: they are what makes YAML dangerous, and an experiment needs none of them.
+Includes changes by path, as in `--set` and sweeps. Limits on size, depth, aliases, merge keys and
+tags apply to the events of the parser, before any object is created. These features make YAML
+dangerous, and experiments do not require them.
 """
 
 from __future__ import annotations
@@ -42,43 +42,53 @@ if TYPE_CHECKING:
 
 
 ALLOW_OUTSIDE = "PBDKIT_ALLOW_OUTSIDE"
-"""The environment variable that, where it is not empty, allows files outside the folder."""
+"""Environment variable that allows files outside the folder unless it is empty."""
 ALLOW = (
     "allow it with --allow-outside (in Python pbdkit.load(..., allow_outside=True), or "
     f"{ALLOW_OUTSIDE}=1)"
 )
-"""The remedy in messages."""
+"""Remedy in messages about files outside the folder."""
 
 
 @dataclass(frozen=True)
-class Beside:
-    """Resolve the names of files relative to the folder of the file that names them.
+class FileResolver:
+    """Resolve the names of files relative to the folder of the file that refers to them.
 
-    Attributes
+    Parameters
     ----------
-    folder : Path or None
-        The folder; None for an experiment that names no files, as in a result, where their content
-        takes their place.
-    outside : bool
-        Whether files outside the folder are allowed, as for a dict that a Python program hands
-        over. The environment variable `ALLOW_OUTSIDE` allows them, too.
+    folder
+        The folder; None for an experiment that cannot refer to files, as in a result, which has the
+        contents of files instead.
+    outside
+        Whether files outside the folder are allowed, as for a dict in a Python program. The
+        environment variable `ALLOW_OUTSIDE` allows them, too.
     """
 
     folder: Path | None = None
     outside: bool = False
 
     def path(self, name: Any, what: str) -> Path:
-        """Return the path of the regular file of that name.
+        """Return the path of a regular file.
 
-        Raises ValueError for what is no name, for files outside the folder, links followed, where
-        these are not allowed, and where there is none; `what` is the kind of file in messages.
+        Parameters
+        ----------
+        name
+            Name of the file.
+        what
+            Kind of the file in messages.
+
+        Raises
+        ------
+        ValueError
+            If it is not a file name, lies outside the folder without permission (links are
+            followed), or does not exist.
         """
         if not isinstance(name, str) or not name or "\0" in name:
             raise ValueError(f"expected the name of a {what} file, got {name!r:.40}")
         if self.folder is None:
             raise ValueError(
-                f"{name:.80}: an experiment that lies in a result or in a store names no files; "
-                "their content takes their place"
+                f"{name:.80}: an experiment in a result or in a store cannot refer to files; "
+                "replace the file name by the content"
             )
         path = self.folder / name
         try:
@@ -87,16 +97,22 @@ class Beside:
             raise ValueError(f"{str(path)[:80]}...: {error.strerror}") from None
         if not inside:
             folder = self.folder.absolute()
-            text = f"{name} lies outside the folder of the file that names it, {folder}"
+            text = f"{name} lies outside the folder of the file that refers to it, {folder}"
             raise ValueError(f"{text}; copy it there, or {ALLOW}")
         if not regular:
-            how = "is no regular file" if path.exists() else "is not there"
-            raise ValueError(f"{path}: {how}; its place counts from the experiment's file")
+            problem = "is not a regular file" if path.exists() else "does not exist"
+            text = "paths are relative to the experiment file"
+            raise ValueError(f"{path}: {problem}; {text}")
         return path
 
     def holds(self, path: Path) -> bool:
-        """Whether a path, links followed, lies in the folder or is allowed to lie elsewhere. Raises
-        OSError."""
+        """Return whether a path, links followed, lies in the folder or is allowed outside.
+
+        Raises
+        ------
+        OSError
+            If the path cannot be resolved.
+        """
         if self.outside or os.environ.get(ALLOW_OUTSIDE):
             return True
         assert self.folder is not None
@@ -106,43 +122,66 @@ class Beside:
             raise OSError(0, str(error)) from None
 
 
-OF_PROGRAM = Beside(Path(), outside=True)
-"""The files that a dict names which a Python program hands over."""
+OF_PROGRAM = FileResolver(Path(), outside=True)
+"""Resolver for a dict in a Python program."""
 
 
-def beside(info: ValidationInfo) -> Beside:
-    """Return what the validation context says of files."""
-    found: Beside = (info.context or {}).get("beside") or Beside()
-    return found
+def file_resolver(info: ValidationInfo) -> FileResolver:
+    """Return the file resolver of a validation context."""
+    resolver: FileResolver = (info.context or {}).get("files") or FileResolver()
+    return resolver
 
 
 MAX_BYTES = 2**20
+"""Maximum size of an experiment file in bytes."""
 MAX_DEPTH = 32
+"""Maximum depth of nested values."""
 MAX_NODES = 20_000
+"""Maximum number of values."""
 Where = tuple[str | int, ...]
+"""Type of the path of a value."""
 
 
 @dataclass
 class Source:
-    """Where an experiment comes from: its raw data, and the place of each value in the file."""
+    """Raw data of an experiment, and the place of each value in its file.
+
+    Parameters
+    ----------
+    name
+        Name of the file.
+    data
+        Raw data.
+    places
+        Place (file:line:column) of each value, by its path.
+    files
+        Resolver for the files to which the experiment refers.
+    """
 
     name: str = ""
     data: Any = None
     places: dict[Where, str] = field(default_factory=dict)
-    beside: Beside = field(default_factory=Beside)
-    """The files that it may name."""
+    files: FileResolver = field(default_factory=FileResolver)
 
     def message(self, where: Sequence[str | int], text: str) -> str:
-        """``file:line:column: field: text``; of an absent field the place of what encloses it."""
-        known = tuple(where)
-        while known and known not in self.places:
-            known = known[:-1]
-        parts = [self.places.get(known, self.name), dotted(where), text]
+        """Return ``file:line:column: field: text``; for an absent field with the place of its
+        parent.
+        """
+        path = tuple(where)
+        while path and path not in self.places:
+            path = path[:-1]
+        parts = [self.places.get(path, self.name), dotted(where), text]
         return ": ".join(part for part in parts if part)
 
 
 def read_file(path: Path) -> Source:
-    """The experiment in a file; ExperimentError names what cannot be read, and where."""
+    """Read the experiment in a file.
+
+    Raises
+    ------
+    ExperimentError
+        If the file cannot be read, with the place and the remedy.
+    """
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
@@ -150,31 +189,39 @@ def read_file(path: Path) -> Source:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
     if raw.startswith((b"\x89HDF", b"CDF\x01", b"CDF\x02", b"CDF\x05")):
         raise ExperimentError(
-            f"{path}: is a result, no experiment; `pbdkit plot {path}` draws it, and "
-            "pbdkit.rerun(pbdkit.open(...)) runs the same again"
+            f"{path}: is a result, not an experiment; `pbdkit plot {path}` draws it, and "
+            "pbdkit.rerun(pbdkit.open(...)) runs it again"
         )
     if raw.startswith(b"SQLite format 3"):
         raise ExperimentError(
-            f"{path}: is what was kept of an unfinished run or of a sweep, no experiment; `pbdkit "
-            "resume OUT.nc` goes on with a run, `pbdkit sweep` with a sweep"
+            f"{path}: is the store of an unfinished run or of a sweep, not an experiment; `pbdkit "
+            "resume OUT.nc` continues a run, `pbdkit sweep` a sweep"
         )
     if len(raw) > MAX_BYTES:
-        raise ExperimentError(f"{path}: is larger than 1 MiB, which no experiment needs")
+        raise ExperimentError(
+            f"{path}: is larger than 1 MiB, the maximum for experiments; move tables to CSV files"
+        )
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         if 0 in raw and not raw.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
-            raise ExperimentError(f"{path}: is no text, and no experiment") from None
+            raise ExperimentError(f"{path}: is not text, and not an experiment") from None
         raise ExperimentError(
             f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8"
         ) from None
     source = read_text(text, str(path))
-    source.beside = Beside(path.parent)
+    source.files = FileResolver(path.parent)
     return source
 
 
 def read_text(text: str, name: str) -> Source:
-    """The experiment in a text; `name` is what messages call it."""
+    """Read an experiment from text; `name` is the name of the source in messages.
+
+    Raises
+    ------
+    ExperimentError
+        If the text is not a valid experiment file, with the place and the remedy.
+    """
     source = Source(name)
     source.data = parsed(text, source)
     if source.data is None:
@@ -185,14 +232,20 @@ def read_text(text: str, name: str) -> Source:
 
 
 def parsed(text: str, source: Source) -> Any:
-    """The data of a text; the places of its values go into the source. Raises ExperimentError."""
+    """Return the data of YAML text, and store the places of its values in the source.
+
+    Raises
+    ------
+    ExperimentError
+        If the text is not valid YAML, or exceeds the limits.
+    """
     yaml = YAML(typ="safe", pure=True)
     yaml.Scanner = _Scanner
     try:
         return _Reading(yaml, text, source).document()
     except ReaderError as error:
-        before = text[: error.position]
-        place = f"{before.count(chr(10)) + 1}:{error.position - before.rfind(chr(10))}"
+        prefix = text[: error.position]
+        place = f"{prefix.count(chr(10)) + 1}:{error.position - prefix.rfind(chr(10))}"
         what = f"the character {error.character!r} is not allowed in YAML"
         raise ExperimentError(f"{source.name}:{place}: {what}") from None
     except YAMLError as error:
@@ -205,50 +258,52 @@ def parsed(text: str, source: Source) -> Any:
 
 
 def _remedy(error: YAMLError) -> str:
-    """What to write instead, of the frequent faults."""
-    what, within = (str(getattr(error, name, "") or "") for name in ("problem", "context"))
+    """Return the remedy for frequent errors."""
+    what, context = (str(getattr(error, name, "") or "") for name in ("problem", "context"))
     mark = getattr(error, "context_mark", None)
     place = f" at {mark.line + 1}:{mark.column + 1}" if mark else ""
     if "\\t" in what:
         return "; indent with spaces, not with tabs"
-    if "flow sequence" in within or "flow mapping" in within:
-        bracket = "[" if "sequence" in within else "{"
+    if "flow sequence" in context or "flow mapping" in context:
+        bracket = "[" if "sequence" in context else "{"
         return f"; the '{bracket}'{place} is not closed, or a comma is missing before"
-    if "quoted scalar" in within:
+    if "quoted scalar" in context:
         return f"; the quotation mark{place} is not closed"
     if "mapping values" in what:
-        return "; put a text with a colon in quotes, and begin each key on a line of its own"
-    if "block" in what or "block" in within:
-        return f"; indent all entries alike that belong together, as those that begin{place}"
+        return "; put text with a colon in quotes, and begin each key on a new line"
+    if "block" in what or "block" in context:
+        return f"; indent all entries of a group equally, as those that begin{place}"
     return ""
 
 
 class _Scanner(Scanner):
-    """Notes no keys where nothing is taken: at each character it goes through all that it noted."""
+    """Store no keys beyond the maximum depth, because every character is compared with all stored
+    keys.
+    """
 
     def save_possible_simple_key(self) -> None:
-        """As ruamel's, down to the depth that is taken."""
+        """Store a possible key up to the maximum depth."""
         if self.flow_level <= MAX_DEPTH:
             super().save_possible_simple_key()
 
 
 class _Reading:
-    """Makes data of the parser's events, one look at each, and notes the places."""
+    """Create data from the events of the parser, and store their places."""
 
     def __init__(self, yaml: YAML, text: str, source: Source) -> None:
         self._yaml, self._source, self._nodes = yaml, source, 0
         self._events = (self._allowed(event) for event in yaml.parse(io.StringIO(text)))
 
     def document(self) -> Any:
-        """The data of the one document; None where there is none."""
+        """Return the data of the single document, or None."""
         data, documents = None, 0
         for event in self._events:
             if isinstance(event, DocumentStartEvent):
                 if event.version or event.tags:
-                    self._refuse(event, "directives (%YAML, %TAG) are not taken")
+                    self._refuse(event, "directives (%YAML, %TAG) are not supported")
                 documents += 1
                 if documents > 1:
-                    self._refuse(event, "a second document; one file holds one experiment")
+                    self._refuse(event, "a second document; a file contains one experiment")
                 data = self._value(next(self._events), ())
         return data
 
@@ -257,17 +312,17 @@ class _Reading:
             return event
         self._nodes += 1
         if isinstance(event, AliasEvent):
-            self._refuse(event, f"aliases (*{event.anchor}) are not taken; write it out")
+            self._refuse(event, f"aliases (*{event.anchor}) are not supported; repeat the value")
         if self._nodes > MAX_NODES:
-            self._refuse(event, f"more than {MAX_NODES} values, which no experiment needs")
+            self._refuse(event, f"more than {MAX_NODES} values, the maximum for experiments")
         tag = getattr(event, "tag", None)
         if str(tag or "!") != "!":
-            self._refuse(event, f"tags ({tag}) are not taken")
+            self._refuse(event, f"tags ({tag}) are not supported")
         if isinstance(event, ScalarEvent):
             if event.value == "<<" and event.implicit[0]:
-                self._refuse(event, "merge keys (<<) are not taken; write the keys out")
+                self._refuse(event, "merge keys (<<) are not supported; repeat the keys")
             if any("\ud800" <= c <= "\udfff" for c in event.value):
-                self._refuse(event, "half a character (\\ud800 to \\udfff) is not taken")
+                self._refuse(event, "half a character (\\ud800 to \\udfff) is not supported")
         return event
 
     def _value(self, event: Any, where: Where) -> Any:
@@ -289,20 +344,23 @@ class _Reading:
             )
 
     def _map(self, where: Where) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         for event in self._inner():
             if not isinstance(event, ScalarEvent):
                 self._refuse(event, "a key must be a word")
             key, places = str(event.value), self._source.places
-            if key in found:
+            if key in result:
                 first = places[(*where, key)]
-                self._refuse(event, f"{dotted((*where, key))}: given twice, first at {first}")
+                text = f"{dotted((*where, key))}: occurs twice, first at {first}; remove one"
+                self._refuse(event, text)
             places[(*where, key)] = self._place(event)
-            found[key] = self._value(next(self._events), (*where, key))
-        return found
+            result[key] = self._value(next(self._events), (*where, key))
+        return result
 
     def _inner(self) -> Iterator[Any]:
-        """The events in a collection, up to its end; whoever takes one takes what is in it too."""
+        """Generate the events in a collection up to its end; the consumer also consumes nested
+        events.
+        """
         while not isinstance(event := next(self._events), CollectionEndEvent):
             yield event
 
@@ -314,60 +372,72 @@ class _Reading:
         raise ExperimentError(f"{self._place(event)}: {what}")
 
 
-ANYBODY = {"version", "name", "seed", "units", "steps", "record"}
-"""The keys of an experiment that other files may have too."""
-PARTS = ANYBODY | {
+COMMON_KEYS = {"version", "name", "seed", "units", "steps", "record"}
+"""Keys of experiments that other files may have too."""
+PARTS = COMMON_KEYS | {
     *("lattice", "body", "regions", "neighbours", "rule", "frame", "fracture", "cuts", "initial"),
     *("leaders", "loads", "obstacles", "diagnostics", "solver"),
 }
-"""All of them."""
-EXPERIMENT, SWEEP, FIT = "an experiment", "a sweep", "a fit"
+"""All keys of experiments."""
+EXPERIMENT = "an experiment"
+"""Kind of an experiment file in messages."""
+SWEEP = "a sweep"
+"""Kind of a sweep file in messages."""
+FIT = "a fit"
+"""Kind of a fit file in messages."""
 
 
 def kind_of(data: Mapping[str, Any]) -> str:
-    """What it describes, empty where nobody can tell. Keys that are only misspelt do not matter."""
+    """Return the kind of a file by its keys, or an empty string; misspelt keys do not matter."""
     if "unknown" in data and "measured" in data:
         return FIT
     if data.keys() & {"lattice", "body", "rule"}:
         return EXPERIMENT
     if data.keys() & {"experiment", "vary", "together"}:
         return SWEEP
-    return EXPERIMENT if data.keys() & (PARTS - ANYBODY) or data.keys() <= PARTS else ""
+    return EXPERIMENT if data.keys() & (PARTS - COMMON_KEYS) or data.keys() <= PARTS else ""
 
 
 def what_takes(kind: str, name: str) -> str:
-    """What to do with a file of that kind."""
+    """Return the command for a file of a kind."""
     if kind == SWEEP:
         return f"`pbdkit sweep {name}` runs it"
     if kind == EXPERIMENT:
         return f"`pbdkit run {name}` runs it"
-    return f"`pbdkit fit {name}` carries it out"
+    return f"`pbdkit fit {name}` runs it"
 
 
-def of_kind(wanted: str, source: Source) -> Source:
-    """The source. Raises ExperimentError where it describes something else than is wanted."""
+def of_kind(required: str, source: Source) -> Source:
+    """Return the source if it is of the required kind.
+
+    Raises
+    ------
+    ExperimentError
+        If it is of another kind.
+    """
     kind, name = kind_of(source.data), source.name
-    if kind == wanted:
+    if kind == required:
         return source
     if kind:
-        how = {SWEEP: "; a sweep names it under `experiment`, and under `vary` what differs"}
-        more = how.get(wanted, "") if kind == EXPERIMENT else ""
-        takes = what_takes(kind, name)
-        raise ExperimentError(f"{name}: is {kind}, not {wanted}; {takes}{more}")
+        hints = {SWEEP: "; a sweep refers to it by `experiment`, and lists parameters in `vary`"}
+        hint = hints.get(required, "") if kind == EXPERIMENT else ""
+        command = what_takes(kind, name)
+        raise ExperimentError(f"{name}: is {kind}, not {required}; {command}{hint}")
     remedy = {
-        EXPERIMENT: "one has `lattice`, `body`, `rule` and `steps`; `pbdkit init` writes one",
-        SWEEP: "one has `experiment` and `vary`",
-        FIT: "one has `experiment`, `unknown` and `measured`",
+        EXPERIMENT: "it requires `lattice`, `body`, `rule`, `steps`; `pbdkit init` writes one",
+        SWEEP: "it requires `experiment` and `vary`",
+        FIT: "it requires `experiment`, `unknown` and `measured`",
     }
     first = ", ".join(f"`{key}`" for key in [*source.data][:3])
-    raise ExperimentError(f"{name}: is not {wanted}, it has {first}; {remedy[wanted]}")
+    raise ExperimentError(f"{name}: is not {required}, it has {first}; {remedy[required]}")
 
 
 Settings = str | Iterable[str] | Mapping[str, Any]
-"""Changes of an experiment, as Python users give them."""
+"""Type of changes of an experiment."""
 EXPECTED = "settings: expected a map, as {'steps': 20}, or a list of texts, as ['steps=20']"
-LONGEST = 80
-"""So many characters of a setting are repeated in messages."""
+"""Message about settings of a wrong type."""
+MAX_LABEL = 80
+"""Maximum number of characters of a setting in messages."""
 
 
 def with_settings(source: Source, settings: Settings, defaults: Mapping[str, Any]) -> Source:
@@ -375,12 +445,19 @@ def with_settings(source: Source, settings: Settings, defaults: Mapping[str, Any
 
     Parameters
     ----------
+    source : Source
+        Raw data.
     settings : mapping, str, or iterable of str
-        A map changes the keys that it names, at any depth: ``{"rule": {"relaxation": 0.3}}`` or
-        ``{"rule.relaxation": 0.3}``; a map with a `type` replaces the whole part. A text is
+        A map changes its keys at any depth: ``{"rule": {"relaxation": 0.3}}`` or
+        ``{"rule.relaxation": 0.3}``; a map with a `type` replaces the whole part. Text is
         ``path=value``.
     defaults : mapping
-        The entries from which parts start that the source leaves out.
+        Initial values of parts that the source does not have.
+
+    Raises
+    ------
+    ExperimentError
+        If a setting is malformed, or its path does not exist.
     """
     if isinstance(settings, Mapping):
         for where, value in _leaves({**defaults, **source.data}, settings, ()):
@@ -397,22 +474,22 @@ def with_settings(source: Source, settings: Settings, defaults: Mapping[str, Any
 
 
 def _leaves(data: Any, changes: Mapping[Any, Any], where: Where) -> Iterator[tuple[Where, Any]]:
-    """Yield the values to set, each with its path."""
+    """Generate the values to set, each with its path."""
     for key, value in changes.items():
-        parts, now = str(key).split("."), data
+        parts, current = str(key).split("."), data
         path = (*where, *parts)
         for part in parts:
-            entries = dict(enumerate(now)) if isinstance(now, list) else now
+            entries = dict(enumerate(current)) if isinstance(current, list) else current
             is_map = isinstance(entries, Mapping)
-            now = entries.get(part, entries.get(_position(part))) if is_map else None
-        if isinstance(value, Mapping) and "type" not in value and isinstance(now, (dict, list)):
-            yield from _leaves(now, value, path)
+            current = entries.get(part, entries.get(_position(part))) if is_map else None
+        if isinstance(value, Mapping) and "type" not in value and isinstance(current, (dict, list)):
+            yield from _leaves(current, value, path)
         else:
             yield path, value
 
 
 def plain(value: Any) -> Any:
-    """Return the value as a file would hold it: Python users give arrays and components too."""
+    """Convert arrays and components to the values that a file would contain."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", by_alias=True)
     if isinstance(value, (np.ndarray, np.generic)):
@@ -423,12 +500,23 @@ def plain(value: Any) -> Any:
 
 
 def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> Source:
-    """A copy of the source with one value set.
+    """Return a copy of the source with one value set.
 
-    `setting` is ``path=value`` with a dotted path, list positions from 0 and a YAML value. A part
-    that the file leaves out starts from its entry in `defaults`.
+    Parameters
+    ----------
+    source
+        Raw data.
+    setting
+        ``path=value`` with a dotted path, list indices from 0 and a YAML value.
+    defaults
+        Initial values of parts that the source does not have.
+
+    Raises
+    ------
+    ExperimentError
+        If the setting is malformed, or its path does not exist.
     """
-    label = f"setting {setting if len(setting) <= LONGEST else setting[:LONGEST] + '...'}"
+    label = f"setting {setting if len(setting) <= MAX_LABEL else setting[:MAX_LABEL] + '...'}"
     path, equals, value = setting.partition("=")
     if not equals or not path:
         raise ExperimentError(f"{label}: expected PATH=VALUE, for instance rule.K=-0.002")
@@ -438,10 +526,12 @@ def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> S
 def with_value(
     source: Source, path: str, value: Any, label: str, defaults: Mapping[str, Any]
 ) -> Source:
-    """The same of a value that is none of YAML; `label` is what messages call its place."""
+    """Return a copy of the source with the value at a dotted path set; `label` is its place in
+    messages.
+    """
     where = tuple(map(_position, path.split(".")))
     places = {k: place for k, place in source.places.items() if k[: len(where)] != where}
-    changed = Source(source.name, copy.deepcopy(source.data), places, source.beside)
+    changed = Source(source.name, copy.deepcopy(source.data), places, source.files)
     _place(changed.data, where, value, label, defaults)
     for depth in range(1, len(where) + 1):
         changed.places.setdefault(where[:depth], label)
@@ -469,17 +559,19 @@ def _entry(data: Any, part: str | int, label: str) -> Any:
     if isinstance(data, dict):
         return data[part if part in data else str(part)]
     if not isinstance(data, list):
-        raise ExperimentError(f"{label}: '{part}' is looked for in a single value")
+        raise ExperimentError(f"{label}: '{part}' is the key of a single value, which has none")
     if not isinstance(part, int) or part >= len(data):
-        raise ExperimentError(f"{label}: '{part}' is no position in a list of {len(data)}, from 0")
+        text = f"'{part}' is not an index of a list of {len(data)}; indices are counted from 0"
+        raise ExperimentError(f"{label}: {text}")
     return data[part]
 
 
 WIDTH = 88
+"""Maximum number of characters in a line."""
 
 
 def yaml_text(parts: dict[str, Any]) -> str:
-    """The parts as YAML, in their order; numbers come back to the bit."""
+    """Return the parts as YAML, in order; numbers are written with all digits."""
     yaml: Any = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False

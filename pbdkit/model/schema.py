@@ -1,4 +1,4 @@
-"""The JSON Schema of experiments, closed over what is installed."""
+"""JSON Schema of experiments with the installed components."""
 
 from __future__ import annotations
 
@@ -15,17 +15,26 @@ from pbdkit.plugin.discovery import RETIRED, Retired
 from pbdkit.plugin.registry import Registry
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+"""Dialect of the schema."""
 
 
 def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:
-    """What an experiment file may hold; without `installed`, of the built-in components alone."""
+    """Return the JSON Schema of experiment files.
+
+    Parameters
+    ----------
+    registry
+        Components.
+    installed
+        Whether to include installed components; otherwise only the built-in ones.
+    """
     offered = {
         field: registry.spellings(interface, installed=installed)
         for field, interface in INTERFACES.items()
     }
     models: chain[type[BaseModel]] = chain([Experiment], *offered.values())
-    names, together = models_json_schema([(model, "validation") for model in models])
-    definitions = together["$defs"]
+    names, combined = models_json_schema([(model, "validation") for model in models])
+    definitions = combined["$defs"]
     top = definitions.pop(names[Experiment, "validation"]["$ref"].split("/")[-1])
     for field, components in offered.items():
         for component, spellings in components.items():
@@ -38,9 +47,9 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
         if field in LISTS:
             part["items"] = {"oneOf": choice} if choice else False
         else:
-            kept = {k: v for k, v in part.items() if k == "default"}
+            default = {k: v for k, v in part.items() if k == "default"}
             choice += [_deprecated(one) for one in RETIRED if one.field == field]
-            top["properties"][field] = {"oneOf": choice} | kept
+            top["properties"][field] = {"oneOf": choice} | default
     everything = json.dumps([top, definitions], ensure_ascii=False)
     used = sorted(name for name in definitions if f'"#/$defs/{name}"' in everything)
     top |= {"title": "pbdkit experiment", "$defs": {name: definitions[name] for name in used}}

@@ -1,4 +1,4 @@
-"""The experiments that come with pbdkit, by name, and the base experiment of a sweep or a fit."""
+"""Shipped experiments by name, and the base experiment of a sweep or a fit."""
 
 from __future__ import annotations
 
@@ -10,49 +10,76 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from pbdkit.errors import ExperimentError, did_you_mean
-from pbdkit.model.reading import ALLOW, EXPERIMENT, Beside, Source, of_kind, read_file, read_text
+from pbdkit.model.reading import (
+    ALLOW,
+    EXPERIMENT,
+    FileResolver,
+    Source,
+    of_kind,
+    read_file,
+    read_text,
+)
 from pbdkit.model.validation import brief, fault
 
 FOLDER = Path(__file__).parent.parent / "experiments"
+"""Folder of the shipped experiments."""
 SUFFIX = ".yaml"
-LONGEST = 100
-"""So many characters a title has, or it ends at its colon."""
+"""Suffix of experiment files."""
+MAX_TITLE = 100
+"""Number of characters above which a title is cut at its colon."""
 
 
 def shipped_names() -> list[str]:
-    """The names of all shipped experiments, sorted."""
-    found = (path.relative_to(FOLDER).as_posix() for path in FOLDER.rglob(f"*{SUFFIX}"))
-    return sorted(name.removesuffix(SUFFIX) for name in found)
+    """Return the names of all shipped experiments, sorted."""
+    names = (path.relative_to(FOLDER).as_posix() for path in FOLDER.rglob(f"*{SUFFIX}"))
+    return sorted(name.removesuffix(SUFFIX) for name in names)
 
 
 def shipped_text(name: str) -> str:
-    """Return the file of a shipped experiment. Raises ExperimentError where there is none of that
-    name."""
+    """Return the text of the file of a shipped experiment.
+
+    Raises
+    ------
+    ExperimentError
+        If there is none of that name.
+    """
     if name not in (names := shipped_names()):
         hint = did_you_mean(name, names) or "; `pbdkit experiments` lists them"
-        raise ExperimentError(f"{name}: is no shipped experiment{hint}")
+        raise ExperimentError(f"{name}: is not a shipped experiment{hint}")
     return (FOLDER / f"{name}{SUFFIX}").read_text("utf-8")
 
 
 def shipped_data(name: str) -> list[Path]:
-    """Return the data files that a shipped experiment names; they lie beside it."""
-    text, beside = shipped_text(name), (FOLDER / name).parent.iterdir()
-    return sorted(path for path in beside if path.suffix != SUFFIX and path.name in text)
+    """Return the data files that a shipped experiment refers to, from its folder."""
+    text, files = shipped_text(name), (FOLDER / name).parent.iterdir()
+    return sorted(path for path in files if path.suffix != SUFFIX and path.name in text)
 
 
 def shipped_title(name: str) -> str:
-    """The first sentence of its file; of a long one what comes before the colon."""
+    """Return the first sentence of the file, cut at its colon if it is long."""
     lines = takewhile(lambda line: line.startswith("#"), shipped_text(name).splitlines())
-    told = " ".join(line.removeprefix("#").strip() for line in lines)
-    sentence = re.split(r"\.(?=\s|$)", told, maxsplit=1)[0]
-    if len(sentence) > LONGEST:
+    text = " ".join(line.removeprefix("#").strip() for line in lines)
+    sentence = re.split(r"\.(?=\s|$)", text, maxsplit=1)[0]
+    if len(sentence) > MAX_TITLE:
         sentence = re.split(r"[:;]\s", sentence, maxsplit=1)[0]
     return f"{sentence}."
 
 
 def read_experiment(name: str, *, allow_outside: bool = False) -> Source:
-    """The source of the experiment in a file, or of the shipped experiment of that name. Files that
-    it names lie in its folder or below, unless others are allowed."""
+    """Read the experiment in a file, or the shipped experiment of that name.
+
+    Parameters
+    ----------
+    name
+        Path of a file, or name of a shipped experiment.
+    allow_outside
+        Whether the experiment may refer to files outside its folder.
+
+    Raises
+    ------
+    ExperimentError
+        If there is no such experiment, or the file cannot be read.
+    """
     path = Path(name)
     try:
         is_file, is_folder = path.is_file(), path.is_dir()
@@ -60,14 +87,14 @@ def read_experiment(name: str, *, allow_outside: bool = False) -> Source:
         raise ExperimentError(f"{name[:80]}...: {error.strerror}") from None
     if is_file:
         source = of_kind(EXPERIMENT, read_file(path))
-        source.beside = Beside(path.parent, allow_outside)
+        source.files = FileResolver(path.parent, allow_outside)
         return source
     names = shipped_names()
     if name in names:
         source = read_text(shipped_text(name), name)
-        source.beside = Beside((FOLDER / name).parent)
+        source.files = FileResolver((FOLDER / name).parent)
         return source
-    what = "is a folder" if is_folder else "is no file and no shipped experiment"
+    what = "is a folder" if is_folder else "is neither a file nor a shipped experiment"
     near = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
     hint = did_you_mean(name, [*near, *names])
     raise ExperimentError(f"{name}: {what}{hint} (`pbdkit experiments` lists them)")
@@ -76,7 +103,8 @@ def read_experiment(name: str, *, allow_outside: bool = False) -> Source:
 def _an_experiment(value: Any) -> Any:
     if not isinstance(value, (str, dict)):
         raise fault(
-            "expected a shipped name, a file beside this one, or the experiment itself, got "
+            "expected the name of a shipped experiment, a file in the folder of this one, or the "
+            "experiment itself, got "
             f"{brief(value)}"
         )
     return value
@@ -85,38 +113,54 @@ def _an_experiment(value: Any) -> Any:
 Base = Annotated[
     Any, AfterValidator(_an_experiment), Field(json_schema_extra={"type": ["string", "object"]})
 ]
-"""A shipped name, a file beside the one that names it, or the experiment itself."""
+"""Type of a base experiment: a shipped name, a file, or the experiment itself.
+"""
 
 
-def base_source(path: Path, given: Any, source: Source) -> Source:
-    """The source of the experiment that is given under `experiment` in a file. Raises
-    ExperimentError."""
-    if isinstance(given, dict):
+def base_source(path: Path, base: Any, source: Source) -> Source:
+    """Return the source of the base experiment of a sweep or fit.
+
+    Parameters
+    ----------
+    path
+        File of the sweep or fit.
+    base
+        Value of the field `experiment`.
+    source
+        Source of the sweep or fit.
+
+    Raises
+    ------
+    ExperimentError
+        If there is no such experiment, or the file cannot be read.
+    """
+    if isinstance(base, dict):
         inner = {w[1:]: p for w, p in source.places.items() if w[:1] == ("experiment",)}
-        return Source(str(path), given, inner, source.beside)
+        return Source(str(path), base, inner, source.files)
     try:
-        return _read(path, given, source.beside)
+        return _read(path, base, source.files)
     except _NoSuchExperimentError as error:
         text = source.message(("experiment",), str(error))
         raise ExperimentError(text, ("experiment",)) from None
 
 
 class _NoSuchExperimentError(ExperimentError):
-    """The field `experiment` leads nowhere."""
+    """The field `experiment` does not refer to an experiment."""
 
 
-def _read(path: Path, name: str, beside: Beside) -> Source:
-    """The source of a file beside that file, or of a shipped experiment."""
+def _read(path: Path, name: str, files: FileResolver) -> Source:
+    """Read a file in the folder of another file, or a shipped experiment."""
     accepted = "give a shipped name, or a file in the folder of that file or below it"
-    file = (beside.folder or path.parent) / name
+    file = (files.folder or path.parent) / name
     try:
-        found = beside.folder is not None and file.is_file()
-        allowed = beside.folder is None or beside.holds(file)
+        is_file = files.folder is not None and file.is_file()
+        is_allowed = files.folder is None or files.holds(file)
     except (OSError, ValueError):
-        raise _NoSuchExperimentError(f"{brief(name)} is no name of a file") from None
-    if not allowed:
-        raise _NoSuchExperimentError(f"{brief(name)} leads elsewhere; {accepted}, or {ALLOW}")
-    if found:
+        raise _NoSuchExperimentError(f"{brief(name)} is not the name of a file") from None
+    if not is_allowed:
+        text = f"{brief(name)} lies outside the folder; {accepted}, or {ALLOW}"
+        raise _NoSuchExperimentError(text)
+    if is_file:
         return of_kind(EXPERIMENT, read_file(file))
     if name in (names := shipped_names()):
         return read_text(shipped_text(name), name)

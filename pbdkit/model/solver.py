@@ -1,4 +1,4 @@
-"""Settings of the solver, a closed family (stepping or equilibrium), and of what is recorded."""
+"""Settings of the solver (stepping or equilibrium), and of what is recorded."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from pbdkit.plugin.component import Strict
 from pbdkit.plugin.schedule import COURSE, PLAIN, WORD, Course, form_of, last
 
 Steps = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, min_length=1)]
+"""Type of a list of recorded steps."""
 
 
 class Record(Strict):
-    """Every so many steps, or at chosen ones; time 0 and the last step always.
+    """Recorded steps: every n-th, or a list; time 0 and the last step are always recorded.
 
     Under `solver: {type: equilibrium}` each of these steps is an equilibrium; `increments` also
-    records those found between them. `dtype` is that of recorded positions and diagnostics; the run
-    itself is not affected.
-    `compression` is that of the file: zlib makes it smaller, and writing it slower.
+    records the equilibria computed between them. `dtype` is that of recorded positions and
+    diagnostics and does not affect the run. `compression` is that of the file: zlib reduces its
+    size, and writing is slower.
     """
 
     every: Annotated[int, Field(ge=1)] = 1
@@ -37,7 +38,7 @@ class Record(Strict):
     def _one_way(self) -> Record:
         if self.at is not None:
             if "every" in self.model_fields_set:
-                raise ValueError("give `every` or `at`, not both")
+                raise ValueError("`every` and `at` exclude each other; give one of them")
             if any(a >= b for a, b in zip(self.at, self.at[1:], strict=False)):
                 raise ValueError(f"`at` must increase, got {list(self.at[:8])}")
         return self
@@ -51,90 +52,95 @@ class Record(Strict):
         return which | {"dtype": self.dtype, "compression": self.compression}
 
     def keeps(self, step: int, steps: int) -> bool:
-        """Whether that step of a run of `steps` is recorded."""
+        """Return whether a step of a run of `steps` is recorded."""
         return step in (0, self.next_after(step - 1, steps))
 
     def steps_before(self, steps: int) -> Iterator[int]:
-        """The recorded steps of a run of `steps` between its start and its last step."""
+        """Generate the recorded steps of a run of `steps` between its start and its last step."""
         step = self.next_after(0, steps)
         while step < steps:
             yield step
             step = self.next_after(step, steps)
 
     def next_after(self, step: int, steps: int) -> int:
-        """The first recorded step after `step`, in a run of `steps`."""
+        """Return the first recorded step after `step`, in a run of `steps`."""
         if self.at is None:
             return min(steps, (step // self.every + 1) * self.every)
         place = bisect_right(self.at, step)
         return min([steps, *self.at[place : place + 1]])
 
     def count(self, steps: int) -> int:
-        """How many steps of a run of `steps` are recorded."""
+        """Return the number of recorded steps of a run of `steps`."""
         if self.at is None:
             return steps // self.every + 1 + (steps % self.every > 0)
         return len({0, steps, *(step for step in self.at if step <= steps)})
 
 
 def _form_of(value: object) -> str:
-    """Which form is meant where a word is taken too."""
+    """Return the form of a value that can also be a word."""
     return WORD if isinstance(value, str) else form_of(value)
 
 
 Word = Annotated[Literal["auto"], Tag(WORD)]
+"""Type of the word `auto`."""
 Threads = Annotated[
     Word | Annotated[int, Field(ge=1, le=1024), Tag(PLAIN)], Discriminator(_form_of)
 ]
+"""Type of a number of threads, or `auto`."""
 _Relaxation = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
 class RelaxationCourse(Course[_Relaxation]):
-    """Of the relaxation."""
+    """Time-dependent relaxation."""
 
 
 Relaxation = Annotated[
     Word | Annotated[_Relaxation, Tag(PLAIN)] | Annotated[RelaxationCourse, Tag(COURSE)],
     Discriminator(_form_of),
 ]
+"""Type of the relaxation: a number, time-dependent, or `auto`."""
 _Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class MemoryCourse(Course[_Memory]):
-    """Of the memory."""
+    """Time-dependent momentum coefficient."""
 
 
 Memory = Annotated[
     Word | Annotated[_Memory, Tag(PLAIN)] | Annotated[MemoryCourse, Tag(COURSE)],
     Discriminator(_form_of),
 ]
+"""Type of the momentum coefficient: a number, time-dependent, or `auto`."""
 
 
 class Settle(Strict):
-    """Stop early: once no follower can be farther from equilibrium than `tolerance`, a share of the
-    largest prescribed displacement."""
+    """Stop a run early, once the distance of every follower from equilibrium is below a tolerance.
+
+    `tolerance` is relative to the largest prescribed displacement.
+    """
 
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
 
 
 class Solver(Component):
-    """What takes a scene from its start to its end."""
+    """Method that advances a scene from its start to its end."""
 
     makes_steps: ClassVar[bool] = True
-    """Whether every step is made, one after the other."""
+    """Whether every step is computed."""
 
     @property
     def stepping(self) -> Stepping:
-        """How a step is made, where one is: the rule's own unless the experiment says more."""
+        """Settings of a single step; the defaults unless this solver is `stepping`."""
         return _stepping()
 
     @property
-    def sought(self) -> Equilibrium:
-        """How an equilibrium is looked for, where one is: as by default, unless the experiment says
-        more."""
-        return _sought()
+    def equilibrium(self) -> Equilibrium:
+        """Settings of an equilibrium; the defaults unless this solver is `equilibrium`."""
+        return _equilibrium()
 
     @property
     def courses(self) -> dict[str, Course[float]]:
-        """The parameters that change in the course of the steps."""
+        """Time-dependent parameters."""
         return {}
 
 
@@ -144,91 +150,100 @@ def _stepping() -> Stepping:
 
 
 @cache
-def _sought() -> Equilibrium:
+def _equilibrium() -> Equilibrium:
     return Equilibrium()
 
 
 class Stepping(Solver):
-    """One step after the other.
+    """Compute one step after the other.
 
-    `relaxation` w and `memory` b apply to any rule's move, for followers only:
-    x(t+1) = m + w · move + b · (x(t) - x(t-1)); each may be a course in time. `engine`: numpy,
-    compiled, gpu, or what serves the scene best, never gpu; `precision` is that of the run's own
-    numbers; `threads` for the compiled engine. With `settle` the run ends where it has settled,
-    after `steps` at the latest. `auto` for `relaxation` or `memory` takes what lets the slowest
-    mode of the scene shrink fastest; results hold numbers.
+    `relaxation` w and `memory` b apply to the move of any rule, for followers only: x(t+1) = m + w
+    · move + b · (x(t) - x(t-1)); both can be time-dependent. `auto` selects the values for which
+    the slowest mode of the scene decays fastest; results contain the numbers. `engine`: numpy,
+    compiled, gpu, or the fastest of numpy and compiled (auto); `precision` is that of the run;
+    `threads` are those of the compiled engine. With `settle` the run ends when it has converged, at
+    the latest after `steps`.
     """
 
     type: Literal["stepping"] = "stepping"
     engine: Literal["auto", "numpy", "compiled", "gpu"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
     threads: Threads = "auto"
-    asked_relaxation: Relaxation = Field(default=1.0, alias="relaxation")
-    asked_memory: Memory = Field(default=0.0, alias="memory")
+    relaxation_setting: Relaxation = Field(default=1.0, alias="relaxation")
+    memory_setting: Memory = Field(default=0.0, alias="memory")
     settle: Settle | None = None
 
     @property
     def stepping(self) -> Stepping:
-        """As the experiment says."""
+        """The settings themselves."""
         return self
 
     @property
     def is_open(self) -> bool:
-        """Whether a number is yet to be chosen for the scene."""
+        """Whether a parameter has yet to be selected for the scene."""
         return bool(self.open_parameters)
 
     @property
     def open_parameters(self) -> tuple[str, ...]:
-        """The names of the numbers that are yet to be chosen for the scene."""
-        asked = {"relaxation": self.asked_relaxation, "memory": self.asked_memory}
-        return tuple(name for name, number in asked.items() if number == "auto")
+        """Names of the parameters that have yet to be selected for the scene."""
+        settings = {"relaxation": self.relaxation_setting, "memory": self.memory_setting}
+        return tuple(name for name, setting in settings.items() if setting == "auto")
 
     @property
     def courses(self) -> dict[str, Course[float]]:
-        """The course of relaxation and memory, where they have one."""
-        both = {"relaxation": self.asked_relaxation, "memory": self.asked_memory}
-        return {name: asked for name, asked in both.items() if isinstance(asked, Course)}
+        """Time dependence of relaxation and memory, by name."""
+        settings = {"relaxation": self.relaxation_setting, "memory": self.memory_setting}
+        return {name: value for name, value in settings.items() if isinstance(value, Course)}
 
     def at(self, moment: float) -> Stepping:
-        """The same with the numbers of a moment."""
-        now = {f"asked_{name}": course.at(moment) for name, course in self.courses.items()}
-        return self.model_copy(update=now)
+        """Return the settings with the values of a moment."""
+        values = {f"{name}_setting": course.at(moment) for name, course in self.courses.items()}
+        return self.model_copy(update=values)
 
     @property
     def relaxation(self) -> float:
-        """w, in the end. Raises ExperimentError where it is yet to be chosen."""
-        return _number(self.asked_relaxation, "relaxation")
+        """Relaxation w at the end of its time dependence.
+
+        Raises
+        ------
+        ExperimentError
+            If it is `auto`.
+        """
+        return _number(self.relaxation_setting, "relaxation")
 
     @property
     def memory(self) -> float:
-        """b, in the end. Raises ExperimentError where it is yet to be chosen."""
-        return _number(self.asked_memory, "memory")
+        """Momentum coefficient b at the end of its time dependence.
+
+        Raises
+        ------
+        ExperimentError
+            If it is `auto`.
+        """
+        return _number(self.memory_setting, "memory")
 
     def with_weights(self, relaxation: float, memory: float) -> Stepping:
-        """The same with these numbers."""
-        chosen = {"asked_relaxation": relaxation, "asked_memory": memory}
-        return self.model_copy(update=chosen)
+        """Return the settings with these values of relaxation and memory."""
+        values = {"relaxation_setting": relaxation, "memory_setting": memory}
+        return self.model_copy(update=values)
 
 
-def _number(asked: Literal["auto"] | float | Course[float], name: str) -> float:
-    if asked == "auto":
-        text = (
-            "'auto' is a number only once it is chosen for a scene: "
-            "pbdkit.stability.relaxation.tuned"
-        )
+def _number(setting: Literal["auto"] | float | Course[float], name: str) -> float:
+    if setting == "auto":
+        text = "'auto' has no value yet; select it with pbdkit.stability.relaxation.tuned"
         raise ExperimentError(text, ("solver", name))
-    return last(asked)
+    return last(setting)
 
 
 class Equilibrium(Solver):
-    """Straight to where the steps converge to, leaders at their last prescribed position with the
-    roles of the last step.
+    """Compute the limit of the steps directly, with leaders at their last prescribed positions.
 
-    `tolerance` is the largest distance from equilibrium, as a share of the largest prescribed
-    displacement. Where bonds can break, the leaders' way is made in so many `increments`, within
-    steps too, each settled before the next; for rules that are not linear in as many as it takes.
-    `method` solves the linear systems: lu, multigrid (with an iteration around it),
-    conjugate-gradients alone, or what serves their size.
+    Roles are those of the last step. `tolerance` is the largest distance from equilibrium, relative
+    to the largest prescribed displacement. If bonds can break, the motion of the leaders is divided
+    into `increments`, also within steps, with an equilibrium for each; under nonlinear rules the
+    number of increments is adaptive. `method` solves the linear systems: lu, multigrid (as the
+    preconditioner of an iteration), conjugate-gradients without preconditioner, or a choice by size
+    (auto).
     """
 
     makes_steps: ClassVar[bool] = False
@@ -238,11 +253,12 @@ class Equilibrium(Solver):
     increments: Annotated[int, Field(ge=1, le=100_000)] = 100
 
     @property
-    def sought(self) -> Equilibrium:
-        """As the experiment says."""
+    def equilibrium(self) -> Equilibrium:
+        """The settings themselves."""
         return self
 
 
 AnySolver = Annotated[
     SerializeAsAny[Stepping | Equilibrium], closed_part(Solver, Stepping, Equilibrium)
 ]
+"""Type of the solver in an experiment."""

@@ -1,5 +1,7 @@
-"""Validate the parts of an experiment with pydantic and word each error with place, field, cause
-and the nearest valid value; read field files.
+"""Validate the parts of an experiment with pydantic.
+
+Each error is reported with place, field, cause and the nearest valid value. Includes reading of
+spatially varying parameters from files.
 """
 
 from __future__ import annotations
@@ -25,59 +27,63 @@ from pbdkit.errors import (
     did_you_mean,
     one_line,
 )
-from pbdkit.model.reading import Beside, Source, beside
+from pbdkit.model.reading import FileResolver, Source, file_resolver
 from pbdkit.plugin import INTERFACES, Component
 from pbdkit.plugin.discovery import blame
-from pbdkit.plugin.fields import MOST_VALUES, Gridded, TakesFields
+from pbdkit.plugin.fields import MAX_VALUES, Gridded, TakesFields
 from pbdkit.plugin.registry import Registry
 from pbdkit.plugin.schedule import FORMS, WORD
 from pbdkit.plugin.units import TEXT
 from pbdkit.untrusted_files import VALUES, read_apart
 
-MOST_BYTES = 2**30
-LONGEST_NAME = 200
+MAX_BYTES = 2**30
+"""Maximum size of a file of spatially varying parameters in bytes."""
+MAX_NAME = 200
 """Maximum number of characters in the name of a variable."""
 
 
 class FieldFileError(ValueError):
-    """A field file that is not there, cannot be read, or holds no field; the text names it."""
+    """A file of a spatially varying parameter is missing, cannot be read, or has no such data."""
 
 
-def read_field(given: dict[str, Any], files: Beside) -> Gridded:
-    """Return what ``{file: NAME, variable: NAME}`` says, the file among those that may be named.
+def read_field(value: dict[str, Any], files: FileResolver) -> Gridded:
+    """Read a spatially varying parameter, ``{file: NAME, variable: NAME}``.
 
-    Raises ValueError where the file or the variable is not there, or no numbers over x and y.
+    Raises
+    ------
+    ValueError
+        If the file or the variable does not exist, or is not a function of x and y.
     """
-    if given.keys() != {"file", "variable"}:
-        raise ValueError(f"a field from a file has file and variable, got {', '.join(given)}")
-    path, variable = files.path(given["file"], "netCDF"), given["variable"]
-    if not isinstance(variable, str) or not variable.isprintable() or len(variable) > LONGEST_NAME:
-        raise ValueError(f"variable should be the name of one in {path}")
-    about = path.stat()
-    if about.st_size > MOST_BYTES:
-        raise ValueError(f"{path} is larger than 1 GiB")
-    return _read(path, variable, about.st_size, about.st_mtime_ns)
+    if value.keys() != {"file", "variable"}:
+        raise ValueError(f"a field from a file has file and variable, got {', '.join(value)}")
+    path, variable = files.path(value["file"], "netCDF"), value["variable"]
+    if not isinstance(variable, str) or not variable.isprintable() or len(variable) > MAX_NAME:
+        raise ValueError(f"variable should be the name of a variable in {path}")
+    info = path.stat()
+    if info.st_size > MAX_BYTES:
+        raise ValueError(f"{path} is larger than 1 GiB; use a coarser grid")
+    return _read(path, variable, info.st_size, info.st_mtime_ns)
 
 
 @lru_cache(maxsize=4)
 def _read(path: Path, variable: str, size: int, changed_ns: int) -> Gridded:
-    """The field in a file of that size and time of change: members of a sweep read the same."""
+    """Read a file of that size and time of change; cached for members of a sweep."""
     try:
-        read = read_apart(path, variable, str(MOST_VALUES))
+        content = read_apart(path, variable, str(MAX_VALUES))
     except StorageError as error:
         raise FieldFileError(str(error)) from None
     try:
-        with np.load(io.BytesIO(read)) as arrays:
+        with np.load(io.BytesIO(content)) as arrays:
             x, y, values = (_decoded(name, arrays) for name in ("x", "y", VALUES))
         return Gridded(x, y, values)
     except MemoryError:
         raise
-    except Exception as error:  # attributes that make no sense, in words of other libraries
+    except Exception as error:  # invalid attributes, reported by other libraries
         raise FieldFileError(f"{path}: '{variable}': {one_line(str(error))}") from None
 
 
 def _decoded(name: str, arrays: Any) -> Any:
-    """The numbers of an array, unpacked and masked as its attributes demand."""
+    """Return an array, unpacked and masked according to its attributes."""
     from xarray import Variable
     from xarray.conventions import decode_cf_variable
 
@@ -91,7 +97,8 @@ def _decoded(name: str, arrays: Any) -> Any:
     return decode_cf_variable(name, stored, decode_times=False).values
 
 
-SHOWN = 8
+MAX_FAULTS = 8
+"""Maximum number of errors in a message."""
 PLAIN = {
     "missing": "is missing",
     "tuple_type": "should be a list, got {got}",
@@ -99,26 +106,26 @@ PLAIN = {
     "too_short": "should have at least {min_length} item(s), got {actual_length}",
     "model_type": "should be a map of keys, got {got}",
 }
-"""Where pydantic speaks of Python's types, the words of an experiment file."""
+"""Messages in terms of experiment files, by the type of a pydantic error."""
 _LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20})[-\d.]+")
-"""A bound that pydantic writes out in full, as 1e-100."""
+"""Pattern of a bound that pydantic writes without exponent, as 1e-100."""
 
 
 def report(error: ValidationError, source: Source) -> ExperimentError:
-    """The error to raise instead: a line a fault, the first few of them."""
-    found = [_plainly(fault) for fault in error.errors(include_url=False)]
-    faults = [f for f in found if f["type"] != "too_short" or not _follows(f, found)]
-    lines = [source.message(*_described(fault)) for fault in faults[:SHOWN]]
-    if len(faults) > SHOWN:
-        lines.append(f"... and {len(faults) - SHOWN} more")
+    """Convert a pydantic error to an ExperimentError with one line for each of the first faults."""
+    details = [_plainly(fault) for fault in error.errors(include_url=False)]
+    faults = [f for f in details if f["type"] != "too_short" or not _follows(f, details)]
+    lines = [source.message(*_described(fault)) for fault in faults[:MAX_FAULTS]]
+    if len(faults) > MAX_FAULTS:
+        lines.append(f"... and {len(faults) - MAX_FAULTS} more")
     return ExperimentError("\n".join(lines), _described(faults[0])[0])
 
 
 def _plainly(fault: Any) -> Any:
-    """The fault without the names of forms, and with all that a word could also be."""
+    """Remove the names of union members from the path, and describe all forms of a value."""
     where = tuple(word for word in fault["loc"] if word not in (*FORMS, "[key]"))
-    said = {"msg": f"should be {WORD}"} if fault["loc"][-1:] == (WORD,) else {}
-    return fault | {"loc": where} | said
+    message = {"msg": f"should be {WORD}"} if fault["loc"][-1:] == (WORD,) else {}
+    return fault | {"loc": where} | message
 
 
 def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
@@ -133,20 +140,20 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     if fault["type"] == "value_error":
         return where, message
     message = _LONG.sub(lambda number: f"{_bound(context):g}", message)
-    hint, given = "", fault["input"]
-    if fault["type"] == "int_type" and isinstance(given, float) and given % 1 == 0:
-        hint = f"; write {int(given)}"
-    if fault["type"] == "literal_error" and isinstance(given, str):
-        hint = did_you_mean(given, re.findall(r"'([^']*)'", context["expected"]))
-    if fault["type"] == "float_type" and isinstance(given, str) and TEXT.fullmatch(given):
+    hint, value = "", fault["input"]
+    if fault["type"] == "int_type" and isinstance(value, float) and value % 1 == 0:
+        hint = f"; write {int(value)}"
+    if fault["type"] == "literal_error" and isinstance(value, str):
+        hint = did_you_mean(value, re.findall(r"'([^']*)'", context["expected"]))
+    if fault["type"] == "float_type" and isinstance(value, str) and TEXT.fullmatch(value):
         hint = "; this takes a plain number, and no unit"
-    if fault["type"] in ("float_type", "int_type") and isinstance(given, str):
-        hint = hint or _meant_number(given)
-    return where, f"{message}, got {brief(given)}{hint}"
+    if fault["type"] in ("float_type", "int_type") and isinstance(value, str):
+        hint = hint or _meant_number(value)
+    return where, f"{message}, got {brief(value)}{hint}"
 
 
 def _meant_number(text: str) -> str:
-    """What to write in place of a text that is a number but for its way of writing."""
+    """Return a hint if text is a number in another notation."""
     number = text.strip().replace(",", ".", 1)
     share = number.endswith("%")
     with suppress(ValueError):
@@ -156,11 +163,11 @@ def _meant_number(text: str) -> str:
 
 
 def _decimal_commas(fault: Any) -> str:
-    """A hint where whole numbers are twice as many as can be: ``[0,01, 0,0]``."""
-    given, most = fault["input"], fault.get("ctx", {}).get("max_length")
-    if fault["type"] != "too_long" or not isinstance(given, (list, tuple)):
+    """Return a hint if there are twice as many integers as numbers, as in ``[0,01, 0,0]``."""
+    items, maximum = fault["input"], fault.get("ctx", {}).get("max_length")
+    if fault["type"] != "too_long" or not isinstance(items, (list, tuple)):
         return ""
-    doubled = len(given) == 2 * most and all(type(value) is int for value in given)
+    doubled = len(items) == 2 * maximum and all(type(item) is int for item in items)
     return "; decimals have a point and no comma, as in 0.01" if doubled else ""
 
 
@@ -168,20 +175,23 @@ def _bound(context: Any) -> float:
     return next(float(context[k]) for k in ("gt", "ge", "lt", "le") if k in context)
 
 
-def _follows(fault: Any, found: list[Any]) -> bool:
-    """Whether a list is too short only because its items are at fault themselves."""
+def _follows(fault: Any, faults: list[Any]) -> bool:
+    """Return whether a list is too short only because its items are invalid."""
     where = fault["loc"]
-    return any(f["loc"][: len(where)] == where and f["loc"] != where for f in found)
+    return any(f["loc"][: len(where)] == where and f["loc"] != where for f in faults)
 
 
-LONGEST_TYPE = 200
+MAX_TYPE = 200
+"""Maximum number of characters in the name of a type."""
 Finder = Callable[[str], type[Component]]
+"""Type of a function from the name of a type to its class."""
 
 
 def open_part(interface: type[Component]) -> BeforeValidator:
-    """The part is a component of an open interface, found in the registry.
+    """Validate a component of an open interface.
 
-    The registry comes in the validation context, so that components handed over in Python count.
+    The class is looked up in the registry of the validation context, which includes components
+    passed as Python objects.
     """
 
     def build(value: Any, info: ValidationInfo) -> Any:
@@ -190,7 +200,7 @@ def open_part(interface: type[Component]) -> BeforeValidator:
         try:
             part.model_dump_json()
         except (Exception, SystemExit) as error:
-            when = "when written as JSON, as datasets keep it"
+            when = "to be written as JSON for datasets"
             raise _blame(type(part), when, error, info) from error
         return part
 
@@ -198,7 +208,7 @@ def open_part(interface: type[Component]) -> BeforeValidator:
 
 
 def closed_part(base: type[Component], *members: type[Component]) -> BeforeValidator:
-    """The part is one of a fixed list of classes, told apart by `type`."""
+    """Validate one of a fixed list of classes, distinguished by `type`."""
     by_name = {member.type_name(): member for member in members}
 
     def find(name: str) -> type[Component]:
@@ -223,7 +233,7 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
         raise fault("`type` is missing")
     if not isinstance(name, str):
         raise fault(f"expected a word, got {brief(name)}", key="type")
-    if len(name) > LONGEST_TYPE:
+    if len(name) > MAX_TYPE:
         raise fault(f"unknown type {brief(name)}", key="type")
     try:
         part = find(name)
@@ -241,22 +251,22 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
     except (Exception, SystemExit) as error:
         if not issubclass(part, tuple(INTERFACES.values())):
             raise
-        raise _blame(part, "when given its parameters", error, info) from error
+        raise _blame(part, "to validate its parameters", error, info) from error
 
 
 def _from_files(
     parameters: dict[str, Any], part: type[TakesFields], info: ValidationInfo
 ) -> dict[str, Any]:
-    """The fields that stand in files, read."""
-    found = {}
+    """Read the spatially varying parameters from their files."""
+    result = {}
     for name in part.numbers() & parameters.keys():
-        given = parameters[name]
-        if isinstance(given, dict) and "file" in given:
+        value = parameters[name]
+        if isinstance(value, dict) and "file" in value:
             try:
-                found[name] = read_field(given, beside(info))
+                result[name] = read_field(value, file_resolver(info))
             except ValueError as error:
                 raise fault(str(error), key=name) from None
-    return found
+    return result
 
 
 def _blame(
@@ -266,12 +276,14 @@ def _blame(
 
 
 def fault(text: str, **where: Any) -> PydanticCustomError:
-    """An error for pydantic to carry: `text` for the user, `key` where a key of it is meant."""
+    """Return an error for pydantic with a text for the user, and a key if a key of the value is
+    wrong.
+    """
     return PydanticCustomError("fault", "{text}", {"text": text, **where})
 
 
 def brief(value: Any) -> str:
-    """The value as users wrote it, cut where it is long."""
+    """Return the value as users wrote it, shortened if it is long."""
     if isinstance(value, (dict, list, tuple)) and len(value) > 4:
         return f"a {'map' if isinstance(value, dict) else 'list'} of {len(value)}"
     if isinstance(value, int) and abs(value) > 10**20:

@@ -372,7 +372,7 @@ def _refuse(scene: Scene) -> None:
     from pbdkit.equilibrium.stencil_matrix import PrimitiveRaster
 
     experiment, rule = scene.experiment, f"the equilibrium of rule '{scene.experiment.rule.type}'"
-    method, grid = experiment.solver.sought.method, PrimitiveRaster.of(scene)
+    method, grid = experiment.solver.equilibrium.method, PrimitiveRaster.of(scene)
     refuse(
         scene,
         [

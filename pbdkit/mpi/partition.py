@@ -246,7 +246,7 @@ class _Window:
     """The rows of a part on a raster that has more, of the whole or of its surroundings."""
 
     def __init__(self, raster: Raster, subdomain: Subdomain) -> None:
-        before = raster.extent.before if raster.extent else 0
+        before = raster.extent.row_offset if raster.extent else 0
         self._whole, self._sub = raster, (subdomain := subdomain.after(before))
         self._axes = len(raster.shape) - 1
         period = raster.lattice.cell().period[0]
@@ -273,7 +273,7 @@ class _Window:
             kind=kind,
             low=(raster.low[0] + low, *raster.low[1:]),
             sites=sites,
-            before=raster.before + int(counts[line(seen[0])]),
+            particle_offset=raster.particle_offset + int(counts[line(seen[0])]),
             extent=RowLayout(raster.row_counts, before + subdomain.low),
             communicator=SERIAL,
             row_range=None,
@@ -336,7 +336,7 @@ class _Window:
         some = self.leads(leading)
         return replace(
             leading,
-            rows=leading.rows[some] - self.raster.before + self._whole.before,
+            rows=leading.rows[some] - self.raster.particle_offset + self._whole.particle_offset,
             place=self._places(leading.place[some]),
             reference=leading.reference[some],
             share=None if leading.share is None else leading.share[some],
@@ -351,7 +351,7 @@ class _Window:
             return None
         entries = some[follow.point]
         point = (np.cumsum(some) - 1)[follow.point[entries]]
-        body = follow.body[entries] - self.raster.before + self._whole.before
+        body = follow.body[entries] - self.raster.particle_offset + self._whole.particle_offset
         cut = replace(follow, point=point, body=body, weight=follow.weight[entries])
         place = self._places(frame.place[some])
         return Frame(place, cut, self._places(frame.body_place[entries]))
@@ -367,14 +367,14 @@ class _Window:
 
     def _operated(self, operated: Operated) -> Operated:
         some = self.moves(operated.place)
-        rows = operated.rows[some] - self.raster.before + self._whole.before
+        rows = operated.rows[some] - self.raster.particle_offset + self._whole.particle_offset
         return replace(operated, rows=rows, place=self._places(operated.place[some]))
 
     def _loads(self, loads: Loads) -> Loads:
         each = []
         for one in loads.each:
             some = self.moves(one.place)
-            rows = one.rows[some] - self.raster.before + self._whole.before
+            rows = one.rows[some] - self.raster.particle_offset + self._whole.particle_offset
             place, share = self._places(one.place[some]), one.share[some]
             each.append(replace(one, rows=rows, place=place, share=share))
         return Loads(tuple(each), self.raster.shape, loads.held_at)

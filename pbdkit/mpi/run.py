@@ -164,7 +164,7 @@ def _levels(rule: FollowerRule) -> int:
     """So many times what a step reaches a particle sees at most: masses see one step farther."""
     levels = 2
     while isinstance(rule, AppliesTwice):
-        with blaming(rule, "when asked for its inner rule", "rule"):
+        with blaming(rule, "to return its inner rule", "rule"):
             levels, rule = levels + 1, rule.inner()
     return levels
 

@@ -1,6 +1,4 @@
-"""The base class of components, its parameters, and numbers that a component remembers for each
-bond or each particle.
-"""
+"""Base class of components, its parameters, and remembered numbers of bonds and particles."""
 
 from __future__ import annotations
 
@@ -18,34 +16,33 @@ from pbdkit.errors import did_you_mean, printable
 from pbdkit.plugin.vector import Vector
 
 Pair = Annotated[tuple[float, float], Field(strict=False)]
-"""Two numbers, (x, y); an experiment file writes them as a list of two."""
+"""Type of two numbers, (x, y); a list of two in an experiment file."""
 
 
 class Strict(BaseModel):
-    """A frozen model that takes finite numbers, known keys and nothing else.
+    """Frozen model that accepts finite numbers and known keys only.
 
-    "10", True and 10.0 are not the integer 10, and an unknown key is answered with the nearest
-    right one.
+    "10", True and 10.0 are not accepted as the integer 10. The message for an unknown key contains
+    the nearest known key.
     """
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True,
-        defer_build=True,  # of what nobody uses here nothing is built
+        defer_build=True,  # validators are built on first use
         validate_by_name=False, validate_by_alias=True, serialize_by_alias=True,
     )  # fmt: skip
 
     _elsewhere: ClassVar[Mapping[str, str]] = {}
-    """Keys that are looked for here, and what says the same."""
+    """Hints for keys that belong to another place, by key."""
 
     @classmethod
-    def found_elsewhere(cls, key: str) -> str:
-        """Return what to write in place of a key that is not known here; empty where there is
-        nothing."""
+    def key_hint(cls, key: str) -> str:
+        """Return a hint for an unknown key, or an empty string."""
         return cls._elsewhere.get(key, "")
 
     @classmethod
     def known_keys(cls) -> list[str]:
-        """The keys that an experiment may write here."""
+        """Return the keys that an experiment file may contain."""
         return [field.alias or name for name, field in cls.model_fields.items()]
 
     @model_validator(mode="before")
@@ -53,20 +50,20 @@ class Strict(BaseModel):
     def _known_keys_only(cls, data: Any) -> Any:
         unknown = [k for k in data if k not in cls.known_keys()] if isinstance(data, dict) else []
         if unknown:
-            known = [k for k in cls.known_keys() if k != "type"]
-            whose = cls.model_fields["type"].default if "type" in cls.model_fields else "here"
-            taken = f"known: {', '.join(known)}" if known else f"'{whose}' takes nothing"
-            hint = did_you_mean(str(unknown[0]), known)
-            if told := cls.found_elsewhere(str(unknown[0])) or _slip(str(unknown[0])):
-                hint = f"; {told}"
-            message = f"unknown key{hint} ({taken})"
+            keys = [k for k in cls.known_keys() if k != "type"]
+            owner = cls.model_fields["type"].default if "type" in cls.model_fields else "here"
+            listing = f"known: {', '.join(keys)}" if keys else f"'{owner}' has no parameters"
+            hint = did_you_mean(str(unknown[0]), keys)
+            if advice := cls.key_hint(str(unknown[0])) or _slip(str(unknown[0])):
+                hint = f"; {advice}"
+            message = f"unknown key{hint} ({listing})"
             key = printable(str(unknown[0]))
             raise PydanticCustomError("key", "{text}", {"text": message, "key": key})
         return data
 
 
 def _slip(key: str) -> str:
-    """What is frequently meant by a key that cannot be one."""
+    """Return a hint for frequent typing errors in keys."""
     name, colon, value = key.partition(":")
     if colon and name and value:
         return f"write a space after the colon: `{name}: {value}`"
@@ -81,14 +78,14 @@ def _require_type(schema: dict[str, Any]) -> None:
 
 
 class Component(Strict, ABC):
-    """A frozen, validated set of parameters together with the behaviour that they drive.
+    """Frozen, validated parameters together with the behaviour that depends on them.
 
-    A final class gives `type` a literal default and is told from its siblings by it::
+    A final class gives `type` a literal default, by which experiments select it::
 
         class Stiff(pbdkit.FollowerRule):
             type: Literal["stiff"] = "stiff"
 
-    A component holds no run state: what it must remember travels in the state of the stepper.
+    A component has no run state: remembered numbers are part of the state of the run.
     """
 
     model_config = ConfigDict(json_schema_extra=_require_type)
@@ -97,27 +94,38 @@ class Component(Strict, ABC):
 
     @classmethod
     def type_name(cls) -> str:
-        """The `type` by which experiments name this component; TypeError if it declares none."""
+        """Return the `type` by which experiments select this component.
+
+        Raises
+        ------
+        TypeError
+            If the class declares none.
+        """
         default = cls.model_fields["type"].default
         if not isinstance(default, str):
             raise TypeError(
-                f'{cls.__name__} does not name its type: add `type: Literal["my-name"] = "my-name"`'
+                f'{cls.__name__} declares no type: add `type: Literal["my-name"] = "my-name"`'
             )
         return default
 
     def numeric_parameters(self) -> dict[str, float]:
-        """The parameters that are numbers or switches, as they reach elementwise functions."""
+        """Return the numeric and boolean parameters by name, for elementwise functions."""
         values: dict[str, Any] = {name: getattr(self, name) for name in type(self).model_fields}
         return {k: v for k, v in values.items() if isinstance(v, (int, float))}
 
 
 class AnswerError(TypeError):
-    """A function returned something of another kind; the text says what to return."""
+    """A function returned an object of the wrong kind; the message contains the correct kind."""
 
 
 def as_vector(answer: Any, what: str, like: Any) -> Any:
-    """The answer of the function `what`; AnswerError where it is no vector of as many components as
-    another."""
+    """Return the result of the function `what` if it is a vector of the type of `like`.
+
+    Raises
+    ------
+    AnswerError
+        If it is not.
+    """
     if type(answer) is not type(like):
         names = ", ".join(type(like)._fields)
         raise AnswerError(
@@ -128,7 +136,13 @@ def as_vector(answer: Any, what: str, like: Any) -> Any:
 
 
 def as_verdict(answer: Any) -> Any:
-    """The answer of `breaks`; AnswerError where it is neither yes nor no."""
+    """Return the result of `breaks` if it is boolean.
+
+    Raises
+    ------
+    AnswerError
+        If it is not.
+    """
     if (dtype := np.asarray(answer).dtype).kind != "b":
         what = "None" if answer is None else dtype
         raise AnswerError(f"`breaks` returned {what}: compare, as in `... > c.limit`")
@@ -136,8 +150,13 @@ def as_verdict(answer: Any) -> Any:
 
 
 def as_values(answer: Any, what: str) -> tuple[Any, ...]:
-    """The answer of a function that gives any number of values; AnswerError where it is one, as
-    where the comma of ``(value,)`` is forgotten."""
+    """Return the result of a function that returns several values as a tuple.
+
+    Raises
+    ------
+    AnswerError
+        If it is a single value, as when the comma of ``(value,)`` is missing.
+    """
     if isinstance(answer, Vector) or not isinstance(answer, (tuple, list)):
         raise AnswerError(f"`{what}` returned {_kind(answer)}, not a tuple: write `(value,)`")
     return tuple(answer)
@@ -148,17 +167,32 @@ def _kind(answer: Any) -> str:
 
 
 DTYPES = ("f8", "i1", "i2", "i4", "i8")
+"""Data types of remembered numbers."""
 
 
 @dataclass(frozen=True)
 class Remembered:
-    """A number that a fracture model keeps for each bond, or a rule for each particle.
+    """Number that a fracture model remembers for each bond, or a rule for each particle.
 
-    It starts at `initial`, or as the part's `draw` says, is carried from step to step and recorded
-    as the variable `name`: at every recorded step where it `changes`, otherwise once, and not at
-    all unless `recorded`. `dtype` is "f8", kept in the precision of the run, or an integer's.
+    Parameters
+    ----------
+    name
+        Name of the number, and of the variable in the dataset.
+    long_name, units
+        Attributes of the variable.
+    initial
+        Initial value, unless the component draws it.
+    dtype
+        ``"f8"``, in the precision of the run, or an integer type.
+    changes
+        Whether it can change; otherwise it is recorded once.
+    recorded
+        Whether it is recorded.
 
-    Raises ValueError for a name that is no word or another dtype.
+    Raises
+    ------
+    ValueError
+        If the name is not an identifier, or the type or the initial value is not supported.
     """
 
     name: str
@@ -171,23 +205,32 @@ class Remembered:
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
-            raise ValueError(f"'{self.name}' is no name for a variable: letters, digits and _ only")
+            raise ValueError(
+                f"'{self.name}' is not the name of a variable; use letters, digits and _"
+            )
         if self.dtype not in DTYPES:
             raise ValueError(f"'{self.name}' has the dtype '{self.dtype}', not {', '.join(DTYPES)}")
         if np.ndim(self.initial):
             raise ValueError(
-                f"'{self.name}' starts at {self.initial!r}, and is one number: declare one for "
-                f"each component, as {self.name}_x and {self.name}_y"
+                f"the initial value of '{self.name}' is {self.initial!r}, not a number; declare "
+                f"one number for each component, as {self.name}_x and {self.name}_y"
             )
 
 
 @dataclass(frozen=True)
 class Bonds:
-    """The bonds of a scene in the order of the dataset, a row a bond, for those who draw.
+    """Bonds of a scene in the order of the dataset, for random initial values.
 
-    `ends` (bond, 2) are the numbers of its particles, lower first; `rest` (bond, axis) is the rest
-    offset from that one to the other and `midpoint` (bond, axis) lies between their reference
-    positions, both in lattice units; `shell` (bond,) counts from 1.
+    Parameters
+    ----------
+    ends
+        Numbers of both particles, lower first, (bond, 2).
+    shell
+        Shell of each bond, from 1, (bond,).
+    rest
+        Rest offset from the first particle to the second, (bond, axis), lattice units.
+    midpoint
+        Midpoint in the reference configuration, (bond, axis), lattice units.
     """
 
     ends: NDArray[np.int64]
@@ -201,8 +244,15 @@ class Bonds:
 
 @dataclass(frozen=True)
 class Particles:
-    """The particles of the body in the order of their numbers, a row each, for those who draw:
-    `number` (particle,) and reference position `X` (particle, axis), lattice units."""
+    """Particles of the body in the order of their numbers, for random initial values.
+
+    Parameters
+    ----------
+    number
+        Numbers of the particles, (particle,).
+    X
+        Reference positions, (particle, axis), lattice units.
+    """
 
     number: NDArray[np.int64]
     X: NDArray[np.float64]
@@ -212,26 +262,33 @@ class Particles:
 
 
 Drawn = dict[str, NDArray[Any]]
-"""Initial values by the name of the number; what is left out starts at its `initial`."""
+"""Type of initial values by the name of the number; others start at their `initial`."""
 
 
 class Remembers(ABC):
-    """A part with numbers of its own: a fracture model's of each bond, seen by name in ``c``, a
-    rule's of each particle of the body, seen by name in ``here.own``."""
+    """Component with remembered numbers.
+
+    A fracture model remembers numbers for each bond and receives them by name in ``c``; a rule
+    remembers numbers for each particle of the body and receives them by name in ``here.own``.
+    """
 
     @abstractmethod
     def remembered(self) -> tuple[Remembered, ...]:
-        """What it remembers."""
+        """Return the declarations of the remembered numbers."""
 
 
 class Draws(Remembers):
-    """A part whose numbers do not all start at their `initial`."""
+    """Component with random initial values of remembered numbers."""
 
     @abstractmethod
     def draw(self, owners: Any, generator: np.random.Generator) -> Drawn:
-        """Where they start, (owner,) by name, for `owners`: Bonds of a fracture model, Particles of
-        a rule.
+        """Return random initial values by name, each (owner,).
 
-        The generator depends on the experiment's `seed` and on nothing else: neither on other
-        random parts, nor on engine or threads.
+        Parameters
+        ----------
+        owners
+            Bonds for a fracture model, Particles for a rule.
+        generator
+            Random number generator. It depends on the seed of the experiment only, not on other
+            random components, engine or threads.
         """

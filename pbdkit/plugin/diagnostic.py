@@ -1,4 +1,4 @@
-"""The Diagnostic interface: a quantity measured from the run, with its units."""
+"""Interface of diagnostics: quantities computed from a run, with their units."""
 
 from __future__ import annotations
 
@@ -14,15 +14,28 @@ from pbdkit.plugin.component import Bonds, Component, Pair
 from pbdkit.plugin.rule import Stiffness
 
 Floats = NDArray[np.floating[Any]]
+"""Type of arrays of floating-point numbers."""
 Need = Literal["bonds", "cells", "material", "forces", "loads"]
+"""Type of a requirement of a diagnostic."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable of the dataset: its name, dimensions, dtype and attributes.
+    """Variable of the dataset.
 
-    `dims` are without the leading time or step, which the framework adds unless the diagnostic is
-    measured at the end.
+    Parameters
+    ----------
+    name
+        Name of the variable.
+    dims
+        Dimensions, without the leading `time` or `step`, which is added unless the diagnostic is
+        evaluated at the end.
+    long_name, units
+        Attributes of the variable.
+    dtype
+        Data type.
+    attributes
+        Further attributes.
     """
 
     name: str
@@ -33,18 +46,28 @@ class Variable:
     attributes: dict[str, Any] = field(default_factory=dict)
 
     def is_recordable(self, values: Any, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which values can go into the dataset: finite ones, and NaN at particles that are not
-        `inside` the body's outline, such as frame points."""
-        fine: NDArray[np.bool_] = np.isfinite(values)
+        """Return which values are allowed in the dataset.
+
+        Values are finite, or NaN at particles outside the outline, such as frame points.
+
+        Parameters
+        ----------
+        values
+            Values of the variable, without the leading dimension.
+        inside
+            Mask of the particles inside the outline, (particle,).
+        """
+        allowed: NDArray[np.bool_] = np.isfinite(values)
         if "particle" in self.dims:
             shape = [-1 if dim == "particle" else 1 for dim in self.dims]
-            fine |= np.isnan(values) & ~inside.reshape(shape)
-        return fine
+            allowed |= np.isnan(values) & ~inside.reshape(shape)
+        return allowed
 
 
 class LeaderRows(NamedTuple):
-    """The rows of a leader group's particles, whether it leads during this step, and the numbers of
-    the axes along which it does."""
+    """Leader group at a step: rows of its particles, whether it is active, and the axes it leads
+    along.
+    """
 
     rows: NDArray[np.intp]
     leads: bool
@@ -52,9 +75,17 @@ class LeaderRows(NamedTuple):
 
 
 class LoadRows(NamedTuple):
-    """The rows of a load's particles, what each bears of it (its share of a force, its area of a
-    body force), and the force now, in all or of a unit of area, over Young's modulus and
-    thickness, (axis,)."""
+    """Load at a step.
+
+    Parameters
+    ----------
+    rows
+        Rows of its particles.
+    share
+        Share of each particle in the force, or its area for a body force.
+    force
+        Total force, or force per area, over Young's modulus and thickness, (axis,).
+    """
 
     rows: NDArray[np.intp]
     share: Floats
@@ -62,8 +93,7 @@ class LoadRows(NamedTuple):
 
 
 class TouchingRows(NamedTuple):
-    """The rows of the followers that touch an obstacle, and the normals there, which point out of
-    it, (row, axis)."""
+    """Followers that touch an obstacle: their rows, and the outward normals there, (row, axis)."""
 
     rows: NDArray[np.intp]
     normals: NDArray[np.float64]
@@ -71,18 +101,28 @@ class TouchingRows(NamedTuple):
 
 @dataclass(frozen=True)
 class BondHistory(Bonds):
-    """The table of bonds and when they broke, (bond,): `broken_step`, -1 where one has not, 0 at a
-    given crack; `broken_strain` in the intermediate configuration, NaN where it has not broken, was
-    cut or broken from the start."""
+    """Bonds with the time and strain of their breaking.
+
+    Parameters
+    ----------
+    broken_step
+        Step at which each bond broke, -1 if it is intact, 0 for an initial crack, (bond,).
+    broken_strain
+        Strain at breaking, in the intermediate configuration, (bond,). NaN if the bond is intact,
+        was cut, or broken from the start.
+    """
 
     broken_step: NDArray[np.int32]
     broken_strain: NDArray[np.float64]
 
 
 class CellValues(ABC):
-    """What cells show. A cell is a polygon of neighbouring sites with no other site in its
-    circumcircle: on the square and rectangular lattice the rectangles, on the others triangles;
-    together they tile the plane, whatever the neighbours are."""
+    """Quantities of the cells of the body.
+
+    A cell is a polygon of neighbouring sites with no other site in its circumcircle: a rectangle on
+    the square and rectangular lattices, a triangle on the others. Cells tile the plane independent
+    of the neighbour metric.
+    """
 
     @abstractmethod
     def over(
@@ -91,180 +131,241 @@ class CellValues(ABC):
         *,
         intact_only: bool = False,
     ) -> Floats:
-        """function(d, r) of every cell whose corners are all of the body, (cell,).
+        """Evaluate a function on every cell whose corners are all in the body.
 
-        d and r hold a vector a corner, counter-clockwise: d[k] = u_k - u_0, r[k] = X_k - X_0; r is
-        constant. Elementwise, and called once a shape and part of the body. Cells with a broken
-        bond between corners count unless `intact_only`.
+        Parameters
+        ----------
+        function
+            Elementwise function of (d, r), which hold one vector for each corner, counterclockwise:
+            d[k] = u_k - u_0 and the constant r[k] = X_k - X_0. It is called once for each shape and
+            part of the body.
+        intact_only
+            Whether to exclude cells with a broken bond between corners.
+
+        Returns
+        -------
+        NDArray
+            Values, (cell,).
         """
 
     @abstractmethod
     def gradient(self) -> Floats:
-        """H = ∂u/∂X at every particle, (particle, component of u, axis); F = 1 + H.
+        """Return the displacement gradient H = ∂u/∂X at every particle, (particle, component,
+        axis).
 
-        The mean over the cells that meet there, by the share of each that belongs to the body,
-        carried on from the middle of those cells to the particle. Cells with a broken bond between
-        corners do not count. NaN at frame points, 0 at body particles without a cell. Beyond the
-        outline (`Moment.inside`) it is carried on from the part of the body nearby.
+        The mean over the cells at the particle, weighted by their shares inside the outline,
+        extrapolated from the centre of these cells to the particle. Cells with a broken bond
+        between corners are excluded. NaN at frame points, 0 at particles without cells,
+        extrapolated outside the outline.
         """
 
     def lost_stress(self) -> Floats | None:
-        """The first Piola-Kirchhoff stress over Young's modulus that softened bonds no longer
-        carry, (particle, component, axis), as the mean over the cells that `gradient` counts; None
-        where nothing has softened."""
+        """Return the stress that softened bonds have lost, (particle, component, axis), or None.
+
+        The first Piola-Kirchhoff stress over Young's modulus, as the mean over the cells of
+        `gradient`.
+        """
         return None
 
 
 class ForceValues(ABC):
-    """What the material that the rule is calibrated to makes of a state, over Young's modulus and
-    thickness, in lattice units."""
+    """Forces and energy of the material, over Young's modulus and thickness, in lattice units."""
 
     @property
     @abstractmethod
     def stiffness(self) -> Stiffness:
-        """The material."""
+        """Stiffness of the material."""
 
     @property
     @abstractmethod
     def through_thickness(self) -> Any:
-        """σ_zz over σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain; one number, or
-        one for each particle."""
+        """Ratio of σ_zz to σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain.
+
+        One number, or one for each particle.
+        """
 
     @abstractmethod
     def on_particles(self) -> Floats:
-        """The forces of the neighbours on every particle, leaders too, (particle, axis); NaN at
-        frame points. Of broken bonds they are what the rule sees."""
+        """Return the forces of the neighbours on every particle, (particle, axis), NaN at frame
+        points.
+
+        Leaders are included. The forces of broken bonds are those of the rule.
+        """
 
     @abstractmethod
     def energy(self) -> float:
-        """The strain energy: ½ uᵀK u, which is -½ Σ u·force, or that of the rule's own bonds where
-        it is not linear."""
+        """Return the strain energy: ½ uᵀK u = -½ Σ u·f of a linear rule, that of the bonds of a
+        nonlinear one.
+        """
 
 
 class Moment(ABC):
-    """The run at the end of a step, as a diagnostic sees it. Tables have a row a particle; nobody
-    can write to them."""
+    """State of the run at the end of a step, as input of diagnostics.
+
+    Tables have one row for each particle and are read-only.
+    """
 
     step: int
 
     @property
     @abstractmethod
     def body(self) -> NDArray[np.bool_]:
-        """(particle,): which are leaders or followers; the others are frame points."""
+        """Mask of leaders and followers, (particle,); the other rows are frame points."""
 
     @property
     @abstractmethod
     def inside(self) -> NDArray[np.bool_]:
-        """(particle,): which particles of the body lie inside or on its outline; corners of cut
-        cells may lie beyond it."""
+        """Mask of the particles inside or on the outline, (particle,).
+
+        Corners of cut cells can lie outside.
+        """
 
     @property
     @abstractmethod
     def cells(self) -> CellValues:
-        """What the cells of the body show."""
+        """Quantities of the cells of the body."""
 
     @property
     @abstractmethod
     def forces(self) -> ForceValues:
-        """Forces and energy of the material, for diagnostics that need it."""
+        """Forces and energy of the material, for diagnostics that require these."""
 
     @abstractmethod
     def rows(self, numbers: tuple[int, ...]) -> NDArray[np.intp]:
-        """The rows of the particles with these numbers."""
+        """Return the rows of the particles with these numbers."""
 
     @abstractmethod
     def nearest(self, points: tuple[Pair, ...]) -> NDArray[np.intp]:
-        """The row of the body particle that is nearest to each point at rest, the lowest number on
-        ties."""
+        """Return the row of the body particle nearest to each point at rest, of several the lowest
+        number.
+        """
 
     @abstractmethod
     def displacement(self, rows: NDArray[np.intp] | None = None) -> Floats:
-        """u = x - X, (particle, axis), of all particles or of some rows."""
+        """Return u = x - X of all particles or of some rows, (particle, axis)."""
 
     @abstractmethod
     def previous_displacement(self) -> Floats:
-        """u at the end of the step before, (particle, axis); at time 0 that of time 0."""
+        """Return u at the end of the previous step, (particle, axis); at time 0 that of time 0."""
 
     @abstractmethod
     def reference(self, rows: NDArray[np.intp] | None = None) -> Floats:
-        """X, (particle, axis)."""
+        """Return X of all particles or of some rows, (particle, axis)."""
 
     @abstractmethod
     def sum_over_neighbours(
         self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
-        """Σ_k function(d, r) over the reference neighbours k of each body particle, (particle,).
+        """Return Σ_k function(d, r) over the reference neighbours k of each body particle,
+        (particle,).
 
-        d = u_k - u_j, r = X_k - X_j; elementwise, like a rule's `gather`. Broken bonds count, with
-        the real neighbour, unless `intact_only`. Frame points get NaN.
+        Parameters
+        ----------
+        function
+            Elementwise function of d = u_k - u_j and r = X_k - X_j, as `gather` of a rule.
+        intact_only
+            Whether to exclude broken bonds; otherwise they count with the real neighbour.
+
+        Returns
+        -------
+        NDArray
+            Sums; NaN at frame points.
         """
 
     @abstractmethod
     def leader_groups(self) -> tuple[LeaderRows, ...]:
-        """The leader groups in the order of the experiment."""
+        """Return the leader groups in the order of the experiment."""
 
     @abstractmethod
     def loads(self) -> tuple[LoadRows, ...]:
-        """The loads in the order of the experiment; none acts yet at time 0."""
+        """Return the loads in the order of the experiment; at time 0 none acts."""
 
     @abstractmethod
     def touching(self) -> tuple[TouchingRows, ...]:
-        """Who touches each obstacle, in their order; nobody while one is not there."""
+        """Return the followers that touch each obstacle, in the order of the experiment.
+
+        Empty for an obstacle that does not exist at this step.
+        """
 
     @abstractmethod
     def broken_bonds(self) -> int:
-        """How many bonds have broken so far."""
+        """Return the number of bonds that have broken."""
 
     @abstractmethod
     def bonds(self) -> BondHistory:
-        """The table of bonds, in the order of the dataset: row n is the bond with number n + 1."""
+        """Return the table of bonds in the order of the dataset; row n is the bond with number n +
+        1.
+        """
 
     @abstractmethod
     def remembered(self, name: str) -> NDArray[Any]:
-        """A number that the fracture model remembers, (bond,) in the order of the dataset, or the
-        rule, (particle,); frame points have its initial value."""
+        """Return a remembered number of the fracture model, (bond,), or of the rule, (particle,).
+
+        Bonds are in the order of the dataset; frame points have the initial value.
+        """
 
 
 class Diagnostic(Component):
-    """A quantity of the run that goes into the dataset.
+    """Quantity of the run that is stored in the dataset.
 
-    To add a diagnostic, write `variables` and `measure`. It is evaluated at recorded steps only,
-    at every step where it declares `every_step`, or once, after the last step, where it declares
-    `at_end`; nothing of it exists where nobody asks.
+    To implement a diagnostic, define `variables` and `measure`. It is evaluated at recorded steps,
+    at every step if it declares `every_step`, or once after the last step if it declares `at_end`.
     """
 
     needs: ClassVar[frozenset[Need]] = frozenset()
-    """What it makes no sense without. "bonds": the table of bonds in the dataset; "cells"
-    (`Moment.cells`): a body that has none, a single row for instance, is refused; "material"
-    (`Moment.forces.stiffness`), "forces" (all of `Moment.forces`): rules that are not calibrated
-    are refused; "loads" (`Moment.loads`): experiments without loads are. Variables can then have
-    a dimension `load`, an entry a load."""
+    """Requirements of the diagnostic.
+
+    "bonds": the table of bonds in the dataset. "cells": `Moment.cells`; a body without cells, such
+    as a single row, is an error. "material": `Moment.forces.stiffness`, and "forces": all of
+    `Moment.forces`; rules that are not calibrated are an error. "loads": `Moment.loads`;
+    experiments without loads are an error. Variables can then have the dimension `load`.
+    """
     every_step: ClassVar[bool] = False
-    """Measure at every step (dimension `step`) instead of at recorded ones (`time`)."""
+    """Whether to evaluate at every step (dimension `step`) rather than at recorded steps."""
     at_end: ClassVar[bool] = False
-    """Measure once, after the last step; the variables have no leading dimension."""
+    """Whether to evaluate once, after the last step; variables then have no leading dimension."""
     local: ClassVar[bool] = False
-    """Whether what it measures at a particle depends on that and its neighbours alone. Each process
-    then measures on its own part of a lattice that is cut up; else one gathers the whole."""
+    """Whether the value at a particle depends only on the particle and its neighbours.
+
+    With several processes each then evaluates its own part of the lattice; otherwise one process
+    evaluates the whole.
+    """
     own_dimension: ClassVar[str] = ""
-    """With `at_end`: a dimension that gets its length from the values, known only then."""
+    """With `at_end`: name of a dimension whose length is that of the values."""
 
     @abstractmethod
     def variables(self) -> tuple[Variable, ...]:
-        """The variables that it adds to the dataset."""
+        """Return the variables in the dataset."""
 
     def coordinates(self) -> dict[str, NDArray[Any]]:
-        """Dimensions of its own with their values; by default none."""
+        """Return additional dimensions with their coordinates; empty by default."""
         return {}
 
     def check(self, particles: int, leader_groups: int) -> None:
-        """Raise ExperimentError where it does not go with a scene of so many particles and leader
-        groups. A variable can have a dimension `leader_group`, an entry a group,
-        `obstacle`, or `principal`, the larger and the smaller principal value in the plane."""
+        """Check that the diagnostic is compatible with the scene.
+
+        Variables can have the dimensions `leader_group`, `obstacle`, and `principal`, the larger
+        and the smaller principal value in the plane.
+
+        Parameters
+        ----------
+        particles
+            Number of particles, frame included.
+        leader_groups
+            Number of leader groups.
+
+        Raises
+        ------
+        ExperimentError
+            If it is not compatible.
+        """
         return
 
     @abstractmethod
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """The values of its variables, one array each, shaped as their `dims` say; finite, but for
-        NaN at frame points in what is measured of the body, and at particles that are not
-        `inside` in what has no meaning beyond the outline."""
+        """Return the values of the variables, one array each, with the shapes given by their
+        `dims`.
+
+        Values must be finite, except NaN at frame points in variables of the body, and at particles
+        that are not `inside` in variables that are not defined outside the outline.
+        """

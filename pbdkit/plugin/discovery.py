@@ -1,7 +1,7 @@
-"""Plugin hooks and discovery of installed plugins by pluggy: each is loaded in its own guard, and
-an error of a component names the component and its distribution.
+"""Plugin hooks, and discovery of installed plugins by pluggy.
 
-Components of earlier versions are mapped to their successors until version 1.0.
+Each plugin is loaded in its own guard, and errors of a component name the component and its
+distribution. Components of earlier versions are mapped to their successors until version 1.0.
 """
 
 from __future__ import annotations
@@ -36,23 +36,27 @@ from pbdkit.plugin.component import AnswerError
 from pbdkit.plugin.hooks import GROUP, Command, Hooks
 
 NUMBERS = {"Parameters": "p", "Weights": "w", "Constants": "c", "Own": "here.own"}
-"""What authors call the tuples of numbers that their functions are given."""
+"""Names of the arguments of elementwise functions, by the class of their named tuple."""
 NO_REFERENCE = (
     "`here.X` and `here.centred` are given to rules that declare "
     "`uses_reference: ClassVar[bool] = True`"
 )
+"""Message about reference positions in rules that do not declare their use."""
 
 
 def interface_of(component: type[Component]) -> type[Component]:
-    """The open interface that a component class implements."""
+    """Return the open interface that a component class implements."""
     return next(i for i in INTERFACES.values() if issubclass(component, i))
 
 
 def whose(component: type[Component]) -> str:
-    """``FollowerRule 'odd' of pbdkit-odd 0.3``, where a distribution's entry point leads to its
-    package."""
+    """Return interface, type and distribution of a component: ``FollowerRule 'odd' of pbdkit-odd
+    0.3``.
+
+    The distribution is that whose entry point refers to the package of the component.
+    """
     package, origin = component.__module__.split(".")[0], ""
-    with suppress(Exception):  # metadata of others can be torn
+    with suppress(Exception):  # metadata of other distributions can be damaged
         for point in entry_points(group=GROUP):
             if point.module.split(".")[0] == package != GROUP and point.dist:
                 origin = f" of {point.dist.name} {point.dist.version}".rstrip()
@@ -60,16 +64,18 @@ def whose(component: type[Component]) -> str:
 
 
 def blame(component: type[Component], when: str, error: BaseException) -> PluginError:
-    """The error to raise where a component's own code has failed."""
-    told = worded(error, component.__module__.split(".")[0], component)
-    return PluginError(f"{whose(component)} failed {when}: {told}")
+    """Return the PluginError for an error in the code of a component."""
+    message = worded(error, component.__module__.split(".")[0], component)
+    return PluginError(f"{whose(component)} failed {when}: {message}")
 
 
 @contextmanager
 def blaming(component: Component, when: str, *field: str | int) -> Iterator[None]:
-    """What a component's own code raises becomes a PluginError with its interface, type and
-    distribution; what it refuses with an ExperimentError is about its `field` of the experiment,
-    where one is given. An interrupt says where it came."""
+    """Convert errors in the code of a component.
+
+    An exception becomes a PluginError with interface, type and distribution of the component. An
+    ExperimentError gets the `field` of the component, if one is given. An interrupt gets the place.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -77,9 +83,9 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
     except ExperimentError as error:
         if not field:
             raise blame(type(component), when, error) from error
-        named = error.where[: len(field)] == field
+        has_field = error.where[: len(field)] == field
         raise ExperimentError(
-            str(error), error.where if named else (*field, *error.where)
+            str(error), error.where if has_field else (*field, *error.where)
         ) from None
     except (PbdkitError, MemoryError, FloatingPointError):
         raise
@@ -90,29 +96,39 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
 def worded(
     error: BaseException, package: str = "", component: type[Component] | None = None
 ) -> str:
-    """Return ``Type: message`` of whatever foreign code raised, on one line, without control
-    characters, cut where it is long; with `package`, the place in its code where the traceback has
-    one, and with the `component` whose code it is a remedy that fits."""
+    """Return ``Type: message`` of an error in foreign code.
+
+    The text is on one line, without control characters, and shortened if it is long.
+
+    Parameters
+    ----------
+    error
+        The error.
+    package
+        Package for which the last place in the traceback is appended.
+    component
+        Component for which a remedy is appended.
+    """
     try:
         message = str(error)
-    except Exception:  # a plugin's own error class can fail to say what it is
-        message = "(its message cannot be had)"
+    except Exception:  # `__str__` of an error class of a plugin can fail
+        message = "(its message is not available)"
     if isinstance(error, AnswerError):
         return one_line(message)
-    told = f"{type(error).__name__}: {message}" if message else type(error).__name__
+    text = f"{type(error).__name__}: {message}" if message else type(error).__name__
     place = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
         if package and str(frame.f_globals.get("__name__")).split(".")[0] == package:
-            # which takes the separators of every system
+            # PureWindowsPath accepts the separators of every system
             place = f" ({PureWindowsPath(frame.f_code.co_filename).name}, line {line})"
     advice = ""
-    with suppress(Exception):  # foreign errors and objects can fail to be looked at
+    with suppress(Exception):  # attributes of foreign errors and objects can fail
         advice = remedy(error, component)
-    return one_line(told) + advice + place
+    return one_line(text) + advice + place
 
 
 def remedy(error: BaseException, component: type[Component] | None = None) -> str:
-    """Return what elementwise functions are to do instead, where the fault is a frequent one."""
+    """Return the remedy for frequent errors in elementwise functions."""
     if isinstance(error, ValueError) and "truth value of an array" in str(error):
         return "; choose with `pbdkit.plugin.where` in the place of `if`, `and` and `or`"
     of_none = isinstance(error, AttributeError | TypeError) and "'NoneType'" in str(error)
@@ -123,30 +139,45 @@ def remedy(error: BaseException, component: type[Component] | None = None) -> st
     name, kind = str(error.name), type(error.obj).__name__
     if kind in NUMBERS and component and name in component.model_fields:
         return (
-            f"; `{NUMBERS[kind]}` holds numbers, and the parameter '{name}' is none: make numbers "
-            "of it in `parameters` or `weights`"
+            f"; `{NUMBERS[kind]}` contains numbers, and the parameter '{name}' is not a number: "
+            "convert it in `parameters` or `weights`"
         )
-    known = [n for n in getattr(error.obj, "_fields", dir(error.obj)) if not n.startswith("_")]
-    there = f"; `{NUMBERS[kind]}` holds {', '.join(known) or 'nothing'}" if kind in NUMBERS else ""
-    return did_you_mean(name, known) or there
+    names = [n for n in getattr(error.obj, "_fields", dir(error.obj)) if not n.startswith("_")]
+    content = ""
+    if kind in NUMBERS:
+        content = f"; `{NUMBERS[kind]}` contains {', '.join(names) or 'nothing'}"
+    return did_you_mean(name, names) or content
 
 
 API = 1
-"""The version of the hook and the interfaces. A plugin may declare the one that it was written for
-as `pbdkit_api`, in the module or on the object that its entry point names."""
+"""Version of the hooks and the interfaces.
+
+A plugin can declare the version that it implements as `pbdkit_api`, in the module or on the object
+of its entry point.
+"""
 
 DISABLE, ALL = "PBDKIT_DISABLE_PLUGINS", "*"
 """The variable that lists what is not to be loaded, distributions or entry points, and its value
 for: nothing at all."""
 SEVERITY = ("ok", "conflict", "broken")
-"""The states of what a plugin offers; its own is the worst of them."""
+"""States of an offer in increasing severity; the state of a plugin is the most severe."""
 
 
 @dataclass(frozen=True)
 class Offer:
-    """One thing on the list of a plugin: a `component` with its type as `name`, and the `reason`
-    where it is in conflict with others. Of a broken one the component is left out, and of
-    `interface` and `name` there is what is known."""
+    """Component of a plugin.
+
+    Parameters
+    ----------
+    name
+        Type of the component.
+    interface
+        Interface, if it is known.
+    component
+        Class; None if it is not usable.
+    reason
+        Why it is not usable, or in conflict with others.
+    """
 
     name: str
     interface: type[Component] | None = None
@@ -155,15 +186,32 @@ class Offer:
 
     @property
     def state(self) -> str:
-        """ok, conflict or broken."""
+        """State: ok, conflict or broken."""
         usable = "conflict" if self.reason else "ok"
         return usable if self.component else "broken"
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """An entry point with the distribution that declares it, and what it offers once it is loaded;
-    or in which state it is that nothing of it can be had, and why."""
+    """Entry point of a distribution, with the components and commands that it provides.
+
+    Parameters
+    ----------
+    name
+        Name of the entry point.
+    distribution, version
+        Name and version of the distribution.
+    entry
+        Entry point.
+    offers
+        Components, after loading.
+    commands
+        Commands, after loading.
+    unusable
+        State if the plugin cannot be used.
+    why
+        Reason of that state.
+    """
 
     name: str
     distribution: str
@@ -176,27 +224,27 @@ class Plugin:
 
     @property
     def state(self) -> str:
-        """ok, disabled, broken (in whole or in part), incompatible or conflict."""
+        """State: ok, disabled, broken (in whole or in part), incompatible or conflict."""
         states = [offer.state for offer in self.offers]
         return self.unusable or max(states, key=SEVERITY.index, default="ok")
 
     @property
     def reason(self) -> str:
-        """Why it is in that state; empty where it is ok."""
+        """Reason of the state, empty if it is ok."""
         return self.why or "; ".join(dict.fromkeys(o.reason for o in self.offers if o.reason))
 
     @property
     def fault(self) -> str:
-        """``broken: why``, or another state in which it cannot be used; else empty."""
+        """State and reason if the plugin cannot be used, otherwise empty."""
         return "" if self.state in ("ok", "conflict") else f"{self.state}: {self.reason}"
 
     @property
     def components(self) -> tuple[type[Component], ...]:
-        """The classes that can be used."""
+        """Usable component classes."""
         return tuple(o.component for o in self.offers if o.component)
 
     def answers_to(self, name: str) -> bool:
-        """Whether the name is that of the distribution or of the entry point."""
+        """Return whether a name is that of the distribution or of the entry point."""
         return canonical(name) in (canonical(self.distribution), canonical(self.name))
 
     def __str__(self) -> str:
@@ -204,89 +252,99 @@ class Plugin:
 
 
 def installed_plugins(group: str = GROUP) -> list[Plugin]:
-    """Return the entry points in a group of all distributions but our own, sorted by the names of
-    both, not loaded.
+    """Return the entry points in a group of all other distributions, sorted by name, without
+    loading them.
 
-    Metadata that cannot be read become a broken plugin, and what the user does not want loaded a
-    disabled one. Of two distributions with one name the first on Python's path counts, as for
-    Python itself.
+    A distribution with unreadable metadata becomes a broken plugin, one that the user disables a
+    disabled plugin. Of two distributions with the same name, the first on the Python path counts.
     """
     names: set[str] = set()
-    found: list[Plugin] = []
-    for each in distributions():
+    plugins: list[Plugin] = []
+    for candidate in distributions():
         try:
-            if f"[{group}]" in (each.read_text("entry_points.txt") or ""):
-                names.add(canonical(_field(each, "Name")))
+            if f"[{group}]" in (candidate.read_text("entry_points.txt") or ""):
+                names.add(canonical(_field(candidate, "Name")))
         except Exception as error:
-            folder = PurePath(str(getattr(each, "_path", "(no name)"))).name
-            found.append(_torn(folder, error))
+            folder = PurePath(str(getattr(candidate, "_path", "(no name)"))).name
+            plugins.append(_damaged(folder, error))
     for name in sorted(names - {BUILTIN}):
         try:
-            own = distribution(name)
-            what = _field(own, "Name"), _field(own, "Version")
-            points = own.entry_points.select(group=group)
-            found += [_wanted(Plugin(point.name, *what, point)) for point in points]
+            source = distribution(name)
+            label = _field(source, "Name"), _field(source, "Version")
+            points = source.entry_points.select(group=group)
+            plugins += [_with_state(Plugin(point.name, *label, point)) for point in points]
         except Exception as error:
-            found.append(_torn(name or "(no name)", error))
-    return sorted(found, key=lambda plugin: (plugin.distribution, plugin.name))
+            plugins.append(_damaged(name or "(no name)", error))
+    return sorted(plugins, key=lambda plugin: (plugin.distribution, plugin.name))
 
 
-def _field(own: Distribution, name: str) -> str:
-    """Of the metadata; empty where it is missing, whether Python reads them or the backport
-    importlib_metadata, which takes its place once anybody imports it, and then raises."""
+def _field(source: Distribution, name: str) -> str:
+    """Return a field of the metadata, or an empty string.
+
+    The backport importlib_metadata, which replaces Python's reader once it is imported, raises if
+    there are no metadata.
+    """
     metadata: Any = None
     with suppress(FileNotFoundError):
-        metadata = own.metadata
+        metadata = source.metadata
     return (metadata and metadata.get(name)) or ""
 
 
-def _torn(distribution: str, error: Exception) -> Plugin:
+def _damaged(distribution: str, error: Exception) -> Plugin:
     why = f"its metadata cannot be read: {worded(error)}"
     return Plugin("", distribution, "", unusable="broken", why=why)
 
 
-def _wanted(plugin: Plugin) -> Plugin:
-    """The plugin, disabled where the user says so."""
+def _with_state(plugin: Plugin) -> Plugin:
+    """Disable the plugin if the user demands it."""
     why = ""
     if ALL in (names := disabled_names()):
-        why = f"no plugin is wanted (--no-plugins or {DISABLE}={ALL})"
+        why = f"all plugins are disabled (--no-plugins or {DISABLE}={ALL})"
     elif any(map(plugin.answers_to, names)):
-        why = f"{DISABLE} names it"
+        why = f"{DISABLE} contains it"
     return replace(plugin, unusable="disabled", why=why) if why else plugin
 
 
 def disabled_names() -> list[str]:
-    """What the variable lists."""
+    """Return the names in the environment variable `DISABLE`."""
     return [word.strip() for word in os.environ.get(DISABLE, "").split(",") if word.strip()]
 
 
 def canonical(name: str) -> str:
-    """The name of a distribution in the one spelling that installers compare."""
+    """Return the normalised name of a distribution."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 TYPE = r"[A-Za-z0-9][A-Za-z0-9._-]*"
+"""Pattern of the type of a component."""
 REFUSALS = ("missing", "value_error", "assertion_error")
-"""Kinds of pydantic's errors that are no fault of a default: a parameter is not given, or the
-component's own validator refuses it."""
+"""Types of pydantic errors that do not concern defaults.
+
+A parameter is missing, or rejected by a validator of the component.
+"""
 
 
 class IncompatibleError(Exception):
-    """A plugin was written for another version of the plugin API."""
+    """The plugin implements another version of the plugin API."""
 
 
 @cache
 def load_builtin() -> Plugin:
-    """The components of pbdkit itself, by its own entry point, with no other looked at; they are
-    not checked, for that is what the tests do."""
-    own = distribution(BUILTIN)
-    (entry,) = own.entry_points.select(group=GROUP)
-    return Plugin(entry.name, BUILTIN, own.version, entry, tuple(map(offer_of, _offered(entry))))
+    """Load the built-in components by their entry point, without other plugins.
+
+    They are not checked, because tests do this.
+    """
+    source = distribution(BUILTIN)
+    (entry,) = source.entry_points.select(group=GROUP)
+    return Plugin(entry.name, BUILTIN, source.version, entry, tuple(map(offer_of, _offered(entry))))
 
 
 def loaded(plugin: Plugin) -> Plugin:
-    """Import the plugin, unless it is disabled, and call its hook `pbdkit_components`; a fault
-    becomes its state and reason. One unusable class leaves the others of the plugin in use."""
+    """Import a plugin and call its hook `pbdkit_components`.
+
+    Errors become state and reason of the plugin; disabled plugins are not imported. An unusable
+    class does not affect the others.
+    """
 
     def load(entry: EntryPoint, package: str) -> Plugin:
         return replace(plugin, offers=tuple(_offer(c, package) for c in _offered(entry)))
@@ -295,8 +353,10 @@ def loaded(plugin: Plugin) -> Plugin:
 
 
 def with_commands(plugin: Plugin) -> Plugin:
-    """Import the plugin, unless it is disabled, and call its hook `pbdkit_commands`; a fault
-    becomes its state and reason."""
+    """Import a plugin and call its hook `pbdkit_commands`.
+
+    Errors become state and reason of the plugin; disabled plugins are not imported.
+    """
 
     def load(entry: EntryPoint, package: str) -> Plugin:
         answer = _answer_of(entry, "pbdkit_commands", "commands")
@@ -306,8 +366,11 @@ def with_commands(plugin: Plugin) -> Plugin:
 
 
 def _guarded(plugin: Plugin, load: Callable[[EntryPoint, str], Plugin]) -> Plugin:
-    """Return the loaded plugin, or with the reason why it cannot be. What a plugin prints at import
-    is no output of the program; its filters of warnings and its folder are its own."""
+    """Load a plugin; errors become its state and reason.
+
+    Output of the plugin at import goes to standard error; its warning filters and working folder
+    are isolated.
+    """
     if plugin.unusable or plugin.entry is None:
         return plugin
     package = plugin.entry.value.split(":")[0].split(".")[0].strip()
@@ -318,12 +381,12 @@ def _guarded(plugin: Plugin, load: Callable[[EntryPoint, str], Plugin]) -> Plugi
         return replace(plugin, unusable="incompatible", why=str(error))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"while {plugin.distribution} was loaded") from None
-    except BaseException as error:  # SystemExit at import is a plugin's fault too
+    except BaseException as error:  # includes SystemExit at import
         return replace(plugin, unusable="broken", why=worded(error, package))
 
 
 def offer_of(component: type[Component]) -> Offer:
-    """The offer of a class that is known to be usable."""
+    """Return the offer of a usable component class."""
     return Offer(component.type_name(), interface_of(component), component)
 
 
@@ -333,19 +396,19 @@ def _offered(entry: EntryPoint) -> list[Any]:
 
 
 def _answer_of(entry: EntryPoint, hook: str, elements: str) -> list[Any]:
-    """Return the list of `elements` that a hook of the entry point's module returns."""
+    """Return the list of `elements` that a hook of the module of an entry point returns."""
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
     module = entry.load()
     declared = getattr(module, "pbdkit_api", None)
-    if declared is None:  # the entry point may name an object in the module
+    if declared is None:  # the entry point can refer to an object in the module
         declared = getattr(sys.modules.get(entry.module), "pbdkit_api", API)
     if type(declared) is not int:
         raise TypeError(f"its `pbdkit_api` should be a whole number, got {declared!r}")
     if declared != API:
         raise IncompatibleError(
-            f"it is written for version {declared} of the plugin API, and pbdkit "
-            f"{version(BUILTIN)} has version {API}; install a version of either that fits the other"
+            f"it implements version {declared} of the plugin API, but pbdkit {version(BUILTIN)} "
+            f"has version {API}; install compatible versions of both"
         )
     manager.register(module, entry.name)
     manager.check_pending()
@@ -359,13 +422,19 @@ def _answer_of(entry: EntryPoint, hook: str, elements: str) -> list[Any]:
 
 
 def _checked_command(command: Any) -> Command:
-    """Return the command; raise TypeError, with what to mend, where it cannot be used."""
+    """Return the command if it is usable.
+
+    Raises
+    ------
+    TypeError
+        If it is not, with the remedy.
+    """
     if not isinstance(command, Command):
-        raise TypeError(f"{command!r} is no pbdkit.plugin.Command")
+        raise TypeError(f"{command!r} is not a pbdkit.plugin.Command")
     if not re.fullmatch(r"[a-z][a-z0-9-]*", command.name):
         raise TypeError(
-            f"'{command.name}' is no name for a command: it begins with a lower-case letter and "
-            "holds lower-case letters, digits and '-' only"
+            f"'{command.name}' is not a valid name of a command; it must begin with a lower-case "
+            "letter and contain only lower-case letters, digits and '-'"
         )
     if not re.fullmatch(r"[\w.]+:\w+", command.target):
         raise TypeError(
@@ -386,78 +455,95 @@ def _offer(component: Any, package: str) -> Offer:
 
 
 def checked(component: Any) -> Offer:
-    """The offer of a component class; raises TypeError, with what to mend, where it is none that
-    can be used."""
+    """Return the offer of a component class if it is usable.
+
+    Raises
+    ------
+    TypeError
+        If it is not, with the remedy.
+    """
     if isinstance(component, Component):
         name = type(component).__name__
-        raise TypeError(f"an object of {name} is offered; offer the class {name} itself")
+        raise TypeError(f"the hook returned an object of {name}; return the class {name}")
     interfaces = tuple(INTERFACES.values())
     if not (inspect.isclass(component) and issubclass(component, interfaces)):
-        raise TypeError(f"{component!r} is no class of one of pbdkit's interfaces")
-    own, name = component.__name__, component.type_name()
+        raise TypeError(f"{component!r} does not implement an interface of pbdkit")
+    label, name = component.__name__, component.type_name()
     if not re.fullmatch(TYPE, name):
         raise TypeError(
-            f"{own} has the type '{name}': a type begins with a letter or digit and "
-            "holds letters, digits, '.', '_' and '-' only"
+            f"{label} has the type '{name}'; a type must begin with a letter or digit and contain "
+            "only letters, digits, '.', '_' and '-'"
         )
     if missing := ", ".join(sorted(getattr(component, "__abstractmethods__", ()))):
-        raise TypeError(f"{own} lacks {missing}")
+        raise TypeError(f"{label} does not define {missing}")
     _check_functions(component)
     try:
         component.model_json_schema()
     except Exception as error:
         why = f"cannot be described in a JSON Schema: {worded(error)}"
-        raise TypeError(f"the parameters of {own} {why}") from None
+        raise TypeError(f"the parameters of {label} {why}") from None
     _check_defaults(component)
     return offer_of(component)
 
 
 def _check_functions(component: type[Component]) -> None:
-    """What the interface declares is called as the interface declares it."""
-    interface, of = interface_of(component), component.__name__
+    """Check that methods have the signature of the interface, and are static where declared so."""
+    interface, label = interface_of(component), component.__name__
     for name, declared in list(vars(interface).items()):
         if name.startswith("_") or not callable(getattr(interface, name)):
             continue
-        own = inspect.getattr_static(component, name)
-        more = issubclass(component, SharesParticles) and name in vars(SharesParticles)
-        asked = getattr(SharesParticles if more else interface, name)
-        given = list(inspect.signature(asked).parameters)
-        called = f"{name}({', '.join(given)})"
-        if isinstance(declared, staticmethod) and not isinstance(own, staticmethod):
-            how = f"write @staticmethod above it, and no `self` in {called}"
-            raise TypeError(f"{of}.{name} must be static: {how}")
-        if isinstance(own, (staticmethod, classmethod)):
-            given = [parameter for parameter in given if parameter != "self"]
+        function = inspect.getattr_static(component, name)
+        is_shared = issubclass(component, SharesParticles) and name in vars(SharesParticles)
+        specification = getattr(SharesParticles if is_shared else interface, name)
+        parameters = list(inspect.signature(specification).parameters)
+        call = f"{name}({', '.join(parameters)})"
+        if isinstance(declared, staticmethod) and not isinstance(function, staticmethod):
+            text = f"write @staticmethod above it, without `self` in {call}"
+            raise TypeError(f"{label}.{name} must be static: {text}")
+        if isinstance(function, (staticmethod, classmethod)):
+            parameters = [parameter for parameter in parameters if parameter != "self"]
         try:
             signature = inspect.signature(getattr(component, name))
-        except (TypeError, ValueError):  # a function in C does not always tell
+        except (TypeError, ValueError):  # functions in C can lack a signature
             continue
         try:
-            signature.bind(*given)
+            signature.bind(*parameters)
         except TypeError:
-            raise TypeError(f"{of}.{name}{signature} is called as {called}") from None
+            raise TypeError(f"{label}.{name}{signature} is called as {call}") from None
 
 
 def _check_defaults(component: type[Component]) -> None:
-    """They are of the types that the parameters declare: the user could not mend them."""
+    """Check that defaults have the declared types, because users cannot correct them."""
     try:
         component.model_validate({})
     except ValidationError as error:
         for fault in error.errors():
             if fault["loc"] and fault["type"] not in REFUSALS:
                 raise TypeError(
-                    f"the default of {component.__name__}.{fault['loc'][0]} does not fit: "
+                    f"the default of {component.__name__}.{fault['loc'][0]} is invalid: "
                     f"{one_line(fault['msg'])}, got {fault['input']!r}"
                 ) from None
-    except (Exception, SystemExit):  # what its own code raises is said where it is used
+    except (Exception, SystemExit):  # errors of its code are reported where it is used
         return
 
 
 @dataclass(frozen=True)
 class Retired:
-    """A built-in component that was removed: its `type` in a `field` of an experiment, the type
-    that takes its place, and how results differ. `renumbers` is true where particles get other
-    numbers."""
+    """Built-in component that was removed.
+
+    Parameters
+    ----------
+    field
+        Field of the experiment.
+    type
+        Type of the component.
+    successor
+        Type of its successor.
+    difference
+        How results differ.
+    renumbers
+        Whether particles have other numbers under the successor.
+    """
 
     field: str
     type: str
@@ -467,7 +553,7 @@ class Retired:
 
     @property
     def advice(self) -> str:
-        """The warning of experiments that name it."""
+        """Warning for experiments with this component."""
         return (
             f"'{self.type}' is retired and read as '{self.successor}' until version 1.0; "
             f"{self.difference}; write {self.field}: {{type: {self.successor}}}"
@@ -484,37 +570,47 @@ RETIRED = (
         renumbers=True,
     ),
 )
+"""All retired components."""
 
 
 def retired_parts(parts: Mapping[str, Any]) -> list[Retired]:
-    """Return the retired components that the parts of an experiment name."""
-    found = []
-    for one in RETIRED:
-        part = parts.get(one.field)
+    """Return the retired components in the parts of an experiment."""
+    result = []
+    for component in RETIRED:
+        part = parts.get(component.field)
         name = part.get("type") if isinstance(part, Mapping) else None
-        if name in (one.type, f"{BUILTIN}:{one.type}"):
-            found.append(one)
-    return found
+        if name in (component.type, f"{BUILTIN}:{component.type}"):
+            result.append(component)
+    return result
 
 
 def with_successors(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parts with the successors of retired components in their places."""
-    renewed = {
-        one.field: {**parts[one.field], "type": one.successor} for one in retired_parts(parts)
+    """Replace retired components in the parts of an experiment by their successors."""
+    successors = {
+        component.field: {**parts[component.field], "type": component.successor}
+        for component in retired_parts(parts)
     }
-    return {**parts, **renewed}
+    return {**parts, **successors}
 
 
 def refuse_retired(parts: Mapping[str, Any], what: str) -> None:
-    """Raise ExperimentError where a scene that was run cannot be built again, since the parts of
-    its experiment name a retired component; `what` needs the scene."""
-    for one in retired_parts(parts):
+    """Raise ExperimentError if a scene cannot be built again because a component is retired.
+
+    Parameters
+    ----------
+    parts
+        Parts of the experiment.
+    what
+        What requires the scene, for the message.
+    """
+    for component in retired_parts(parts):
+        field = component.field
         raise ExperimentError(
-            f"{what} needs the scene that was run, and its {one.field} '{one.type}' is retired; "
-            f"run the experiment anew, with {one.field}: {{type: {one.successor}}}"
+            f"{what} requires the scene of the run, but its {field} '{component.type}' is retired; "
+            f"run the experiment again, with {field}: {{type: {component.successor}}}"
         )
 
 
 def is_retired(interface: type | None, name: str) -> bool:
     """Return whether a type is the name of a retired component of an interface."""
-    return any(name == one.type and INTERFACES[one.field] is interface for one in RETIRED)
+    return any(name == part.type and INTERFACES[part.field] is interface for part in RETIRED)

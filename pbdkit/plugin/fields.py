@@ -1,5 +1,6 @@
-"""Parameters that vary in space or time: functions of place, values over a grid, random fields, and
-time-dependent parameters.
+"""Parameters that vary in space or time.
+
+By region, by functions of position, by values on a grid, as random fields, and time-dependent.
 """
 
 from __future__ import annotations
@@ -30,65 +31,92 @@ from pbdkit.plugin.schedule import Course, as_course
 from pbdkit.plugin.units import LENGTH, PATTERN, Quantity, or_text
 
 Floats = NDArray[np.float64]
+"""Type of arrays of double precision."""
 Held = Mapping[str, NDArray[np.bool_]]
-"""Which places a region holds, by its name, in the order in which the experiment names them."""
-MOST_IN_WORDS = 1000
-"""So many values are written as numbers, more as bytes in base 64."""
-MOST_VALUES = 2**24
+"""Type of the masks of places inside each region, in the order of the experiment."""
+MAX_TEXT_VALUES = 1000
+"""Number of values above which they are written as bytes in base 64."""
+MAX_VALUES = 2**24
+"""Maximum number of values on a grid."""
 
 
 class Varying(ABC):
-    """What a parameter is, place by place (lattice units)."""
+    """Spatially varying parameter (lattice units)."""
 
     @property
     @abstractmethod
     def samples(self) -> dict[str, float]:
-        """Values that occur, by where, for those who validate; the first serves where one number is
-        asked for."""
+        """Values by place for validation; the first is used where a single number is required."""
 
     @abstractmethod
-    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
-        """The values at places of one shape; NaN where there is none. What lies within `reach` of
-        a place that has one may have the same."""
+    def at(self, x: Floats, y: Floats, regions: Held, reach: float = 0.0) -> Floats:
+        """Return the values at places.
+
+        Parameters
+        ----------
+        x, y
+            Coordinates of the places, of one shape.
+        regions
+            Masks of the places inside each region.
+        reach
+            Distance up to which places outside the data may have the nearest value.
+
+        Returns
+        -------
+        NDArray
+            Values in the shape of the places; NaN where there is none.
+        """
 
     @abstractmethod
     def written(self) -> dict[str, Any]:
-        """As an experiment file writes it."""
+        """Return the parameter as in an experiment file."""
 
 
 @dataclass(frozen=True)
 class ByRegion(Varying):
-    """One value a region, and `otherwise` where none of them holds the place; of several the last
-    that the experiment names."""
+    """One value for each region, and `otherwise` outside all regions.
+
+    Where regions overlap, the last one in the experiment counts.
+    """
 
     otherwise: float
     values: tuple[tuple[str, float], ...]
 
     @property
     def samples(self) -> dict[str, float]:
-        """All."""
+        """All values."""
         return {"otherwise": self.otherwise, **dict(self.values)}
 
-    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
-        """Region after region."""
-        found, values = np.full(np.shape(x), self.otherwise), dict(self.values)
-        for name, inside in held.items():
+    def at(self, x: Floats, y: Floats, regions: Held, reach: float = 0.0) -> Floats:
+        """Return the values at places, by region."""
+        result, values = np.full(np.shape(x), self.otherwise), dict(self.values)
+        for name, inside in regions.items():
             if name in values:
-                found[inside] = values[name]
-        return found
+                result[inside] = values[name]
+        return result
 
     def written(self) -> dict[str, Any]:
-        """A value a name."""
+        """Return the values by region."""
         return self.samples
 
 
 class Gridded(Varying):
-    """Values over a grid of places, (x, y), bilinear between; along an axis with one place it is
-    constant."""
+    """Values on a grid (x, y), bilinear between; constant along an axis with a single coordinate.
+
+    Parameters
+    ----------
+    x, y
+        Coordinates, which increase.
+    values
+        Values, (x, y).
+
+    Raises
+    ------
+    ValueError
+        If coordinates do not increase, shapes differ, or numbers are not finite.
+    """
 
     def __init__(self, x: Any, y: Any, values: Any) -> None:
-        """Raises ValueError for places that do not increase, and for values of another shape or
-        that are not finite."""
         self.x, self.y = (np.atleast_1d(np.array(places, float)) for places in (x, y))
         self.values = np.array(values, float)
         for name, places in (("x", self.x), ("y", self.y)):
@@ -96,13 +124,13 @@ class Gridded(Varying):
                 raise ValueError(f"{name} should be numbers that increase")
         if self.values.shape != (shape := (len(self.x), len(self.y))):
             raise ValueError(
-                f"values should be {shape[0]} lists of {shape[1]} numbers, a list for each x and "
-                f"in it a number for each y; their shape is {self.values.shape}"
+                f"values should be {shape[0]} lists of {shape[1]} numbers, a list for each x with "
+                f"a number for each y; their shape is {self.values.shape}"
             )
-        if self.values.size > MOST_VALUES:
-            raise ValueError(f"{self.values.size} values are more than {MOST_VALUES}")
+        if self.values.size > MAX_VALUES:
+            raise ValueError(f"{self.values.size} values exceed {MAX_VALUES}; use a coarser grid")
         if not all(np.isfinite(numbers).all() for numbers in (self.x, self.y, self.values)):
-            raise ValueError("places and values should be finite")
+            raise ValueError("coordinates and values should be finite")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Gridded) and all(
@@ -112,128 +140,137 @@ class Gridded(Varying):
 
     @property
     def samples(self) -> dict[str, float]:
-        """The median, the smallest and the largest."""
+        """Median, minimum and maximum of the values."""
         ordered = np.sort(self.values, axis=None)
-        middle, least, most = (float(ordered[n]) for n in (len(ordered) // 2, 0, -1))
-        return {"the median": middle, "the smallest value": least, "the largest value": most}
+        middle, smallest, largest = (float(ordered[n]) for n in (len(ordered) // 2, 0, -1))
+        return {"the median": middle, "the smallest value": smallest, "the largest value": largest}
 
-    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
-        """Bilinear (scipy)."""
+    def at(self, x: Floats, y: Floats, regions: Held, reach: float = 0.0) -> Floats:
+        """Return the values at places by bilinear interpolation."""
         from scipy.interpolate import RegularGridInterpolator
 
         grid, values, places = [], self.values, []
-        for axis, (known, wanted) in enumerate(((self.x, x), (self.y, y))):
-            if len(known) == 1:
+        for axis, (nodes, target) in enumerate(((self.x, x), (self.y, y))):
+            if len(nodes) == 1:
                 values = np.repeat(values, 2, axis=axis)
                 grid.append(np.array([0.0, 1.0]))
-                places.append(np.zeros(np.shape(wanted)))
+                places.append(np.zeros(np.shape(target)))
                 continue
-            slack = reach + 1e-9 * (known[-1] - known[0])
-            near = (wanted >= known[0] - slack) & (wanted <= known[-1] + slack)
-            grid.append(known)
-            places.append(np.where(near, np.clip(wanted, known[0], known[-1]), np.nan))
-        look = RegularGridInterpolator(grid, values, bounds_error=False)
-        found: Floats = look(np.stack(places, axis=-1))
-        return found
+            slack = reach + 1e-9 * (nodes[-1] - nodes[0])
+            near = (target >= nodes[0] - slack) & (target <= nodes[-1] + slack)
+            grid.append(nodes)
+            places.append(np.where(near, np.clip(target, nodes[0], nodes[-1]), np.nan))
+        interpolate = RegularGridInterpolator(grid, values, bounds_error=False)
+        result: Floats = interpolate(np.stack(places, axis=-1))
+        return result
 
     def written(self) -> dict[str, Any]:
-        """Numbers, or bytes where they are many."""
-        few = self.values.size <= MOST_IN_WORDS
+        """Return coordinates and values; many values as bytes in base 64."""
+        is_text = self.values.size <= MAX_TEXT_VALUES
         packed = base64.b64encode(self.values.astype("<f8").tobytes()).decode()
         return {
             "x": self.x.tolist(),
             "y": self.y.tolist(),
-            "values": self.values.tolist() if few else packed,
+            "values": self.values.tolist() if is_text else packed,
         }
 
 
 @dataclass(frozen=True)
 class OfPlace(Varying):
-    """A function of arrays x and y. An experiment keeps its values at the places of a grid, so that
-    its dataset says all; see `sampled`."""
+    """Function of arrays x and y.
+
+    An experiment stores its values on a grid, so that the dataset is complete; see `sampled`.
+    """
 
     function: Callable[[Floats, Floats], Any]
 
     @property
     def samples(self) -> dict[str, float]:
-        """The value at (0, 0)."""
+        """Value at (0, 0)."""
         return {"(0, 0)": float(self.function(np.zeros(1), np.zeros(1))[0])}
 
-    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
-        """The function's."""
+    def at(self, x: Floats, y: Floats, regions: Held, reach: float = 0.0) -> Floats:
+        """Return the values of the function at places."""
         return np.broadcast_to(np.asarray(self.function(x, y), float), np.shape(x))
 
     def written(self) -> dict[str, Any]:
-        """Nothing that could be read again."""
+        """Return an empty map: a function cannot be written to a file."""
         return {}
 
     def sampled(self, x: Floats, y: Floats) -> Gridded:
-        """Its values over a grid."""
+        """Return the values of the function on a grid."""
         return Gridded(x, y, self.at(*np.meshgrid(x, y, indexing="ij"), {}))
 
 
-def as_varying(given: Any) -> Varying | None:
-    """What stands in place of a number, if that is no number.
+def as_varying(value: Any) -> Varying | None:
+    """Return a value as a spatially varying parameter, or None if it is a number.
 
-    Raises ValueError for a map that is none of the forms.
+    Raises
+    ------
+    ValueError
+        If it is a map of an unknown form.
     """
-    if isinstance(given, Varying):
-        return given
-    if hasattr(given, "coords") and hasattr(given, "transpose"):  # xarray's DataArray
-        if set(given.dims) != {"x", "y"}:
-            raise ValueError(f"an array should have the dimensions x and y, got {given.dims}")
-        return Gridded(given["x"], given["y"], given.transpose("x", "y"))
-    if callable(given):
-        return OfPlace(given)
-    if not isinstance(given, dict):
+    if isinstance(value, Varying):
+        return value
+    if hasattr(value, "coords") and hasattr(value, "transpose"):  # xarray's DataArray
+        if set(value.dims) != {"x", "y"}:
+            raise ValueError(f"an array should have the dimensions x and y, got {value.dims}")
+        return Gridded(value["x"], value["y"], value.transpose("x", "y"))
+    if callable(value):
+        return OfPlace(value)
+    if not isinstance(value, dict):
         return None
-    if "otherwise" in given:
-        return _by_region(given)
-    by_chance = given.keys() & {"mean", "scatter", "correlation_length"}
-    if given and not by_chance and all(isinstance(v, (int, float)) for v in given.values()):
-        raise ValueError("otherwise is missing: the number where none of these regions is")
-    if given.keys() == {"x", "y", "values"}:
-        return Gridded(given["x"], given["y"], _unpacked(given))
+    if "otherwise" in value:
+        return _by_region(value)
+    random_keys = value.keys() & {"mean", "scatter", "correlation_length"}
+    if (
+        value
+        and not random_keys
+        and all(isinstance(number, (int, float)) for number in value.values())
+    ):
+        raise ValueError("otherwise is missing: the number outside these regions")
+    if value.keys() == {"x", "y", "values"}:
+        return Gridded(value["x"], value["y"], _unpacked(value))
     raise ValueError(
         "should be a number, {otherwise: number, REGION: number}, {file: NAME.nc, variable: NAME}, "
         "{steps: [...], values: [...]}, "
         "{mean: number, scatter: number, correlation_length: number}, "
-        f"or {{x: [...], y: [...], values: [[...]]}}; got a map of {', '.join(map(str, given))}"
+        f"or {{x: [...], y: [...], values: [[...]]}}; got a map of {', '.join(map(str, value))}"
     )
 
 
-def _by_region(given: dict[str, Any]) -> ByRegion:
-    for name, value in given.items():
+def _by_region(data: dict[str, Any]) -> ByRegion:
+    for name, value in data.items():
         if isinstance(value, dict):
             raise ValueError(
-                f"'{name}' should be a number: there is no field in a field, and none that changes "
-                "in time"
+                f"'{name}' should be a number: values by region cannot vary in space or time"
             )
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"'{name}' should be a number, got {value!r:.40}")
-    values = {name: float(value) for name, value in given.items()}
+    values = {name: float(value) for name, value in data.items()}
     return ByRegion(values.pop("otherwise"), tuple(values.items()))
 
 
-def _unpacked(given: dict[str, Any]) -> Any:
-    values = given["values"]
+def _unpacked(data: dict[str, Any]) -> Any:
+    values = data["values"]
     if not isinstance(values, str):
         return values
     try:
         numbers = np.frombuffer(base64.b64decode(values, validate=True), "<f8")
-        return numbers.reshape(len(given["x"]), len(given["y"]))
+        return numbers.reshape(len(data["x"]), len(data["y"]))
     except (binascii.Error, TypeError, ValueError):
-        raise ValueError("values are no numbers: bytes in base 64 of as many as x and y") from None
+        text = "values should be numbers, or bytes in base 64 of one number for each x and y"
+        raise ValueError(text) from None
 
 
-MOST_DRAWN = 2**22
-"""So many values are drawn, which takes minutes."""
-NEAR = 1e-9
-"""Of the distance between places: so far they differ by rounding."""
+MAX_RANDOM_VALUES = 2**22
+"""Maximum number of values of a random field, which takes minutes to compute."""
+COORDINATE_RTOL = 1e-9
+"""Relative difference up to which coordinates of two grids are the same."""
 
 
 class Drawn(Strict):
-    """Values over a grid, and the numbers and the seed from which they were drawn."""
+    """Values of a random field on a grid, with the parameters and the seed that generated them."""
 
     seed: Annotated[int, ModelField(ge=0)]
     mean: float
@@ -254,107 +291,134 @@ class Drawn(Strict):
 
     @property
     def grid(self) -> Gridded:
-        """The values."""
+        """Values on the grid."""
         return self._grid
 
-    def answers(self, asked: Mapping[str, float], x: Floats, y: Floats) -> bool:
-        """Whether they were drawn from these numbers, for these places."""
-        if any(getattr(self, name) != number for name, number in asked.items()):
+    def matches(self, parameters: Mapping[str, float], x: Floats, y: Floats) -> bool:
+        """Return whether the values belong to these parameters and coordinates."""
+        if any(getattr(self, name) != number for name, number in parameters.items()):
             return False
         pairs = (self._grid.x, x), (self._grid.y, y)
         return all(
-            len(known) == len(wanted) and np.allclose(known, wanted, NEAR, NEAR * np.ptp(wanted))
-            for known, wanted in pairs
+            len(nodes) == len(target)
+            and np.allclose(nodes, target, COORDINATE_RTOL, COORDINATE_RTOL * np.ptp(target))
+            for nodes, target in pairs
         )
 
 
 class RandomField(Strict, Varying):
-    """A field with a mean and a standard deviation of `scatter` times the mean, drawn from the
-    experiment's seed: lognormal, so that all values are positive and both are exact.
+    """Lognormal random field with a mean and a standard deviation of `scatter` times the mean.
 
-    Z = mean · exp(σ g - σ²/2) with σ² = ln(1 + scatter²), where g is a standard Gaussian field with
-    the covariance exp(-(r/correlation_length)²) over the distance r. g is a sum of waves with
-    random wave vectors, by the randomisation method (Heße et al., Environ. Model. Softw. 55 (2014)
-    32-48) of GSTools: a function of the place alone, whatever the spacing and the body.
+    All values are positive. The seed is that of the experiment. Z = mean · exp(σ g - σ²/2) with σ²
+    = ln(1 + scatter²), where g is a standard Gaussian field with the covariance
+    exp(-(r/correlation_length)²) over the distance r. g is a sum of waves with random wave vectors,
+    by the randomisation method (Heße et al., Environ. Model. Softw. 55 (2014) 32-48) of GSTools,
+    and depends on the position only, not on spacing and body.
     """
 
     mean: Annotated[float, ModelField(gt=0.0, le=1e100)]
     scatter: Annotated[float, ModelField(gt=0.0, lt=1.0)]
     correlation_length: Annotated[float, ModelField(gt=1e-100, le=1e100), LENGTH]
     drawn: Drawn | None = None
-    """What came of it; drawn anew where it is no answer to what is asked now."""
+    """Values on a grid; computed again if they do not match parameters and grid."""
 
     @property
     def samples(self) -> dict[str, float]:
-        """Those of the values; the mean as long as there are none."""
+        """Values for validation: those of the grid, or the mean before values are drawn."""
         return self.drawn.grid.samples if self.drawn else {"the mean": self.mean}
 
-    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
-        """The values; the mean as long as there are none."""
+    def at(self, x: Floats, y: Floats, regions: Held, reach: float = 0.0) -> Floats:
+        """Return the values at places, or the mean before values are drawn."""
         if self.drawn is None:
             return np.full(np.shape(x), self.mean)
-        return self.drawn.grid.at(x, y, held, reach)
+        return self.drawn.grid.at(x, y, regions, reach)
 
     def written(self) -> dict[str, Any]:
-        """What was asked, and what came of it."""
+        """Return the parameters and the values."""
         return self.model_dump(mode="json", exclude_none=True)
 
     def drawn_at(self, x: Floats, y: Floats, seed: int, stream: str) -> RandomField:
-        """With its values over a grid of places. All fields of one stream come of the same g, each
-        with its own length.
+        """Return the field with its values on a grid.
 
-        Raises ValueError for too many places, and without GSTools.
+        All fields of one stream use the same realisation g, each with its correlation length.
+
+        Parameters
+        ----------
+        x, y
+            Coordinates of the grid.
+        seed
+            Seed of the experiment.
+        stream
+            Name of the stream of random numbers.
+
+        Raises
+        ------
+        ValueError
+            If the grid has too many points, or GSTools is not installed.
         """
-        asked = self.model_dump(exclude={"drawn"}) | {"seed": seed}
-        if self.drawn and self.drawn.answers(asked, x, y):
+        parameters = self.model_dump(exclude={"drawn"}) | {"seed": seed}
+        if self.drawn and self.drawn.matches(parameters, x, y):
             return self
         sigma = np.sqrt(np.log1p(self.scatter**2))
         g = _standard(x, y, self.correlation_length, seed, stream)
-        found = Gridded(x, y, self.mean * np.exp(sigma * g - sigma**2 / 2))
-        drawn = Drawn.model_validate(asked | found.written())
+        grid = Gridded(x, y, self.mean * np.exp(sigma * g - sigma**2 / 2))
+        drawn = Drawn.model_validate(parameters | grid.written())
         return self.model_copy(update={"drawn": drawn})
 
 
 def _standard(x: Floats, y: Floats, length: float, seed: int, stream: str) -> Floats:
-    """g at (x, y)."""
-    if len(x) * len(y) > MOST_DRAWN:
+    """Return the standard Gaussian field g on a grid."""
+    if len(x) * len(y) > MAX_RANDOM_VALUES:
         raise ValueError(
-            f"{len(x) * len(y)} values are more than the {MOST_DRAWN} that are drawn; draw it at "
-            "fewer places, and give it as {file: NAME.nc, variable: NAME}"
+            f"{len(x) * len(y)} values exceed {MAX_RANDOM_VALUES}, the maximum for random fields; "
+            "generate it on a coarser grid, and read it by {file: NAME.nc, variable: NAME}"
         )
     try:
         import gstools
     except ImportError:
-        raise ValueError(
-            "random fields are drawn with GSTools: pip install 'pbdkit[random]'"
-        ) from None
+        raise ValueError("random fields require GSTools: pip install 'pbdkit[random]'") from None
     model = gstools.Gaussian(dim=2, len_scale=length, rescale=1.0)
-    own = np.random.SeedSequence(seed, spawn_key=tuple(f"{stream} field".encode()))
-    waves = gstools.SRF(model, seed=int(own.generate_state(1)[0]))
+    sequence = np.random.SeedSequence(seed, spawn_key=tuple(f"{stream} field".encode()))
+    waves = gstools.SRF(model, seed=int(sequence.generate_state(1)[0]))
     return np.asarray(waves.structured((x, y), store=False))
 
 
 class _RandomFields(RootModel[dict[str, RandomField]]):
-    """By name, so that what is wrong has its place."""
+    """Random fields by name, so that errors have a path."""
 
     model_config = ConfigDict(defer_build=True)
 
 
 def random_fields(data: Mapping[str, Any], names: Set[str], context: Any) -> dict[str, RandomField]:
-    """The parameters of these names that are maps of a random field. Raises ValidationError."""
-    asked = {name: data[name] for name in names & data.keys() if _asks(data[name])}
-    return _RandomFields.model_validate(asked, context=context).root if asked else {}
+    """Return the parameters that are random fields.
+
+    Parameters
+    ----------
+    data
+        Raw parameters.
+    names
+        Names of the parameters that can vary.
+    context
+        Validation context.
+
+    Raises
+    ------
+    ValidationError
+        If a random field is invalid.
+    """
+    fields = {name: data[name] for name in names & data.keys() if _is_random(data[name])}
+    return _RandomFields.model_validate(fields, context=context).root if fields else {}
 
 
-def _asks(given: Any) -> bool:
-    keys = given.keys() if isinstance(given, dict) else set[str]()
+def _is_random(value: Any) -> bool:
+    keys = value.keys() if isinstance(value, dict) else set[str]()
     return "otherwise" not in keys and not keys.isdisjoint(RandomField.model_fields)
 
 
 RESERVED = ("otherwise", "file", "steps")
-"""What no region is called, so that a map tells what it is."""
+"""Names that regions cannot have, because they distinguish the forms of a map."""
 ABOUT = ("title", "description", "examples", "default")
-"""What a schema says of a parameter whatever stands in it."""
+"""Keys of a JSON Schema that describe a parameter of any form."""
 ALTERNATIVES: dict[str, Any] = {
     "oneOf": [
         {
@@ -405,21 +469,20 @@ ALTERNATIVES: dict[str, Any] = {
         },
     ],
 }
-"""The JSON Schema of what a file writes in place of a number."""
+"""JSON Schema of the values in place of a number."""
 
 
 class Field(RootModel[Any]):
-    """A value for each place: by region, from a netCDF file, over a grid, or by chance; or for each
-    step."""
+    """Value for each place (by region, from a file, on a grid, or random), or for each step."""
 
     model_config = ConfigDict(json_schema_extra=ALTERNATIVES)
 
 
 class TakesFields(Component):
-    """A component whose numbers may differ from place to place, or change in time.
+    """Component whose numbers can vary in space or time.
 
-    Each stands in its field with the value that serves where one number is asked for: of a course
-    the last. What it is elsewhere and before, `varying` and `courses` tell.
+    Fields contain the value that is used where a single number is required, for time-dependent
+    numbers the last one. `varying` and `courses` contain the variation.
     """
 
     _varying: dict[str, Varying] = PrivateAttr(default_factory=dict)
@@ -427,36 +490,45 @@ class TakesFields(Component):
 
     @property
     def varying(self) -> Mapping[str, Varying]:
-        """The parameters that differ from place to place."""
+        """Spatially varying parameters, by name."""
         return self._varying
 
     @property
     def courses(self) -> Mapping[str, Course[float]]:
-        """The parameters that change in time."""
+        """Time-dependent parameters, by name."""
         return self._courses
 
     def at(self, moment: float) -> Any:
-        """The component with the numbers that its parameters are at a moment."""
+        """Return the component with its parameters at a moment."""
         return self.with_more(**{name: c.at(moment) for name, c in self._courses.items()})
 
     def with_more(self, **values: Any) -> Any:
-        """The component with other numbers, fields or courses besides those that it has. Raises
-        ValidationError where they do not go together."""
+        """Return the component with some parameters changed, and its other variations.
+
+        Raises
+        ------
+        ValidationError
+            If the parameters are incompatible.
+        """
         return self.with_values(**{**self._varying, **self._courses, **values})
 
     def in_place_of_numbers(self) -> dict[str, Any]:
-        """What stands there, as an experiment file writes it."""
+        """Return the varying parameters as in an experiment file."""
         fields = {name: field.written() for name, field in self._varying.items()}
         courses = {name: course.model_dump(mode="json") for name, course in self._courses.items()}
         return fields | courses
 
     def with_values(self, **values: Any) -> Any:
-        """The component with other numbers, fields or courses in place of its own; what is not
-        given is the same everywhere and always. Raises ValidationError where they do not go
-        together."""
+        """Return the component with some parameters changed, and without its other variations.
+
+        Raises
+        ------
+        ValidationError
+            If the parameters are incompatible.
+        """
         fields = type(self).model_fields.items()
-        given = {field.alias or name: getattr(self, name) for name, field in fields}
-        return type(self).model_validate(given | values)
+        parameters = {field.alias or name: getattr(self, name) for name, field in fields}
+        return type(self).model_validate(parameters | values)
 
     @model_validator(mode="wrap")
     @classmethod
@@ -474,74 +546,73 @@ class TakesFields(Component):
                     varying[name] = field
             except ValueError as error:
                 raise _fault(name, str(error)) from None
-        no_numbers: dict[str, Varying | Course[float]] = {**varying, **courses}
-        if no_numbers:
-            cls._refuse_wrong(data, no_numbers, info.context)
-        part = handler(data | {name: _first(each) for name, each in no_numbers.items()})
+        variations: dict[str, Varying | Course[float]] = {**varying, **courses}
+        if variations:
+            cls._refuse_wrong(data, variations, info.context)
+        part = handler(data | {name: _first(field) for name, field in variations.items()})
         part._varying, part._courses = varying, courses
         return part
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, own: Any, handler: Any) -> dict[str, Any]:
-        """Numbers, or what may stand in their place."""
-        schema: dict[str, Any] = handler(own)
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
+        """Return the JSON Schema with all forms of numbers."""
+        schema: dict[str, Any] = handler(core)
         field = handler(core_schema.union_schema([Field.__pydantic_core_schema__]))
-        known = handler.resolve_ref_schema(schema).get("properties", {})
-        for name in cls.numbers() & known.keys():
-            about = {k: v for k, v in known[name].items() if k in ABOUT}
-            number = {k: v for k, v in known[name].items() if k not in ABOUT}
-            known[name] = about | {"anyOf": [number, field]}
+        properties = handler.resolve_ref_schema(schema).get("properties", {})
+        for name in cls.numbers() & properties.keys():
+            about = {k: v for k, v in properties[name].items() if k in ABOUT}
+            number = {k: v for k, v in properties[name].items() if k not in ABOUT}
+            properties[name] = about | {"anyOf": [number, field]}
         return schema
 
     @classmethod
     def numbers(cls) -> set[str]:
-        """The parameters that can differ from place to place, and change."""
+        """Return the names of the parameters that can vary in space or time."""
         return {name for name, field in cls.model_fields.items() if field.annotation is float}
 
     @classmethod
-    def _number_of(cls, name: str, given: Any, info: ValidationInfo) -> Any:
-        """What is given in place of a number, with numbers of lattice units for texts with a
-        unit."""
+    def _number_of(cls, name: str, data: Any, info: ValidationInfo) -> Any:
+        """Convert text with units in a varying parameter to numbers in lattice units."""
         field = cls.model_fields.get(name)
         quantity = (
             next((m for m in field.metadata if isinstance(m, Quantity)), None) if field else None
         )
-        if quantity is None or not isinstance(given, dict):
-            return given
+        if quantity is None or not isinstance(data, dict):
+            return data
 
         def number(value: Any, key: str) -> Any:
             if isinstance(value, list | tuple):
-                return [number(each, key) for each in value]
+                return [number(item, key) for item in value]
             try:
                 return quantity.number(value, info)
             except PydanticCustomError as error:
-                told = {"text": error.message(), "key": (name, key)}
-                raise PydanticCustomError("fault", "{text}", told) from None
+                context = {"text": error.message(), "key": (name, key)}
+                raise PydanticCustomError("fault", "{text}", context) from None
 
-        if "otherwise" in given:
-            return {key: number(value, key) for key, value in given.items()}
-        if "steps" in given and isinstance(given.get("values"), list | tuple):
-            return given | {"values": number(given["values"], "values")}
-        return given | {"mean": number(given["mean"], "mean")} if "mean" in given else given
+        if "otherwise" in data:
+            return {key: number(value, key) for key, value in data.items()}
+        if "steps" in data and isinstance(data.get("values"), list | tuple):
+            return data | {"values": number(data["values"], "values")}
+        return data | {"mean": number(data["mean"], "mean")} if "mean" in data else data
 
     @classmethod
     def _refuse_wrong(cls, data: dict[str, Any], varying: dict[str, Any], context: Any) -> None:
-        """Validates with the values of each place, or time, that is told apart."""
+        """Validate the component with the values of each place or time."""
         for label in dict.fromkeys(label for field in varying.values() for label in field.samples):
-            here = {n: field.samples.get(label, _first(field)) for n, field in varying.items()}
+            sample = {n: field.samples.get(label, _first(field)) for n, field in varying.items()}
             try:
-                cls.model_validate(data | here, context=context)
+                cls.model_validate(data | sample, context=context)
             except ValidationError as error:
                 for fault in error.errors(include_url=False):
-                    name = next((w for w in fault["loc"] if w in here), None)
+                    name = next((word for word in fault["loc"] if word in sample), None)
                     if fault["type"] == "key" or (fault["loc"] and not name):
                         continue  # it is about another parameter
                     text = fault["msg"].removeprefix("Value error, ")
                     text = text.replace("Input should", "should")
-                    got = f", got {here[name]:g}" if name else ""
-                    known = varying[name].samples if name else [label]
-                    where = label if label in known else next(iter(known))
-                    raise _fault(str(name or min(here)), f"{where}: {text}{got}") from None
+                    got = f", got {sample[name]:g}" if name else ""
+                    labels = varying[name].samples if name else [label]
+                    where = label if label in labels else next(iter(labels))
+                    raise _fault(str(name or min(sample)), f"{where}: {text}{got}") from None
 
 
 def _first(field: Varying | Course[float]) -> float:
@@ -555,12 +626,12 @@ def _fault(name: str, text: str) -> PydanticCustomError:
 def unknown_regions(
     part: TakesFields, regions: Mapping[str, Any]
 ) -> Iterator[tuple[str, str, str]]:
-    """The parameters whose fields name regions that there are not, these, and a message each."""
+    """Generate the parameters that refer to unknown regions, as parameter, region and message."""
     for name, field in part.varying.items():
         for region, _ in field.values if isinstance(field, ByRegion) else ():
             if region not in regions:
-                known = (
+                names = (
                     f"known: {', '.join(regions)}" if regions else "there is none: add `regions`"
                 )
                 hint = did_you_mean(region, regions)
-                yield name, region, f"there is no region '{region}'{hint} ({known})"
+                yield name, region, f"there is no region '{region}'{hint} ({names})"

@@ -1,4 +1,4 @@
-"""The FramePolicy interface: how the frame follows the body, as a linear map."""
+"""Interface of frame policies: how frame points follow the body, as a linear map."""
 
 from __future__ import annotations
 
@@ -14,15 +14,23 @@ from pbdkit.plugin.lattice import Cell, Index
 from pbdkit.plugin.rule import FollowerRule
 
 Indices = NDArray[np.intp]
+"""Type of arrays of indices."""
 
 
 @dataclass(frozen=True)
 class FrameMap:
-    """u of frame point `point[e]` is the sum over its entries e of weight[e] · u[body[e]].
+    """Linear map to the frame: u of frame point `point[e]` is Σ_e weight[e] · u[body[e]].
 
-    `point` counts the frame points from 0 in the order of their numbers, sorted; `body` are
-    rows of the particle table. `weight` is a number an entry, (entry,), or a matrix an entry,
-    (entry, axis, axis). With `lag` 1 the body's displacements of the step before count.
+    Parameters
+    ----------
+    point
+        Index of the frame point of each entry, in the order of their numbers, sorted.
+    body
+        Row of the body particle of each entry in the particle table.
+    weight
+        Number for each entry, (entry,), or matrix, (entry, axis, axis).
+    lag
+        Delay in steps; with 1 the displacements of the previous step are used.
     """
 
     point: Indices
@@ -33,9 +41,17 @@ class FrameMap:
 
 @dataclass(frozen=True)
 class FrameSites(ABC):
-    """The frame of a scene, as a policy sees it: the lattice's `cell`, the `site` index (i, j)
-    of every frame point in the order of the numbers, (point, 2), the smallest and largest
-    site index of the body, `low` and `high`, and the `rule` of the followers."""
+    """Frame of a scene, as input of a policy.
+
+    Parameters
+    ----------
+    cell
+        Repeat cell of the lattice.
+    site
+        Site index (i, j) of every frame point in the order of the numbers, (point, 2).
+    low, high
+        Smallest and largest site index of the body.
+    """
 
     cell: Cell
     site: NDArray[np.int32]
@@ -45,48 +61,68 @@ class FrameSites(ABC):
     @property
     @abstractmethod
     def rule(self) -> FollowerRule:
-        """The rule of the followers, with the numbers that it has in a step. A map that was made
-        with it is made again wherever these numbers change."""
+        """Rule of the followers with its parameters at a step.
+
+        A map created with it is created again whenever these parameters change.
+        """
 
     @abstractmethod
     def nearest(self) -> tuple[Indices, Indices]:
-        """(point, body): each frame point with every body particle that is nearest to it in the
-        reference configuration, distance ≤ d_min(1 + 1e-9); sorted by both."""
+        """Return (point, body): each frame point with every nearest body particle, sorted by both.
+
+        Nearest in the reference configuration are those with distance ≤ d_min (1 + 1e-9).
+        """
 
     @abstractmethod
     def body_at(self, site: NDArray[np.int32]) -> Indices:
-        """The row of the body particle at each site (i, j), (entry, 2); -1 where there is none."""
+        """Return the row of the body particle at each site, (entry, 2); -1 if there is none."""
 
 
 class FramePolicy(Component):
-    """The points around the body that remove the edge effect, and how they follow it.
+    """Points around the body that remove the edge effect, and how they follow the body.
 
-    To add a policy, write `depth` and `follow`. The map is linear and has no memory.
+    To implement a policy, define `depth` and `follow`. The map is linear and has no memory.
     """
 
     weighs_cells: ClassVar[bool] = False
-    """Whether the body is made of the lattice's cells, each weighted by the share of it that lies
-    inside the outline; for rules that declare `uses_cells`. The corners of cut cells are then
-    particles of the body, on whichever side of the outline they lie."""
+    """Whether the body consists of cells, each weighted by its share inside the outline.
+
+    For rules that declare `uses_cells`. The corners of cut cells on both sides of the outline are
+    then particles of the body.
+    """
     local: ClassVar[bool] = False
-    """Whether each point is told of by itself, and follows particles that are nearest to it, or no
-    farther off than twice the layers in site index. Several processes then build the frame in
-    parts; else each of them builds the whole."""
+    """Whether each frame point can be mapped independently, to particles near it.
+
+    These are the nearest particles, or those within twice the number of layers in site index.
+    Several processes then build the frame in parts; otherwise each builds the whole.
+    """
     has_axes: ClassVar[bool] = False
-    """Whether directions, or the order of the sites, count: mirrored, or turned by a right angle, a
-    body may then move otherwise."""
+    """Whether the map depends on directions or on the order of sites.
+
+    A body that is mirrored or rotated by a right angle may then move differently.
+    """
     edges_are_free: ClassVar[bool] = False
-    """Whether edges are free of stress under a calibrated rule; where not, a warning says so."""
+    """Whether edges are free of stress under a calibrated rule; otherwise a warning is issued."""
 
     @abstractmethod
     def depth(self, reach: int) -> int:
-        """How many layers the frame has; `reach` is what the neighbours reach, in site index."""
+        """Return the number of layers of the frame.
+
+        Parameters
+        ----------
+        reach
+            Reach of the neighbours in site index.
+        """
 
     @abstractmethod
     def follow(self, frame: FrameSites) -> FrameMap:
-        """The map from body displacements to the frame's; every frame point needs an entry."""
+        """Return the map from displacements of the body to those of the frame, with every frame
+        point.
+        """
 
 
 class Anchors:
-    """A frame that ties the body to its place: a translated body then moves otherwise. Of other
-    frames the weights of each point sum to 1."""
+    """Frame that fixes the body in space: moves are not invariant under translation of the body.
+
+    Under other frames the weights of each point sum to 1.
+    """

@@ -16,11 +16,11 @@ Points = Annotated[tuple[Place, ...], Field(strict=False, min_length=1)]
 
 
 class Selection(Strict):
-    """Chooses body particles of the reference configuration, in one of five ways.
+    """Selection of body particles in the reference configuration, by one of five criteria.
 
-    `edge`: the outermost of every row (left, right) or column (bottom, top); `box`: [xmin, ymin,
-    xmax, ymax], inclusive; `numbers`: as they are numbered; `nearest`: to each of some points;
-    `region`: all that the region of that name holds.
+    `edge`: the outermost particle of every row (left, right) or column (bottom, top); `box`: the
+    particles within [xmin, ymin, xmax, ymax], inclusive; `numbers`: particle numbers; `nearest`:
+    the particle nearest to each point; `region`: the particles inside a region.
     """
 
     model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})

@@ -1,4 +1,4 @@
-"""The registry: from the `type` in an experiment to the class that implements it."""
+"""Registry: from the `type` in an experiment to the class that implements it."""
 
 from __future__ import annotations
 
@@ -25,101 +25,128 @@ from pbdkit.plugin.discovery import (
 from pbdkit.plugin.hooks import COMMAND_GROUP
 
 GIVEN = "components"
-"""How classes that were handed over in Python appear among the plugins."""
+"""Name of the plugin with the classes that are passed as Python objects."""
 
 
 class Registry:
-    """The built-in components, those handed over in Python, and, once needed, the installed ones.
+    """Built-in components, those passed as Python objects, and, on demand, installed ones.
 
-    An experiment that uses only built-in names imports no third-party code, and one that names a
-    distribution imports no other.
+    An experiment with built-in components only imports no third-party code, and one that specifies
+    a distribution imports no other.
+
+    Parameters
+    ----------
+    components
+        Component classes in addition to the installed ones.
     """
 
     def __init__(self, components: Iterable[type[Component]] = ()) -> None:
         self._builtin = load_builtin()
-        self._own = [self._builtin, _given(components, self._builtin)]
+        self._local = [self._builtin, _given(components, self._builtin)]
         self._loaded: dict[Plugin, Plugin] = {}
 
     @cached_property
     def installed(self) -> list[Plugin]:
-        """The third-party plugins; the first look at them imports them."""
+        """Third-party plugins, which are imported on first access."""
         return self._load(self._found)
 
     @property
     def plugins(self) -> list[Plugin]:
-        """Every plugin, the built-in one first."""
-        return [p for p in self._own if p.offers] + self.installed
+        """All plugins, the built-in one first."""
+        return [p for p in self._local if p.offers] + self.installed
 
     def find(self, interface: type[Component], name: str) -> type[Component]:
-        """The class of that interface and type.
+        """Return the class of an interface and type.
 
-        `name` may name its distribution: ``pbdkit-x:rule-name``. Raises ExperimentError for a name
-        that nobody offers or that several offer, PluginError where the distribution that it is
-        asked of, or that it comes from, is missing, disabled, broken or incompatible.
+        Parameters
+        ----------
+        interface
+            Interface of the component.
+        name
+            Type, optionally with its distribution: ``pbdkit-x:rule-name``.
+
+        Raises
+        ------
+        ExperimentError
+            If no distribution provides the type, or several do.
+        PluginError
+            If the distribution of the type is missing, disabled, broken or incompatible.
         """
         distribution, _, kind = name.rpartition(":")
         if distribution:
             plugins = self._of(distribution, kind)
         else:
-            plugins = self._own if _offers(self._own, interface, kind) else self.installed
-        offers, told = _offers(plugins, interface, kind), one_line(kind)
+            plugins = self._local if _offers(self._local, interface, kind) else self.installed
+        offers, label = _offers(plugins, interface, kind), one_line(kind)
         classes = {p.distribution: o.component for p, o in offers if o.component}
         if len(classes) > 1:
-            choice = ", ".join(f"'{one}:{kind}'" for one in classes)
-            raise ExperimentError(f"'{told}' is offered by several distributions: write {choice}")
+            choice = ", ".join(f"'{source}:{kind}'" for source in classes)
+            raise ExperimentError(f"'{label}' is offered by several distributions: write {choice}")
         if classes:
             return classes.popitem()[1]
         if distribution:
             for plugin in [p for p, _ in offers] or plugins:
                 if plugin.fault:
-                    raise PluginError(f"'{told}' is asked of {plugin}, which is {plugin.fault}")
+                    raise PluginError(f"'{label}' belongs to {plugin}, which is {plugin.fault}")
             hint = did_you_mean(kind, [o.name for _, o in _offers(plugins, interface)])
-            what = f"offers no {interface.__name__} '{told}'{hint}"
-            raise ExperimentError(f"{one_line(distribution)} {what}")
+            text = f"offers no {interface.__name__} '{label}'{hint}"
+            raise ExperimentError(f"{one_line(distribution)} {text}")
         for plugin, offer in offers:
-            raise PluginError(f"'{told}' comes from {plugin}, which is broken: {offer.reason}")
+            raise PluginError(f"'{label}' belongs to {plugin}, which is broken: {offer.reason}")
         installed = sorted(names[0] for names in self.spellings(interface).values())
         hint = f"{did_you_mean(kind, installed)} (installed: {', '.join(installed)})"
-        others = "".join(f"; {p} is {p.fault}" for p in self.installed if p.fault)
-        raise ExperimentError(f"unknown type '{told}'{hint}{others}")
+        faults = "".join(f"; {p} is {p.fault}" for p in self.installed if p.fault)
+        raise ExperimentError(f"unknown type '{label}'{hint}{faults}")
 
     def spellings(
         self, interface: type[Component], *, installed: bool = True
     ) -> dict[type[Component], list[str]]:
-        """Every usable component of an interface, third parties' too if `installed`, with all names
-        that an experiment may give it, the shortest first."""
-        found: dict[type[Component], list[str]] = {}
-        for plugin, offer in _offers(self.plugins if installed else self._own, interface):
+        """Return the usable components of an interface, each with all its names, the shortest
+        first.
+
+        Parameters
+        ----------
+        interface
+            Interface of the components.
+        installed
+            Whether to include third-party plugins.
+        """
+        result: dict[type[Component], list[str]] = {}
+        for plugin, offer in _offers(self.plugins if installed else self._local, interface):
             if offer.component:
-                names = found.setdefault(offer.component, [self._name_in(plugin, offer)])
+                names = result.setdefault(offer.component, [self._name_in(plugin, offer)])
                 full = f"{plugin.distribution}:{offer.name}"
-                if plugin not in self._own and full not in names:
+                if plugin not in self._local and full not in names:
                     names.append(full)
-        return found
+        return result
 
     def versions(self, used: Iterable[Component]) -> dict[str, str]:
-        """The distributions that these components come from, with their versions; under GIVEN the
-        types of those that come from none."""
+        """Return the versions of the distributions of components.
+
+        Classes without distribution are listed by their types under `GIVEN`.
+        """
         classes = {type(component) for component in used}
-        known = [self._builtin, *self._loaded.values()]
-        found = {p.distribution: p.version for p in known if classes & set(p.components)}
-        given = classes.difference(*(p.components for p in known))
-        types = ", ".join(sorted(c.type_name() for c in given))
-        return found | ({GIVEN: types} if given else {})
+        plugins = [self._builtin, *self._loaded.values()]
+        versions = {p.distribution: p.version for p in plugins if classes & set(p.components)}
+        local_classes = classes.difference(*(p.components for p in plugins))
+        types = ", ".join(sorted(c.type_name() for c in local_classes))
+        return versions | ({GIVEN: types} if local_classes else {})
 
     def name_of(self, component: Component) -> str:
-        """The type by which an experiment finds this component again: with its distribution unless
-        nobody else is known to offer the type."""
-        known = [(p, o) for p in [*self._own, *self._loaded.values()] for o in p.offers]
-        names = (self._name_in(p, o) for p, o in known if o.component is type(component))
+        """Return the type by which an experiment selects a component again.
+
+        The name includes the distribution unless no other is known to provide the type.
+        """
+        offers = [(p, o) for p in [*self._local, *self._loaded.values()] for o in p.offers]
+        names = (self._name_in(p, o) for p, o in offers if o.component is type(component))
         return next(names, component.type_name())
 
     def doubts(self) -> list[str]:
-        """Return warnings about names to be disabled that no installed plugin has."""
+        """Return warnings about disabled names that no installed plugin has."""
         plugins = [*self._found, *installed_plugins(COMMAND_GROUP)]
-        known = {name for p in plugins for name in (p.distribution, p.name)}
+        names = {name for p in plugins for name in (p.distribution, p.name)}
         return [
-            f"{DISABLE} names '{name}', which is not installed{did_you_mean(name, known)}"
+            f"{DISABLE} contains '{name}', which is not installed{did_you_mean(name, names)}"
             for name in disabled_names()
             if name != ALL and not any(plugin.answers_to(name) for plugin in plugins)
         ]
@@ -133,21 +160,22 @@ class Registry:
         return _judged([self._loaded[p] for p in plugins], self._builtin)
 
     def _of(self, distribution: str, name: str) -> list[Plugin]:
-        """The plugins of a distribution."""
+        """Return the loaded plugins of a distribution."""
         if canonical(distribution) == BUILTIN:
             return [self._builtin]
-        own = [p for p in self._found if canonical(p.distribution) == canonical(distribution)]
-        if not own:
-            hint = did_you_mean(distribution, [p.distribution for p in self._found])
-            asked = f"'{one_line(name)}' is asked of {one_line(distribution)}"
-            raise PluginError(f"{asked}, which is not installed{hint}")
-        return self._load(own)
+        key, plugins = canonical(distribution), self._found
+        selected = [p for p in plugins if canonical(p.distribution) == key]
+        if not selected:
+            hint = did_you_mean(distribution, [p.distribution for p in plugins])
+            text = f"'{one_line(name)}' belongs to {one_line(distribution)}"
+            raise PluginError(f"{text}, which is not installed{hint}")
+        return self._load(selected)
 
     def _name_in(self, plugin: Plugin, offer: Offer) -> str:
-        if plugin in self._own:
+        if plugin in self._local:
             return offer.name
-        if "installed" in self.__dict__:  # only then are all known
-            offers = _offers([*self._own, *self.installed], offer.interface, offer.name)
+        if "installed" in self.__dict__:  # all plugins are loaded only then
+            offers = _offers([*self._local, *self.installed], offer.interface, offer.name)
             if {p.distribution for p, o in offers if o.component} == {plugin.distribution}:
                 return offer.name
         return f"{plugin.distribution}:{offer.name}"
@@ -156,47 +184,54 @@ class Registry:
 def _offers(
     plugins: Iterable[Plugin], interface: type[Component] | None, name: str | None = None
 ) -> list[tuple[Plugin, Offer]]:
-    """The offers of that interface, and of one type where it is given, the broken ones too."""
-    every = [(plugin, o) for plugin in plugins for o in plugin.offers if o.interface is interface]
-    return [(plugin, o) for plugin, o in every if name in (None, o.name)]
+    """Return the offers of an interface, optionally of one type, including broken ones."""
+    offers = [(plugin, o) for plugin in plugins for o in plugin.offers if o.interface is interface]
+    return [(plugin, o) for plugin, o in offers if name in (None, o.name)]
 
 
 def _judged(plugins: list[Plugin], builtin: Plugin) -> list[Plugin]:
-    """The plugins, with the reason at each offer that is in conflict with others."""
-    found = []
+    """Add the reason to each offer that is in conflict with others."""
+    result = []
     for plugin in plugins:
         offers = tuple(_judged_offer(plugin, o, plugins, builtin) for o in plugin.offers)
-        found.append(replace(plugin, offers=offers))
-    return found
+        result.append(replace(plugin, offers=offers))
+    return result
 
 
 def _judged_offer(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: Plugin) -> Offer:
     if offer.component is None:
         return offer
-    name, chosen = offer.name, f"write '{plugin.distribution}:{offer.name}'"
+    name, advice = offer.name, f"write '{plugin.distribution}:{offer.name}'"
     twins = [(p, o) for p, o in _offers(plugins, offer.interface, name) if o.component]
-    own = {o.component for p, o in twins if p.distribution == plugin.distribution}
-    if len(own) > 1:
-        reason = f"it offers two classes with the type '{name}'; give one of them another"
+    classes = {o.component for p, o in twins if p.distribution == plugin.distribution}
+    if len(classes) > 1:
+        reason = f"it has two classes with the type '{name}'; change the type of one of them"
         return replace(offer, component=None, reason=reason)
     if _offers([builtin], offer.interface, name) or is_retired(offer.interface, name):
         what = f"'{name}' is the name of a built-in {interface_of(offer.component).__name__}"
-        remedy = f"{chosen}, or give it another type" if plugin.distribution else "give it another"
+        change = "change the type"
+        remedy = f"{advice}, or {change}" if plugin.distribution else change
         return replace(offer, reason=f"{what}; {remedy}")
     if others := [str(p) for p, _ in twins if p.distribution != plugin.distribution]:
-        reason = f"'{name}' is offered by {', '.join(others)} too; {chosen}"
+        reason = f"'{name}' is offered by {', '.join(others)} too; {advice}"
         return replace(offer, reason=reason)
     return offer
 
 
 def _given(components: Iterable[type[Component]], builtin: Plugin) -> Plugin:
-    """Classes from Python as a plugin; ExperimentError for what cannot be used."""
+    """Return a plugin with classes that are passed as Python objects.
+
+    Raises
+    ------
+    ExperimentError
+        If a class is not usable.
+    """
     try:
-        offers = tuple(dict.fromkeys(map(checked, components)))  # each once, in their order
+        offers = tuple(dict.fromkeys(map(checked, components)))  # unique, in their order
     except TypeError as error:
         raise ExperimentError(f"components: {error}") from None
-    (given,) = _judged([Plugin(GIVEN, "", "", offers=offers)], builtin)
-    for offer in given.offers:
+    (plugin,) = _judged([Plugin(GIVEN, "", "", offers=offers)], builtin)
+    for offer in plugin.offers:
         if offer.reason:
             raise ExperimentError(f"components: {offer.reason}")
-    return given
+    return plugin

@@ -1,4 +1,4 @@
-"""Schedules: numbers, and forces along x and y, that are constant or change with the steps."""
+"""Time-dependent numbers and forces."""
 
 from __future__ import annotations
 
@@ -15,100 +15,117 @@ from pbdkit.plugin.component import Strict
 from pbdkit.plugin.units import BODY_FORCE, FORCE
 
 Value = TypeVar("Value")
-MOST_KNOTS = 100_000
-PLAIN, COURSE, WORD = FORMS = ("number", "course", "a number or 'auto'")
-"""What faults call the forms of a number that may change, or be chosen."""
+"""Type of the values of a time-dependent number."""
+MAX_KNOTS = 100_000
+"""Maximum number of steps of a time-dependent number."""
+PLAIN = "number"
+"""Form of a constant number in the messages of pydantic."""
+COURSE = "course"
+"""Form of a time-dependent number in the messages of pydantic."""
+WORD = "a number or 'auto'"
+"""Form of a number that can be selected automatically in messages."""
+FORMS = (PLAIN, COURSE, WORD)
+"""All forms of a number."""
 
 
 class Course(Strict, Generic[Value]):
-    """A number in the course of the steps: `values` at the end of some `steps`, linear between; the
-    first before them, the last after them."""
+    """Time-dependent number: `values` at the end of `steps`, linear between, constant outside."""
 
     steps: Annotated[
         tuple[Annotated[int, Field(ge=0, lt=2**53)], ...],
-        Field(strict=False, min_length=1, max_length=MOST_KNOTS),
+        Field(strict=False, min_length=1, max_length=MAX_KNOTS),
     ]
-    values: Annotated[tuple[Value, ...], Field(strict=False, min_length=1, max_length=MOST_KNOTS)]
+    values: Annotated[tuple[Value, ...], Field(strict=False, min_length=1, max_length=MAX_KNOTS)]
 
     @model_validator(mode="after")
     def _in_order(self) -> Course[Value]:
         if len(self.steps) != len(self.values):
             raise ValueError(f"{len(self.steps)} steps have {len(self.values)} values")
-        for before, after in pairwise(self.steps):
-            if after <= before:
-                raise ValueError(f"steps should increase, and {after} comes after {before}")
+        for first, second in pairwise(self.steps):
+            if second <= first:
+                raise ValueError(f"steps should increase, but {second} follows {first}")
         return self
 
     @property
     def last(self) -> float:
-        """What it comes to."""
+        """Value at the end."""
         return float(self._values[-1])
 
     @property
     def samples(self) -> dict[str, float]:
-        """Values that occur, by what they are; the first is what it comes to."""
+        """Values for validation, by description; the first is the value at the end."""
         values = self._values
         return {"the last value": self.last, "the smallest value": min(values),
                 "the largest value": max(values)}  # fmt: skip
 
     def at(self, moment: float) -> float:
-        """At the end of a step, or at a moment within it."""
+        """Return the value at the end of a step, or at a moment within it."""
         return float(np.interp(moment, self.steps, self._values))
 
     @cached_property
     def bends(self) -> tuple[int, ...]:
-        """The steps at whose end it begins to change, changes otherwise or ceases to."""
+        """Steps after which the slope changes."""
         knots = list(zip(self.steps, self._values, strict=True))
-        flat = (0.0, False)  # what is so small that its slope is zero is not flat
+        flat = (0.0, False)  # a change whose slope rounds to zero is not flat
         slopes = [flat, *(((d - b) / (c - a), d != b) for (a, b), (c, d) in pairwise(knots)), flat]
-        ways = zip(self.steps, pairwise(slopes), strict=True)
-        return tuple(step for step, (before, after) in ways if before != after)
+        pairs = zip(self.steps, pairwise(slopes), strict=True)
+        return tuple(step for step, (first, second) in pairs if first != second)
 
     def bends_within(self, begin: int, end: int) -> list[int]:
-        """The bends between two steps, both included, and the second where it still changes there;
-        none where the second comes first."""
+        """Return the bends between two steps, both included, and the end if the number changes
+        there.
+
+        Empty if the end precedes the beginning.
+        """
         if end < begin:
             return []
-        found = [bend for bend in self.bends if begin <= bend <= end]
-        return found if end in found or self.next_change(end - 1) > end else [*found, end]
+        bends = [bend for bend in self.bends if begin <= bend <= end]
+        return bends if end in bends or self.next_change(end - 1) > end else [*bends, end]
 
     def next_change(self, step: int) -> float:
-        """The first step after `step` at whose end it is another than at that one's; infinite where
-        there is none."""
+        """Return the first step after `step` with another value, or infinity."""
         k = bisect_right(self.steps, step)
         if 0 < k < len(self.steps) and self.values[k - 1] != self.values[k]:
             return step + 1
         return min((bend + 1 for bend in self.bends[:-1] if bend > step), default=math.inf)
 
     def way(self, begin: float, end: float) -> float:
-        """By what share of its largest value it changes between two moments."""
-        most = max(map(abs, self._values))
-        return abs(self.at(end) - self.at(begin)) / most if most else 0.0
+        """Return the change between two moments, relative to the largest absolute value."""
+        largest = max(map(abs, self._values))
+        return abs(self.at(end) - self.at(begin)) / largest if largest else 0.0
 
     @property
     def _values(self) -> tuple[float, ...]:
-        values: Any = self.values  # what stands for Value is a number
-        found: tuple[float, ...] = values
-        return found
+        values: Any = self.values  # the type parameter is always a number
+        numbers: tuple[float, ...] = values
+        return numbers
 
 
 class NumberCourse(Course[float]):
-    """Of a plain number. Each kind of number has a class of its own, which can be pickled."""
+    """Time-dependent plain number. Each kind of number has a class of its own, which can be
+    pickled.
+    """
 
 
 def form_of(value: Any) -> str:
-    """Which of two forms is meant."""
+    """Return the form of a value, PLAIN or COURSE."""
     return COURSE if isinstance(value, (dict, Course)) else PLAIN
 
 
-def as_course(given: Any) -> Course[float] | None:
-    """What stands in place of a number, if that is a course. Raises ValueError for a wrong one."""
-    if isinstance(given, Course):
-        return given
-    if not (isinstance(given, dict) and "steps" in given):
+def as_course(value: Any) -> Course[float] | None:
+    """Return a value as a time-dependent number, or None if it is of another form.
+
+    Raises
+    ------
+    ValueError
+        If the value is malformed.
+    """
+    if isinstance(value, Course):
+        return value
+    if not (isinstance(value, dict) and "steps" in value):
         return None
     try:
-        return NumberCourse.model_validate(given)
+        return NumberCourse.model_validate(value)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         place = "".join(f"{word}: " for word in fault["loc"])
@@ -118,32 +135,34 @@ def as_course(given: Any) -> Course[float] | None:
 
 
 def at(number: float | Course[float], moment: float) -> float:
-    """A number at a moment, whether it changes or not."""
+    """Return the value of a constant or time-dependent number at a moment."""
     return number.at(moment) if isinstance(number, Course) else number
 
 
 def last(number: float | Course[float]) -> float:
-    """What a number comes to."""
+    """Return the value of a constant or time-dependent number at the end."""
     return number.last if isinstance(number, Course) else number
 
 
 class ForceCourse(Course[Annotated[float, FORCE]]):
-    """Of a force."""
+    """Time-dependent force."""
 
 
 class BodyForceCourse(Course[Annotated[float, BODY_FORCE]]):
-    """Of a force on a unit of area."""
+    """Time-dependent force per area."""
 
 
 OneForce = Annotated[
     Annotated[float, FORCE, Tag(PLAIN)] | Annotated[ForceCourse, Tag(COURSE)],
     Discriminator(form_of),
 ]
+"""Type of a component of a force."""
 Force = Annotated[tuple[OneForce, OneForce], Field(strict=False)]
-"""Two forces; an experiment file writes them as a list of two."""
+"""Type of a force; a list of two numbers in an experiment file."""
 OneBodyForce = Annotated[
     Annotated[float, BODY_FORCE, Tag(PLAIN)] | Annotated[BodyForceCourse, Tag(COURSE)],
     Discriminator(form_of),
 ]
+"""Type of a component of a force per area."""
 BodyForce = Annotated[tuple[OneBodyForce, OneBodyForce], Field(strict=False)]
-"""Two forces on a unit of area."""
+"""Type of a force per area; a list of two numbers in an experiment file."""

@@ -1,1 +1,3 @@
-"""The scene: what an experiment comes to on its lattice, ready to be stepped."""
+"""Scene of an experiment: body, frame, leaders, loads and obstacles on a lattice, ready for
+stepping.
+"""

@@ -1,4 +1,4 @@
-"""What a user is warned of where a scene can be built and may not be what was meant."""
+"""Warnings about scenes that can be built but may not be what the user intends."""
 
 from __future__ import annotations
 
@@ -28,124 +28,134 @@ if TYPE_CHECKING:
     from pbdkit.scene.obstacles import Barrier
 
 
-MANY = 1000
-"""Equilibria of one run beyond which it is likely that fewer are wanted."""
-FLAT = 0.05
-"""Cells flatter than this are warned of."""
-FAR, SHOWN = 2.0, 5
-"""So many spacings from the body a point is warned of, and so many of them are named."""
-ANGLE, ROUNDING, DECIMALS = math.pi / 12, 1e-3, 2
-"""Of this multiples are written as radians, to that many digits; degrees are written with fewer."""
+MAX_EQUILIBRIA = 1000
+"""Number of recorded equilibria above which a warning suggests fewer."""
+MIN_FLATNESS = 0.05
+"""Flatness of a cell below which a warning is issued."""
+MAX_DISTANCE = 2.0
+"""Distance of a selected point from the body above which a warning is issued, in spacings."""
+MAX_LISTED = 5
+"""Maximum number of distant points listed in warnings."""
+ROUND_ANGLE = math.pi / 12
+"""Angle whose multiples are recognised as radians."""
+ROUND_ATOL = 1e-3
+"""Tolerance of the recognition of multiples of `ROUND_ANGLE`."""
+DECIMALS = 2
+"""Number of decimals from which on an angle counts as not rounded."""
+LOCKING_FACTOR = 0.07
+"""Relative excess stiffness of a body of n cells across is about this factor times c_shear / λ / n.
 
-LOCKING, NOTICED = 0.07, 0.05
-"""A body of n cells across is too stiff by about this share of the shear stiffness over the least
-stiffness of its cells, over n, where that is of a stretch along one axis with a squeeze along the
-other; from what share on it is warned of."""
+λ is the smallest stiffness of a cell, of a mode that extends one axis and contracts the other."""
+MAX_LOCKING = 0.05
+"""Relative excess stiffness above which a warning is issued."""
 
 
-def doubts_of(
+def lattice_warnings(
     experiment: Experiment, neighbourhood: Neighbourhood, raster: Raster, layers: int
 ) -> list[str]:
-    """A line each, on the lattice, who is whose neighbour, and the frame of a body."""
-    doubts, frame, rule = [], experiment.frame, experiment.rule
-    if (flat := flatness(neighbourhood.cell)) < FLAT:
-        doubts.append(
-            f"lattice: nearly degenerate, sites lie {1 / flat:.3g} times closer along one line "
-            "than its longer cell vector is long, so that neighbours by distance lie along that "
-            "line; take chebyshev neighbours, or open the angle between the vectors"
+    """Return warnings about the lattice, the neighbours and the frame."""
+    warnings, frame, rule = [], experiment.frame, experiment.rule
+    if (flat := flatness(neighbourhood.cell)) < MIN_FLATNESS:
+        warnings.append(
+            f"lattice: nearly degenerate, the longer cell vector is {1 / flat:.3g} times the "
+            "smallest distance of sites, so that neighbours by distance lie along one line; use "
+            "chebyshev neighbours, or increase the angle between the vectors"
         )
     if not neighbourhood.spans_space():
-        doubts.append(
-            "neighbours: they lie along one line only, so that rows do not feel each other; "
-            "more shells, or chebyshev neighbours, connect them"
+        warnings.append(
+            "neighbours: all lie along one line, so that rows are not coupled; "
+            "use more shells, or chebyshev neighbours"
         )
     if layers and raster.communicator.any(has_narrow_slot(raster.sites == FOLLOWER, layers)):
-        doubts.append(
+        warnings.append(
             f"body: a slot is narrower than {2 * layers + 1} sites, so that frame points in it "
-            "belong to both faces; widen it, or take fewer layers"
+            "belong to both faces; widen it, or use fewer layers"
         )
     if not frame.edges_are_free and material_of(rule) is not None:
-        doubts.append(
+        warnings.append(
             WarningText(
                 f"frame: under '{frame.type}' edges are not free of stress, and with the "
-                f"calibrated rule '{rule.type}' the result does not converge to elasticity, "
-                "however fine the lattice (copying frames err by 6.7 % on a bar in tension, "
-                "14.5 % on a cantilever); take {type: natural}",
+                f"calibrated rule '{rule.type}' the result does not converge to elasticity under "
+                "refinement (the error of copying frames is 6.7 % for a bar in tension, 14.5 % "
+                "for a cantilever); use {type: natural}",
                 AccuracyWarning,
             )
         )
-    return doubts
+    return warnings
 
 
 def narrow_voids(lattice: Lattice, left_out: LeftOut) -> Iterator[str]:
-    """A line where cells are left out because they would connect the two sides of a void."""
+    """Generate a warning if cells are omitted that would connect the two sides of a void."""
     if left_out.first is not None:
         cell = lattice.cell()
         at = positions(cell, *cells_of_sites(cell, *(np.array([n]) for n in left_out.first)))
         x, y = (float(c[0]) + origin for c, origin in zip(at, lattice.origin, strict=True))
         cells = "a cell is" if left_out.count == 1 else f"{left_out.count} cells are"
         yield (
-            f"body: {cells} left out, near ({x:.6g}, {y:.6g}) first, where a void is less than two "
-            "cells wide: they would connect both of its sides; take a finer lattice, so that two "
-            "cells lie across the void, or for a crack without width `cuts`"
+            f"body: {cells} left out, the first near ({x:.6g}, {y:.6g}), where a void is less than "
+            "two cells wide: they would connect its two sides; use a finer lattice, with two cells "
+            "across the void, or `cuts` for a crack of zero width"
         )
 
 
 def locking(experiment: Experiment, raster: Raster) -> Iterator[str]:
-    """A line on materials that hardly stretch along the diagonals of the lattice: shear and the sum
-    of both stretches are stiff, their difference is soft, and cells, which resist hourglassing by
-    their shear stiffness, cannot bend without the former."""
+    """Generate a warning about cells that lock in bending.
+
+    A material that hardly extends along the diagonals of the lattice is stiff in shear and under
+    equal biaxial strain, and compliant under extension along one axis with contraction along the
+    other. Cells resist hourglass modes by their shear stiffness, and cannot bend without these.
+    """
     rule = experiment.rule
     if not isinstance(rule, MixesCells) or (c := rule.elasticity()) is None:
         return
     values, vectors = np.linalg.eigh([[c.xx, c.xy], [c.xy, c.yy]])
-    if vectors[0, 0] * vectors[1, 0] > -0.25:  # no stretch with a squeeze
+    if vectors[0, 0] * vectors[1, 0] > -0.25:  # the compliant mode is not of that kind
         return
     sides = [math.hypot(*vector) for vector in raster.lattice.cell().vectors]
     ends = zip(*body_box(raster), sides, strict=True)
     across = max(1.0, min((high - low) / side for low, high, side in ends))
-    error = LOCKING * float(c.shear / values[0]) / across
-    if error > NOTICED:
+    error = LOCKING_FACTOR * float(c.shear / values[0]) / across
+    if error > MAX_LOCKING:
         yield WarningText(
-            f"rule: '{rule.type}' hardly stretches along the diagonals of the lattice with these "
-            f"ratios, so that cells lock: with {across:.3g} of them across the body it may be too "
-            f"stiff by some {100 * error:.2g} %; turn the body onto the lattice, so that the stiff "
-            "directions of the material lie along its axes, or refine it",
+            f"rule: '{rule.type}' hardly extends along the diagonals of the lattice with these "
+            f"ratios, so that cells lock: with {across:.3g} cells across, the body may be too "
+            f"stiff by about {100 * error:.2g} %; align the stiff directions of the material with "
+            "the axes of the lattice, or refine the lattice",
             AccuracyWarning,
         )
 
 
 def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
-    """A line each on what is said and changes nothing: regions, courses, records."""
+    """Generate warnings about regions, time-dependent parameters and records without effect."""
     fields = [*experiment.rule.varying.values(), *experiment.fracture.varying.values()]
-    named = {name for f in fields if isinstance(f, ByRegion) for name, _ in f.values}
-    named |= {group.select.region or "" for group in experiment.leaders}
-    named |= {load.select.region or "" for load in experiment.loads}
+    names = {name for f in fields if isinstance(f, ByRegion) for name, _ in f.values}
+    names |= {group.select.region or "" for group in experiment.leaders}
+    names |= {load.select.region or "" for load in experiment.loads}
     for name, region in experiment.regions.items():
         cell = experiment.lattice.cell()
         x, y = raster.reference(raster.body_rows).T
-        near = max(float(np.hypot(v.x, v.y)) for v in cell.vectors)
-        if name not in named:
-            yield f"regions.{name}: nothing names it, so that it changes nothing"
-        elif not raster.communicator.any((signed_distance(region, cell, x, y) <= near).any()):
-            yield f"regions.{name}: lies outside of the body, so that it changes nothing"
+        tolerance = max(float(np.hypot(v.x, v.y)) for v in cell.vectors)
+        if name not in names:
+            yield f"regions.{name}: not referenced, so that it has no effect"
+        elif not raster.communicator.any((signed_distance(region, cell, x, y) <= tolerance).any()):
+            yield f"regions.{name}: lies outside the body, so that it has no effect"
     for place, course in experiment.courses.items():
         if course.bends and course.bends[-1] > experiment.steps:
             yield (
-                f"{'.'.join(place)}: changes until step {course.bends[-1]}, and the run ends with "
+                f"{'.'.join(place)}: changes until step {course.bends[-1]}, but the run ends with "
                 f"step {experiment.steps}"
             )
-    if not experiment.solver.makes_steps and experiment.record_count > MANY:
+    if not experiment.solver.makes_steps and experiment.record_count > MAX_EQUILIBRIA:
         yield (
-            f"record: {experiment.record_count} equilibria are found and recorded; `every` or `at` "
-            "names fewer steps"
+            f"record: {experiment.record_count} equilibria are computed and recorded; select fewer "
+            "steps with `every` or `at`"
         )
 
 
 def carried_by_leaders(
     raster: Raster, leading: Sequence[Leading], loads: Loads | None, steps: int
 ) -> Iterator[str]:
-    """A line for each load all of whose particles lead along it whenever it acts."""
+    """Generate a warning for each load whose particles all lead along it whenever it acts."""
     for n, loading in enumerate(loads.each if loads else ()):
         load = loading.load
         along = np.flatnonzero(load.force_at(max(load.from_, 1))).tolist()
@@ -154,35 +164,34 @@ def carried_by_leaders(
             if group.group.from_ <= load.from_ and group.group.last(steps) >= load.last(steps):
                 for axis in free.keys() & {*group.axes}:
                     free[axis] = free[axis] & ~np.isin(loading.rows, group.rows)
-        if along and not raster.communicator.any(any(each.any() for each in free.values())):
-            yield f"loads.{n}: acts on leaders alone, which carry it, so that it moves nothing"
+        if along and not raster.communicator.any(any(mask.any() for mask in free.values())):
+            yield f"loads.{n}: acts only on leaders, so that it has no effect on the body"
 
 
 def never_near(
     raster: Raster, barriers: Sequence[Barrier], leading: Sequence[Leading], steps: int
 ) -> Iterator[str]:
-    """A line for each obstacle that stays farther from the body than leaders could turn and move
-    it."""
+    """Generate a warning for each obstacle that leaders cannot bring into contact with the body."""
     driven: list[Leading | Barrier] = [*barriers, *leading]
-    if any(isinstance(one.group.motion, Newton | Rotation) for one in driven):
+    if any(isinstance(part.group.motion, Newton | Rotation) for part in driven):
         return
     box = np.array(body_box(raster)) + raster.lattice.origin if barriers else np.zeros((2, 2))
-    ways = [np.abs(way).max(initial=0.0) for one in leading for way in _ways(one, steps)]
-    reach = 2.0 * max(ways, default=0.0) + float(np.hypot(*(box[1] - box[0])))
+    offsets = [offset for group in leading for offset in _offsets(group, steps)]
+    largest = max((np.abs(offset).max(initial=0.0) for offset in offsets), default=0.0)
+    reach = 2.0 * largest + float(np.hypot(*(box[1] - box[0])))
     for n, barrier in enumerate(barriers):
-        moves = np.concatenate(_ways(barrier, steps))
+        moves = np.concatenate(_offsets(barrier, steps))
         low, high = barrier.start.box[:2], barrier.start.box[2:]
         gaps = [low + moves.min(axis=0) - box[1], box[0] - high - moves.max(axis=0)]
         if np.max(gaps) > reach:
             yield (
-                f"obstacles.{n}: stays farther from the body than that is large, so that it "
-                "changes nothing"
+                f"obstacles.{n}: stays farther from the body than the size of the body, so that it "
+                "has no effect"
             )
 
 
-def _ways(driven: Leading | Barrier, steps: int) -> list[NDArray[Any]]:
-    """(particle or 1, axis) by which a motion is away from its start, at the moments between which
-    it changes as one formula."""
+def _offsets(driven: Leading | Barrier, steps: int) -> list[NDArray[Any]]:
+    """Return the displacements of a motion at its knots, each (particle or 1, axis)."""
     motion, last = driven.group.motion, driven.group.last(steps) - driven.group.from_ + 1
     if isinstance(motion, Oscillation):
         return [np.array([motion.amplitude]), -np.array([motion.amplitude])]
@@ -192,34 +201,37 @@ def _ways(driven: Leading | Barrier, steps: int) -> list[NDArray[Any]]:
 
 
 def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
-    """A line each, for the first few, on points of `nearest` that no particle is near."""
+    """Generate a warning for each of the first points of `nearest` far from every particle."""
     selections = {f"leaders.{n}": group.select for n, group in enumerate(experiment.leaders)}
     selections |= {f"loads.{n}": load.select for n, load in enumerate(experiment.loads)}
     points = [(name, at) for name, select in selections.items() for at in select.nearest or ()]
     body = Selecting(raster)
-    limit = FAR * max(math.hypot(*vector) for vector in raster.lattice.cell().vectors)
+    limit = MAX_DISTANCE * max(math.hypot(*vector) for vector in raster.lattice.cell().vectors)
     far = body.least_distances(at for _, at in points) > limit
-    for name, (x, y) in islice(compress(points, far), SHOWN):
+    for name, (x, y) in islice(compress(points, far), MAX_LISTED):
         rows = body.nearest([(x, y)])
-        own = (raster.before + rows[0] + 1, *raster.reference(rows)[0]) if len(rows) else None
-        number, at_x, at_y = raster.communicator.first(own)
+        nearest = None
+        if len(rows):
+            nearest = (raster.particle_offset + rows[0] + 1, *raster.reference(rows)[0])
+        number, at_x, at_y = raster.communicator.first(nearest)
         yield (
-            f"{name}.select.nearest: ({x:g}, {y:g}) lies {math.hypot(x - at_x, y - at_y):.4g} away "
-            f"from the body; the particle nearest to it is {number}, at ({at_x:.6g}, {at_y:.6g})"
+            f"{name}.select.nearest: the distance of ({x:g}, {y:g}) from the body is "
+            f"{math.hypot(x - at_x, y - at_y):.4g}; the nearest particle is {number}, at "
+            f"({at_x:.6g}, {at_y:.6g})"
         )
 
 
 def angles_in_radians(experiment: Experiment) -> Iterator[str]:
-    """A line each on angles, or turns in all, that are round in radians; degrees are asked for."""
-    found = {}
+    """Generate a warning for each angle, or total rotation, that is a round number of radians."""
+    angles = {}
     if (angle := getattr(experiment.lattice, "angle", None)) is not None:
-        found["lattice.angle"] = angle, angle
+        angles["lattice.angle"] = angle, angle
     for part, driven in (("leaders", experiment.leaders), ("obstacles", experiment.obstacles)):
-        for n, one in enumerate(driven):
-            if isinstance(one.motion, Rotation):
-                whole = one.motion.angle * one.motion.steps
-                found[f"{part}.{n}.motion.angle"] = one.motion.angle, whole
-    for name, (angle, whole) in found.items():
+        for n, group in enumerate(driven):
+            if isinstance(group.motion, Rotation):
+                whole = group.motion.angle * group.motion.steps
+                angles[f"{part}.{n}.motion.angle"] = group.motion.angle, whole
+    for name, (angle, whole) in angles.items():
         if round_in_radians(angle) or round_in_radians(whole):
             yield (
                 f"{name}: {angle:g} degrees look like radians, which would be "
@@ -228,7 +240,11 @@ def angles_in_radians(experiment: Experiment) -> Iterator[str]:
 
 
 def round_in_radians(angle: float) -> bool:
-    """Whether it is a multiple of 15°, up to a full turn, written in radians: 0.7854, not 2.88."""
-    turns = round(abs(angle) / ANGLE)
-    near = abs(abs(angle) - turns * ANGLE) <= ROUNDING
-    return 0 < turns <= 24 and near and round(angle, DECIMALS) != round(angle, 9)
+    """Return whether an angle is a multiple of 15° up to a full turn, in radians with enough
+    decimals.
+
+    0.7854 is such an angle, 2.88 is not.
+    """
+    multiple = round(abs(angle) / ROUND_ANGLE)
+    is_multiple = abs(abs(angle) - multiple * ROUND_ANGLE) <= ROUND_ATOL
+    return 0 < multiple <= 24 and is_multiple and round(angle, DECIMALS) != round(angle, 9)

@@ -1,8 +1,8 @@
-"""Constants and remembered numbers that elementwise functions see, and where each is attached: to
-the scene, a slot, a cell, a bond or a particle.
+"""Constants and remembered numbers of elementwise functions, and what each is attached to.
 
-A new kind of value is declared here: who sees it, under which name, and where it is attached. numpy
-and kernels read this description.
+A number belongs to the scene, a slot, a cell, a bond or a particle. New kinds of numbers are
+declared here, with the function that receives them and their name; the numpy engine and the kernels
+use this description.
 """
 
 from __future__ import annotations
@@ -53,29 +53,35 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import vector
 
 Declared = tuple[Remembered, ...]
+"""Type of the declarations of remembered numbers."""
 
 
 def bond_numbers(experiment: Experiment) -> Declared:
-    """What the fracture model remembers of each bond; nothing where bonds cannot break."""
+    """Return the numbers that the fracture model remembers for each bond; none if bonds cannot
+    break.
+    """
     return _declared(experiment.fracture, "fracture") if experiment.fracture.can_break else ()
 
 
 def particle_numbers(experiment: Experiment) -> Declared:
-    """What the rule remembers of each particle."""
+    """Return the numbers that the rule remembers for each particle."""
     return _declared(experiment.rule, "rule")
 
 
 def _declared(part: FollowerRule | FractureModel, field: str) -> Declared:
     if not isinstance(part, Remembers):
         return ()
-    with blaming(part, "when asked what it remembers", field):
+    with blaming(part, "to declare its remembered numbers", field):
         return as_values(part.remembered(), "remembered")
 
 
 def remembered_names(experiment: Experiment) -> dict[str, str]:
-    """Each number's name with the field of the part that remembers it.
+    """Return the field of the component that remembers each number, by the name of the number.
 
-    Raises PluginError for a name that is declared twice.
+    Raises
+    ------
+    PluginError
+        If a name is declared twice.
     """
     bonds, particles = bond_numbers(experiment), particle_numbers(experiment)
     names = [number.name for number in (*bonds, *particles)]
@@ -84,7 +90,7 @@ def remembered_names(experiment: Experiment) -> dict[str, str]:
             raise PluginError(
                 f"the number '{name}' is declared {count} times, by FractureModel "
                 f"'{experiment.fracture.type}' and FollowerRule '{experiment.rule.type}'; "
-                "each needs a name of its own"
+                "use different names"
             )
     return {n.name: "fracture" for n in bonds} | {n.name: "rule" for n in particles}
 
@@ -92,44 +98,59 @@ def remembered_names(experiment: Experiment) -> dict[str, str]:
 def check_diagnostics(
     experiment: Experiment, raster: Raster, neighbourhood: Neighbourhood
 ) -> list[str]:
-    """Raises ExperimentError for diagnostics that do not go with the scene or each other; returns
-    warnings about them."""
-    taken = remembered_names(experiment)
+    """Check that diagnostics are compatible with the scene and with each other.
+
+    Returns
+    -------
+    list
+        Warnings about diagnostics.
+
+    Raises
+    ------
+    ExperimentError
+        If a diagnostic requires something that the scene does not have, or two declare one
+        variable.
+    """
+    owners = remembered_names(experiment)
     for n, diagnostic in enumerate(experiment.diagnostics):
-        with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
+        with blaming(diagnostic, "to declare what it measures", "diagnostics", n):
             diagnostic.check(raster.total, len(experiment.leaders))
             diagnostic.coordinates()
             if "cells" in diagnostic.needs and not raster.communicator.any(
                 patches(raster, neighbourhood.tiling)
             ):
                 raise ExperimentError(
-                    f"'{diagnostic.type}' needs cells, and nowhere do the corners of one all "
-                    "belong to the body; make it wider, or leave the diagnostic out"
+                    f"'{diagnostic.type}' requires cells, and no cell has all its corners in the "
+                    "body; use a wider body, or remove the diagnostic"
                 )
             if "loads" in diagnostic.needs and not experiment.loads:
-                raise ExperimentError(f"'{diagnostic.type}' is of loads, and there is none")
+                raise ExperimentError(
+                    f"'{diagnostic.type}' requires loads; the experiment has none"
+                )
             if diagnostic.needs & {"material", "forces"}:
                 _refuse_without_material(diagnostic, experiment)
             for variable in diagnostic.variables():
-                ours = diagnostic.own_dimension != "obstacle" and not diagnostic.coordinates()
-                if "obstacle" in variable.dims and ours and not experiment.obstacles:
-                    raise ExperimentError(f"'{diagnostic.type}' is of obstacles, and there is none")
-                if variable.name in taken:
-                    other = f"{taken[variable.name]} does too"
+                is_plain = diagnostic.own_dimension != "obstacle" and not diagnostic.coordinates()
+                if "obstacle" in variable.dims and is_plain and not experiment.obstacles:
+                    raise ExperimentError(
+                        f"'{diagnostic.type}' requires obstacles; the experiment has none"
+                    )
+                if variable.name in owners:
+                    other = f"{owners[variable.name]} does too"
                     raise ExperimentError(f"adds the variable '{variable.name}'; {other}")
-                taken[variable.name] = f"diagnostics.{n}"
-    return _doubts(experiment, raster)
+                owners[variable.name] = f"diagnostics.{n}"
+    return _frame_warnings(experiment, raster)
 
 
-def _doubts(experiment: Experiment, raster: Raster) -> list[str]:
+def _frame_warnings(experiment: Experiment, raster: Raster) -> list[str]:
     has_frame = raster.communicator.any((raster.table_kind == FRAME).any())
     return of_category(
         AccuracyWarning,
         (
-            f"diagnostics.{n}: '{diagnostic.type}' counts what frame points pull at leaders, which "
-            "at the corners of held edges is no force of the body (the reaction of a clamped "
-            "cantilever with 10 cells over its height is 8 times that of the body under 'mean', "
-            "and 1.6 % off under 'natural'); take frame: {type: natural}"
+            f"diagnostics.{n}: '{diagnostic.type}' includes forces of frame points on leaders, "
+            "which at the corners of prescribed edges are artefacts of the frame (the reaction of "
+            "a clamped cantilever with 10 cells over its height is too large by a factor of 8 "
+            "under 'mean', and has an error of 1.6 % under 'natural'); use frame: {type: natural}"
             for n, diagnostic in enumerate(experiment.diagnostics)
             if has_frame and "forces" in diagnostic.needs
         ),
@@ -140,60 +161,83 @@ def _refuse_without_material(diagnostic: Diagnostic, experiment: Experiment) -> 
     rule = experiment.rule
     if material_of(rule) is None:
         raise ExperimentError(
-            f"'{diagnostic.type}' needs a rule that is calibrated to a material ('elastic', "
-            f"'orthotropic', 'springs', 'strain-gradient'), which '{rule.type}' with these "
-            "parameters is not; take one of those, or leave the diagnostic out"
+            f"'{diagnostic.type}' requires a rule that is calibrated to a material ('elastic', "
+            f"'orthotropic', 'springs', 'strain-gradient'); '{rule.type}' with these parameters is "
+            "not; use one of those, or remove the diagnostic"
         )
     if experiment.neighbours.nearness():
         raise ExperimentError(
-            f"'{diagnostic.type}' needs neighbours that stay; set neighbours.reevaluate: false"
+            f"'{diagnostic.type}' requires fixed neighbours; set neighbours.reevaluate: false"
         )
 
 
 Values = Mapping[str, Floats]
-"""By the name of the parameter, an array over the places."""
+"""Type of spatially varying parameters: arrays over places, by name."""
 
 
 def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: Mask) -> Values:
-    """The parameters of the part at a field of the experiment that differ, at places where they
-    are `needed`; elsewhere where there is none the number that serves for all.
+    """Evaluate the spatially varying parameters of a component at places.
 
-    Raises ExperimentError for a place outside of what is known, and where the values at a place do
-    not go together.
+    Parameters
+    ----------
+    experiment
+        The experiment.
+    field
+        Field of the component in the experiment.
+    x, y
+        Coordinates of the places.
+    needed
+        Mask of the places where values are required. Elsewhere missing values are replaced by the
+        default of the parameter.
+
+    Returns
+    -------
+    dict
+        Values by name of the parameter.
+
+    Raises
+    ------
+    ExperimentError
+        If a required place lies outside the data, or the values at a place are incompatible.
     """
     part: TakesFields = getattr(experiment, field)
-    cell, held = experiment.lattice.cell(), dict[str, Mask]()
-    # Corners of cut cells lie that far outside of a body at most.
+    cell, regions = experiment.lattice.cell(), dict[str, Mask]()
+    # The maximum distance of the corners of cut cells from the body.
     reach = max(math.hypot(*vector) for vector in cell.vectors)
     if any(isinstance(varying, ByRegion) for varying in part.varying.values()):
         for name, region in experiment.regions.items():
-            held[name] = signed_distance(region, cell, x, y) <= 0.0
-    found = {}
+            regions[name] = signed_distance(region, cell, x, y) <= 0.0
+    result = {}
     for name, varying in part.varying.items():
-        values = varying.at(x, y, held, reach)
+        values = varying.at(x, y, regions, reach)
         missing = np.isnan(values)
         if (missing & needed).any():
             place = int(np.argmax(missing & needed))
             raise ExperimentError(
-                f"has no value at ({x.flat[place]:.6g}, {y.flat[place]:.6g}), where one is needed; "
-                "its places must cover the body",
+                f"has no value at ({x.flat[place]:.6g}, {y.flat[place]:.6g}), where one is "
+                "required; extend its data to cover the body",
                 (field, name),
             )
-        found[name] = np.where(missing, getattr(part, name), values)
-    if len(found) > 1 and needed.any():
-        _refuse_apart(
-            part, field, {name: own[needed] for name, own in found.items()}, x[needed], y[needed]
-        )
-    return found
+        result[name] = np.where(missing, getattr(part, name), values)
+    if len(result) > 1 and needed.any():
+        selected = {name: array[needed] for name, array in result.items()}
+        _refuse_incompatible(part, field, selected, x[needed], y[needed])
+    return result
 
 
-def _refuse_apart(part: TakesFields, field: str, values: Values, x: Floats, y: Floats) -> None:
-    """Numbers that each may be need not go together, as where one must be above another: looked at
-    are the places where two are farthest apart, either way."""
-    for one, other in combinations(values.values(), 2):
-        for place in (int(np.argmin(one - other)), int(np.argmax(one - other))):
+def _refuse_incompatible(
+    part: TakesFields, field: str, values: Values, x: Floats, y: Floats
+) -> None:
+    """Validate the values together at the places with the largest differences between two
+    parameters.
+
+    Values that are valid one by one can be incompatible, for instance where one must exceed
+    another.
+    """
+    for first, second in combinations(values.values(), 2):
+        for place in (int(np.argmin(first - second)), int(np.argmax(first - second))):
             try:
-                part.with_values(**{name: float(own[place]) for name, own in values.items()})
+                part.with_values(**{name: float(array[place]) for name, array in values.items()})
             except ValidationError as error:
                 fault = error.errors()[0]
                 text = f"at ({x[place]:.6g}, {y[place]:.6g}): {fault['msg']}"
@@ -201,15 +245,21 @@ def _refuse_apart(part: TakesFields, field: str, values: Values, x: Floats, y: F
 
 
 def signed_distance(body: Body, cell: Cell, x: Floats, y: Floats) -> Floats:
-    """To an outline, negative inside, zero on it whatever the rounding."""
+    """Return the signed distance from an outline, negative inside, exactly zero within rounding."""
     nowhere = np.zeros(np.shape(x), int)
     distance = body.distance(Sites((nowhere, nowhere), Vector(x, y)))
     return np.where(np.abs(distance) <= rounding_of(cell, x, y), 0.0, distance)
 
 
 def kinds_of(part: TakesFields, values: Values) -> tuple[list[Any], NDArray[np.intp]]:
-    """(parts, kind): the part with the numbers of each kind of place, and of each place its kind,
-    in the shape of the values."""
+    """Return the component with each distinct combination of values, and the index of it at each
+    place.
+
+    Returns
+    -------
+    tuple
+        Components, and indices in the shape of the values.
+    """
     shape = next(iter(values.values())).shape
     table = np.stack([value.ravel() for value in values.values()], axis=1)
     rows, kind = np.unique(table, axis=0, return_inverse=True)
@@ -218,19 +268,33 @@ def kinds_of(part: TakesFields, values: Values) -> tuple[list[Any], NDArray[np.i
 
 
 WHOLE_CELLS = {"left": 1.0, "right": 1.0}
-"""The shares of the cells on both sides of a bond, where no frame weighs cells."""
-
+"""Shares of the cells on both sides of a bond under frames that do not weight cells."""
 Planes = Mapping[str, Floats]
+"""Type of numbers on rasters or planes, by name."""
 
 
 @dataclass(frozen=True)
 class SceneConstants:
-    """Named tuples: the parameters `rule` and `fracture` (``p``); by slot the rule's `weights`
-    (``w``) and the fracture model's `limits` (``c`` without what is remembered). `of_bond` makes
-    ``c`` of limits and remembered numbers, `of_particle` ``here.own``.
+    """Constants passed to elementwise functions, as named tuples.
 
-    Where fields make them differ, `by_particle` has parameters of the rule, (sublattice, cell,
-    cell), and `by_bond` limits, (plane, cell, cell), each by name.
+    Parameters
+    ----------
+    rule
+        Parameters ``p`` of the rule.
+    weights
+        Weights ``w`` of the rule, by slot.
+    fracture
+        Parameters ``p`` of the fracture model.
+    limits
+        Constants ``c`` of the fracture model without remembered numbers, by slot.
+    of_bond
+        Named tuple of limits and remembered numbers of a bond, ``c``.
+    of_particle
+        Named tuple of remembered numbers of a particle, ``here.own``.
+    by_particle
+        Spatially varying parameters of the rule by name, (sublattice, cell, cell).
+    by_bond
+        Spatially varying limits by name, (plane, cell, cell).
     """
 
     rule: Any
@@ -244,110 +308,130 @@ class SceneConstants:
 
     @property
     def shared(self) -> list[float]:
-        """The parameters of the rule that are the same everywhere."""
+        """Parameters of the rule that do not vary in space."""
         return [v for name, v in self.rule._asdict().items() if name not in self.by_particle]
 
     def limits_of(self, slot: Slot) -> list[float]:
-        """The limits of a slot that all its bonds share."""
-        own = self.limits[slot]._asdict()
-        return [value for name, value in own.items() if name not in self.by_bond]
+        """Return the limits of a slot that do not vary in space."""
+        limits = self.limits[slot]._asdict()
+        return [value for name, value in limits.items() if name not in self.by_bond]
 
     def rule_at(self, where: Where) -> Any:
-        """The rule's parameters of some particles."""
+        """Return the parameters of the rule at particles."""
         return self.rule._replace(**{name: where.of(v) for name, v in self.by_particle.items()})
 
     def limits_at(self, slot: Slot, plane: int, home: Where) -> Any:
-        """The limits of bonds along a slot, where they are kept on a plane."""
-        own = {name: home.within(values[plane]) for name, values in self.by_bond.items()}
-        return self.limits[slot]._replace(**own)
+        """Return the limits of bonds along a slot that are stored on a plane."""
+        values = {name: home.within(planes[plane]) for name, planes in self.by_bond.items()}
+        return self.limits[slot]._replace(**values)
 
 
-def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
-    """What rule and fracture model answer; what they refuse is about their part."""
-    slots = [slot for own in setting.slots for slot in own]
+def scene_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
+    """Compute the constants of the rule and the fracture model.
+
+    Raises
+    ------
+    ExperimentError
+        If a component does not support the lattice or the other components.
+    PluginError
+        If a component fails or returns malformed constants.
+    """
+    slots = [slot for ends in setting.slots for slot in ends]
     rule, fracture = experiment.rule, experiment.fracture
-    with blaming(rule, "when asked for its constants", "rule"):
+    with blaming(rule, "to return its constants", "rule"):
         of_rule = _named("Parameters", rule.parameters(setting))
         weights = {s: named_weights(rule.weights(s, setting), rule) for s in slots}
         _refuse_other_names(weights, "weights")
-    with blaming(fracture, "when asked for its constants", "fracture"):
+    with blaming(fracture, "to return its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
-        further = {s: of_material(fracture, rule, setting, s) for s in slots}
+        material_constants = {s: of_material(fracture, rule, setting, s) for s in slots}
         if isinstance(fracture, SoftensCells) and not experiment.frame.weighs_cells:
             raise ExperimentError(
                 f"'{fracture.type}' softens the cells of the body, which the frame "
-                f"'{experiment.frame.type}' does not tell from others; take frame: "
+                f"'{experiment.frame.type}' does not distinguish from other cells; use frame: "
                 "{type: natural}, or fracture: {type: damage}"
             )
-        limits = {s: _named("Constants", fracture.constants(s), **further[s]) for s in slots}
+        limits = {
+            s: _named("Constants", fracture.constants(s), **material_constants[s]) for s in slots
+        }
         _refuse_other_names(limits, "constants")
         if isinstance(rule, Calibrated) and fracture.can_break:
             _refuse_pulling(fracture, rule, slots, of_fracture)
         names = (*limits[slots[0]]._fields, *(n.name for n in bond_numbers(experiment)))
-        if twice := {name for name in names if names.count(name) > 1}:
+        if duplicates := {name for name in names if names.count(name) > 1}:
             raise PluginError(
-                f"'{fracture.type}' has a constant and remembers a number of the name "
-                f"'{min(twice)}': leave one out"
+                f"'{fracture.type}' has a constant and a remembered number of the name "
+                f"'{min(duplicates)}'; rename one of them"
             )
-    own = tuple(number.name for number in particle_numbers(experiment))
-    kinds = _kind("Constants", names), _kind("Own", own)
+    particle_names = tuple(number.name for number in particle_numbers(experiment))
+    kinds = _kind("Constants", names), _kind("Own", particle_names)
     return SceneConstants(of_rule, weights, of_fracture, limits, *kinds)
 
 
 def _refuse_pulling(
     fracture: FractureModel, rule: FollowerRule, slots: list[Slot], parameters: Any
 ) -> None:
-    """A force that a lost bond goes on to exert on one end alone balances no other."""
+    """Raise ExperimentError if broken bonds exert forces under a calibrated rule.
+
+    Such a force acts on one end only, so that forces do not balance.
+    """
     u = 0.1 * slots[0].rest
     lost = [fracture.fictitious(u, slot.rest, parameters) for slot in slots]
-    if any(component != 0.0 for one in lost for component in one):
+    if any(component != 0.0 for difference in lost for component in difference):
         raise ExperimentError(
-            f"'{fracture.type}' places fictitious points that pull at the ends of lost bonds, and "
-            f"under the calibrated rule '{rule.type}' nothing would balance these forces; take "
+            f"'{fracture.type}' places fictitious points that exert forces at broken bonds, and "
+            f"under the calibrated rule '{rule.type}' these forces would not balance; use "
             "placement: 1 and fictitious: cell, or a rule of the paper"
         )
 
 
 def named_weights(values: Any, rule: FollowerRule) -> Any:
-    """w of what a rule gives for a slot."""
+    """Return the weights of a rule for a slot as the named tuple ``w``."""
     return _named("Weights", values, **(WHOLE_CELLS if rule.uses_cells else {}))
 
 
 def of_material(
     fracture: FractureModel, rule: FollowerRule, setting: Setting, slot: Slot
 ) -> dict[str, float]:
-    """Further constants of a slot, of a model that knows the material."""
+    """Return the constants of a slot that a fracture model derives from the material.
+
+    Raises
+    ------
+    ExperimentError
+        If the rule is not calibrated to a material, or not defined by cells.
+    """
     if not isinstance(fracture, KnowsStiffness):
         return {}
     if not isinstance(rule, TearsCells) or rule.elasticity() is None:
         raise ExperimentError(
-            f"'{fracture.type}' needs a rule that is calibrated to a material and works cell by "
-            f"cell, which '{rule.type}' with these parameters is not; take 'springs' or 'elastic', "
-            "or fracture: {type: damage}"
+            f"'{fracture.type}' requires a rule that is calibrated to a material and defined by "
+            f"cells; '{rule.type}' with these parameters is not; use 'springs' or 'elastic', or "
+            "fracture: {type: damage}"
         )
     return fracture.of_material(slot, rule, setting)
 
 
-def _named(kind: str, values: Any, **more: float) -> Any:
-    """Plain numbers by name: those of numpy would raise single precision to double."""
+def _named(kind: str, values: Any, **constants: float) -> Any:
+    """Return a named tuple of Python floats; numpy's would promote single precision to double."""
     if not isinstance(values, dict):
         raise TypeError(f"it returned {type(values).__name__}, not numbers by name: {{'k': 1.0}}")
-    return _kind(kind, (*values, *more))(*map(float, (*values.values(), *more.values())))
+    names = (*values, *constants)
+    return _kind(kind, names)(*map(float, (*values.values(), *constants.values())))
 
 
 @cache
 def _kind(name: str, fields: tuple[str, ...]) -> Any:
-    """Making a kind of tuple takes as long as many a part of a scene."""
+    """Create a type of named tuples; cached because this is slow."""
     return namedtuple(name, fields)
 
 
 def _refuse_other_names(by_slot: dict[Slot, Any], what: str) -> None:
     if len({values._fields for values in by_slot.values()}) > 1:
-        raise ValueError(f"its `{what}` do not have the same names for all slots")
+        raise ValueError(f"`{what}` returned different names for different slots; use the same")
 
 
 class Home(Enum):
-    """What has a value of its own."""
+    """What a number is attached to."""
 
     SCENE = "scene"
     SLOT = "slot"
@@ -360,7 +444,17 @@ class Home(Enum):
 
 @dataclass(frozen=True)
 class Number:
-    """A number that elementwise functions see by its name; one that is remembered may change."""
+    """Number passed to elementwise functions.
+
+    Parameters
+    ----------
+    name
+        Name of the number.
+    home
+        What it is attached to.
+    changes
+        Whether it can change during a run.
+    """
 
     name: str
     home: Home
@@ -368,12 +462,26 @@ class Number:
 
 
 Numbers = tuple[Number, ...]
+"""Type of the numbers that a function receives, in order."""
 
 
 @dataclass(frozen=True)
 class VisibleNumbers:
-    """The numbers by who sees them, in their order: the rule's parameters p, weights w and
-    `here.own`, the fracture model's parameters p and c."""
+    """Numbers by the argument that holds them, in order.
+
+    Parameters
+    ----------
+    rule
+        Parameters ``p`` of the rule.
+    weights
+        Weights ``w`` of the rule.
+    own
+        Remembered numbers of a particle, ``here.own``.
+    fracture
+        Parameters ``p`` of the fracture model.
+    bond
+        Constants and remembered numbers of a bond, ``c``.
+    """
 
     rule: Numbers
     weights: Numbers
@@ -385,7 +493,7 @@ class VisibleNumbers:
 def numbers_of(
     experiment: Experiment, constants: SceneConstants, *, weighs_cells: bool
 ) -> VisibleNumbers:
-    """What the functions of a scene's rule and fracture model see."""
+    """Return the numbers that the functions of the rule and the fracture model receive."""
     shares = WHOLE_CELLS if weighs_cells else {}
     weights = next(iter(constants.weights.values()))._fields
     limits = next(iter(constants.limits.values()))._fields
@@ -400,19 +508,19 @@ def numbers_of(
 
 
 def _all(
-    names: Iterable[str], home: Home, fixed: Container[str] = (), theirs: Home = Home.SCENE
+    names: Iterable[str], home: Home, varying: Container[str] = (), varying_home: Home = Home.SCENE
 ) -> Numbers:
-    return tuple(Number(name, theirs if name in fixed else home) for name in names)
+    return tuple(Number(name, varying_home if name in varying else home) for name in names)
 
 
 def _remembered(numbers: Iterable[Remembered], home: Home) -> Numbers:
     return tuple(Number(number.name, home, number.changes) for number in numbers)
 
 
-FEW = 3
-"""So many places are looked at to see whether a part answers for whole arrays."""
+SAMPLE_COUNT = 3
+"""Number of places at which the evaluation of a component on whole arrays is verified."""
 PROBE = 0.7
-"""So far, in bond lengths, ends are put to see what a fracture model's functions look at."""
+"""Largest relative displacement at which fracture models are evaluated, in bond lengths."""
 
 
 def with_fields(
@@ -422,82 +530,91 @@ def with_fields(
     neighbourhood: Neighbourhood,
     setting: Setting,
 ) -> SceneConstants:
-    """The constants with those that fields make differ; the same where the experiment has none.
+    """Add the constants that vary in space.
 
-    Raises ExperimentError where the place cannot be taken into account.
+    Raises
+    ------
+    ExperimentError
+        If a component does not support spatially varying parameters.
     """
     rule, fracture = experiment.rule, experiment.fracture
     if not (rule.varying or fracture.varying):
         return constants
     _refuse(experiment)
     if rule.varying and not rule.uses_cells:
-        with blaming(rule, "when asked for its constants", "rule"):
-            found = _by_particle(experiment, raster, setting, constants)
-        constants = replace(constants, by_particle=found)
+        with blaming(rule, "to return its constants", "rule"):
+            planes = _by_particle(experiment, raster, setting, constants)
+        constants = replace(constants, by_particle=planes)
     if fracture.can_break and (fracture.varying or _knows_varying(fracture, rule)):
-        with blaming(fracture, "when asked for its constants", "fracture"):
-            found = _by_bond(experiment, raster, neighbourhood, constants, setting)
-        constants = replace(constants, by_bond=found)
+        with blaming(fracture, "to return its constants", "fracture"):
+            planes = _by_bond(experiment, raster, neighbourhood, constants, setting)
+        constants = replace(constants, by_bond=planes)
     return constants
 
 
 def _refuse(experiment: Experiment) -> None:
+    """Raise ExperimentError if a component does not support spatially varying parameters."""
     rule, fracture = experiment.rule, experiment.fracture
-    unfit = (
+    clashes = (
         (isinstance(rule, AppliesTwice), "rule",
-         "applies a rule to the moves of another: what its energy would be is not told"),
+         "applies a rule to the moves of another, and has no energy for varying parameters"),
         (experiment.neighbours.nearness(), "rule",
-         "is asked for neighbours that are found anew; set neighbours.reevaluate: false"),
-        (_draws(rule), "rule", "draws a number for each particle from it"),
-        (_draws(fracture), "fracture", "draws a number for each bond from it"),
+         "requires fixed neighbours for varying parameters; set neighbours.reevaluate: false"),
+        (_draws(rule), "rule", "draws a random number for each particle from its parameters"),
+        (_draws(fracture), "fracture", "draws a random number for each bond from its parameters"),
     )  # fmt: skip
-    for clash, part_name, text in unfit:
+    for clash, part_name, text in clashes:
         part: TakesFields = getattr(experiment, part_name)
         if clash and part.varying:
             name = min(part.varying)
             raise ExperimentError(
-                f"'{part.type}' {text}; '{name}' must be one number here", (part_name, name)
+                f"'{part.type}' {text}; '{name}' must be a single number", (part_name, name)
             )
 
 
 def _knows_varying(fracture: FractureModel, rule: FollowerRule) -> bool:
-    """Whether bonds break by a stiffness that differs from place to place."""
+    """Return whether bonds break by a stiffness that varies in space."""
     return isinstance(fracture, KnowsStiffness) and bool(rule.varying)
 
 
 def _draws(part: TakesFields) -> bool:
-    """Whether numbers that stay come from the part's parameters."""
+    """Return whether constant numbers are drawn from the parameters of a component."""
     return isinstance(part, Draws) and any(not number.changes for number in part.remembered())
 
 
 def _by_particle(
     experiment: Experiment, raster: Raster, setting: Setting, constants: SceneConstants
 ) -> dict[str, Floats]:
-    """(sublattice, cell, cell) by name; frame points have the parameters that serve for all."""
+    """Compute the spatially varying parameters of the rule by name, (sublattice, cell, cell).
+
+    Frame points have the default parameters.
+    """
     rule, rows = experiment.rule, raster.body_rows
     x, y = raster.reference(rows).T
     values = values_at(experiment, "rule", x, y, np.ones(len(rows), bool))
     _refuse_weights(rule, values, setting)
-    place, found = raster.place_of(rows), {}
-    for name, own in _asked(rule, values, lambda part: part.parameters(setting)).items():
+    place, result = raster.place_of(rows), {}
+    for name, numbers in _evaluate(rule, values, lambda part: part.parameters(setting)).items():
         base = getattr(constants.rule, name)
-        if raster.communicator.any((own != base).any()):
+        if raster.communicator.any((numbers != base).any()):
             planes = np.full(raster.shape, base)
-            planes.reshape(-1)[place] = own
-            found[name] = planes
-    return found
+            planes.reshape(-1)[place] = numbers
+            result[name] = planes
+    return result
 
 
 def _refuse_weights(rule: FollowerRule, values: Values, setting: Setting) -> None:
-    """Weights are of slots: they cannot differ from place to place."""
-    slots = [slot for own in setting.slots for slot in own]
+    """Raise ExperimentError if weights depend on the values: weights of a slot cannot vary in
+    space.
+    """
+    slots = [slot for ends in setting.slots for slot in ends]
     parts, _ = kinds_of(rule, {name: _ends(value) for name, value in values.items()})
     weights = [[part.weights(slot, setting) for slot in slots] for part in parts]
-    if any(own != weights[0] for own in weights):
+    if any(other != weights[0] for other in weights):
         name = min(values)
         raise ExperimentError(
-            f"'{rule.type}' takes its weights of neighbours from its numbers, and has one weight a "
-            f"neighbour for all particles; '{name}' must be one number",
+            f"the weights of '{rule.type}' depend on its parameters and are the same for all "
+            f"particles; '{name}' must be a single number",
             ("rule", name),
         )
 
@@ -505,17 +622,19 @@ def _refuse_weights(rule: FollowerRule, values: Values, setting: Setting) -> Non
 def _by_bond(
     experiment: Experiment,
     raster: Raster,
-    around: Neighbourhood,
+    neighbourhood: Neighbourhood,
     constants: SceneConstants,
     setting: Setting,
 ) -> dict[str, Floats]:
-    """(plane, cell, cell) by name, of the fracture model's limits; bonds take the values at their
-    middle, and what the functions see besides must be the same everywhere."""
-    fracture, slots = experiment.fracture, [plane.slot for plane in around.planes]
+    """Compute the spatially varying limits of the fracture model by name, (plane, cell, cell).
+
+    Bonds have the values at their midpoint. All other results of the model must be uniform.
+    """
+    fracture, slots = experiment.fracture, [plane.slot for plane in neighbourhood.planes]
     base = [constants.limits[slot]._asdict() for slot in slots]
     shape, origin = raster.shape[1:], raster.lattice.origin
-    found = {name: np.stack([np.full(shape, b[name]) for b in base]) for name in base[0]}
-    for n, plane in enumerate(around.planes):
+    result = {name: np.stack([np.full(shape, b[name]) for b in base]) for name in base[0]}
+    for n, plane in enumerate(neighbourhood.planes):
         if not (block := plane_block(raster, plane)):
             continue
         start = raster.reference_planes(block)
@@ -523,24 +642,27 @@ def _by_bond(
         x, y = np.broadcast_arrays(*middle)
         needed = bonds_in(raster, block, plane, frame_too=False)
         values = values_at(experiment, "fracture", x, y, needed)
-        for rule, some in _rules_at(experiment, x, y, needed):
-            ask = partial(_limits, plane.slot, rule, setting)
-            own = {name: value[some] for name, value in values.items()}
-            for name, limits in (_asked(fracture, own, ask) if own else ask(fracture)).items():
-                block.within(found[name][n])[some] = limits
+        for rule, mask in _rules_at(experiment, x, y, needed):
+            limits_of = partial(_limits, plane.slot, rule, setting)
+            local = {name: value[mask] for name, value in values.items()}
+            limits = _evaluate(fracture, local, limits_of) if local else limits_of(fracture)
+            for name, numbers in limits.items():
+                block.within(result[name][n])[mask] = numbers
         if values:
             _refuse_parameters(experiment, constants, plane.slot, values)
-    apart = {
-        name: any((own != b[name]).any() for own, b in zip(planes, base, strict=True))
-        for name, planes in found.items()
+    varies = {
+        name: any((limits != b[name]).any() for limits, b in zip(planes, base, strict=True))
+        for name, planes in result.items()
     }
-    return {name: v for name, v in found.items() if raster.communicator.any(apart[name])}
+    return {name: v for name, v in result.items() if raster.communicator.any(varies[name])}
 
 
 def _rules_at(
     experiment: Experiment, x: Floats, y: Floats, needed: Mask
 ) -> Iterator[tuple[FollowerRule, Mask]]:
-    """The rule as the fracture model knows it, and where: of each kind of place, if it does."""
+    """Generate the rule with each combination of parameters, and the mask of the places that have
+    it.
+    """
     rule = experiment.rule
     parts, kind = [rule], np.zeros(x.shape, np.intp)
     if _knows_varying(experiment.fracture, rule):
@@ -549,22 +671,27 @@ def _rules_at(
 
 
 def _limits(slot: Slot, rule: FollowerRule, setting: Setting, fracture: FractureModel) -> Any:
-    """What a fracture model gives for a slot, what it makes of the rule's stiffness included."""
+    """Return the constants of a fracture model for a slot, including those derived from the
+    material.
+    """
     return {**fracture.constants(slot), **of_material(fracture, rule, setting, slot)}
 
 
 def _refuse_parameters(
     experiment: Experiment, constants: SceneConstants, slot: Slot, values: Values
 ) -> None:
-    """Limits are of bonds, the model's parameters of all: what its functions make of these must be
-    the same everywhere."""
+    """Raise ExperimentError if functions of the fracture model depend on values other than by
+    limits.
+
+    Limits are stored for each bond, parameters once.
+    """
     fracture = experiment.fracture
     parts, _ = kinds_of(fracture, {name: _ends(value) for name, value in values.items()})
-    alone = [_probed(experiment, constants, slot, part.parameters()) for part in parts]
-    if any(not np.array_equal(answers, alone[0], equal_nan=True) for answers in alone):
+    results = [_probed(experiment, constants, slot, part.parameters()) for part in parts]
+    if any(not np.array_equal(answers, results[0], equal_nan=True) for answers in results):
         name = min(fracture.varying)
         raise ExperimentError(
-            f"'{name}' of '{fracture.type}' is no limit of a bond: it must be one number",
+            f"'{name}' of '{fracture.type}' is not a limit of bonds; it must be a single number",
             ("fracture", name),
         )
 
@@ -572,53 +699,55 @@ def _refuse_parameters(
 def _probed(
     experiment: Experiment, constants: SceneConstants, slot: Slot, parameters: Mapping[str, float]
 ) -> Floats:
-    """What the model's functions make of some differences."""
+    """Evaluate the functions of the fracture model at several differences."""
     fracture, p = experiment.fracture, type(constants.fracture)(**parameters)
     initial = (number.initial for number in bond_numbers(experiment))
     c = constants.of_bond(*constants.limits[slot], *initial)
-    u = vector(np.linspace(-PROBE, PROBE, 2 * FEW) * math.hypot(*slot.rest) for _ in slot.rest)
+    size = 2 * SAMPLE_COUNT
+    u = vector(np.linspace(-PROBE, PROBE, size) * math.hypot(*slot.rest) for _ in slot.rest)
     lost = fracture.fictitious(u, slot.rest, p)
     answers = [*lost, fracture.breaks(u, slot.rest, c, p)]
     if isinstance(fracture, Softens):
         answers += fracture.seen(u, lost, slot.rest, c, p)
-    return np.array([np.broadcast_to(np.asarray(a, float), (2 * FEW,)) for a in answers])
+    return np.array([np.broadcast_to(np.asarray(a, float), (size,)) for a in answers])
 
 
 def _ends(value: Floats) -> Floats:
-    """The smallest and the largest."""
     return np.array([value.min(), value.max()])
 
 
-def _asked(
-    part: Any, values: Values, ask: Callable[[Any], Mapping[str, Any]]
+def _evaluate(
+    part: Any, values: Values, function: Callable[[Any], Mapping[str, Any]]
 ) -> dict[str, NDArray[Any]]:
-    """What a part answers, by name, for numbers at places.
+    """Evaluate a function of a component with spatially varying parameters.
 
-    It is asked for whole arrays first. Where it does not take them, or answers otherwise for the
-    first places than for each by itself, it is asked once for each kind of place.
+    The function is evaluated on whole arrays first. If it does not support these, or gives other
+    results for several places than for each place alone, it is evaluated once for each distinct
+    combination of values.
     """
-    shape, names = next(iter(values.values())).shape, list(ask(part))
-    found = _of_arrays(part, values, ask, names)
-    if found is None:
+    shape, names = next(iter(values.values())).shape, list(function(part))
+    result = _evaluate_arrays(part, values, function, names)
+    if result is None:
         parts, kind = kinds_of(part, values)
-        answers = [ask(one) for one in parts]
-        found = {name: np.array([float(a[name]) for a in answers])[kind] for name in names}
-    return {name: np.broadcast_to(value, shape) for name, value in found.items()}
+        answers = [function(component) for component in parts]
+        result = {name: np.array([float(a[name]) for a in answers])[kind] for name in names}
+    return {name: np.broadcast_to(value, shape) for name, value in result.items()}
 
 
-def _of_arrays(
-    part: Any, values: Values, ask: Callable[[Any], Mapping[str, Any]], names: Iterable[str]
+def _evaluate_arrays(
+    part: Any, values: Values, function: Callable[[Any], Mapping[str, Any]], names: Iterable[str]
 ) -> dict[str, NDArray[Any]] | None:
     try:
-        answer = ask(part.model_copy(update=dict(values)))
-        found = {name: np.asarray(answer[name], float) for name in names}
-    except Exception:  # it is asked place by place instead
+        answer = function(part.model_copy(update=dict(values)))
+        result = {name: np.asarray(answer[name], float) for name in names}
+    except Exception:  # evaluated place by place instead
         return None
     size = next(iter(values.values())).size
-    for n in sorted({0, size // 2, size - 1})[:FEW]:
-        alone = ask(part.with_values(**{name: float(v.flat[n]) for name, v in values.items()}))
-        for name, value in found.items():
-            here = value if value.ndim == 0 else value.flat[n]
-            if value.size not in (1, size) or float(here) != float(alone[name]):
+    for n in sorted({0, size // 2, size - 1})[:SAMPLE_COUNT]:
+        numbers = {name: float(value.flat[n]) for name, value in values.items()}
+        expected = function(part.with_values(**numbers))
+        for name, value in result.items():
+            number = value if value.ndim == 0 else value.flat[n]
+            if value.size not in (1, size) or float(number) != float(expected[name]):
                 return None
-    return found
+    return result

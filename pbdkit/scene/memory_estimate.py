@@ -68,7 +68,7 @@ def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
 
 def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> bool:
     """Whether the lattice's stencils serve."""
-    method, cell = experiment.solver.sought.method, neighbourhood.cell
+    method, cell = experiment.solver.equilibrium.method, neighbourhood.cell
     if not (asks_for_grids(experiment, method, particles) and find_spec("numba")):
         return False
     if isinstance(experiment.rule, AppliesTwice) or experiment.obstacles:

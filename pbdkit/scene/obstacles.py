@@ -1,8 +1,7 @@
-"""Obstacles on a lattice: where their outlines are at a step, which particles begin inside one, and
-the distance and way out from a place.
+"""Obstacles on a lattice: their outlines at a moment, and the shortest way out for a particle.
 
-`facing`, `way_out` and `clearance` are elementwise, and the same source runs on arrays and inside
-kernels; `leave` and `way_between` treat single places in both.
+`facing`, `way_out` and `clearance` are elementwise; the same source is evaluated on arrays and
+inside kernels. `leave` and `way_between` are evaluated for one particle at a time in both.
 """
 
 from __future__ import annotations
@@ -26,24 +25,47 @@ from pbdkit.plugin.frame import Indices
 from pbdkit.scene.leaders import Leading
 
 Floats = NDArray[np.float64]
+"""Type of arrays of double precision."""
 AnyFloats = NDArray[np.floating[Any]]
-HALF_PLANE, CIRCLES, POLYGON = 0, 1, 2
-NOTHING, LINE, SEGMENT, CIRCLE = 0, 1, 2, 3
-"""Shapes of the faces of outlines."""
+"""Type of arrays of floating-point numbers."""
+HALF_PLANE = 0
+"""Kind of the outline of a half-plane."""
+CIRCLES = 1
+"""Kind of an outline of one or two concentric circles."""
+POLYGON = 2
+"""Kind of the outline of a polygon."""
+NOTHING = 0
+"""Shape of a face that does not exist."""
+LINE = 1
+"""Shape of a face that is a line."""
+SEGMENT = 2
+"""Shape of a face that is a segment."""
+CIRCLE = 3
+"""Shape of a face that is a circle."""
 ROUNDING = 64 * float(np.finfo(float).eps)
-"""Rounding of a gap, relative to coordinates and sizes of outlines."""
+"""Rounding error of a gap, relative to coordinates and sizes of outlines."""
 FLAT = 1e-12
-"""Square of the sine of the angle below which two lines do not meet."""
+"""Squared sine of the angle below which two lines count as parallel."""
 TURNS = 8
-"""Iterations of Newton's method for the nearest point of a circle."""
-STRAIGHTEST, WIDEST = 0.1, 0.5
-"""Smallest second derivative that serves these, relative to that of a straight face; largest turn
-of the normal in one of them (radians)."""
+"""Number of iterations of Newton's method for the nearest point of a circle."""
+STRAIGHTEST = 0.1
+"""Smallest second derivative used in these iterations, relative to that of a straight face."""
+WIDEST = 0.5
+"""Largest rotation of the normal in one of these iterations (radians)."""
 
 
 class Face(NamedTuple):
-    """A smooth part of an outline before some places: their distances, its normals there, (axis,
-    place), and its curvature, positive where it bulges into free space."""
+    """Smooth part of an outline as seen from places.
+
+    Parameters
+    ----------
+    distance
+        Distance of each place, (place,).
+    normal
+        Outward normal at the nearest point, (axis, place).
+    curvature
+        Curvature, positive if the face is convex.
+    """
 
     distance: Floats
     normal: Floats
@@ -51,8 +73,19 @@ class Face(NamedTuple):
 
 
 class Walls(NamedTuple):
-    """Outlines as arrays: the kind of each, all points one after the other, where those of each
-    begin, and (inner, outer, size)."""
+    """Outlines as arrays.
+
+    Parameters
+    ----------
+    kinds
+        Kind of each outline.
+    points
+        Points of all outlines, (point, axis).
+    first
+        Index of the first point of each outline, and the number of points.
+    radii
+        Inner radius, outer radius and size of each outline, (outline, 3).
+    """
 
     kinds: NDArray[np.int64]
     points: Floats
@@ -61,31 +94,41 @@ class Walls(NamedTuple):
 
     @classmethod
     def of(cls, outlines: Sequence[Outline]) -> Walls:
-        """Those of some outlines."""
+        """Create from outlines."""
         points = [np.empty((0, 2)), *(outline.points for outline in outlines)]
         return cls(
             np.array([outline.kind for outline in outlines], np.int64),
             np.concatenate(points),
-            np.cumsum([len(own) for own in points]),
+            np.cumsum([len(part) for part in points]),
             np.array([(o.inner, o.outer, o.size) for o in outlines]).reshape(-1, 3),
         )
 
     def clearance(self, x: Any, y: Any) -> Any:
-        """`clearance` of some places."""
+        """Evaluate `clearance` at places."""
         return clearance(x, y, self.kinds, self.points, self.first, self.radii)
 
-    def way_between(self, at: AnyFloats, C: AnyFloats, led: int) -> tuple[Any, Any]:
-        """`way_between` of a particle."""
+    def way_between(self, at: AnyFloats, C: AnyFloats, code: int) -> tuple[Any, Any]:
+        """Evaluate `way_between` for a particle."""
         (x, y), (xx, xy, yy) = at, C
-        wx, wy = way_between(x, y, xx, xy, yy, led, self.kinds, self.points, self.first, self.radii)
+        arrays = self.kinds, self.points, self.first, self.radii
+        wx, wy = way_between(x, y, xx, xy, yy, code, *arrays)
         return wx, wy
 
 
 @dataclass(frozen=True)
 class Outline:
-    """An outline by its `kind` and `points`, (point, axis): of a half-plane a point and another
-    one unit along its normal, of circles the centre, of a polygon its vertices counter-clockwise.
-    What lies between the radii `inner` and `outer` is inside of circles."""
+    """Outline of an obstacle.
+
+    Parameters
+    ----------
+    kind
+        HALF_PLANE, CIRCLES or POLYGON.
+    points
+        Points, (point, axis): a point of the half-plane and that point plus the unit normal, the
+        centre of circles, or the vertices of a polygon, counterclockwise.
+    inner, outer
+        Radii of circles; the obstacle lies between them.
+    """
 
     kind: int
     points: Floats
@@ -93,50 +136,52 @@ class Outline:
     outer: float = 0.0
 
     def shifted(self, by: Floats) -> Outline:
-        """The same with its points elsewhere, by one vector each or for all."""
+        """Return the outline with its points shifted, by one vector for all or by one for each."""
         return Outline(self.kind, self.points + by, self.inner, self.outer)
 
     @property
     def box(self) -> Floats:
-        """(low x, low y, high x, high y) of the rectangle around it, as far as it ends."""
+        """Bounding box (low x, low y, high x, high y), infinite where the outline is unbounded."""
         if self.kind == HALF_PLANE:
             box = np.array([-math.inf, -math.inf, math.inf, math.inf])
-            for axis, along in enumerate(self.points[1] - self.points[0]):
-                if abs(along) == 1.0:
-                    box[axis + (2 if along > 0.0 else 0)] = self.points[0, axis]
+            for axis, component in enumerate(self.points[1] - self.points[0]):
+                if abs(component) == 1.0:
+                    box[axis + (2 if component > 0.0 else 0)] = self.points[0, axis]
             return box
         low, high = self.points.min(axis=0) - self.outer, self.points.max(axis=0) + self.outer
         return np.array([*low, *high])
 
     @property
     def size(self) -> float:
-        """The largest coordinate on it, as far as rounding goes."""
+        """Largest coordinate on the outline, for estimates of rounding errors."""
         return float(np.abs(self.points).max()) + self.outer
 
     def facing(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-        """`facing` of some places."""
+        """Evaluate `facing` at places."""
         whole = 0, len(self.points)
         with np.errstate(all="ignore"):
-            found = facing(x, y, self.kind, self.points, *whole, self.inner, self.outer)
-        gap, nx, ny = (np.broadcast_to(value, x.shape) for value in found)
+            result = facing(x, y, self.kind, self.points, *whole, self.inner, self.outer)
+        gap, nx, ny = (np.broadcast_to(value, x.shape) for value in result)
         return gap, nx, ny
 
     def way_out(self, at: AnyFloats, C: AnyFloats) -> AnyFloats:
-        """`way_out` of some places (axis, place), with C (xx xy yy, place)."""
+        """Evaluate `way_out` at places, (axis, place), with the compliance C, (xx xy yy, place)."""
         whole = self.points, 0, len(self.points), self.inner, self.outer
-        found = way_out(at[0], at[1], C[0], C[1], C[2], self.kind, *whole)
-        return np.stack([np.broadcast_to(way, at[0].shape) for way in found])
+        result = way_out(at[0], at[1], C[0], C[1], C[2], self.kind, *whole)
+        return np.stack([np.broadcast_to(way, at[0].shape) for way in result])
 
     def faces(self, x: Floats, y: Floats) -> Iterator[Face]:
-        """Its faces before some places: of a half-plane one, of circles each, of a polygon its
-        edges."""
+        """Generate the faces of the outline as seen from places.
+
+        A half-plane has one face, circles have one each, a polygon has one for each edge.
+        """
         if self.kind == HALF_PLANE:
             gap, nx, ny = self.facing(x, y)
             yield Face(np.abs(gap), np.stack([nx, ny]), 0.0)
         elif self.kind == CIRCLES:
-            way = np.stack([x, y]) - self.points[0][:, None]
-            r = np.hypot(*way)
-            u = np.where(r > 0.0, way / np.where(r > 0.0, r, 1.0), np.array([[1.0], [0.0]]))
+            offset = np.stack([x, y]) - self.points[0][:, None]
+            r = np.hypot(*offset)
+            u = np.where(r > 0.0, offset / np.where(r > 0.0, r, 1.0), np.array([[1.0], [0.0]]))
             yield Face(np.abs(r - self.outer), u, 1.0 / self.outer)
             if self.inner > 0.0:
                 yield Face(np.abs(r - self.inner), -u, -1.0 / self.inner)
@@ -152,7 +197,7 @@ class Outline:
 
 
 def outline_of(shape: AnyShape) -> Outline:
-    """The outline of an obstacle's shape."""
+    """Return the outline of the shape of an obstacle."""
     if isinstance(shape, Facing):
         point, normal = (np.array(v) for v in (shape.half_plane.point, shape.half_plane.normal))
         return Outline(HALF_PLANE, np.stack([point, point + normal / math.hypot(*normal)]))
@@ -169,8 +214,8 @@ def outline_of(shape: AnyShape) -> Outline:
 
 def _counter_clockwise(vertices: Sequence[tuple[float, float]]) -> Floats:
     points: Floats = np.array(vertices)
-    ways = np.roll(points, -1, axis=0) - points
-    points = points[ways.any(axis=1)]
+    edges = np.roll(points, -1, axis=0) - points
+    points = points[edges.any(axis=1)]
     x, y = (points - points.mean(axis=0)).T
     doubled = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum()
     return points if doubled > 0.0 else points[::-1].copy()
@@ -179,9 +224,26 @@ def _counter_clockwise(vertices: Sequence[tuple[float, float]]) -> Floats:
 def facing(
     x: Any, y: Any, kind: Any, points: Any, first: Any, last: Any, inner: Any, outer: Any
 ) -> Any:
-    """(gap, n_x, n_y) of places (x, y) before an outline whose points are those from `first` to
-    `last`: the distance from it, negative inside, and the normal into free space where it is
-    nearest."""
+    """Return the signed distance of places from an outline and the normal at the nearest point.
+
+    Parameters
+    ----------
+    x, y
+        Coordinates of the places.
+    kind
+        Kind of the outline.
+    points
+        Points of outlines, (point, axis).
+    first, last
+        Indices of the first point of the outline, and of the end of its points.
+    inner, outer
+        Radii of the outline.
+
+    Returns
+    -------
+    tuple
+        Signed distance, negative inside, and the components of the normal, which points outward.
+    """
     if kind == HALF_PLANE:
         return _before_half_plane(x, y, points, first)
     if kind == CIRCLES:
@@ -193,9 +255,12 @@ def way_out(
     x: Any, y: Any, xx: Any, xy: Any, yy: Any, kind: Any, points: Any, first: Any, last: Any,
     inner: Any, outer: Any,
 ) -> Any:  # fmt: skip
-    """(w_x, w_y) from places inside an outline to the nearest point of it, in the metric S = C⁻¹ of
-    particles with a compliance C = (xx, xy, yy): the way which a push along the normal n there
-    makes, w ∥ C n. That is along n where C is a multiple of 1."""
+    """Return the displacement from places inside an outline to its nearest point.
+
+    Distances are measured in the metric S = C⁻¹ of particles with the compliance C = (xx, xy, yy).
+    The displacement is the one that a force along the normal n causes, w ∥ C n, which is along n if
+    C is a multiple of the identity. The parameters are those of `facing`.
+    """
     if kind == HALF_PLANE:
         gap, nx, ny = _before_half_plane(x, y, points, first)
         sx, sy = xx * nx + xy * ny, xy * nx + yy * ny
@@ -220,69 +285,82 @@ def way_out(
 
 
 def clearance(x: Any, y: Any, kinds: Any, points: Any, first: Any, radii: Any) -> Any:
-    """0 where places are in none of some outlines, else minus the depth in the deepest. `kinds`,
-    `first` and `radii` (inner, outer, size) have a row an outline; `points` are those of all."""
-    found = 0.0
+    """Return 0 at places outside all outlines, otherwise minus the depth in the deepest one.
+
+    `kinds`, `first` and `radii` (inner, outer, size) have a row for each outline; `points` are
+    those of all outlines.
+    """
+    depth = 0.0
     for w in range(len(kinds)):
         inner, outer = radii[w, 0], radii[w, 1]
         gap = facing(x, y, kinds[w], points, first[w], first[w + 1], inner, outer)[0]
         gap = gap + ROUNDING * (np.abs(x) + np.abs(y) + radii[w, 2])
-        found = where(gap < found, gap, found)
-    return found
+        depth = where(gap < depth, gap, depth)
+    return depth
 
 
 def leave(
-    x: Any, y: Any, xx: Any, xy: Any, yy: Any, led: Any,
+    x: Any, y: Any, xx: Any, xy: Any, yy: Any, code: Any,
     kinds: Any, points: Any, first: Any, radii: Any,
 ) -> Any:  # fmt: skip
-    """(w_x, w_y) of one particle to the nearest place outside of all outlines, in its metric, zero
-    where it is in none. By `led` it is free (0), led along x (1) or y (2), or along both (3)."""
-    count, one = 0, 0
+    """Return the displacement of one particle to the nearest place outside all outlines.
+
+    The displacement is (w_x, w_y), in the metric of the particle, and zero if the particle is
+    outside. The particle follows along both axes (`code` 0), leads along x (1), along y (2) or
+    along both (3).
+    """
+    count, n = 0, 0
     for w in range(len(kinds)):
         inner, outer = radii[w, 0], radii[w, 1]
         gap = facing(x, y, kinds[w], points, first[w], first[w + 1], inner, outer)[0]
         if gap < 0.0:
-            count, one = count + 1, w
-    if count == 0 or led == 3:
+            count, n = count + 1, w
+    if count == 0 or code == 3:
         return 0.0, 0.0
-    if count == 1 and led == 0:
+    if count == 1 and code == 0:
         wx, wy = way_out(
             x, y, xx, xy, yy,
-            kinds[one], points, first[one], first[one + 1], radii[one, 0], radii[one, 1],
+            kinds[n], points, first[n], first[n + 1], radii[n, 0], radii[n, 1],
         )  # fmt: skip
         if clearance(x + wx, y + wy, kinds, points, first, radii) >= 0.0:
             return wx, wy
-    return way_between(x, y, xx, xy, yy, led, kinds, points, first, radii)
+    return way_between(x, y, xx, xy, yy, code, kinds, points, first, radii)
 
 
 def way_between(
-    x: Any, y: Any, xx: Any, xy: Any, yy: Any, led: Any,
+    x: Any, y: Any, xx: Any, xy: Any, yy: Any, code: Any,
     kinds: Any, points: Any, first: Any, radii: Any,
 ) -> Any:  # fmt: skip
-    """The same of one particle that lies inside several outlines, or comes into another on its way
-    out of one: the nearest of all points on faces, and where two faces meet, that are in none. Of
-    a particle that is led along an axis those on the line along the other. Where none of them is
-    free, that which is least deep; where there is none at all, it stays."""
+    """Return the displacement of one particle inside several outlines to a place outside all of
+    them.
+
+    Candidates are the nearest points of faces, and the points where two faces meet, that lie in no
+    outline; for a particle that leads along one axis the points on the line along the other. The
+    nearest candidate is chosen. If none lies outside all outlines, the least deep one is chosen; if
+    there is none at all, the displacement is zero.
+    """
     best, far, bx, by = -math.inf, math.inf, 0.0, 0.0
     for w in range(len(kinds)):
         for e in range(_faces(kinds[w], first[w], first[w + 1])):
-            one = _face(x, y, kinds[w], points, first[w], first[w + 1], radii[w, 0], radii[w, 1], e)
-            ends = _nearest_on(one, xx, xy, yy)
-            if led > 0:
-                line = (0.0, 0.0, 1.0 if led == 2 else 0.0, 1.0 if led == 1 else 0.0, LINE)
-                ends = _meeting(line, one)
+            face = _face(
+                x, y, kinds[w], points, first[w], first[w + 1], radii[w, 0], radii[w, 1], e
+            )
+            ends = _nearest_on(face, xx, xy, yy)
+            if code > 0:
+                line = (0.0, 0.0, 1.0 if code == 2 else 0.0, 1.0 if code == 1 else 0.0, LINE)
+                ends = _meeting(line, face)
             for n in range(2):
                 qx, qy = ends[2 * n], ends[2 * n + 1]
                 free = clearance(x + qx, y + qy, kinds, points, first, radii)
                 d = _square(qx, qy, xx, xy, yy)
                 if d < math.inf and (free > best or (free == best and d < far)):
                     best, far, bx, by = free, d, qx, qy
-            for v in range(w + 1, len(kinds) if led == 0 else 0):
+            for v in range(w + 1, len(kinds) if code == 0 else 0):
                 for f in range(_faces(kinds[v], first[v], first[v + 1])):
                     other = _face(
                         x, y, kinds[v], points, first[v], first[v + 1], radii[v, 0], radii[v, 1], f
                     )
-                    ends = _meeting(one, other)
+                    ends = _meeting(face, other)
                     for n in range(2):
                         qx, qy = ends[2 * n], ends[2 * n + 1]
                         free = clearance(x + qx, y + qy, kinds, points, first, radii)
@@ -293,7 +371,7 @@ def way_between(
 
 
 def _faces(kind: Any, first: Any, last: Any) -> Any:
-    """How many faces an outline has: lines, segments or circles."""
+    """Return the number of faces of an outline."""
     if kind == HALF_PLANE:
         return 1
     return 2 if kind == CIRCLES else last - first
@@ -302,8 +380,10 @@ def _faces(kind: Any, first: Any, last: Any) -> Any:
 def _face(
     x: Any, y: Any, kind: Any, points: Any, first: Any, last: Any, inner: Any, outer: Any, e: Any
 ) -> Any:
-    """(a, b, c, d, shape) of the e-th face, from (x, y): a point and a way, or the centre and the
-    radius of a circle."""
+    """Return the e-th face of an outline relative to (x, y), as (a, b, c, d, shape).
+
+    (a, b) is a point and (c, d) a direction; for a circle (a, b) is the centre and c the radius.
+    """
     if kind == HALF_PLANE:
         px, py = points[first, 0], points[first, 1]
         return px - x, py - y, py - points[first + 1, 1], points[first + 1, 0] - px, LINE
@@ -317,7 +397,7 @@ def _face(
 
 
 def _nearest_on(face: Any, xx: Any, xy: Any, yy: Any) -> Any:
-    """The ways to the nearest point of a face, twice; NaN where it has none."""
+    """Return the displacement to the nearest point of a face, twice; NaN if there is none."""
     a, b, c, d, shape = face
     wx, wy = math.nan, math.nan
     if shape == CIRCLE:
@@ -329,9 +409,11 @@ def _nearest_on(face: Any, xx: Any, xy: Any, yy: Any) -> Any:
     return wx, wy, wx, wy
 
 
-def _meeting(one: Any, other: Any) -> Any:
-    """The ways to the two points at most in which two faces meet; NaN where they do not."""
-    a, b, c, d, shape = one
+def _meeting(face: Any, other: Any) -> Any:
+    """Return the displacements to the at most two points where two faces meet; NaN if there are
+    none.
+    """
+    a, b, c, d, shape = face
     p, q, r, s, like = other
     if shape == NOTHING or like == NOTHING:
         return math.nan, math.nan, math.nan, math.nan
@@ -364,29 +446,36 @@ def _meeting(one: Any, other: Any) -> Any:
 
 
 def _is_off(t: Any, shape: Any) -> Any:
-    """Whether a point lies beyond the ends of a segment, by its share of the way."""
+    """Return whether a point, given by its fraction of a segment, lies beyond the ends of the
+    segment.
+    """
     return shape == SEGMENT and (t < -ROUNDING or t > 1.0 + ROUNDING)
 
 
 def _square(wx: Any, wy: Any, xx: Any, xy: Any, yy: Any) -> Any:
-    """w·S w times det C."""
+    """Return w·S w times det C."""
     return yy * wx * wx - 2.0 * xy * wx * wy + xx * wy * wy
 
 
 def _to_segment(
-    a: Any, b: Any, c: Any, d: Any, xx: Any, xy: Any, yy: Any, least: Any, most: Any
+    a: Any, b: Any, c: Any, d: Any, xx: Any, xy: Any, yy: Any, low: Any, high: Any
 ) -> Any:
-    """The way to the nearest point of those that lie `least` to `most` of (c, d) from (a, b)."""
+    """Return the displacement to the nearest point of the line (a, b) + t (c, d) with t in [low,
+    high].
+    """
     sx, sy = yy * c - xy * d, xx * d - xy * c
     t = -(a * sx + b * sy) / (c * sx + d * sy)
-    t = where(t < least, least, where(t > most, most, t))
+    t = where(t < low, low, where(t > high, high, t))
     return a + t * c, b + t * d
 
 
 def _to_circle(dx: Any, dy: Any, radius: Any, xx: Any, xy: Any, yy: Any) -> Any:
-    """The way to the nearest point of a circle from the place (dx, dy) from its centre: by Newton's
-    method for the angle of its normal (u_x, u_y), a fixed number of times, so that single numbers
-    and arrays go through the same operations."""
+    """Return the displacement to the nearest point of a circle from (dx, dy) relative to its
+    centre.
+
+    Newton's method for the angle of the normal (u_x, u_y), with a fixed number of iterations, so
+    that numbers and arrays are treated by the same operations.
+    """
     r = np.sqrt(dx * dx + dy * dy)
     off = r > 0.0
     over = where(off, r, 1.0)
@@ -451,13 +540,22 @@ def _before_polygon(x: Any, y: Any, points: Any, first: Any, last: Any) -> Any:
 
 
 SLACK = 1e-9
-"""Of a lattice constant: so far inside a particle may begin, as one on the outline does."""
+"""Depth up to which a particle counts as outside at the start, relative to the lattice constant."""
 
 
 @dataclass(frozen=True)
 class Barrier:
-    """An obstacle with the outline that it starts with, in coordinates; `origin` is where the
-    lattice's site (0, 0) lies."""
+    """Obstacle of a scene.
+
+    Parameters
+    ----------
+    group
+        The obstacle in the experiment.
+    start
+        Outline at the start, in coordinates.
+    origin
+        Position of site (0, 0) of the lattice.
+    """
 
     group: Obstacle
     start: Outline
@@ -465,16 +563,18 @@ class Barrier:
 
     @property
     def reference(self) -> Floats:
-        """The points that its motion moves, (point, axis)."""
+        """Points of the outline at the start, (point, axis)."""
         return self.start.points
 
     def offset(self, n: float) -> Floats:
-        """Of the motion, (point or 1, axis)."""
+        """Return the displacement of the motion, (point or 1, axis)."""
         return np.atleast_2d(self.group.motion.offset(n, self.reference))
 
     def at(self, moment: float) -> Outline | None:
-        """The outline at the end of a step, or at a moment within it, from the lattice's site
-        (0, 0); None where the obstacle is not there then."""
+        """Return the outline at the end of a step, or at a moment within it.
+
+        Relative to site (0, 0) of the lattice. None if the obstacle does not exist at that moment.
+        """
         if not self.group.leads(math.ceil(moment)):
             return None
         offset = self.group.motion.offset(moment - self.group.from_ + 1, self.reference)
@@ -482,40 +582,47 @@ class Barrier:
 
 
 def outlines_at(barriers: Sequence[Barrier], moment: float) -> list[tuple[int, Outline]]:
-    """Those that are there, with their place among the experiment's obstacles."""
-    found = ((n, barrier.at(moment)) for n, barrier in enumerate(barriers))
-    return [(n, outline) for n, outline in found if outline is not None]
+    """Return the outlines at a moment, with the indices of their obstacles in the experiment."""
+    outlines = ((n, barrier.at(moment)) for n, barrier in enumerate(barriers))
+    return [(n, outline) for n, outline in outlines if outline is not None]
 
 
 def build_obstacles(raster: Raster, experiment: Experiment) -> tuple[Barrier, ...]:
-    """Every obstacle with its outline.
+    """Create the obstacles of an experiment.
 
-    Raises ExperimentError in space, for motions that leave the finite numbers, and where a body
-    at rest begins inside an obstacle.
+    Raises
+    ------
+    ExperimentError
+        If the lattice is not plane, a motion is not finite, or a body at rest overlaps an obstacle.
     """
     if not experiment.obstacles:
         return ()
     if len(raster.lattice.cell().vectors) != 2:
-        raise ExperimentError("obstacles lie in a plane, and the lattice does not", ("obstacles",))
-    origin, found = np.array(raster.lattice.origin, float), list[Barrier]()
+        raise ExperimentError(
+            "obstacles require a plane lattice; remove them, or use a plane lattice",
+            ("obstacles",),
+        )
+    origin, barriers = np.array(raster.lattice.origin, float), list[Barrier]()
     for n, obstacle in enumerate(experiment.obstacles):
         barrier = Barrier(obstacle, outline_of(obstacle.shape), origin)
         _refuse_infinite(barrier, experiment.steps, n)
         if obstacle.from_ == 1 and experiment.initial.at_rest:
             _refuse_body_inside(raster, barrier.start, n)
-        found.append(barrier)
-    return tuple(found)
+        barriers.append(barrier)
+    return tuple(barriers)
 
 
 def _refuse_infinite(barrier: Barrier, steps: int, n: int) -> None:
     group = barrier.group
     last = group.last(steps) - group.from_ + 1
     for k in sorted({1, last, *(k for k in group.motion.knots() if k <= last)}):
-        with np.errstate(all="ignore"):  # that it overflows is said below
+        with np.errstate(all="ignore"):  # overflow is reported below
             finite = k < 1 or np.isfinite(group.motion.offset(k, barrier.reference)).all()
         if not finite:
-            where = ("obstacles", n, "motion")
-            raise ExperimentError(f"leaves the finite numbers at its step {k}", where)
+            raise ExperimentError(
+                f"the displacement at step {k} of the motion is not finite; reduce it",
+                ("obstacles", n, "motion"),
+            )
 
 
 def _refuse_body_inside(raster: Raster, outline: Outline, n: int) -> None:
@@ -525,8 +632,9 @@ def _refuse_body_inside(raster: Raster, outline: Outline, n: int) -> None:
         worst = int(np.argmin(gap))
         x, y = raster.reference(rows[worst : worst + 1])[0]
         raise ExperimentError(
-            f"particle {rows[worst] + 1} at ({x:.6g}, {y:.6g}) begins {-gap[worst]:.3g} inside of "
-            "it; let the obstacle begin outside the body and move there, or begin at a later step",
+            f"particle {rows[worst] + 1} at ({x:.6g}, {y:.6g}) starts at a depth of "
+            f"{-gap[worst]:.3g} inside it; start the obstacle outside the body and move it there, "
+            "or start it at a later step",
             ("obstacles", n, "shape"),
         )
 
@@ -534,56 +642,60 @@ def _refuse_body_inside(raster: Raster, outline: Outline, n: int) -> None:
 def collisions(
     raster: Raster, leading: Sequence[Leading], barriers: Sequence[Barrier], steps: int
 ) -> list[str]:
-    """Warnings about leaders that are driven into an obstacle, which does not touch them: as they
-    stand where motions change, from rest. Those that move by Newton's law are stopped; guided ones
-    may make way along the axis along which they follow."""
+    """Return a warning for each leader group that moves into an obstacle.
+
+    Obstacles do not act on leaders. Positions are compared where motions change, from rest. Groups
+    that move by Newton's law are stopped by obstacles and are not considered, nor are guided
+    particles that can evade along the axis along which they follow.
+    """
     slack = SLACK * math.hypot(*raster.lattice.cell().vectors[0])
-    found = []
-    for k, led in enumerate(leading):
-        if isinstance(led.group.motion, Newton):
+    warnings = []
+    for k, leaders in enumerate(leading):
+        if isinstance(leaders.group.motion, Newton):
             continue
         for n, barrier in enumerate(barriers):
-            for step in _moments(led, barrier, steps):
-                at = led.reference + led.group.motion.offset(
-                    step - led.group.from_ + 1, led.reference
+            for step in _moments(leaders, barrier, steps):
+                at = leaders.reference + leaders.group.motion.offset(
+                    step - leaders.group.from_ + 1, leaders.reference
                 )
                 outline = barrier.at(step)
                 assert outline
                 places = (at - barrier.origin).T
                 gap = outline.facing(*places)[0]
-                if len(led.axes) < len(places):
-                    gap = np.where(_makes_way(outline, places, led.axes[0]), np.inf, gap)
-                own = np.array([gap.min(initial=np.inf)])
-                deepest = float(raster.communicator.smallest(own)[0])
+                if len(leaders.axes) < len(places):
+                    gap = np.where(_can_evade(outline, places, leaders.axes[0]), np.inf, gap)
+                deepest = float(
+                    raster.communicator.smallest(np.array([gap.min(initial=np.inf)]))[0]
+                )
                 if deepest < -slack:
-                    number = raster.communicator.first(_number(raster, led.rows, gap == deepest))
-                    found.append(
-                        f"leaders.{k}: drives particle {number} into obstacles.{n} by step {step}; "
-                        "obstacles stop followers, not leaders"
+                    number = _number(raster, leaders.rows, gap == deepest)
+                    warnings.append(
+                        f"leaders.{k}: moves particle {raster.communicator.first(number)} into "
+                        f"obstacles.{n} by step {step}; obstacles stop followers, not leaders"
                     )
                     break
-    return found
+    return warnings
 
 
-def _makes_way(outline: Outline, places: Floats, axis: int) -> Mask:
-    """Which places (axis, place) are in free space somewhere along the other axis."""
-    walls, found = Walls.of([outline]), np.zeros(places.shape[1], bool)
+def _can_evade(outline: Outline, places: Floats, axis: int) -> Mask:
+    """Return which places, (axis, place), have a place outside the outline along the other axis."""
+    walls, result = Walls.of([outline]), np.zeros(places.shape[1], bool)
     with np.errstate(all="ignore"):
         for k, at in enumerate(places.T):
             x, y = at + walls.way_between(at, np.array([1.0, 0.0, 1.0]), axis + 1)
-            found[k] = walls.clearance(x, y) >= 0.0
-    return found
+            result[k] = walls.clearance(x, y) >= 0.0
+    return result
 
 
-def _moments(led: Leading, barrier: Barrier, steps: int) -> Iterator[int]:
-    """The steps in which both are there, at their ends and where a motion changes."""
-    groups = led.group, barrier.group
+def _moments(leaders: Leading, barrier: Barrier, steps: int) -> Iterator[int]:
+    """Generate the steps at which both are active: the first, the last, and knots of a motion."""
+    groups = leaders.group, barrier.group
     begin = max(group.from_ for group in groups)
     end = min(group.last(steps) for group in groups)
     knots = (group.from_ - 1 + k for group in groups for k in group.motion.knots())
     yield from sorted({step for step in (begin, end, *knots) if begin <= step <= end})
 
 
-def _number(raster: Raster, rows: Indices, those: Mask) -> int | None:
-    """That of the first of those, if there is any."""
-    return raster.before + int(rows[np.argmax(those)]) + 1 if those.any() else None
+def _number(raster: Raster, rows: Indices, mask: Mask) -> int | None:
+    """Return the number of the first particle of the mask, or None."""
+    return raster.particle_offset + int(rows[np.argmax(mask)]) + 1 if mask.any() else None

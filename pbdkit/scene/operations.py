@@ -1,4 +1,4 @@
-"""Operations of particles on a raster: the particles to which each of them happens."""
+"""Operations of particles on a raster, with the particles of each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pbdkit.scene.selection import Selecting
 
 @dataclass(frozen=True)
 class Operated:
-    """An operation with the rows and places of its particles, and its numbers p."""
+    """Operation with the rows and places of its particles, and its parameters p."""
 
     operation: ParticleOperation
     rows: Indices
@@ -25,15 +25,20 @@ class Operated:
 
 
 def build_operations(raster: Raster, experiment: Experiment) -> tuple[Operated, ...]:
-    """Return every operation with its particles. Raises ExperimentError for one that selects
-    nobody or a frame point."""
-    body, found = Selecting(raster, experiment.regions), []
+    """Find the particles of every operation.
+
+    Raises
+    ------
+    ExperimentError
+        If an operation selects no particle or a frame point.
+    """
+    body, operations = Selecting(raster, experiment.regions), []
     for n, operation in enumerate(experiment.operations):
         rows = raster.body_rows
         if operation.select:
             rows = body.select(operation.select, ("operations", n, "select"))
-        with blaming(operation, "when asked for its parameters", "operations", n):
+        with blaming(operation, "to return its parameters", "operations", n):
             numbers = operation.parameters()
         parameters = namedtuple("Parameters", numbers)(**numbers)
-        found.append(Operated(operation, rows, raster.place_of(rows), parameters))
-    return tuple(found)
+        operations.append(Operated(operation, rows, raster.place_of(rows), parameters))
+    return tuple(operations)

@@ -1,5 +1,7 @@
-"""Build the scene of an experiment: neighbourhood, body and frame on rasters, and only those parts
-that the experiment uses.
+"""Build the scene of an experiment: neighbours, body and frame on rasters, leaders, loads,
+obstacles.
+
+Only the parts that the experiment uses are built.
 """
 
 from __future__ import annotations
@@ -50,14 +52,14 @@ from pbdkit.plugin.schedule import Course
 from pbdkit.scene.checks import (
     angles_in_radians,
     carried_by_leaders,
-    doubts_of,
     far_from_the_body,
+    lattice_warnings,
     locking,
     narrow_voids,
     never_near,
     without_effect,
 )
-from pbdkit.scene.constants import SceneConstants, ask_for_constants, check_diagnostics, with_fields
+from pbdkit.scene.constants import SceneConstants, check_diagnostics, scene_constants, with_fields
 from pbdkit.scene.frame import Frame, build_frame
 from pbdkit.scene.leaders import Leading, build_leading, check_directions
 from pbdkit.scene.loads import Loads, build_loads
@@ -68,11 +70,32 @@ from pbdkit.scene.operations import Operated, build_operations
 
 
 class Ground:
-    """The neighbourhood, how many `layers` the frame has, and what they have to warn of; then the
-    raster of all sites, and the cells `left_out` at narrow voids. Nothing of the size of the body
-    is made before it is asked for.
+    """Neighbours, frame layers and body of an experiment, as the first stage of its scene.
 
-    Raises ExperimentError where parts do not go together, and for bodies too large for the memory.
+    Arrays of the size of the body are created only on request.
+
+    Parameters
+    ----------
+    experiment
+        The experiment.
+    communicator
+        Processes that share the lattice.
+
+    Attributes
+    ----------
+    neighbourhood
+        Neighbours on the lattice.
+    layers
+        Number of layers of the frame.
+    warnings
+        Warnings of the fracture model.
+    left_out
+        Cells omitted at narrow voids, after a call of `raster`.
+
+    Raises
+    ------
+    ExperimentError
+        If parts of the experiment are incompatible, or the body is too large for the memory.
     """
 
     def __init__(
@@ -82,16 +105,16 @@ class Ground:
         row_range: RowRange | None = None,
     ) -> None:
         self.left_out = LeftOut()
-        self.experiment, lattice = experiment, experiment.lattice
-        self._communicator, self._row_range = communicator, row_range
-        neighbours, fracture, frame = experiment.neighbours, experiment.fracture, experiment.frame
-        with blaming(lattice, "when asked for its cell", "lattice"):
+        self.experiment, self._communicator, self._row_range = experiment, communicator, row_range
+        lattice, neighbours = experiment.lattice, experiment.neighbours
+        fracture, frame = experiment.fracture, experiment.frame
+        with blaming(lattice, "to return its cell", "lattice"):
             self.cell = checked_cell(lattice)
-        with blaming(neighbours, "when asked for the neighbours", "neighbours"):
+        with blaming(neighbours, "to return the neighbours", "neighbours"):
             self.neighbourhood = build_neighbourhood(self.cell, neighbours)
-        with blaming(fracture, "when asked about the rest lengths", "fracture"):
+        with blaming(fracture, "to check the rest lengths", "fracture"):
             self.warnings = tuple(fracture.check(self.neighbourhood.shells()))
-        with blaming(frame, "when asked for its depth", "frame"):
+        with blaming(frame, "to return its depth", "frame"):
             self.layers = frame.depth(self.neighbourhood.reach)
         low, high = window(experiment.body, lattice)
         extent = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
@@ -99,11 +122,11 @@ class Ground:
 
     @property
     def spill(self) -> int:
-        """So many lines beyond its window the body can have particles."""
+        """Maximum number of lines outside its window on which the body can have particles."""
         return margin_of(self.neighbourhood.tiling) if self.experiment.frame.weighs_cells else 0
 
     def filled(self, lines: Lines | None = None) -> Filling:
-        """The body, of those sites that are on some lines."""
+        """Return the sites of the body on the lines; all lines by default."""
         experiment, tiling = self.experiment, self.neighbourhood.tiling
         if not experiment.frame.weighs_cells:
             return fill(experiment.body, experiment.lattice, lines)
@@ -111,7 +134,7 @@ class Ground:
         return fill_with_cells(experiment.body, experiment.lattice, tiling, lines)
 
     def raster(self) -> tuple[Raster, WeighedCells | None]:
-        """The raster, and the cells where the frame weighs them."""
+        """Return the raster, and the weighted cells if the frame weights cells."""
         lattice, stretch = self.experiment.lattice, self._row_range and self._row_range.stretch
         filling = self.filled((stretch.low[0], stretch.high[0]) if stretch else None)
         self.left_out = stretch.left_out if stretch else filling.left_out_on()
@@ -121,31 +144,31 @@ class Ground:
         filling = filling.within(*box)
         low, sites = framed(lattice, filling, self.layers)
         if stretch:
-            (first, last), (before, *rest) = stretch.lines, low
-            low, sites = (first, *rest), sites[first - before : last - before]
+            (first, last), (start, *rest) = stretch.lines, low
+            low, sites = (first, *rest), sites[first - start : last - start]
         raster = build_raster(lattice, low, sites, self.neighbourhood.reach_in_cells)
         if stretch:
             extent = RowLayout(stretch.rows, raster.first[0] - stretch.first)
             raster = replace(
                 raster,
-                before=stretch.before,
+                particle_offset=stretch.particle_offset,
                 extent=extent,
                 communicator=self._communicator,
                 row_range=self._row_range,
             )
         cells, tiling = filling.on(raster, self.neighbourhood.tiling), self.neighbourhood.tiling
-        # Without frame points a cell that misses a corner is none: what the other corners exert on
-        # each other would not balance.
+        # Without frame points, a cell with a missing corner does not count: the forces between its
+        # other corners would not balance.
         if not (cells or self.layers) and isinstance(self.experiment.rule, MixesCells):
             cells = whole_cells(raster, tiling) if tiling.beside else None
         return raster, cells
 
     def nothing(self) -> ExperimentError:
-        """Where the body has no particle."""
-        text = "holds no site of the lattice; make it larger, or move it"
+        """Return the error for a body without particles."""
+        text = "contains no site of the lattice; enlarge it, or move it"
         if self.experiment.frame.weighs_cells:
             text = (
-                "holds no cell of the lattice; make it larger, or take a frame that does not weigh "
+                "contains no cell of the lattice; enlarge it, or use a frame that does not weight "
                 "cells"
             )
         return ExperimentError(text, ("body",))
@@ -154,14 +177,14 @@ class Ground:
         frame, rule = self.experiment.frame, self.experiment.rule
         if not rule.uses_cells:
             raise ExperimentError(
-                f"'{frame.type}' weighs the cells between neighbours, and the rule '{rule.type}' "
-                "does not work cell by cell; take a calibrated rule ('elastic' with poisson_ratio "
-                "-1 is the barycentre), or another frame",
+                f"'{frame.type}' weights the cells between neighbours, but the rule '{rule.type}' "
+                "is not defined by cells; use a calibrated rule ('elastic' with poisson_ratio -1 "
+                "is the barycentre), or another frame",
                 ("frame",),
             )
         if not self.neighbourhood.tiling.beside:
             raise ExperimentError(
-                "the neighbours of a site are not the corners of the cells around it: take 8 on "
+                "the neighbours of a site are not the corners of the cells around it: use 8 on "
                 "the square or the rectangular lattice ({type: chebyshev, shells: 1}), 6 on the "
                 "hexagonal one ({type: coordination, shells: 1})",
                 ("neighbours",),
@@ -170,13 +193,38 @@ class Ground:
 
 @dataclass(frozen=True)
 class Scene:
-    """An experiment on its lattice.
+    """Experiment on its lattice.
 
-    `constants` are what the elementwise functions are called with. `frame`, `cells`, `inner` (the
-    scene with the rule's inner rule) and `loads` are None where the scene has none. `leading` are
-    the leader groups; `setting` is what a rule may derive its constants from, `middle` that of the
-    body's box, from the lattice's site (0, 0); `warnings` are for the user, `barriers` the
-    obstacles, `operations` those of the experiment.
+    Parameters
+    ----------
+    experiment
+        The experiment.
+    neighbourhood
+        Neighbours on the lattice.
+    raster
+        Particles.
+    constants
+        Constants of the rule and the fracture model.
+    frame
+        Frame points; None if there are none.
+    cells
+        Weighted cells; None if cells are not weighted.
+    inner
+        Scene of the inner rule; None if the rule has none.
+    leading
+        Leader groups.
+    loads
+        Loads; None if there are none.
+    setting
+        Lattice context from which rules derive constants.
+    middle
+        Centre of the bounding box of the body, relative to site (0, 0) of the lattice.
+    warnings
+        Warnings for the user.
+    barriers
+        Obstacles.
+    operations
+        Operations of particles.
     """
 
     experiment: Experiment
@@ -196,57 +244,61 @@ class Scene:
 
     @property
     def driven(self) -> tuple[Leading | Barrier, ...]:
-        """All that motions drive."""
+        """Leader groups and obstacles, which move by motions."""
         return (*self.leading, *self.barriers)
 
     def at(self, moment: float) -> Scene:
-        """The scene with its numbers as they are at the end of a step, or at a moment within it; in
-        itself they are as in the end."""
+        """Return the scene with its time-dependent parameters at the end of a step, or at a moment
+        within it.
+
+        The parameters of the scene itself are those of the end of their time dependence.
+        """
         courses = self._courses
         if all(course.at(moment) == course.last for course in courses):
             return self
-        now = tuple(course.at(moment) for course in courses)
-        if now not in self._known:
-            self._known.clear()
-            self._known[now] = renumbered(self, self.experiment.at(moment))
-        return self._known[now]
+        values = tuple(course.at(moment) for course in courses)
+        if values not in self._cache:
+            self._cache.clear()
+            self._cache[values] = renumbered(self, self.experiment.at(moment))
+        return self._cache[values]
 
     @cached_property
     def _courses(self) -> tuple[Course[float], ...]:
-        """The numbers that change in time."""
+        """Time-dependent parameters."""
         return tuple(self.experiment.courses.values())
 
     @cached_property
-    def _known(self) -> dict[tuple[float, ...], Scene]:
-        """The scene of the last moment, by its numbers."""
+    def _cache(self) -> dict[tuple[float, ...], Scene]:
+        """Scene of the last moment, by the values of the time-dependent parameters."""
         return {}
 
     @cached_property
     def bare(self) -> Scene:
-        """The same without obstacles and operations of particles."""
+        """The scene without obstacles and operations of particles."""
         if not (self.barriers or self.operations):
             return self
         return replace(self, barriers=(), operations=())
 
     @property
     def has_fracture(self) -> bool:
-        """Whether bonds can come to be broken, torn or cut, so that their state is kept."""
+        """Whether bonds can be torn or cut, so that their state is stored."""
         return self.experiment.parts_bonds
 
     @property
     def tears(self) -> bool:
-        """Whether cells can be torn: bonds can break, and the rule computes what torn cells
-        exert."""
+        """Whether bonds can break and the rule computes the forces of torn cells."""
         return self.has_fracture and isinstance(self.experiment.rule, TearsCells)
 
     @cached_property
     def home_reach(self) -> tuple[Index, Index]:
-        """How many repeat cells before and after a particle's own, along each axis, the bonds are
-        kept on which its move depends: its own, or where cells can be torn all of the cells around
-        it."""
+        """Largest differences of repeat cell, backward and forward, at which bonds of a move are
+        stored.
+
+        These are the bonds of the particle or, if cells can be torn, of all cells around it.
+        """
         if not self.tears:
             return self.neighbourhood.home_reach
-        cells = (cell for of in self.neighbourhood.cells_around for cell in of.cells)
+        cells = (cell for around in self.neighbourhood.cells_around for cell in around.cells)
         homes = {bond.home for cell in cells for bond in cell}
         steps = np.array([home.cell if home else (0,) * self.axes for home in homes])
         low, high = np.minimum(steps.min(axis=0), 0), np.maximum(steps.max(axis=0), 0)
@@ -254,34 +306,34 @@ class Scene:
 
     @property
     def lag(self) -> int:
-        """By how many steps the frame trails whom it follows."""
+        """Delay of the frame in steps."""
         return self.frame.map.lag if self.frame else 0
 
     @property
     def axes(self) -> int:
-        """How many axes space has: the lattice says so."""
+        """Number of axes of space, that of the lattice."""
         return len(self.raster.lattice.cell().vectors)
 
     @property
     def frame_changes(self) -> bool:
-        """Whether the frame's map follows numbers of the rule that change in time."""
-        changing = bool(self.experiment.rule.courses)
-        return changing and self.frame is not None and self.frame.depends_on_rule
+        """Whether the map of the frame depends on time-dependent parameters of the rule."""
+        is_variable = bool(self.experiment.rule.courses)
+        return is_variable and self.frame is not None and self.frame.depends_on_rule
 
     @cached_property
     def leaders_overlap(self) -> bool:
-        """Whether any particle belongs to two leader groups."""
+        """Whether a particle belongs to two leader groups."""
         rows = [leading.rows for leading in self.leading]
         return bool(rows) and len(distinct(np.concatenate(rows))) < sum(map(len, rows))
 
     @cached_property
     def bonds(self) -> BondTable:
-        """The table of bonds."""
+        """Table of all bonds."""
         return build_bond_table(self.raster, self.neighbourhood)
 
     @cached_property
     def patches(self) -> tuple[Patch, ...]:
-        """The cells of the body."""
+        """Cells whose corners are all in the body."""
         return patches(self.raster, self.neighbourhood.tiling)
 
 
@@ -290,9 +342,22 @@ def build_scene(
     communicator: Communicator = SERIAL,
     row_range: RowRange | None = None,
 ) -> Scene:
-    """Return the scene of an experiment, or of a range of its rows, which the processes of a
-    `communicator` build together. Raises ExperimentError, with file and line where they are known,
-    if there is none."""
+    """Build the scene of an experiment.
+
+    Parameters
+    ----------
+    experiment
+        The experiment.
+    communicator
+        Processes that share the lattice.
+    row_range
+        Range of rows that this process builds; all by default.
+
+    Raises
+    ------
+    ExperimentError
+        If no scene can be built, with file and line if they are known.
+    """
     try:
         return _build(experiment, Ground(experiment, communicator, row_range))
     except ExperimentError as error:
@@ -303,19 +368,19 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     neighbours = experiment.neighbours
     neighbourhood, layers = ground.neighbourhood, ground.layers
     raster, cells = ground.raster()
-    warnings = [*ground.warnings, *doubts_of(experiment, neighbourhood, raster, layers)]
+    warnings = [*ground.warnings, *lattice_warnings(experiment, neighbourhood, raster, layers)]
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
     warnings += [*angles_in_radians(experiment), *locking(experiment, raster)]
     warnings += narrow_voids(experiment.lattice, ground.left_out)
     warnings += missing_segments(raster, neighbourhood, _segments(experiment))
     setting = setting_of(raster, neighbourhood)
-    constants = ask_for_constants(experiment, setting)
+    constants = scene_constants(experiment, setting)
     constants = with_fields(constants, experiment, raster, neighbourhood, setting)
     if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(
-            f"'{experiment.rule.type}' weighs neighbours by their slots, which re-evaluated "
-            "neighbours do not have; set neighbours.reevaluate: false",
+            f"'{experiment.rule.type}' has weights for each slot, which re-evaluated neighbours "
+            "do not have; set neighbours.reevaluate: false",
             ("neighbours",),
         )
     leading = build_leading(raster, experiment)
@@ -336,57 +401,60 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
 
 
 def _segments(experiment: Experiment) -> dict[str, Segment]:
-    """The cuts, and the cracks that are there from the start, by their fields."""
-    found = {f"cuts.{n}": cut.segment for n, cut in enumerate(experiment.cuts)}
+    """Return the cuts and the initial cracks, by their fields."""
+    segments = {f"cuts.{n}": cut.segment for n, cut in enumerate(experiment.cuts)}
     if isinstance(model := experiment.fracture, StartsCracked):
-        with blaming(model, "when asked for its cracks", "fracture"):
-            found |= {f"fracture.cracks.{n}": s for n, s in enumerate(model.segments())}
-    return found
+        with blaming(model, "to return its cracks", "fracture"):
+            segments |= {f"fracture.cracks.{n}": s for n, s in enumerate(model.segments())}
+    return segments
 
 
 def renumbered(scene: Scene, experiment: Experiment) -> Scene:
-    """The scene with the numbers of an experiment that is like its own but for them."""
-    constants = ask_for_constants(experiment, scene.setting)
+    """Return the scene of an experiment that differs only in the values of parameters."""
+    constants = scene_constants(experiment, scene.setting)
     parts = (experiment, scene.raster, scene.neighbourhood, scene.setting)
     constants = with_fields(constants, *parts)
     cells, frame = weighed(experiment, scene.raster, scene.setting, scene.cells), scene.frame
     if frame and frame.depends_on_rule and experiment.rule is not scene.experiment.rule:
         frame = _frame_of(scene.raster, experiment)
-    found = replace(scene, experiment=experiment, constants=constants, cells=cells, frame=frame)
-    return with_inner(found)
+    scene = replace(scene, experiment=experiment, constants=constants, cells=cells, frame=frame)
+    return with_inner(scene)
 
 
 def _frame_of(raster: Raster, experiment: Experiment) -> Frame | None:
-    with blaming(experiment.frame, "when asked whom its points follow", "frame"):
+    with blaming(experiment.frame, "to map the frame points", "frame"):
         return build_frame(raster, experiment.frame, experiment.rule)
 
 
 def with_inner(scene: Scene) -> Scene:
-    """The scene with that of its inner rule, where the rule works on the moves of another.
+    """Add the scene of the inner rule if the rule is applied to the moves of another.
 
-    Raises ExperimentError for frames that lag, for bonds that break, neighbours that come and go
-    and rules that remember: what the moves of the inner rule are is not told there.
+    Raises
+    ------
+    ExperimentError
+        If the frame lags, bonds can break, neighbours are re-evaluated or a rule remembers numbers:
+        the moves of the inner rule are not defined then.
     """
     experiment, rule = scene.experiment, scene.experiment.rule
     if not isinstance(rule, AppliesTwice):
         return scene
-    with blaming(rule, "when asked for its inner rule", "rule"):
+    with blaming(rule, "to return its inner rule", "rule"):
         inner = rule.inner()
     remembers = isinstance(rule, Remembers) or isinstance(inner, Remembers)
-    for unfit, part, remedy in (
+    for clash, part, remedy in (
         (scene.lag, "frame", "lag: 0"),
         (experiment.cuts, "cuts", "[]"),
         (experiment.fracture.can_break, "fracture", "{type: none}"),
         (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
-        (remembers, "rule", "one that remembers nothing"),
+        (remembers, "rule", "one without remembered numbers"),
     ):
-        if unfit:
+        if clash:
             raise ExperimentError(
-                f"'{rule.type}' applies a rule to the moves of another, which does not go with "
-                f"{'such' if part == 'cuts' else 'this'} {part}; take {part}: {remedy}",
+                f"'{rule.type}' applies a rule to the moves of another, which is incompatible with "
+                f"{'such' if part == 'cuts' else 'this'} {part}; use {part}: {remedy}",
                 (part,),
             )
     experiment = experiment.model_copy(update={"rule": inner})
-    constants = ask_for_constants(experiment, scene.setting)
+    constants = scene_constants(experiment, scene.setting)
     below = replace(scene, experiment=experiment, constants=constants, inner=None, loads=None)
     return replace(scene, inner=with_inner(below))

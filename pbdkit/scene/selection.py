@@ -1,6 +1,4 @@
-"""Selections of body particles in the reference configuration, and the distribution of a total
-force over a selection.
-"""
+"""Selections of body particles in the reference configuration, and the distribution of a force."""
 
 from __future__ import annotations
 
@@ -19,28 +17,41 @@ from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.particles import Selection
 from pbdkit.scene.constants import signed_distance
 
-STRAIGHT = 1e-9
-"""Particles that lie off a line by less than this share of its length are on it."""
+COLLINEAR_RTOL = 1e-9
+"""Distance from a line, relative to its length, up to which a particle lies on it."""
 
 
 def shares_of(raster: Raster, rows: Indices) -> Floats:
-    """(particle,): the parts of a force on all that are selected, of those that a raster has."""
-    own = raster.is_own(raster.site_of(rows)[:, 0])
-    every = raster.communicator.allgather((raster.before + rows[own], raster.reference(rows[own])))
-    numbers, at = (np.concatenate(part) for part in zip(*every, strict=True))
-    return np.asarray(shares(at)[np.searchsorted(numbers, raster.before + rows)])
+    """Return the shares of the selected particles of a raster in a force on all selected,
+    (particle,).
+    """
+    local = rows[raster.is_own(raster.site_of(rows)[:, 0])]
+    parts = raster.communicator.allgather((raster.particle_offset + local, raster.reference(local)))
+    numbers, at = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return np.asarray(shares(at)[np.searchsorted(numbers, raster.particle_offset + rows)])
 
 
 def shares(at: Floats) -> Floats:
-    """(particle,): the part of a force that falls to each of some places, (particle, axis): half
-    the way to the next one on both sides where all lie on a line, else all alike."""
+    """Distribute a force over particles.
+
+    Parameters
+    ----------
+    at
+        Reference positions, (particle, axis).
+
+    Returns
+    -------
+    NDArray
+        Share of each particle, (particle,): half the distance to the next particle on both sides if
+        all lie on a line, otherwise equal shares.
+    """
     order = np.lexsort(at.T)
-    way = at - at[order[0]]
-    x, y = along = way[order[-1]]
+    offset = at - at[order[0]]
+    x, y = along = offset[order[-1]]
     squared = along @ along
-    if len(at) == 1 or (np.abs(way @ [-y, x]) > STRAIGHT * squared).any():
+    if len(at) == 1 or (np.abs(offset @ [-y, x]) > COLLINEAR_RTOL * squared).any():
         return np.full(len(at), 1.0 / len(at))
-    half = np.diff((way @ along)[order]) / (2 * squared)
+    half = np.diff((offset @ along)[order]) / (2 * squared)
     share = np.empty(len(at))
     share[order] = np.append(half, 0.0) + np.append(0.0, half)
     return share
@@ -48,7 +59,15 @@ def shares(at: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Selecting:
-    """Chooses body particles of a raster; what it looks at is made once."""
+    """Select body particles of a raster.
+
+    Parameters
+    ----------
+    raster
+        Particles of the scene.
+    regions
+        Named regions of the experiment.
+    """
 
     raster: Raster
     regions: Mapping[str, Body] = field(default_factory=dict)
@@ -62,11 +81,18 @@ class Selecting:
         return self.raster.reference(self._body)
 
     def distance(self, point: Pair) -> Floats:
-        """(particle,): how far each body particle is from a point at rest."""
+        """Return the distance of each body particle from a point at rest, (particle,)."""
         return np.asarray(np.hypot(*(self._x - point).T))
 
     def select(self, selection: Selection, where: tuple[str | int, ...]) -> Indices:
-        """The rows of the selected body particles, sorted."""
+        """Return the rows of the selected body particles, sorted.
+
+        Raises
+        ------
+        ExperimentError
+            If no particle is selected, or the selection refers to a particle or region that does
+            not exist.
+        """
         if selection.edge is not None:
             rows = self._edge(selection.edge)
         elif selection.box is not None:
@@ -79,12 +105,14 @@ class Selecting:
             rows = self.nearest(selection.nearest or ())
         if not self.raster.communicator.any(len(rows)):
             low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
-            text = f"selects no particle; the body reaches from {low} to {high}"
+            text = f"selects no particle; the body extends from {low} to {high}"
             raise ExperimentError(text, where)
         return distinct(rows)
 
     def _edge(self, edge: str) -> Indices:
-        """The body particle of smallest or largest i in every row j, or j in every column i."""
+        """Return the body particle of smallest or largest i in every row j, or of j in every column
+        i.
+        """
         axis = 0 if edge in ("left", "right") else 1
         return self.raster.ends_of_lines(axis, last=edge in ("right", "top"))
 
@@ -95,47 +123,49 @@ class Selecting:
 
     def _region(self, name: str, where: tuple[str | int, ...]) -> Indices:
         if name not in self.regions:
-            known = ", ".join(self.regions) or "there is none: add `regions`"
+            names = ", ".join(self.regions) or "there is none: add `regions`"
             hint = did_you_mean(name, self.regions)
-            raise ExperimentError(f"there is no region '{name}'{hint} (known: {known})", where)
+            raise ExperimentError(f"there is no region '{name}'{hint} (known: {names})", where)
         distance = signed_distance(self.regions[name], self.raster.lattice.cell(), *self._x.T)
         return self._body[distance <= 0.0]
 
     def nearest(self, points: Iterable[Pair]) -> Indices:
-        """The row of the particle nearest to each point, the lowest number on ties."""
-        every, raster = list(points), self.raster
-        least = self.least_distances(every)
-        numbers = np.full(len(every), NOWHERE)
-        for n, point in enumerate(every):
-            ties = self.distance(point) <= least[n] * (1 + 1e-9) + 1e-12 * spacing(raster)
+        """Return the row of the particle nearest to each point, of several the one of lowest
+        number.
+        """
+        targets, raster = list(points), self.raster
+        smallest = self.least_distances(targets)
+        numbers = np.full(len(targets), NOWHERE)
+        for n, point in enumerate(targets):
+            ties = self.distance(point) <= smallest[n] * (1 + 1e-9) + 1e-12 * spacing(raster)
             if ties.any():
-                numbers[n] = raster.before + self._body[np.argmax(ties)]
-        rows = raster.communicator.smallest(numbers) - raster.before
+                numbers[n] = raster.particle_offset + self._body[np.argmax(ties)]
+        rows = raster.communicator.smallest(numbers) - raster.particle_offset
         return rows[(rows >= 0) & (rows < raster.count)].astype(np.intp)
 
     def least_distances(self, points: Iterable[Pair]) -> Floats:
-        """(point,): how far each point is from the body."""
-        own = [self.distance(point).min(initial=np.inf) for point in points]
-        return np.asarray(self.raster.communicator.smallest(np.array(own)))
+        """Return the distance of each point from the nearest body particle, (point,)."""
+        distances = [self.distance(point).min(initial=np.inf) for point in points]
+        return np.asarray(self.raster.communicator.smallest(np.array(distances)))
 
 
 def spacing(raster: Raster) -> float:
-    """The length of the lattice's first vector."""
+    """Return the length of the first vector of the lattice."""
     return math.hypot(*raster.lattice.cell().vectors[0])
 
 
 def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, ...]) -> Indices:
-    found = []
+    rows = []
     for n, number in enumerate(numbers):
         if number > raster.total:
             raise ExperimentError(
                 f"there is no particle {number}; they are numbered 1 to {raster.total}", (*where, n)
             )
-        if not 0 <= (row := number - 1 - raster.before) < raster.count:
+        if not 0 <= (row := number - 1 - raster.particle_offset) < raster.count:
             continue
         if raster.table_kind[row] != FOLLOWER:
             raise ExperimentError(
-                f"particle {number} is a frame point: only body particles can lead", (*where, n)
+                f"particle {number} is a frame point; select particles of the body", (*where, n)
             )
-        found.append(row)
-    return np.array(found, np.intp)
+        rows.append(row)
+    return np.array(rows, np.intp)

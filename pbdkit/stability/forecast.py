@@ -400,7 +400,7 @@ def pushed_parts(scene: Scene) -> list[PushedPart]:
     # Only linear rules rotate without resistance by any angle; frames that copy the body resist.
     modes = 3 if rule.linear and (scene.frame is None or frame.weighs_cells) else 2
     return [
-        PushedPart(len(followers), raster.before + int(raster.body_rows[followers[0]]) + 1)
+        PushedPart(len(followers), raster.particle_offset + int(raster.body_rows[followers[0]]) + 1)
         for rows in _parts(scene)
         if _is_pushed(x[rows], is_prescribed[:, place[rows]].T, forces[rows], modes)
         and len(followers := rows[~is_prescribed[:, place[rows]].all(axis=0)])

@@ -184,7 +184,7 @@ def chosen_weights(scene: Scene) -> Weights:
     """Choose numbers for `auto`; prescribed numbers remain."""
     _refuse(scene)
     solver = scene.experiment.stepping
-    both = ("relaxation", solver.asked_relaxation), ("memory", solver.asked_memory)
+    both = ("relaxation", solver.relaxation_setting), ("memory", solver.memory_setting)
     prescribed = [None if number == "auto" else getattr(solver, name) for name, number in both]
     plain = with_solver(scene.bare, Stepping())
     rest = initial_state(scene)

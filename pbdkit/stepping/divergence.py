@@ -68,7 +68,9 @@ class Guard:
     def worst(self, scene: Scene, state: State) -> int:
         """The number of the particle that has it."""
         table = scene.raster.table(state.u)
-        return scene.raster.before + int(np.argmax(np.abs(table).max(axis=1))) + 1  # NaN is largest
+        return (
+            scene.raster.particle_offset + int(np.argmax(np.abs(table).max(axis=1))) + 1
+        )  # NaN is largest
 
     def last_good(
         self, scene: Scene, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]

@@ -148,8 +148,8 @@ class Guidance:
         if not self.slanted or not len(guided.place):
             return shares
         pulls = stiffnesses(self._scene, guided.place)
-        for pattern in np.unique(guided.led, axis=1).T:
-            some = np.flatnonzero((pattern == guided.led.T).all(axis=1))
+        for pattern in np.unique(guided.lead_axes, axis=1).T:
+            some = np.flatnonzero((pattern == guided.lead_axes.T).all(axis=1))
             f, of = np.flatnonzero(~pattern), np.flatnonzero(pattern)
             own, across = (pulls[np.ix_(some, f, axis)] for axis in (f, of))
             shares[np.ix_(some, f, of)] = np.linalg.pinv(own) @ across
@@ -294,8 +294,9 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
         place = components[order[clashes]].min(keepdims=True) % size
         raster = scene.raster
         row = int(raster.rows_at(*np.unravel_index(place, raster.shape))[0])
+        number = raster.particle_offset + row + 1
         raise ExperimentError(
-            f"two groups move particle {raster.before + row + 1} differently in step {step}; "
+            f"two groups move particle {number} differently in step {step}; "
             "select it in one of them only, or let one end before the other begins",
             ("leaders",),
         )

@@ -585,8 +585,8 @@ def called(
 ) -> xarray.Dataset:
     """The dataset of a sweep with these parts, loaded where no folder keeps it."""
     base = replace(experiment.as_written(), name="")
-    if base.beside.folder is None:
-        base.beside = OF_PROGRAM
+    if base.files.folder is None:
+        base.files = OF_PROGRAM
     given = given_classes(experiment)
     if given and folder is not None:
         raise ExperimentError(

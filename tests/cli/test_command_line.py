@@ -182,7 +182,7 @@ WRONG = {
     "a word for several": (2, ["list"], "there is no command 'list'; `pbdkit experiments` lists shipped experiments, `pbdkit plugins list` plugins"),
     "a word of others": (2, ["validate"], "there is no command 'validate'; `pbdkit check` checks an experiment"),
     "unknown command": (2, ["rnu"], "there is no command 'rnu'; did you mean 'run'?"),
-    "missing file": (2, ["run", "f.yaml"], "f.yaml: is no file and no shipped experiment"),
+    "missing file": (2, ["run", "f.yaml"], "f.yaml: is neither a file nor a shipped experiment"),
     "fault in the file": (2, ["check", "e.json", "--set", "steps=0"], "setting steps=0: steps: "),
     "unknown type": (2, ["run", "e.json", "--set", "rule.type=x"], "unknown type 'x'"),
     "missing plugin": (3, ["run", "e.json", "--set", "rule.type=no:x"], "no, which is not installed"),
@@ -193,8 +193,8 @@ WRONG = {
     "long file name": (6, ["run", "e.json", "-o", "o" * 300], "File name too long"),
     "init over a file": (2, ["init", "e.json"], "e.json: exists and is not changed"),
     "init of a shipped one": (2, ["init", "paper/f1"], "paper/f1: is the name of a shipped experiment, not a file; `pbdkit init f1.yaml --from paper/f1` copies it"),
-    "init from no shipped one": (2, ["init", "--from", "paper/f3"], "paper/f3: is no shipped experiment; did you mean 'paper/f2'?"),
-    "no shipped experiment": (2, ["experiments", "f1"], "f1: is no shipped experiment; `pbdkit experiments` lists them"),
+    "init from no shipped one": (2, ["init", "--from", "paper/f3"], "paper/f3: is not a shipped experiment; did you mean 'paper/f2'?"),
+    "no shipped experiment": (2, ["experiments", "f1"], "f1: is not a shipped experiment; `pbdkit experiments` lists them"),
     "plot of nothing": (6, ["plot", "o.nc"], "o.nc: there is no such file"),
 }  # fmt: skip
 
@@ -230,9 +230,9 @@ def test_a_setting(call: Call, setting: str, holds: Callable[[Any], bool]) -> No
 
 UNSET = {
     "steps": "expected PATH=VALUE, for instance rule.K=-0.002",
-    "leaders.-1.until=3": "'-1' is no position in a list of 2, from 0",
-    "leaders.².until=3": "'²' is no position in a list of 2, from 0",
-    "steps.x=1": "'x' is looked for in a single value",
+    "leaders.-1.until=3": "'-1' is not an index of a list of 2; indices are counted from 0",
+    "leaders.².until=3": "'²' is not an index of a list of 2; indices are counted from 0",
+    "steps.x=1": "'x' is the key of a single value, which has none",
     "rule.K=1": "rule.K: unknown key",
     "rulee.K=1": "rulee: unknown key; did you mean 'rule'?",
     "steps=[1": "not valid YAML",

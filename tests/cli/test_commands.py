@@ -76,7 +76,7 @@ def test_a_disabled_plugin_adds_none(
     result = call("shear")
     assert result.code == 2
     assert "no command 'shear'" in result.err
-    assert f"pbdkit-shear 1.0 is disabled: {DISABLE} names it" in result.err
+    assert f"pbdkit-shear 1.0 is disabled: {DISABLE} contains it" in result.err
     assert call("plugins", "list").err == ""
 
 
@@ -115,9 +115,9 @@ BROKEN = {
     ),
     "no command": (
         "import pbdkit\n@pbdkit.hookimpl\ndef pbdkit_commands():\n    return [3]\n",
-        "TypeError: 3 is no pbdkit.plugin.Command",
+        "TypeError: 3 is not a pbdkit.plugin.Command",
     ),
-    "no name": (source("Shear it"), "TypeError: 'Shear it' is no name for a command"),
+    "no name": (source("Shear it"), "TypeError: 'Shear it' is not a valid name of a command"),
     "no target": (source(target="pbdkit_target"), "TypeError: the target of the command 'shear'"),
 }
 

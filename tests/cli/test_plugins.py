@@ -144,7 +144,7 @@ def test_torn_metadata_stop_nobody(
 def test_another_api_version_is_incompatible(install: Install, call: Call) -> None:
     install("pbdkit-newer", NEWER, "9.0")
     row = listed(call)["pbdkit-newer"]
-    expected = "it is written for version 2 of the plugin API, and pbdkit "
+    expected = "it implements version 2 of the plugin API, but pbdkit "
     assert (row["version"], row["state"]) == ("9.0", "incompatible")
     assert row["reason"].startswith(f"{expected}{pbdkit.__version__} has version 1; install")
     result = call("run", "e.json", "--set=rule={type: newer}")
@@ -184,7 +184,7 @@ def test_a_run_that_needs_the_broken_part_says_whose_it_is(install: Install, cal
     reason = "ModuleNotFoundError: No module named 'no_such_module' (pbdkit_broken.py, line 1)"
     result = call("run", "e.json", "--set=rule={type: 'pbdkit-broken:lost'}")
     assert (result.code, Path("tensile.nc").exists()) == (3, False)
-    whose = "'lost' is asked of pbdkit-broken 0.3, which is broken"
+    whose = "'lost' belongs to pbdkit-broken 0.3, which is broken"
     assert f": rule.type: {whose}: {reason}\n" in result.err
     result = call("run", "e.json", "--set=rule={type: lost}")
     assert (result.code, Path("tensile.nc").exists()) == (2, False)
@@ -224,7 +224,7 @@ def test_one_bad_class_leaves_the_others_in_use(install: Install, call: Call) ->
     assert call("run", "e.json", "--set=rule={type: half}").code == 0
     result = call("check", "e.json", "--set=rule={type: bad}")
     assert result.code == 3
-    assert "'bad' comes from pbdkit-half 0.3, which is broken: TypeError: Bad.apply" in result.err
+    assert "'bad' belongs to pbdkit-half 0.3, which is broken: TypeError: Bad.apply" in result.err
     rows = json.loads(call("plugins", "list", "--json").out)
     states = [(r["interface"], r["type"], r["state"]) for r in rows if "half" in r["distribution"]]
     assert states == [

@@ -27,7 +27,7 @@ from tests.components.test_elasticity import (
 # Fields are given by the start of a run: nobody needs to lead.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:leaders. there are none"),
-    pytest.mark.filterwarnings("ignore:neighbours. they lie along one line"),
+    pytest.mark.filterwarnings("ignore:neighbours. all lie along one line"),
 ]
 
 E = 7.0
@@ -318,9 +318,9 @@ def test_stress_of_a_rule_without_a_material_is_refused(rule):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         pbdkit.run(given, progress=False)
     assert str(caught.value) == (
-        "diagnostics.2: 'stress' needs a rule that is calibrated to a material ('elastic', "
-        f"'orthotropic', 'springs', 'strain-gradient'), which '{rule['type']}' with these "
-        "parameters is not; take one of those, or leave the diagnostic out"
+        "diagnostics.2: 'stress' requires a rule that is calibrated to a material ('elastic', "
+        f"'orthotropic', 'springs', 'strain-gradient'); '{rule['type']}' with these parameters is "
+        "not; use one of those, or remove the diagnostic"
     )
 
 

@@ -31,7 +31,7 @@ from tests.components.test_elasticity import (
 # Forces are those of given starts, and of any frame.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:leaders. there are none"),
-    pytest.mark.filterwarnings("ignore:diagnostics.. .* counts what frame points pull"),
+    pytest.mark.filterwarnings("ignore:diagnostics.. .* includes forces of frame points"),
     pytest.mark.filterwarnings("ignore:frame. under 'none' edges"),
 ]
 
@@ -244,7 +244,8 @@ def test_the_dataset_is_described_and_stored(tmp_path):
 def test_reactions_without_leaders_are_refused():
     with pytest.raises(pbdkit.ExperimentError) as caught:
         ran(pulled(SQUARE | {"rule": STRESS}, leaders=[], solver={"type": "stepping"}))
-    assert str(caught.value) == "diagnostics.0: 'reaction' is of leader groups, and there is none"
+    expected = "diagnostics.0: 'reaction' requires leader groups; the experiment has none"
+    assert str(caught.value) == expected
 
 
 class Loose(pbdkit.plugin.Calibrated, pbdkit.FollowerRule):
@@ -275,7 +276,7 @@ def test_forces_of_neighbours_that_come_and_go_are_refused():
     with pytest.raises(pbdkit.ExperimentError) as caught:
         pbdkit.run(given, components=[Loose], progress=False)
     assert str(caught.value) == (
-        "diagnostics.0: 'reaction' needs neighbours that stay; set neighbours.reevaluate: false"
+        "diagnostics.0: 'reaction' requires fixed neighbours; set neighbours.reevaluate: false"
     )
 
 
@@ -309,5 +310,5 @@ def test_frame_points_at_held_corners_are_warned_of(name, off):
         "diagnostics.0: 'reaction'",
         "diagnostics.1: 'strain-en",
     ]
-    assert "what frame points pull at leaders, which at the corners of held" in of_diagnostics[0]
+    assert "forces of frame points on leaders, which at the corners of" in of_diagnostics[0]
     assert build_scene(pbdkit.Experiment(**given | {"diagnostics": []})).warnings == (of_frames,)

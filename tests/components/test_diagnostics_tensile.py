@@ -138,9 +138,9 @@ def test_springs_have_youngs_modulus_at_first_and_then_bend_off_in_proportion():
         ({"numbers": [1, 99]}, "diagnostics.0.numbers.1: there is no particle 99; they are "
          "numbered 1 to 54"),
         ({"numbers": [1, 2], "points": [[0, 0], [1, 0]]},
-         "diagnostics.0: give the gauge by points or by numbers, not by both"),
+         "diagnostics.0: the gauge has both points and numbers; give one of them"),
         ({"points": [[0, 0], [0, 1]]}, "diagnostics.0: the gauge has no length along x: both ends "
-         "lie at 0; give two points apart"),
+         "lie at 0; choose two points at a distance"),
     ],
 )  # fmt: skip
 def test_what_makes_no_curve_is_refused(wrong, message):

@@ -78,7 +78,10 @@ def test_copying_frames_err_as_much_on_every_lattice_and_the_warning_says_so(nam
     asked = pbdkit.Experiment(**experiment(PROBLEMS[name], 10, **parts))
     (warning,) = build_scene(asked).warnings
     assert warning.startswith("frame: under 'mean' edges are not free of stress")
-    assert "(copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever)" in warning
+    assert (
+        "(the error of copying frames is 6.7 % for a bar in tension, 14.5 % for a cantilever)"
+        in warning
+    )
 
 
 @pytest.mark.parametrize(("cells", "within"), [(20, 2.7e-3), (40, 6.5e-4)])

@@ -35,12 +35,12 @@ UNFIT = {
     "neighbours of elastic": (
         {"neighbours": FOUR, "frame": MEAN},
         "rule",
-        "works on the square and the rectangular lattice with 8 neighbours",
+        "requires the square or the rectangular lattice with 8 neighbours",
     ),
     "neighbours of cells": (
         {"neighbours": FOUR},
         "neighbours",
-        "take 8 on the square or the rectangular lattice",
+        "use 8 on the square or the rectangular lattice",
     ),
     "lattice of cells": (
         {"lattice": {"type": "oblique", "a": 1.0, "b": 1.0, "angle": 70.0}},
@@ -50,42 +50,42 @@ UNFIT = {
     "lattice of elastic": (
         {"lattice": {"type": "oblique", "a": 1.0, "b": 1.0, "angle": 70.0}, "frame": MEAN},
         "rule",
-        "works on the square and the rectangular lattice",
+        "requires the square or the rectangular lattice",
     ),
     "orthotropic triangles": (
         {"lattice": HEXAGONAL, "neighbours": FOUR, "rule": ORTHOTROPIC},
         "rule",
-        "is not isotropic and goes with the square or rectangular lattice",
+        "is not isotropic and requires the square or rectangular lattice",
     ),
     "springs on rectangles": (
         {"lattice": RECTANGULAR, "rule": SPRINGS},
         "rule",
-        "works on the hexagonal lattice with 6 neighbours",
+        "requires the hexagonal lattice with 6 neighbours",
     ),
     "gradient on rectangles": (
         {"lattice": RECTANGULAR, "rule": GRADIENT},
         "rule",
-        "works on cells of equal sides, and these are 1 by 1.3",
+        "requires cells of equal sides, but these are 1 by 1.3",
     ),
     "gradient with a frame that lags": (
         {"rule": GRADIENT, "frame": {"type": "mean", "lag": 1}},
         "frame",
-        "does not go with this frame; take frame: lag: 0",
+        "is incompatible with this frame; use frame: lag: 0",
     ),
     "gradient with fracture": (
         {"rule": GRADIENT, "fracture": {"type": "threshold", "thresholds": [2.0]}},
         "fracture",
-        "does not go with this fracture; take fracture: {type: none}",
+        "is incompatible with this fracture; use fracture: {type: none}",
     ),
     "cells of a rule that has none": (
         {"rule": {"type": "barycentre"}},
         "frame",
-        "the rule 'barycentre' does not work cell by cell",
+        "the rule 'barycentre' is not defined by cells",
     ),
     "no cell": (
         {"body": {"type": "disc", "radius": 0.05, "centre": [0.5, 0.5]}},
         "body",
-        "holds no cell of the lattice",
+        "contains no cell of the lattice",
     ),
 }
 
@@ -130,7 +130,7 @@ def test_copying_frames_are_warned_of_with_the_size_of_the_error(frame, warned):
 
 def test_cut_cells_have_the_area_of_the_outline(monkeypatch):
     """That of a disc, at second order, but for the slivers that are left out."""
-    monkeypatch.setattr(cut_cells, "SMALLEST", 0.0)
+    monkeypatch.setattr(cut_cells, "MIN_SHARE", 0.0)
     off = []
     for spacing in (0.2, 0.1, 0.05):
         lattice = SQUARE | {"a": spacing}
@@ -161,7 +161,7 @@ class Tiring(pbdkit.plugin.Remembers, StrainGradient):
 
 def test_a_rule_on_the_moves_of_another_remembers_nothing():
     tiring = Tiring(poisson_ratio=0.3, length=2.0)
-    with pytest.raises(pbdkit.ExperimentError, match="one that remembers nothing"):
+    with pytest.raises(pbdkit.ExperimentError, match="one without remembered numbers"):
         scene(rule=tiring)
 
 

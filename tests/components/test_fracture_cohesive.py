@@ -279,9 +279,9 @@ def test_kernels_soften_as_numpy_does(interpreted):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        (body(14.0), ["0.0006 is too little for this spacing", "make the spacing smaller than"]),
+        (body(14.0), ["0.0006 is too small for this spacing", "multiply the spacing by less than"]),
         (body(0.1, {"type": "barycentre"}) | {"frame": {"type": "mean"}},
-         ["'cohesive' needs a rule that is calibrated to a material", "which 'barycentre'",
+         ["'cohesive' requires a rule that is calibrated to a material", "which 'barycentre'",
           "or fracture: {type: damage}"]),
         (body(0.1) | {"frame": {"type": "none"}},
          ["'cohesive' softens the cells of the body", "frame 'none'", "{type: natural}"]),

@@ -141,7 +141,7 @@ def test_old_results_open_and_run_again(old_result):
 
 @pytest.mark.filterwarnings("ignore:.*carries no seal:pbdkit.PbdkitWarning")
 def test_what_needs_the_scene_that_was_run_is_refused(old_result, call):
-    refusal = "needs the scene that was run, and its frame 'traction-free' is retired"
+    refusal = "requires the scene of the run, but its frame 'traction-free' is retired"
     with pbdkit.open(old_result) as ds:
         with pytest.raises(pbdkit.ExperimentError, match=refusal):
             ds.pbd.curve()

@@ -382,7 +382,7 @@ def test_single_precision_settles_as_far_as_it_goes():
 
 def test_neighbours_found_anew_cannot_settle():
     near = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
-    message = r"solver.*no distance from equilibrium is known.*leave solver.settle out"
+    message = r"solver.*the distance from equilibrium has no bound.*remove solver.settle"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         run(sheet(neighbours=near))
 

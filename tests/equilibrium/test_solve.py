@@ -224,5 +224,5 @@ def test_a_tolerance_below_rounding_is_not_reached_and_says_so(tmp_path, monkeyp
 
 def test_neighbours_found_anew_have_no_equilibrium_solver():
     neighbours = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
-    with pytest.raises(pbdkit.ExperimentError, match="nothing tells where the steps lead"):
+    with pytest.raises(pbdkit.ExperimentError, match="the limit of the steps is not defined"):
         run(sheet(neighbours=neighbours))

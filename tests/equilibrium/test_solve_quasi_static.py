@@ -175,7 +175,7 @@ def test_increments_are_recorded_with_fractions_of_a_step_on_request():
 
 
 def test_increments_of_steps_are_refused():
-    with pytest.raises(pbdkit.ExperimentError, match="increments of load are those of an equil"):
+    with pytest.raises(pbdkit.ExperimentError, match="increments of load exist only for an equil"):
         ran({"record": {"increments": True}, "solver": {"type": "stepping"}})
 
 

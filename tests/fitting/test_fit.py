@@ -349,7 +349,7 @@ WRONG = {
     "no such parameter": ({"unknown": {"rule.poison_ratio": [0.0, 0.4]}}, "no 'poison_ratio'"),
     "bounds the wrong way": ({"unknown": {"rule.poisson_ratio": [0.4, 0.1]}}, "the lower first"),
     "nothing unknown": ({"unknown": {}}, "unknown"),
-    "no such file": ({"measured": {"file": "none.csv"}}, r"\.csv: is not there"),
+    "no such file": ({"measured": {"file": "none.csv"}}, r"\.csv: does not exist"),
     "no such column": ({"measured": {"columns": ["x", "y", "u", "v"]}}, "no 'u'"),
     "points elsewhere": ({"measured": {"margin": 100.0}}, "only 0 measured numbers"),
     "no such group": (

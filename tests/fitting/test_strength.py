@@ -362,7 +362,7 @@ WRONG = {
         {"measured": {"peaks": [1.0, 2.0, 3.0], "broke": [1, 1], "of": "force"}},
         "2 numbers for 3 peaks",
     ),
-    "no such file": ({"measured": {"file": "no.csv", "of": "force"}}, r"\.csv: is not there"),
+    "no such file": ({"measured": {"file": "no.csv", "of": "force"}}, r"\.csv: does not exist"),
     "no quantity": ({"measured": {"peaks": [1.0, 2.0, 3.0]}}, "of"),
     "bounds at 0": ({"unknown": {"fracture.scale": [0.0, 1.0]}}, "above 0; got 0"),
     "one parameter": (

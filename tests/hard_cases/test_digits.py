@@ -29,7 +29,7 @@ def naively_broken(spacing, origin):
 @every_lattice
 @pytest.mark.parametrize("neighbours", ["coordination-1", "coordination-2"])
 @pytest.mark.parametrize("h", [0.1, 0.7, 1.0, 1.23, 1 / 3, 1e-7, 123.4])
-@pytest.mark.filterwarnings("ignore:neighbours. they lie along one line")
+@pytest.mark.filterwarnings("ignore:neighbours. all lie along one line")
 def test_case_10_nothing_breaks_at_rest_at_a_threshold_of_the_rest_distance(lattice, neighbours, h):
     scaled = {k: h * v if k in ("a", "b") else v for k, v in LATTICES[lattice].items()}
     parts = {"lattice": scaled, "neighbours": neighbours, "leaders": BOTH_ENDS_HELD}
@@ -112,7 +112,7 @@ def test_case_18_single_precision_keeps_its_digits_in_displacements():
 
 @every_lattice
 @pytest.mark.parametrize("far", [1e8, 1e12])
-@pytest.mark.filterwarnings("ignore:neighbours. they lie along one line")
+@pytest.mark.filterwarnings("ignore:neighbours. all lie along one line")
 def test_case_19_far_from_the_origin_the_same_moves_are_made(lattice, far):
     parts = {"lattice": LATTICES[lattice], "leaders": [HOLD_LEFT, pull_right(0.35, 0.1)]}
     near, away = near_and_away(far, **parts, steps=200)

@@ -144,7 +144,7 @@ def test_the_warning_is_printed_by_run_and_silenced_by_quiet(call, tmp_path):
 def test_a_body_without_a_cell_is_refused_by_the_diagnostic_and_never_inside_out(columns, rows):
     given = experiment(columns, rows, leaders=BOTH_ENDS_HELD[:1])
     asked = given | {"diagnostics": [{"type": "smallest-cell-area"}]}
-    message = "diagnostics.0.*needs cells, and nowhere do the corners of one all belong to the body"
+    message = "diagnostics.0.*requires cells, and no cell has all its corners in the body"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         pbdkit.run(asked, progress=False)
     assert pbdkit.run(given, progress=False).status == "complete"

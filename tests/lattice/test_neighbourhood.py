@@ -143,8 +143,8 @@ class OnTheCorner(pbdkit.Lattice):
 def test_neighbours_that_surround_a_site_unevenly_are_refused():
     """Mutual as they are, a body at rest would drift under the barycentre."""
     expected = (
-        r"'coordination' is lopsided on this lattice: the 1 neighbours of a site have their "
-        r"barycentre \(0\.25, 0\) away from it, and a body at rest would drift; choose whole shells"
+        r"'coordination' is unbalanced on this lattice: the barycentre of the 1 neighbours of a "
+        r"site differs from the site by \(0\.25, 0\), and a body at rest would drift; choose whole"
     )
     with pytest.raises(pbdkit.ExperimentError, match=expected):
         build_neighbourhood(OnTheCorner().cell(), Coordination())

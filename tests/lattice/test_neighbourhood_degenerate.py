@@ -58,26 +58,32 @@ def test_nearly_degenerate_lattices_are_refused_at_once(lattice):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         scene_of(lattice=lattice)
     assert str(caught.value).startswith("lattice: the cell vectors (")
-    assert "nearly degenerate: sites lie" in str(caught.value)
-    assert "open their angle, or make their lengths more alike" in str(caught.value)
+    assert "nearly degenerate: the longer vector" in str(caught.value)
+    assert "increase their angle, or choose more similar lengths" in str(caught.value)
 
 
 @pytest.mark.parametrize(("angle", "said"), [(2.8, True), (2.9, False), (177.2, True)])
 def test_flat_lattices_are_warned_of(angle, said):
     warnings = scene_of(lattice=oblique(angle), neighbours="chebyshev-1").warnings
     closer = 1 / math.sin(math.radians(angle))
-    expected = f"lattice: nearly degenerate, sites lie {closer:.3g} times closer along one line"
+    expected = (
+        f"lattice: nearly degenerate, the longer cell vector is {closer:.3g} times the smallest"
+    )
     assert [w.startswith(expected) for w in warnings] == [True] * said
 
 
 @pytest.mark.parametrize(
     ("lattice", "said"),
     [
-        ("no area", "lattice: the cell vectors (1.0, 0.0) and (-2.0, 0.0) span no area"),
+        (
+            "no area",
+            "lattice: the cell vectors (1.0, 0.0) and (-2.0, 0.0) span no area; "
+            "choose independent ones",
+        ),
         (
             "two at one place",
             "lattice: the sites with the indices (0, 0) and (0, 1) lie at one place, (0.0, 0.0); "
-            "give each its own",
+            "choose different positions",
         ),
     ],
 )
@@ -133,5 +139,6 @@ def test_a_frame_point_whose_weights_are_all_zero_copies_nobody():
     with pytest.raises(pbdkit.ExperimentError) as caught:
         scene_of(frame=Mute())
     assert str(caught.value) == (
-        "frame: 'mute' gives frame point 3 nobody to follow, and it would anchor the body"
+        "frame: 'mute' maps frame point 3 to no particle of the body, so that the point would be "
+        "fixed in space; map every frame point"
     )

@@ -113,7 +113,7 @@ def test_a_slot_too_narrow_for_the_frame_is_warned_of(gap, narrow):
 REFUSED = {
     "empty body": (
         {"body": {"type": "disc", "radius": 0.1, "centre": [0.5, 0.5]}},
-        "holds no site",
+        "contains no site",
     ),
     "ring inside out": (
         {"body": {"type": "ring", "inner": 3.0, "outer": 2.0, "centre": [0, 0]}},
@@ -134,11 +134,11 @@ REFUSED = {
                 "radius": 4.0,
             }
         },
-        "lengthen it, or make the radius smaller",
+        "increase the length, or decrease the radius",
     ),
     "mirror on hexagonal": (
         {"frame": {"type": "mirror"}, "lattice": {"type": "hexagonal", "a": 1.0}},
-        "needs a square or rectangular lattice",
+        "requires a square or rectangular lattice",
     ),
     "mirror of a disc": (
         {"frame": {"type": "mirror"}, "body": {"type": "disc", "radius": 3.0, "centre": [0, 0]}},
@@ -150,21 +150,27 @@ REFUSED = {
     ),
     "lattice neighbours re-evaluated": (
         {"neighbours": {"type": "chebyshev", "reevaluate": True}},
-        "take euclidean ones",
+        "use {type: euclidean}",
     ),
     "fracture with re-evaluated neighbours": (
         {
             "neighbours": {"type": "euclidean", "radius": 1.2, "reevaluate": True},
             "fracture": {"type": "threshold", "thresholds": [2.0]},
         },
-        "there are no lasting bonds",
+        "bonds are not permanent",
     ),
     "radius below every distance": (
         {"neighbours": {"type": "euclidean", "radius": 0.5}},
-        "no neighbour at all",
+        "some sites have no neighbour",
     ),
-    "recorded in two ways": ({"record": {"every": 2, "at": [4]}}, "give `every` or `at`"),
-    "recorded beyond the end": ({"record": {"at": [4, 21]}}, "step 21 is beyond the run's 20"),
+    "recorded in two ways": (
+        {"record": {"every": 2, "at": [4]}},
+        "`every` and `at` exclude each other",
+    ),
+    "recorded beyond the end": (
+        {"record": {"at": [4, 21]}},
+        "step 21 exceeds the number of steps, 20",
+    ),
     "recorded out of order": ({"record": {"at": [4, 3]}}, "must increase"),
     "path out of order": (
         {

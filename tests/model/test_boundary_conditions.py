@@ -173,7 +173,7 @@ def test_a_run_goes_on_before_and_after_its_cut(call, tmp_path):
     file = tmp_path / "plate.json"
     file.write_text(json.dumps(PLATE | {"cuts": cut(20), "steps": 19}))
     whole = run(cuts=cut(20))
-    with pytest.raises(pbdkit.ExperimentError, match="step 20 is beyond the run's 19"):
+    with pytest.raises(pbdkit.ExperimentError, match="step 20 exceeds the number of steps, 19"):
         pbdkit.load(str(file))
     for steps in (20, 25):
         file.write_text(json.dumps(PLATE | {"cuts": cut(20), "steps": steps}))
@@ -194,15 +194,15 @@ def test_it_runs_again_from_its_dataset():
     ("parts", "words"),
     [
         ({"cuts": [{"from": [1.0, 1.0], "to": [1.0, 1.0]}]},
-         "cuts.0.to: is the point that the cut comes from; move one of the two"),
-        ({"cuts": cut(41)}, "cuts: step 41 is beyond the run's 40"),
+         "cuts.0.to: both ends of the cut are the same point; move one of them"),
+        ({"cuts": cut(41)}, "cuts: step 41 exceeds the number of steps, 40"),
         ({"cuts": cut(-1)}, "cuts.0.at: "),
         ({"cuts": [{"from": [0.0, 0.0]}]}, "cuts.0"),
         ({"cuts": cut(3), "frame": {"type": "none"}, "rule": {"type": "barycentre"},
           "neighbours": {"type": "euclidean", "radius": 1.5, "reevaluate": True}},
-         "bonds cannot be cut where neighbours are re-evaluated"),
+         "bonds cannot be cut if neighbours are re-evaluated"),
         ({"cuts": cut(3), "rule": {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 1.0}},
-         "which does not go with such cuts; take cuts: "),
+         "which is incompatible with such cuts; use cuts: "),
     ],
 )  # fmt: skip
 def test_wrong_cuts_are_told(parts, words):

@@ -42,25 +42,25 @@ def told(call: Any) -> Any:
 
 
 NO_EXPERIMENT = {
-    "result.yaml": "result.yaml: is a result, no experiment; `pbdkit plot result.yaml` draws it",
+    "result.yaml": "result.yaml: is a result, not an experiment; `pbdkit plot result.yaml` draws it",
     "sweep.nc": "sweep.nc: is a sweep, not an experiment; `pbdkit sweep sweep.nc` runs it",
-    "fit.nc": "fit.nc: is a fit, not an experiment; `pbdkit fit fit.nc` carries it out",
-    "other.yaml": "other.yaml: is not an experiment, it has `services`, `volumes`; one has `lattice`, `body`, `rule` and `steps`; `pbdkit init` writes one",
-    "picture.yaml": "picture.yaml: is no text, and no experiment",
-    "left.nc.run": "left.nc.run: is what was kept of an unfinished run or of a sweep, no experiment; `pbdkit resume OUT.nc` goes on with a run",
+    "fit.nc": "fit.nc: is a fit, not an experiment; `pbdkit fit fit.nc` runs it",
+    "other.yaml": "other.yaml: is not an experiment, it has `services`, `volumes`; it requires `lattice`, `body`, `rule`, `steps`; `pbdkit init` writes one",
+    "picture.yaml": "picture.yaml: is not text, and not an experiment",
+    "left.nc.run": "left.nc.run: is the store of an unfinished run or of a sweep, not an experiment; `pbdkit resume OUT.nc` continues a run",
 }  # fmt: skip
 NO_SWEEP = {
     "result.yaml": NO_EXPERIMENT["result.yaml"],
-    "experiment.nc": "experiment.nc: is an experiment, not a sweep; `pbdkit run experiment.nc` runs it; a sweep names it under `experiment`",
+    "experiment.nc": "experiment.nc: is an experiment, not a sweep; `pbdkit run experiment.nc` runs it; a sweep refers to it by `experiment`",
     "fit.nc": "fit.nc: is a fit, not a sweep",
-    "paper/a": "paper/a: is an experiment, not a sweep; `pbdkit run paper/a` runs it; a sweep names it under `experiment`",
-    "other.yaml": "other.yaml: is not a sweep, it has `services`, `volumes`; one has `experiment` and `vary`",
+    "paper/a": "paper/a: is an experiment, not a sweep; `pbdkit run paper/a` runs it; a sweep refers to it by `experiment`",
+    "other.yaml": "other.yaml: is not a sweep, it has `services`, `volumes`; it requires `experiment` and `vary`",
 }  # fmt: skip
 NO_RESULT = {
     "experiment.nc": "experiment.nc: is an experiment; `pbdkit run experiment.nc` makes a result of it",
     "e.json": "e.json: is an experiment; `pbdkit run e.json` makes a result of it",
     "sweep.nc": "sweep.nc: is a sweep, no result; `pbdkit sweep sweep.nc` runs it",
-    "fit.nc": "fit.nc: is a fit, no result; `pbdkit fit fit.nc` carries it out",
+    "fit.nc": "fit.nc: is a fit, no result; `pbdkit fit fit.nc` runs it",
     "other.yaml": "other.yaml: is no result: those end in .nc",
     "picture.yaml": "picture.yaml: is no result, by its name an experiment",
 }  # fmt: skip

@@ -113,7 +113,8 @@ def test_deep_brackets_cost_no_more_the_deeper_they_are(opening: str, monkeypatc
 def test_too_many_neighbours_are_refused_before_they_are_listed(lattice, radius, weights) -> None:
     metric = {"type": "euclidean", "radius": radius, "weights": [float(w) for w in weights]}
     begun = time.process_time()
-    with pytest.raises(pbdkit.ExperimentError, match="neighbours on this lattice, and 4224 is the"):
+    text = "neighbours on this lattice; the maximum is 4224"
+    with pytest.raises(pbdkit.ExperimentError, match=text):
         checked(neighbours=metric, lattice={"type": lattice, "a": 1.0})
     assert time.process_time() - begun < SOON_S
 
@@ -255,8 +256,8 @@ def test_points_far_from_the_body_are_warned_of() -> None:
     far = {"select": {"nearest": [[100.0, 100.0], [9.4, 3.0]]}, "motion": {"type": "hold"}}
     (warning,) = [w for w in checked(leaders=[far])[0].warnings if "nearest" in w]
     assert warning == (
-        "leaders.0.select.nearest: (100, 100) lies 128.7 away from the body; the particle nearest "
-        "to it is 131, at (9, 9)"
+        "leaders.0.select.nearest: the distance of (100, 100) from the body is 128.7; the nearest "
+        "particle is 131, at (9, 9)"
     )
 
 
@@ -264,7 +265,7 @@ def test_files_in_the_place_of_others_are_recognised(call: Call, tmp_path: Path)
     assert call("run", "paper/e", "-o", "m3.nc").code == 0
     result = call("run", "m3.nc")
     assert result.code == 2
-    assert "m3.nc: is a result, no experiment; `pbdkit plot m3.nc` draws it" in result.err
+    assert "m3.nc: is a result, not an experiment; `pbdkit plot m3.nc` draws it" in result.err
     for command in ("explain", "curve"):
         result = call(command, "e.json")
         assert result.code == 2

@@ -46,7 +46,7 @@ def agrees(message: str, expected: str) -> bool:
 
 A, STEPS, RULE = "a: 1.0", "steps: 10", "type: barycentre"
 INTEGER = "e.yaml:12:1: steps: should be a valid integer, got "
-MERGE = "merge keys (<<) are not taken; write the keys out"
+MERGE = "merge keys (<<) are not supported; repeat the keys"
 EDITS = {
     "no is a word": (A, "a: no", "e.yaml:3:25: lattice.a: should be a valid number, got 'no'"),
     "inf": (A, "a: .inf", "e.yaml:3:25: lattice.a: should be a finite number, got inf"),
@@ -63,20 +63,20 @@ EDITS = {
     "integer of 5000 digits": (STEPS, "steps: " + "1" * 5000, "e.yaml:12:..."),
     "huge for a number": (A, "a: 1" + "0" * 400, "e.yaml:3:25: lattice.a: should be a valid number, got a huge integer"),
     "huge body": ("columns: 4", "columns: 1" + "0" * 400, "e.yaml:4:..."),
-    "newer version": ("version: 1", "version: 2", "e.yaml:1:1: version: this pbdkit reads version 1, got 2"),
+    "newer version": ("version: 1", "version: 2", "e.yaml:1:1: version: this pbdkit supports version 1, got 2"),
     "version 1.0": ("version: 1", "version: 1.0", "e.yaml:1:1: version: should be..."),
     "version true": ("version: 1", "version: true", "e.yaml:1:1: version: should be..."),
     "missing": (STEPS + "\n", "", "e.yaml:1:1: steps: is missing"),
-    "given twice": (STEPS, "steps: 10\nsteps: 20", "e.yaml:13:1: steps: given twice, first at e.yaml:12:1"),
-    "given twice inside": (A, "a: 1, a: 2", "e.yaml:3:31: lattice.a: given twice, first at e.yaml:3:25"),
+    "given twice": (STEPS, "steps: 10\nsteps: 20", "e.yaml:13:1: steps: occurs twice, first at e.yaml:12:1; remove one"),
+    "given twice inside": (A, "a: 1, a: 2", "e.yaml:3:31: lattice.a: occurs twice, first at e.yaml:3:25; remove one"),
     "unknown key": (STEPS, "stepz: 10", "e.yaml:12:1: stepz: unknown key; did you mean 'steps'? (known: version,..."),
     "unknown parameter": ("columns: 4", "colums: 4", "e.yaml:4:20: body.colums: unknown key; did you mean 'columns'? (known: columns, rows)"),
     "centre of a rectangle": ("{type: grid, columns: 4, rows: 3}", "{type: rectangle, width: 4.0, height: 3.0, centre: [0, 0]}", "e.yaml:4:50: body.centre: unknown key; `origin` is its lower left corner (known: width, height, origin)"),
     "modulus of a rule": (RULE, "type: springs, youngs_modulus: 2.1e5", "e.yaml:6:23: rule.youngs_modulus: unknown key; a rule says where particles go, which does not depend on it; it scales forces and stresses, and stands under `units`, or in each diagnostic that gives them (known: ..."),
     "region without a part": (RULE + "}", "type: barycentre}\nregions:\n  hole: {type: disc, radius: 1.0}", "e.yaml:8:3: regions.hole.centre: is missing"),
     "region with a number": (RULE + "}", "type: barycentre}\nregions:\n  hole: {type: disc, centre: [0, 0], radius: -1}", "e.yaml:8:38: regions.hole.radius: should be greater than 0, got -1"),
-    "region with a reserved name": (RULE + "}", "type: barycentre}\nregions:\n  file: {type: disc, centre: [0, 0], radius: 1}", "e.yaml:8:3: regions.file: a region's name may hold ..."),
-    "region of sites": (RULE + "}", "type: barycentre}\nregions:\n  hole: {type: grid, columns: 1, rows: 1}", "e.yaml:8:3: regions.hole: counts sites, and a region is a place: take a rectangle"),
+    "region with a reserved name": (RULE + "}", "type: barycentre}\nregions:\n  file: {type: disc, centre: [0, 0], radius: 1}", "e.yaml:8:3: regions.file: the name of a region may contain ..."),
+    "region of sites": (RULE + "}", "type: barycentre}\nregions:\n  hole: {type: grid, columns: 1, rows: 1}", "e.yaml:8:3: regions.hole: a grid counts sites and cannot be a region; use a rectangle"),
     "unknown region in a field": (RULE, "type: springs, stiffness: {otherwise: 1, hole: 2}", "e.yaml:6:49: rule.stiffness.hole: there is no region 'hole' (there is none: add `regions`)"),
     "misspelt rule": (RULE, "type: baricentre", "e.yaml:6:8: rule.type: unknown type 'baricentre'; did you mean 'barycentre'? (installed: barycentre,..."),
     "misspelt body": ("grid", "gird", "e.yaml:4:8: body.type: unknown type 'gird'; did you mean 'grid'? (known: ..."),
@@ -87,7 +87,7 @@ EDITS = {
     "a word for a part": ("{type: mean}", "mean", "e.yaml:7:1: frame: expected {type: ..., its parameters}, got 'mean'"),
     "nothing for a part": ("{type: mean}", "", "e.yaml:7:1: frame: expected {type: ..., its parameters}, got None"),
     "merge key": ("{type: mean}", "{<<: {type: mean}}", f"e.yaml:7:9: {MERGE}"),
-    "tag": ("{type: mean}", "!!python/name:os.system x", "e.yaml:7:8: tags (tag:yaml.org,2002:python/name:os.system) are not taken"),
+    "tag": ("{type: mean}", "!!python/name:os.system x", "e.yaml:7:8: tags (tag:yaml.org,2002:python/name:os.system) are not supported"),
     "list for a key": (STEPS, "? [a]\n: 1", "e.yaml:12:3: a key must be a word"),
     "tab": (STEPS, "\tsteps: 10", "e.yaml:12:1: not valid YAML: found character '\\t' that cannot start any token; indent with spaces, not with tabs"),
     "decimal comma": (A, "a: 1,5", "e.yaml:3:30: lattice.5: unknown key; decimals have a point and no comma, as in 0.3 (known: ..."),
@@ -97,26 +97,26 @@ EDITS = {
     "no space after the colon": (A, "a:1.5", "e.yaml:3:25: lattice.a:1.5: unknown key; write a space after the colon: `a: 1.5` (known: ..."),
     "open bracket": ("[0.1, 0.0]", "[0.1, 0.0", "e.yaml:11:83: not valid YAML: expected ',' or ']', but got '}'; the '[' at 11:64 is not closed, or a comma is missing before"),
     "open quotation": ("name: tensile", "name: 'tensile", "e.yaml:14:1: not valid YAML: found unexpected end of stream; the quotation mark at 2:7 is not closed"),
-    "two colons": ("name: tensile", "name: a: b", "e.yaml:2:8: not valid YAML: mapping values are not allowed here; put a text with a colon in quotes, ..."),
-    "indented otherwise": ("  - {select: {edge: right}", " - {select: {edge: right}", "e.yaml:11:2: not valid YAML: expected <block end>, but found '<block sequence start>'; indent all entries alike ..."),
+    "two colons": ("name: tensile", "name: a: b", "e.yaml:2:8: not valid YAML: mapping values are not allowed here; put text with a colon in quotes, ..."),
+    "indented otherwise": ("  - {select: {edge: right}", " - {select: {edge: right}", "e.yaml:11:2: not valid YAML: expected <block end>, but found '<block sequence start>'; indent all entries of a group ..."),
     "spacing at the top": (STEPS, "steps: 10\na: 1.0", "e.yaml:13:1: a: unknown key; write it under `lattice`, as in `lattice: {a: ...}` (known: ..."),
     "width at the top": (STEPS, "steps: 10\nwidth: 1.0", "e.yaml:13:1: width: unknown key; write it under `body`, as in `body: {width: ...}` (known: ..."),
     "relaxation at the top": (STEPS, "steps: 10\nrelaxation: 1.0", "e.yaml:13:1: relaxation: unknown key; write it under `solver`, as in `solver: {relaxation: ...}` (known: ..."),
     "unit in other letters": ("name: tensile", "name: tensile\nunits: {length: 1 mm, youngs_modulus: 210 Gpa}", "e.yaml:3:23: units.youngs_modulus: '210 Gpa': there is no unit 'Gpa'; did you mean 'GPa'?"),
-    "a speed": ("name: tensile", "name: tensile\nunits: {length: 1 mm/s}", "e.yaml:3:9: units.length: '1 mm/s' is no length; the steps of a run have no duration: write what changes in one step, without the time, as in 0.01 mm"),
+    "a speed": ("name: tensile", "name: tensile\nunits: {length: 1 mm/s}", "e.yaml:3:9: units.length: '1 mm/s' is not a length; the steps of a run have no duration: write the change in one step, without the time, as in 0.01 mm"),
     "control character": ("tensile", "ten\x07sile", "e.yaml:2:..."),
     "open brace": ("{type: mean}", "{type: mean", "e.yaml:8:9: not valid YAML: ..."),
     "until before from": ("hold}", "hold}, from: 5, until: 2", "e.yaml:10:5: leaders.0: until (2) is before from (5)"),
     "from 0": ("hold}", "hold}, from: 0", "e.yaml:10:50: leaders.0.from: should be greater than or equal to 1, got 0"),
     "two selections": ("left}", "left, numbers: [7]}", "e.yaml:10:6: leaders.0.select: give exactly one of edge, box, numbers, nearest, region"),
     "no selection": ("{edge: left}", "{}", "e.yaml:10:6: leaders.0.select: give exactly one of edge, box, numbers, nearest, region"),
-    "nobody selected": ("edge: left", "box: [50, 50, 60, 60]", "e.yaml:10:6: leaders.0.select: selects no particle; the body reaches from [0.0, 0.0] to [3.0, 2.0]"),
-    "frame point": ("edge: left", "numbers: [7, 1]", "e.yaml:10:28: leaders.0.select.numbers.1: particle 1 is a frame point: only body particles can lead"),
+    "nobody selected": ("edge: left", "box: [50, 50, 60, 60]", "e.yaml:10:6: leaders.0.select: selects no particle; the body extends from [0.0, 0.0] to [3.0, 2.0]"),
+    "frame point": ("edge: left", "numbers: [7, 1]", "e.yaml:10:28: leaders.0.select.numbers.1: particle 1 is a frame point; select particles of the body"),
     "number out of range": ("edge: left", "numbers: [31]", "e.yaml:10:25: leaders.0.select.numbers.0: there is no particle 31; they are numbered 1 to 30"),
     "number 0": ("edge: left", "numbers: [0]", "e.yaml:10:25: leaders.0.select.numbers.0: should be greater than or equal to 1, got 0"),
-    "contradiction": ("left", "bottom", "e.yaml:11:5: leaders.1: moves particle 22 in step 1 otherwise than leaders.0 does; select it in one of them only, or let one end before the other begins"),
-    "thresholds": ("none}", "threshold, thresholds: [1.5, 2]}", "e.yaml:8:29: fracture.thresholds: one threshold a shell is needed: 2 given for 1 shell(s)"),
-    "low threshold": ("none}", "threshold, thresholds: [.5]}", "e.yaml:8:42: fracture.thresholds.0: 0.5 is below the rest length 1 of shell 1: every bond would break at rest; raise it"),
+    "contradiction": ("left", "bottom", "e.yaml:11:5: leaders.1: moves particle 22 in step 1 differently from leaders.0; select it in one group only, or end one motion before the other begins"),
+    "thresholds": ("none}", "threshold, thresholds: [1.5, 2]}", "e.yaml:8:29: fracture.thresholds: one threshold for each shell is required: there are 2 for 1 shell(s)"),
+    "low threshold": ("none}", "threshold, thresholds: [.5]}", "e.yaml:8:42: fracture.thresholds.0: 0.5 is below the rest length 1 of shell 1: every bond would break at rest; increase it"),
     "one variable twice": ("pe2}", "pe2}, {type: pe1}, {type: pe2}", "e.yaml:13:41: diagnostics.2: adds the variable 'pe2'; diagnostics.0 does too"),
     "track out of range": ("pe2", "track, numbers: [7, 31]", "e.yaml:13:42: diagnostics.0.numbers.1: there is no particle 31; they are numbered 1 to 30"),
 }  # fmt: skip
@@ -131,11 +131,11 @@ def test_a_fault_has_its_place(refused: Refused, old: str, new: str, expected: s
 TEXTS = {
     "empty": ("", "e.yaml: is empty; `pbdkit init` writes an experiment to start from"),
     "list": ("- 1\n", "e.yaml:1:1: expected keys such as `lattice:` at the top level"),
-    "two documents": (TENSILE + "---\nname: b\n", "e.yaml:14:1: a second document; one file holds one experiment"),
+    "two documents": (TENSILE + "---\nname: b\n", "e.yaml:14:1: a second document; a file contains one experiment"),
     "bad UTF-8": (TENSILE.encode()[:40] + b"\xff", "e.yaml: byte 40 is not UTF-8; save the file as UTF-8"),
     "UTF-16": (TENSILE.encode("utf-16"), "e.yaml: byte 0 is not UTF-8; save the file as UTF-8"),
-    "too large": (TENSILE + "#" * 2**20, "e.yaml: is larger than 1 MiB, which no experiment needs"),
-    "alias bomb": ("a: &a [x]\n" + "".join(f"b{n}: &a [*a, *a, *a]\n" for n in range(30)), "e.yaml:2:9: aliases (*a) are not taken; write it out"),
+    "too large": (TENSILE + "#" * 2**20, "e.yaml: is larger than 1 MiB, the maximum for experiments; move tables to CSV files"),
+    "alias bomb": ("a: &a [x]\n" + "".join(f"b{n}: &a [*a, *a, *a]\n" for n in range(30)), "e.yaml:2:9: aliases (*a) are not supported; repeat the value"),
     "merge bomb": ("a: &a {k: 1}\n" + "".join(f"b{n}: &a {{<<: [*a, *a]}}\n" for n in range(30)), f"e.yaml:2:9: {MERGE}"),
     "100 000 levels of [": ("a: " + "[" * 100_000, "e.yaml:1:35: nested more than 32 levels deep"),
     "100 000 levels of {": ("{a: " * 100_000, "e.yaml:1:129: nested more than 32 levels deep"),
@@ -175,7 +175,9 @@ NAMES = ["../x", "a/../b", "/x", "..", "a..b", "a//b", "a/", "''", "a b", r"a\b"
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_cannot_leave_its_folder(refused: Refused, name: str) -> None:
     message = refused(edited("name: tensile", f"name: {name}"))
-    assert agrees(message, "e.yaml:2:1: name: may hold letters, digits, '.', '_', '-' and '/', ...")
+    assert agrees(
+        message, "e.yaml:2:1: name: may contain letters, digits, '.', '_', '-' and '/', ..."
+    )
 
 
 JARGON = {
@@ -196,8 +198,8 @@ def test_messages_speak_of_lists_and_maps(refused: Refused, old: str, new: str) 
 @pytest.mark.parametrize(
     ("name", "expected"),
     {
-        "nofile.yaml": "nofile.yaml: is no file and no shipped experiment...",
-        "paper/aa": "paper/aa: is no file and no shipped experiment; did you mean 'paper/a'? ...",
+        "nofile.yaml": "nofile.yaml: is neither a file nor a shipped experiment...",
+        "paper/aa": "paper/aa: is neither a file nor a shipped experiment; did you mean 'paper/a'? ...",
         ".": ".: is a folder...",
         "x" * 300: "x...",
     }.items(),
@@ -262,7 +264,7 @@ def test_groups_may_not_contradict(
     tensile: dict[str, Any], first: Any, second: Any, step: int
 ) -> None:
     experiment = pbdkit.Experiment(**tensile | {"leaders": [first, second]})
-    expected = f"^leaders.1: moves particle 7 in step {step} otherwise than leaders.0 does; "
+    expected = f"^leaders.1: moves particle 7 in step {step} differently from leaders.0; "
     with pytest.raises(pbdkit.ExperimentError, match=expected) if step else nullcontext():
         assert len(build_scene(experiment).leading) == 2
 

@@ -227,7 +227,7 @@ def test_a_bug_in_one_process_ends_all(monkeypatch):
     original = pbdkit.scene.scene.build_leading
 
     def breaks(raster, given_):
-        if raster.before > 0:
+        if raster.particle_offset > 0:
             raise ZeroDivisionError("somewhere")
         return original(raster, given_)
 

@@ -96,8 +96,8 @@ def test_a_default_that_does_not_fit_is_the_plugins_fault(install: Install, call
     result = call("run", "e.json", ODD)
     assert result.code == 3
     assert result.err.endswith(
-        "'odd' comes from pbdkit-odd 0.3, which is broken: TypeError: the default of Rule.strength "
-        "does not fit: Input should be a valid number, got 'x'\n"
+        "'odd' belongs to pbdkit-odd 0.3, which is broken: TypeError: the default of Rule.strength "
+        "is invalid: Input should be a valid number, got 'x'\n"
     )
 
 
@@ -134,7 +134,7 @@ def test_a_component_that_raises_is_no_bug_of_ours(install: Install, call: Call,
     install("pbdkit-raising", source, "0.3")
     result = call("run", "e.json", "--set=rule={type: raising}")
     assert (result.code, Path("tensile.nc").exists()) == (3, False)
-    assert "FollowerRule 'raising' of pbdkit-raising 0.3 failed when " in result.err
+    assert "FollowerRule 'raising' of pbdkit-raising 0.3 failed to " in result.err
     assert ": here" in result.err
     assert call("schema").code == 0
 

@@ -51,7 +51,7 @@ def test_a_clash_names_both_distributions_and_the_way_out(call: Call) -> None:
     )
     assert found["pbdkit-thief"]["reason"] == (
         "'barycentre' is the name of a built-in FollowerRule; "
-        "write 'pbdkit-thief:barycentre', or give it another type"
+        "write 'pbdkit-thief:barycentre', or change the type"
     )
     assert {row["state"] for row in found.values()} == {"ok", "conflict"}
     assert call("run", "e.json", "--set=rule={type: twin}").code == 2
@@ -88,7 +88,7 @@ def test_two_entry_points_of_one_distribution(install: Install, tmp_path: Path) 
     assert Registry().find(pbdkit.FollowerRule, "twin").__module__ == "pbdkit_one"
     points.write_text("[pbdkit]\na = pbdkit_one\nb = pbdkit_two\n")
     for name in ("twin", "pbdkit-one:twin"):
-        with pytest.raises(pbdkit.PluginError, match="it offers two classes with the type 'twin'"):
+        with pytest.raises(pbdkit.PluginError, match="it has two classes with the type 'twin'"):
             Registry().find(pbdkit.FollowerRule, name)
 
 
@@ -138,7 +138,7 @@ def test_disabling_one_of_two_settles_a_clash(call: Call, monkeypatch: pytest.Mo
 @pytest.mark.usefixtures("twins")
 def test_a_misspelt_name_to_disable_is_said(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(DISABLE, "pbdkit-tow")
-    expected = "warning: PBDKIT_DISABLE_PLUGINS names 'pbdkit-tow', which is not installed; "
+    expected = "warning: PBDKIT_DISABLE_PLUGINS contains 'pbdkit-tow', which is not installed; "
     assert call("plugins", "list").err == f"{expected}did you mean 'pbdkit-two'?\n"
 
 
@@ -169,7 +169,7 @@ def test_without_plugins_all_are_disabled_for_that_call(call: Call, words: Any) 
     rows = json.loads(call(*words).out)
     (row,) = [row for row in rows if row["distribution"] == "zz-healthy"]
     assert row["state"] == "disabled"
-    assert row["reason"] == "no plugin is wanted (--no-plugins or PBDKIT_DISABLE_PLUGINS=*)"
+    assert row["reason"] == "all plugins are disabled (--no-plugins or PBDKIT_DISABLE_PLUGINS=*)"
     assert call("check", "e.json", HEALTHY, "--no-plugins").code == 2
     assert (DISABLE in os.environ, call("check", "e.json", HEALTHY).code) == (False, 0)
 

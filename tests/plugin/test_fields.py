@@ -14,7 +14,7 @@ import xarray
 from jsonschema import Draft202012Validator
 
 import pbdkit
-from pbdkit.model.reading import Beside
+from pbdkit.model.reading import FileResolver
 from pbdkit.model.validation import read_field
 from pbdkit.plugin.fields import Gridded, as_varying
 from pbdkit.scene.scene import build_scene
@@ -99,7 +99,7 @@ def test_a_damaged_field_file_is_refused_by_name_and_in_silence(field_file, monk
             damaged[start : start + 8] = by_chance.randbytes(8)
         field_file.write_bytes(damaged[: by_chance.choice([None, len(damaged) // 2])])
         try:
-            read_field({"file": "m.nc", "variable": "E"}, Beside(field_file.parent))
+            read_field({"file": "m.nc", "variable": "E"}, FileResolver(field_file.parent))
         except ValueError as error:
             refused.append(str(error))
     gc.collect()
@@ -138,7 +138,7 @@ def test_a_grid_is_bilinear_and_nowhere_else():
         ({"stiffness": {"otherwise": 1.0, "disc": "x"}}, "rule.stiffness", "'disc' should be a"),
         ({"stiffness": {"otherwise": 1.0, "disc": -2.0}}, "rule.stiffness", "disc: should be gre"),
         ({"poisson_ratio": {"otherwise": 0.3, "disc": 0.7}}, "rule.poisson_ratio", "got 0.7"),
-        ({"stiffness": {"file": "no.nc", "variable": "E"}}, "rule.stiffness", "is not there"),
+        ({"stiffness": {"file": "no.nc", "variable": "E"}}, "rule.stiffness", "does not exist"),
         ({"stiffness": {"file": "no.nc"}}, "rule.stiffness", "has file and variable"),
         (
             {"stiffness": {"x": [1, 0], "y": [0], "values": [[1], [2]]}},
@@ -171,8 +171,8 @@ def test_a_place_outside_the_data_is_an_error():
 
 def test_regions_are_places_with_names_of_their_own():
     for regions, text in (
-        ({"file": DISC}, "and be none of otherwise, file, steps"),
-        ({"grid": {"type": "grid", "columns": 3, "rows": 3}}, "take a rectangle"),
+        ({"file": DISC}, "and must not be one of otherwise, file, steps"),
+        ({"grid": {"type": "grid", "columns": 3, "rows": 3}}, "use a rectangle"),
     ):
         with pytest.raises(pbdkit.ExperimentError, match=text):
             pbdkit.Experiment(**GIVEN | {"regions": regions})
@@ -210,7 +210,7 @@ def test_what_is_no_field_is_left_to_the_parameter(given):
     [
         (
             {"fracture": {"type": "strain", "failure": {"otherwise": 0.1}, "scatter": 0.2}},
-            r"fracture\.failure: 'strain' draws a number for each bond from it",
+            r"fracture\.failure: 'strain' draws a random number for each bond",
         ),
         (
             {"rule": {"type": "strain-gradient", "poisson_ratio": 0.3, "length": {"otherwise": 1}}},
@@ -224,7 +224,7 @@ def test_what_is_no_field_is_left_to_the_parameter(given):
                     "placement": {"otherwise": 1.0, "disc": 1.2},
                 }
             },
-            r"fracture\.placement: 'placement' of 'strain' is no limit of a bond",
+            r"fracture\.placement: 'placement' of 'strain' is not a limit of bonds",
         ),
         (
             {

@@ -204,7 +204,7 @@ def test_results_repeat_to_the_bit_without_gstools(monkeypatch, call):
             assert call("explain", "strip.nc").code == 0
             refused = call("check", "strip.json")
         assert refused.code == 2
-        assert "random fields are drawn with GSTools: pip install 'pbdkit[random]'" in refused.err
+        assert "random fields require GSTools: pip install 'pbdkit[random]'" in refused.err
         assert "strip.json:1:" in refused.err
 
 
@@ -261,11 +261,14 @@ def rows(folder):
     ("change", "text"),
     [
         ({"mean": 0.0}, "fracture.failure.mean: should be greater than 0, got 0.0"),
-        ({"mean": "5 mm"}, "fracture.failure.mean: .5 mm. is no stress"),
+        ({"mean": "5 mm"}, "fracture.failure.mean: .5 mm. is not a stress"),
         ({"scatter": -0.1}, "fracture.failure.scatter: should be greater than 0, got -0.1"),
         ({"scatter": 20}, "fracture.failure.scatter: should be less than 1, got 20"),
         ({"correlation_length": 0}, "fracture.failure.correlation_length: should be greater than"),
-        ({"correlation_length": "5 mm"}, "correlation_length: '5 mm' names a unit, and nothing"),
+        (
+            {"correlation_length": "5 mm"},
+            "correlation_length: '5 mm' has a unit, but the lattice unit",
+        ),
         ({"scater": 0.1}, "fracture.failure.scater: unknown key; did you mean 'scatter'"),
         ({"drawn": 1}, "fracture.failure.drawn: should be a map of keys, got 1"),
         ({"drawn": ASKED | {"seed": 0, "x": [0], "y": [0], "values": "?"}}, "drawn: .* base 64"),
@@ -284,11 +287,11 @@ def test_what_is_wrong_is_named_with_its_place(change, text):
         ({"rule": {"type": "elastic", "poisson_ratio": ASKED | {"mean": 0.4}}},
          r"^rule\.poisson_ratio: the largest value: should be less than or equal to 0\.5"),
         ({"fracture": {"type": "strain", "failure": ASKED, "scatter": 0.1}},
-         r"^fracture\.failure: 'strain' draws a number for each bond from it"),
+         r"^fracture\.failure: 'strain' draws a random number for each bond"),
         ({"body": {"type": "grid", "columns": 1100, "rows": 1000}},
-         r"^fracture\.failure: 4395801 values are more than the 4194304 that are drawn; .*file"),
+         r"^fracture\.failure: 4395801 values exceed 4194304, the maximum .*file"),
         ({"body": {"type": "grid", "columns": 10**9, "rows": 10**9}},
-         r"^fracture\.failure: 4e\+18 values are more than 16777216; make the body smaller"),
+         r"^fracture\.failure: 4e\+18 values exceed 16777216; use a smaller body"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(parts, text):

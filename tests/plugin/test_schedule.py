@@ -346,7 +346,7 @@ def test_members_of_a_sweep_are_told_apart_by_their_courses():
 
 WRONG = {
     "order": ({"fracture": {"type": "strain", "failure": course([5, 5], [1, 2])}},
-              r"fracture\.failure: steps should increase, and 5 comes after 5"),
+              r"fracture\.failure: steps should increase, but 5 follows 5"),
     "count": ({"fracture": {"type": "strain", "failure": course([5], [1, 2])}},
               r"fracture\.failure: 1 steps have 2 values"),
     "value": ({"fracture": {"type": "strain", "failure": course([1, 5], [1, -2])}},
@@ -361,7 +361,7 @@ WRONG = {
     "in a field": ({"regions": {"a": {"type": "disc", "radius": 1.0, "centre": [0.0, 0.0]}},
                     "rule": {"type": "elastic", "poisson_ratio": 0.3, "stiffness":
                              {"otherwise": 1.0, "a": {"steps": [1], "values": [2.0]}}}},
-                   r"rule\.stiffness: 'a' should be a number: there is no field in a field"),
+                   r"rule\.stiffness: 'a' should be a number: values by region cannot vary"),
     "auto": ({"solver": {"type": "stepping", "relaxation": "auto",
                          "memory": course([1, 2], [0.1, 0.2])}},
              r"'auto' needs constant parameters"),
@@ -398,9 +398,9 @@ def test_what_changes_nothing_is_warned_of():
         )
     )  # fmt: skip
     for said in (
-        "regions.far: lies outside of the body",
-        "regions.idle: nothing names it",
-        "fracture.failure: changes until step 99, and the run ends with step 30",
+        "regions.far: lies outside the body",
+        "regions.idle: not referenced",
+        "fracture.failure: changes until step 99, but the run ends with step 30",
     ):
         assert sum(warning.startswith(said) for warning in scene.warnings) == 1
 

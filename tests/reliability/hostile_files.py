@@ -46,7 +46,7 @@ import pbdkit.web.command_line
 import pbdkit.web.report  # noqa: F401  # as above
 from pbdkit.cli import main as program
 from pbdkit.io.seal import put_seal, seal_of
-from pbdkit.model.reading import Beside
+from pbdkit.model.reading import FileResolver
 from pbdkit.model.validation import read_field
 
 PATIENCE_S, LONGEST_S = 120.0, 60.0
@@ -417,7 +417,7 @@ def _leaks(folder: Path, log: str) -> bool:
 
 def _as_stored(folder: Path) -> bool:
     """Whether the field that was taken is what HDF5 itself finds in the file."""
-    taken = read_field({"file": "f.nc", "variable": "E"}, Beside(folder))
+    taken = read_field({"file": "f.nc", "variable": "E"}, FileResolver(folder))
     with h5py.File(folder / "f.nc") as file:
         stored = {name: file[name][...] for name in ("E", "x", "y")}
         packed = {*file["E"].attrs, *file["x"].attrs} & {"scale_factor", "add_offset", "_Unsigned"}

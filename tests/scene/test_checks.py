@@ -38,13 +38,13 @@ def test_a_point_far_from_the_body_is_named_with_group_particle_and_distance() -
     select = [{"select": nearest, "motion": HOLD}]
     # The corner (4, 2) is a 3-4-5 triangle away, and the last of 9 columns of 5.
     assert warnings_of(leaders=select) == [
-        "leaders.0.select.nearest: (7, 6) lies 5 away from the body; the particle nearest to it is "
-        "45, at (4, 2)"
+        "leaders.0.select.nearest: the distance of (7, 6) from the body is 5; the nearest particle "
+        "is 45, at (4, 2)"
     ]
     load = {"select": {"nearest": [[-3.0, 0.0]]}, "force": [1.0, 0.0]}
     assert warnings_of(loads=[load])[0] == (
-        "loads.0.select.nearest: (-3, 0) lies 3 away from the body; the particle nearest to it is "
-        "1, at (0, 0)"
+        "loads.0.select.nearest: the distance of (-3, 0) from the body is 3; the nearest particle "
+        "is 1, at (0, 0)"
     )
 
 
@@ -148,7 +148,7 @@ def test_cells_of_cloth_along_the_diagonals_lock_and_the_cure_is_named() -> None
 
     with pytest.warns(pbdkit.PbdkitWarning, match="cells lock") as caught:
         coarse, fine = force(12), force(48)
-    told = re.search(r"too stiff by some (\S+) %; turn the body onto", str(caught[0].message))
+    told = re.search(r"too stiff by about (\S+) %; align the stiff", str(caught[0].message))
     assert told
     assert 0.6 < (coarse / fine - 1.0) / (float(told[1]) / 100.0) < 1.7
 
@@ -217,7 +217,7 @@ def test_strains_in_per_cent_are_warned_of(fracture: dict[str, Any], fields: lis
 
 
 def test_a_load_on_leaders_alone_is_warned_of() -> None:
-    told = "loads.0: acts on leaders alone, which carry it, so that it moves nothing"
+    told = "loads.0: acts only on leaders, so that it has no effect on the body"
     on_the_left = [{"select": {"edge": "left"}, "force": [1e-3, 0.0]}]
     assert doubted(loads=on_the_left) == [told]
     rollers = [{"select": {"edge": "left"}, "motion": HOLD, "axes": ["x"]}]

@@ -164,11 +164,11 @@ class Writing(pbdkit.plugin.RenewsBonds, Keeping):
         (Misspelt, "'plain' draws 'agee', which it does not remember; did you mean 'age'?"),
         (Twice, "the number 'age' is declared 2 times, by FractureModel 'plain' and FollowerRule"),
         (Taken, "a part remembers 'shell' of each bond, and that name is taken in the dataset"),
-        (Worded, "'the age' is no name for a variable: letters, digits and _ only"),
+        (Worded, "'the age' is not the name of a variable; use letters, digits and _"),
         (Typed, "'age' has the dtype 'f4', not f8, i1, i2, i4, i8"),
         (Generous, "it returned 2 values, and it remembers 1 that change: declare `changes=False`"),
         (Bare, "step 1: `update` returned ndarray, not a tuple: write `\\(value,\\)`"),
-        (Loose, "asked what it remembers: `remembered` returned Remembered, not a tuple"),
+        (Loose, "to declare its remembered numbers: `remembered` returned Remembered, not a tuple"),
         (
             Tangled,
             "'tangled' failed to place .*: `fictitious` returned tuple: return a vector, as",
@@ -176,7 +176,7 @@ class Writing(pbdkit.plugin.RenewsBonds, Keeping):
         (Measured, "'plain' failed at step 1: `breaks` returned float64: compare, as in"),
         (Silent, "'plain' failed at step 1: `breaks` returned None: compare, as in"),
         (Misshapen, "'plain' failed at step 1: ValueError: operands could not be broadcast"),
-        (Constant, "asked for its constants: TypeError: it returned float, not numbers by name"),
+        (Constant, "to return its constants: TypeError: it returned float, not numbers by name"),
         (Fractional, "failed at step 1.*same_kind"),
         (Writing, "failed at step 1.*read-only"),
     ],
@@ -229,7 +229,7 @@ def test_a_dimension_of_its_own_has_one_length():
 
 def test_a_rule_that_remembers_has_no_equilibrium():
     given = SHEET | {"rule": Tiring(), "solver": {"type": "equilibrium"}}
-    message = "the rule 'tiring' remembers, so that where the steps lead depends on all of them"
+    message = "the rule 'tiring' depends on the history, so that the limit of the steps depends"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         pbdkit.run(given, components=[Tiring], progress=False)
 

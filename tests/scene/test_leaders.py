@@ -243,7 +243,7 @@ def test_groups_on_one_axis_contradict_each_other_and_on_two_do_not():
 @pytest.mark.parametrize(
     ("axes", "text"),
     [
-        (["x", "x"], "axes name one twice: x, x"),
+        (["x", "x"], "axes has an axis twice: x, x"),
         (["z"], "should be 'x' or 'y'"),
         ([], "should have at least 1"),
         ("x", "should be a list"),

@@ -134,19 +134,19 @@ class Misnamed(Vanes):
 @pytest.mark.parametrize(
     ("parts", "told"),
     [
-        ({"frame": {"type": "mean"}}, "frame points do not remember; take frame: {type: none}"),
+        ({"frame": {"type": "mean"}}, "frame points do not have; use frame: {type: none}"),
         (
             {"fracture": Weakest()},
-            "the points in place of broken bonds do not remember; take fract",
+            "fictitious points of broken bonds do not have; use fracture",
         ),
         (
             {"rule": {"type": "barycentre"}, "leaders": [TURNED]},
-            r"leaders\.0\.clamped: with 'barycentre' particles have no directions that could be",
+            r"leaders\.0\.clamped: with 'barycentre' particles have no directions that can be",
         ),
         ({"rule": Tiring(), "leaders": [TURNED]}, "with 'tiring' particles have no directions"),
         (
             {"rule": Misnamed(), "leaders": [TURNED]},
-            "names 'lift' in `rotations`, which it does not",
+            "has 'lift' in `rotations`, but `remembered` declares no",
         ),
     ],
 )

@@ -271,7 +271,7 @@ def test_a_dataset_runs_again_and_tells_of_its_loads():
     assert ds["load"].values.tolist() == [0]
 
 
-KNOWS_NONE = r"loads: the rule '.*' with these parameters knows no forces: .* take a calibrated"
+KNOWS_NONE = r"loads: the rule '.*' with these parameters defines moves, .* use a calibrated"
 REFUSED = {
     "barycentre": ({"rule": {"type": "barycentre"}, "frame": {"type": "mean"}}, KNOWS_NONE),
     "auxetic": ({"rule": ELASTIC | {"poisson_ratio": -1.0}}, KNOWS_NONE),
@@ -280,7 +280,7 @@ REFUSED = {
             "neighbours": {"type": "euclidean", "radius": 1.5, "reevaluate": True},
             "solver": {"type": "stepping"},
         },
-        "loads: need neighbours that stay; set neighbours.reevaluate: false",
+        "loads: loads require fixed neighbours; set neighbours.reevaluate: false",
     ),
     "both": ({"loads": [TIP | {"body_force": [1, 0]}]}, r"loads.0: give exactly one of force, bo"),
     "neither": ({"loads": [{"select": ALL}]}, r"loads.0: give exactly one of force, body_force"),
@@ -288,13 +288,13 @@ REFUSED = {
     "infinite": ({"loads": [TIP | {"force": [math.inf, 0]}]}, r"loads.0.force.0: should be a fin"),
     "too large": (
         {"loads": [WEIGHT | {"body_force": [1e308, 0.0]}]},
-        r"loads.0: leaves the finite numbers",
+        r"loads.0: the force is not finite",
     ),
     "nobody": (
         {"loads": [TIP | {"select": {"box": [50, 50, 51, 51]}}]},
         r"loads.0.select: selects no particle",
     ),
-    "none to measure": ({"loads": []}, r"diagnostics.1: 'load-displacement' is of loads, and th"),
+    "none to measure": ({"loads": []}, r"diagnostics.1: 'load-displacement' requires loads; the"),
 }
 
 

@@ -380,19 +380,17 @@ def test_an_obstacle_that_is_not_there_yet_may_lie_in_the_body() -> None:
 MESSAGES: dict[str, tuple[dict[str, Any], str]] = {
     "grid": (
         {"shape": {"type": "grid", "columns": 2, "rows": 2}},
-        "obstacles.0.shape.type: a grid is sites of the body's lattice and has no outline; take a "
-        "rectangle",
+        "obstacles.0.shape.type: a grid has no outline and cannot be an obstacle; use a rectangle",
     ),
     "union": (
         {"shape": {"type": "union", "of": []}},
-        "obstacles.0.shape.type: a union is no obstacle; give each of its parts as an obstacle of "
-        "its own",
+        "obstacles.0.shape.type: a union cannot be an obstacle; use one obstacle for each part",
     ),
-    "dogbone": ({"shape": {"type": "dogbone"}}, "a dogbone is no obstacle; take a polygon"),
+    "dogbone": ({"shape": {"type": "dogbone"}}, "a dogbone cannot be an obstacle; use a polygon"),
     "misspelt": ({"shape": {"type": "dics"}}, "unknown type 'dics'; did you mean 'disc'?"),
     "no normal": (
         {"shape": {"half_plane": {"point": [0.0, 0.0], "normal": [0.0, 0.0]}}},
-        "obstacles.0.shape.half_plane: the normal has no direction: give a vector that is not",
+        "obstacles.0.shape.half_plane: the normal has no direction; give a vector other than",
     ),
     "until": (
         {"shape": SHAPES["disc"], "from": 4, "until": 2},
@@ -400,15 +398,15 @@ MESSAGES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "inside": (
         {"shape": {"type": "disc", "radius": 1.2, "centre": [7.1, 4.0]}},
-        "obstacles.0.shape: particle 68 at (7, 4) begins 1.1 inside of it; let the obstacle begin "
-        "outside the body and move there, or begin at a later step",
+        "obstacles.0.shape: particle 68 at (7, 4) starts at a depth of 1.1 inside it; start the "
+        "obstacle outside the body and move it there, or start it at a later step",
     ),
     "infinite": (
         {
             "shape": SHAPES["disc"],
             "motion": {"type": "velocity", "velocity": [1e300, 0.0], "steps": 10**10},
         },
-        "obstacles.0.motion: leaves the finite numbers at its step",
+        "obstacles.0.motion: the displacement at step",
     ),
     "never rests": (
         {
@@ -433,7 +431,7 @@ def test_what_is_refused_names_place_and_remedy(fault: str) -> None:
 def test_contact_needs_obstacles() -> None:
     contact = {"type": "contact", "youngs_modulus": 1.0}
     with pytest.raises(
-        pbdkit.ExperimentError, match="'contact' is of obstacles, and there is none"
+        pbdkit.ExperimentError, match="'contact' requires obstacles; the experiment has none"
     ):
         build_scene(pbdkit.Experiment(**block(obstacles=[], diagnostics=[contact])))
 
@@ -452,7 +450,7 @@ def test_leaders_that_are_driven_into_an_obstacle_are_warned_of() -> None:
     into = {"type": "velocity", "velocity": [0.0, 0.5], "steps": 4}
     given = block(leaders=[{"select": {"edge": "top"}, "motion": into}])
     warnings = build_scene(pbdkit.Experiment(**given)).warnings
-    known = "leaders.0: drives particle 72 into obstacles.0 by step 1; obstacles stop followers"
+    known = "leaders.0: moves particle 72 into obstacles.0 by step 1; obstacles stop followers"
     assert any(known in warning for warning in warnings)
 
 

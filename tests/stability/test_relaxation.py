@@ -152,7 +152,7 @@ def test_a_word_that_is_none_is_answered_once(name, call):
 
 
 def test_numbers_that_are_yet_to_be_chosen_are_none():
-    with pytest.raises(pbdkit.ExperimentError, match="once it is chosen for a scene"):
+    with pytest.raises(pbdkit.ExperimentError, match="has no value yet"):
         _ = scene_of().experiment.stepping.memory
 
 

@@ -262,7 +262,7 @@ def test_guided_particles_are_warned_of_where_no_way_is_left() -> None:
     for normal, count in (([-1.0, 0.0], 1), ([-1.0, -1.0], 0)):
         given = block(leaders=[hold, right], obstacles=[plane([14.2, 8.0], normal)])
         warnings = build_scene(pbdkit.Experiment(**given)).warnings
-        assert sum("leaders.1: drives particle" in each for each in warnings) == count
+        assert sum("leaders.1: moves particle" in each for each in warnings) == count
 
 
 CURVED = {

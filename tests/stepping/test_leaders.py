@@ -149,11 +149,11 @@ def particle_5(data):
         ({"solver": {"type": "stepping", "settle": {}}}, "without settle"),
         (
             {"rule": {"type": "barycentre"}, "frame": {"type": "none"}},
-            "rule: leaders that move by Newton's law need forces, and 'barycentre' knows none",
+            "rule: leaders that move by Newton's law require forces, which 'barycentre' with",
         ),
         (
             {"rule": {"type": "elastic", "poisson_ratio": -1.0}},
-            "'elastic' knows none with these parameters",
+            "'elastic' with these parameters does not define",
         ),
     ],
 )

@@ -122,7 +122,7 @@ def test_an_equilibrium_stays_where_it_is():
 
 @pytest.mark.parametrize("solver", [{"type": "equilibrium"}, {"type": "stepping", "settle": {}}])
 def test_what_may_move_at_rest_has_no_equilibrium(solver):
-    with pytest.raises(pbdkit.ExperimentError, match="solver: 'wind' may move particles"):
+    with pytest.raises(pbdkit.ExperimentError, match="solver: 'wind' can move particles"):
         pbdkit.Experiment(**sheet(operations=[Wind(select={"edge": "top"})], solver=solver))
 
 

@@ -130,18 +130,18 @@ class Infinite(Measured):
 
 
 DECLARE = "are given to rules that declare `uses_reference: ClassVar[bool] = True`"
-NO_NUMBER = "is none: make numbers of it in `parameters` or `weights`"
+NO_NUMBER = "is not a number: convert it in `parameters` or `weights`"
 TUPLE = ", not a tuple: write `(value,)`"
 MISTAKES = {
     DividesByZero: ("particle 25, found at step 1", "a displacement is NaN", "in divide (test_ru",
                     "guard divisions and roots with `pbdkit.plugin.where`"),
     TakesReference: ("test_rule_evaluation.py, line ", "`here.X` and `here.centred`", DECLARE),
     TakesReferenceWhole: ("test_rule_evaluation.py, line ", DECLARE),
-    TakesOther: ("has no attribute 'part'", "; `p` holds share", "evaluation.py, line "),
-    HasTable: ("`p` holds numbers, and the parameter 'table'", NO_NUMBER, "evaluation.py, line "),
-    HasMode: ("`p` holds numbers, and the parameter 'mode'", NO_NUMBER, "evaluation.py, line "),
+    TakesOther: ("has no attribute 'part'", "; `p` contains share", "evaluation.py, line "),
+    HasTable: ("`p` contains numbers, and the param", NO_NUMBER, "evaluation.py, line "),
+    HasMode: ("`p` contains numbers, and the parameter 'mode'", NO_NUMBER, "evaluation.py, line "),
     HasWeights: ("did you mean 'nearness'?", "evaluation.py, line "),
-    StartsAtVector: ("'way' starts at Vector", "is one number", "as way_x and way_y"),
+    StartsAtVector: ("the initial value of 'way' is Vector", "is one number", "as way_x and way_y"),
     Array: ("Diagnostic 'array' failed at step 0: `measure` returned ndarray", TUPLE),
     Alone: ("Diagnostic 'alone' failed", "`variables` returned Variable", TUPLE),
     Misspelt: ("no attribute 'displacment'; did you mean 'displacement'?", "evaluation.py, line "),

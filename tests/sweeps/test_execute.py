@@ -416,7 +416,7 @@ WRONG = [
     ({"vary": {"rule": [{"type": "barycentre"}], "rule.K": [1]}}, "'rule' is varied twice"),
     ({"vary": {"seed": [1]}, "replicates": 2}, "'seed' is varied twice: replicates vary it"),
     ({"together": {"steps": [1, 2], "seed": [1]}}, "equal length.*steps has 2, seed has 1"),
-    ({"vary": {"leaders.7.until": [1]}}, "member leaders.7.until=1: .*'7' is no position"),
+    ({"vary": {"leaders.7.until": [1]}}, "member leaders.7.until=1: .*'7' is not an index"),
     ({"vary": {"steps": {"from": 1, "to": 10**6, "count": 10**5}}, "replicates": 9},
      "900000 members; at most 100000"),
     ({"vary": {"steps": [10**9]}}, "come to a dataset of .* GiB"),
@@ -425,10 +425,10 @@ WRONG = [
     ({"keep": {"times": "lost"}}, "keep.times"),
     ({"vary": {"body.columns": [10**5], "body.rows": [10**6]}}, "member body.columns=1.*GiB"),
     ({"experiment": "paper/x"}, "experiment: 'paper/x' is neither; did you mean 'paper/"),
-    ({"experiment": "../e.json"}, "leads elsewhere; give a shipped name, or a file in the folder"),
-    ({"experiment": "/etc/passwd"}, "leads elsewhere"),
-    ({"experiment": "link.json"}, "'link.json' leads elsewhere"),
-    ({"experiment": 3}, "experiment: expected a shipped name, a file beside this one"),
+    ({"experiment": "../e.json"}, "lies outside the folder; give a shipped name, or"),
+    ({"experiment": "/etc/passwd"}, "lies outside the folder"),
+    ({"experiment": "link.json"}, "'link.json' lies outside the folder"),
+    ({"experiment": 3}, "experiment: expected the name of a shipped experiment"),
 ]  # fmt: skip
 
 

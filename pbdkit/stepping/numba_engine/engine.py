@@ -226,12 +226,12 @@ def _stays(scene: Scene) -> bool:
     """Whether a particle with all its neighbours moves nowhere at rest, and no bond breaks."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     still, slots = vector(np.zeros(scene.axes)), scene.neighbourhood.slots
-    with blaming(experiment.rule, "when asked whether it rests"):
+    with blaming(experiment.rule, "to move at rest"):
         if any(component != 0.0 for own in slots for component in evaluator.at_rest(own)):
             return False
     if not scene.has_fracture:
         return True
-    with blaming(experiment.fracture, "when asked what breaks at rest"):
+    with blaming(experiment.fracture, "to test bonds at rest"):
         limits = scene.constants.limits
         return not any(evaluator.breaks(still, k.rest, limits[k], ()) for k in chain(*slots))
 

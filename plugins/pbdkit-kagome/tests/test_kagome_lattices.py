@@ -105,7 +105,7 @@ def test_neighbours_that_surround_a_site_unevenly_are_refused(lattice):
     if lattice is Kagome:
         pbdkit.run(asked, components=COMPONENTS, progress=False)
         return
-    with pytest.raises(pbdkit.ExperimentError, match="'chebyshev' is lopsided on this lattice"):
+    with pytest.raises(pbdkit.ExperimentError, match="'chebyshev' is unbalanced on this lattice"):
         pbdkit.run(asked, components=COMPONENTS, progress=False)
 
 
