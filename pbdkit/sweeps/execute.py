@@ -73,27 +73,30 @@ if TYPE_CHECKING:
 HANDED_OUT_S = 0.25
 """Members are handed out in chunks that take about so long."""
 MOST_AT_ONCE = 16
-"""So many at most, so that no chunk fills the pipe to a worker that was killed."""
+"""Largest number of members in a chunk, so that no chunk fills the pipe to a killed worker."""
 HEARTBEAT_S = 0.2
 MOST_LOSSES = 3
-"""So often a member may be lost with the process that ran it, and it alone; then it has failed."""
+"""Number of times that a member may be lost, alone, with its process before it has failed."""
 AHEAD = 2
 """Chunks that a worker has at a time, so that it need not wait for the next."""
 WAIT_FOR_WORKERS_S = 30.0
 
 
 class Executor(ABC):
-    """Runs members in whatever order."""
+    """Run members in any order."""
 
     @abstractmethod
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
-        """A report for each job, and None every now and then while there is none. Once `stopping`
-        says so nothing more is begun. Whoever closes the iterator ends the workers, too."""
+        """Yield a report for each job, and None at intervals while there is none.
+
+        No further job is started once `stopping` returns true. Closing the iterator ends the
+        workers.
+        """
 
 
 @dataclass
 class Queue:
-    """What is still to be handed out, how long members take, and how often each was lost."""
+    """Queue of members, with their duration and how often each was lost."""
 
     jobs: deque[Job]
     workers: int
@@ -103,8 +106,10 @@ class Queue:
     _losses: dict[str, int] = field(default_factory=dict)
 
     def chunk(self) -> list[Job]:
-        """The next members for one worker: one as long as nothing is known, and one alone that was
-        lost before."""
+        """Return the next members for one worker.
+
+        It is one member until durations are known, and a lost member is run alone.
+        """
         if not self._count or self.jobs[0].key in self._losses:
             return [self.jobs.popleft()]
         size = int(HANDED_OUT_S * self._count / max(self._seconds, 1e-9))
@@ -121,8 +126,8 @@ class Queue:
             yield report
 
     def lost(self, chunk: list[Job], reason: str) -> Iterator[MemberReport]:
-        """Takes members back whose worker came to an end; one that was alone too often is given
-        up."""
+        """Put back the members of a worker that ended; a member that was lost alone too often has
+        failed."""
         again = []
         for job in chunk:
             losses = self._losses.get(job.key, 0) + (len(chunk) == 1)
@@ -136,13 +141,13 @@ class Queue:
 
 
 class SerialExecutor(Executor):
-    """This process, with classes from Python where there are any."""
+    """Run members in this process, with component classes from Python."""
 
     def __init__(self, components: tuple[type[Component], ...] = ()) -> None:
         self._components = components
 
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
-        """One after the other."""
+        """Run one member after the other."""
         for job in jobs:
             if stopping():
                 return
@@ -150,7 +155,7 @@ class SerialExecutor(Executor):
 
 
 class ClusterExecutor(Executor):
-    """The workers of a dask cluster. Who can reach it can run code on it."""
+    """Run members on the workers of a dask cluster, on which clients can execute any code."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
@@ -175,7 +180,7 @@ class ClusterExecutor(Executor):
                 self._client.cancel(list(out))
 
     def _is_there(self) -> bool:
-        """Whether the scheduler is connected."""
+        """Return whether the scheduler is connected."""
         return bool(self._client.status == "running")
 
     def _with_workers(self, stopping: Callable[[], bool]) -> Iterator[None]:
@@ -211,7 +216,7 @@ class ClusterExecutor(Executor):
 
 
 def _reports(future: Any, chunk: list[Job], queue: Queue) -> Iterator[MemberReport]:
-    """Of a task that has ended, well or not."""
+    """Return the reports of a task that has ended."""
     try:
         reports = future.result()
     except Exception as error:  # a worker was lost, or cannot import pbdkit
@@ -223,9 +228,9 @@ def _reports(future: Any, chunk: list[Job], queue: Queue) -> Iterator[MemberRepo
 SHAPING = ("lattice", "body", "neighbours", "frame", "fracture", "diagnostics", "units")
 """The parts of an experiment on which the shape of its dataset depends, besides its times."""
 SHARE = 0.5
-"""Of the memory of this machine that the dataset of a sweep may take."""
+"""Fraction of the memory of this machine that the dataset of a sweep may take."""
 TEXT = 8
-"""Bytes of a text, about."""
+"""Approximate size of a text in bytes."""
 
 
 class SizeEstimate:
@@ -306,8 +311,11 @@ Show = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Summary:
-    """How a sweep went: its members, how those ended that did (status and message by key), how many
-    were run now, what was found damaged, and where the dataset is; None where it was stopped."""
+    """Outcome of a sweep.
+
+    It has the members, status and message of those that ended by key, the number of members that
+    were run, messages about damage, and the path of the dataset, None if the sweep was stopped.
+    """
 
     members: list[Member]
     ends: dict[str, tuple[str, str]]
@@ -373,7 +381,7 @@ class _StoppedError(Exception):
 def _heard(
     reports: Iterator[MemberReport | None], members: int, todo: int, show: Show
 ) -> Iterator[MemberReport | None]:
-    """The reports of all but interrupted members, with what whoever waits is told meanwhile."""
+    """Yield the reports of all but interrupted members, and show progress meanwhile."""
     run = failed = 0
     for report in reports:
         if report is not None and report.status == INTERRUPTED:
@@ -385,8 +393,18 @@ def _heard(
 
 
 def validated(asked: SweepPlan, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
-    """The grid, the members on it, and the versions of what they use. Raises ExperimentError and
-    PluginError."""
+    """Validate all members.
+
+    Returns
+    -------
+    grid, members, versions
+        Dimensions, members, and versions of pbdkit and plugins.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        With the parameters of an invalid member.
+    """
     experiment = asked.experiment()
     grid, outlook = asked.grid(experiment), SizeEstimate(asked.sweep.keep, asked.sweep.count)
     members: list[Member] = []
@@ -421,7 +439,7 @@ def _attributes(asked: SweepPlan, versions: dict[str, str]) -> dict[str, str]:
 GRACE_S = 1.0
 """Seconds that members have to end once the sweep is stopped."""
 MOST_STARTS = 10
-"""So many workers that end before they have begun, with nothing reported between, are no chance."""
+"""Number of workers in succession that may end before they start."""
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
@@ -430,8 +448,8 @@ the one that each member asks for."""
 
 
 class ProcessExecutor(Executor):
-    """So many workers, each a pool of one process, so that who is killed takes nobody along and
-    what it was doing is known."""
+    """Run members in worker processes, each a pool of one, so that a killed process affects no
+    other."""
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
@@ -460,13 +478,13 @@ class ProcessExecutor(Executor):
 
 
 def _any_done(workers: list[_Worker]) -> bool:
-    """Whether any chunk is done now, or soon."""
+    """Return whether a chunk is done, now or after a short wait."""
     futures = [future for worker in workers for future in worker.chunks]
     return bool(wait(futures, HEARTBEAT_S, FIRST_COMPLETED).done)
 
 
 class _Worker:
-    """One process at a time, and the chunks that it has, the one that it is at first."""
+    """One worker process and its chunks; the first is running."""
 
     def __init__(self) -> None:
         self.chunks: dict[Future[list[MemberReport]], list[Job]] = {}
@@ -474,7 +492,8 @@ class _Worker:
         self._processes: set[BaseProcess] = set()
 
     def take(self, queue: Queue) -> bool:
-        """Whether it could take the next chunk: not where it was killed and has still to say so."""
+        """Return whether the worker can take the next chunk; a killed worker cannot before its end
+        is reported."""
         chunk = queue.chunk()
         for _ in range(1 + (not self.chunks)):
             try:
@@ -488,7 +507,8 @@ class _Worker:
         return False
 
     def reports(self, queue: Queue) -> Iterator[MemberReport]:
-        """Of the chunks that are done. Where the process was killed the first is what it was at."""
+        """Return the reports of finished chunks; the first chunk was running if the process was
+        killed."""
         for future in [future for future in self.chunks if future.done()]:
             chunk = self.chunks.pop(future, None)
             if chunk is None:
@@ -502,7 +522,7 @@ class _Worker:
             yield from queue.reported(reports)
 
     def end(self) -> None:
-        """Ends the process, whatever it is at, begun or not."""
+        """End the process, whatever it is doing."""
         if self._pool is not None:
             for process in self._processes:
                 process.kill()
@@ -541,7 +561,8 @@ class _Worker:
 
 
 def _begin() -> None:
-    """In a worker: Ctrl-C is for the sweep, and with the sweep's process its workers end."""
+    """Prepare a worker: Ctrl-C is left to the sweep, and the worker ends with the process of the
+    sweep."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     assert parent is not None
@@ -555,8 +576,11 @@ def _end_after(parent: Any) -> None:
 
 @contextmanager
 def _spawning() -> Iterator[None]:
-    """What a process that is started in the block finds: one thread of linear algebra, Ctrl-C
-    blocked until it is ignored, and no script of the caller, which would run once more."""
+    """Set up the environment of processes that are started in the block.
+
+    They use one thread of linear algebra, Ctrl-C is blocked until it is ignored, and the script of
+    the caller is not run again.
+    """
     blocks: Any = getattr(signal, "pthread_sigmask", None)
     mask = blocks(signal.SIG_BLOCK, {signal.SIGINT}) if blocks else None
     main, before = sys.modules["__main__"], {name: os.environ.get(name) for name in ONE_THREAD}
@@ -617,7 +641,7 @@ def called(
 def crew_of(
     workers: int | None, client: Any, components: tuple[type[Component], ...] = ()
 ) -> Executor:
-    """Who runs the members. Raises ExperimentError where that cannot be."""
+    """Return the executor of a sweep; raise ExperimentError if it is not available."""
     if workers is not None and (type(workers) is not int or workers < 1):
         raise ExperimentError(f"workers: should be a number from 1, got {workers!r}")
     if client is not None and workers is not None:
