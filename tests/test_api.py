@@ -1,8 +1,11 @@
 """The first calls of Python users, and what is said of wrong ones."""
 
 import inspect
+import pickle
+import re
 import subprocess
 import sys
+import warnings
 
 import pytest
 
@@ -192,3 +195,42 @@ def test_a_dataset_is_saved_as_a_sealed_result(ds, call, tmp_path, monkeypatch):
     with pytest.raises(pbdkit.StorageError):
         ds.pbd.save(tmp_path / "nowhere" / "a.nc")
     assert [p.name for p in tmp_path.glob("*.nc")] == ["some.nc"]
+
+
+def test_warnings_are_silenced_one_by_one(tensile):
+    """Of a body whose waves grow and a region that nothing names, the class of each."""
+    parts = tensile | {"solver": {"type": "stepping", "relaxation": 2.5}, "steps": 2}
+    parts["regions"] = {"nowhere": {"type": "disc", "radius": 1.0, "centre": [4.5, 4.5]}}
+    with pytest.warns(pbdkit.PbdkitWarning) as told:
+        pbdkit.run(parts, progress=False)
+    kinds = {w.category.__name__: str(w.message) for w in told}
+    assert kinds["StabilityWarning"].startswith("solver.relaxation: 2.5 can diverge")
+    assert kinds["SceneWarning"].startswith("regions.nowhere: nothing names it")
+    with warnings.catch_warnings(record=True) as left:
+        warnings.simplefilter("always")
+        warnings.simplefilter("ignore", pbdkit.errors.StabilityWarning)
+        pbdkit.run(parts, progress=False)
+    assert {w.category for w in left} == {pbdkit.errors.SceneWarning}
+
+
+def test_every_warning_has_a_class_of_its_subject():
+    for name in pbdkit.errors.__all__:
+        if name.endswith("Warning"):
+            assert issubclass(getattr(pbdkit.errors, name), pbdkit.PbdkitWarning)
+    text = pbdkit.errors.WarningText("doubtful", pbdkit.errors.AccuracyWarning)
+    again = pickle.loads(pickle.dumps(text))
+    assert (again, again.category) == ("doubtful", pbdkit.errors.AccuracyWarning)
+
+
+def test_sweeps_take_keywords_alone(tensile):
+    with pytest.raises(TypeError, match="takes 1 positional argument but 2 were given"):
+        pbdkit.sweep(tensile, {"steps": [1, 2]})
+
+
+def test_analyses_and_identities_read_well(tensile):
+    known = str(pbdkit.analyse(tensile))
+    assert known.startswith("analysis of tensile\n  stability ")
+    assert re.search(r"^  settles +to 1e-3 in \d+, .* steps$", known, re.M)
+    identity = str(pbdkit.identify("material/bar"))
+    assert identity.startswith("material/bar: elastic, ")
+    assert re.search(r"^  Poisson", identity, re.M | re.I)

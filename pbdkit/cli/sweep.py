@@ -166,8 +166,7 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         result = pbdkit.fit_strength(file) if repeats else pbdkit.fit(file)
     write(path, json.dumps(result.as_dict(), indent=2) + "\n", replace=force)
     if not quiet:
-        for line in result.lines():
-            click.echo(line)
+        click.echo(str(result))
         click.echo(f"{path} written")
     if picture:
         from pbdkit.fitting.result import Fitted

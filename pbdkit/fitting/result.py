@@ -275,8 +275,11 @@ class Fitted:
             result[path] = np.asarray(part[rows] ** 2)
         return result
 
-    def lines(self) -> Iterator[str]:
-        """Yield a summary of the result, line by line."""
+    def __str__(self) -> str:
+        """A summary: a line for each value with its error, then correlations and residuals."""
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
         for path, estimate in self.values.items():
             yield f"{path}: {estimate}"
         if self.youngs_modulus:

@@ -983,8 +983,11 @@ class FittedStrength:
             "excess": None if checked is None else checked.excess,
         }
 
-    def lines(self) -> Iterator[str]:
-        """Yield a summary of the result, line by line."""
+    def __str__(self) -> str:
+        """A summary: a line for each value with its error, then correlations and residuals."""
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
         for path, estimate in self.values.items():
             yield f"{path}: {estimate}"
         if self.variation and all(value.identifiable for value in self.values.values()):

@@ -72,6 +72,13 @@ class Identity:
     long: LongWaves | None = field(repr=False)
     notes: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        """A summary: what the rule is, its constants, and notes on them."""
+        title = f"{self.name}: {self.rule}, {self.lattice} lattice, {self.neighbours}"
+        rows = [*rows_of(self), *(("note", note) for note in self.notes)]
+        width = max(len(name) for name, _ in rows)
+        return "\n".join([title, *(f"  {name:<{width}}  {text}" for name, text in rows)])
+
     def _repr_html_(self) -> str:
         """Return the identity with its constants for notebooks."""
         return str(import_module("pbdkit.plotting.notebook").identity_html(self))

@@ -10,7 +10,7 @@ from pbdkit.identification.report import Identity, rows_of
 from pbdkit.model.experiment import Experiment
 from pbdkit.plotting.scene import Picture, picture_of
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.stability.analysis import Analysis
+from pbdkit.stability.analysis import Analysis, verdict_of
 from pbdkit.stability.forecast import Forecast, forecast
 from pbdkit.stability.relaxation import tuned
 
@@ -37,18 +37,7 @@ def experiment_html(experiment: Experiment) -> str:
 
 def analysis_html(analysis: Analysis) -> str:
     """The verdict on stability, and the eigenvalues in a few numbers."""
-    rows = _verdict(analysis)
-    spectrum = analysis.spectrum
-    if spectrum is not None:
-        if (smallest := analysis.smallest_eigenvalue) is not None:
-            rows.append(("smallest eigenvalue", f"{smallest:.6g}"))
-        values = spectrum.eigenvalues
-        turning = int((abs(values.imag) > 1e-12).sum())
-        which = "estimated" if analysis.estimated else "known"
-        kinds = f", {turning} of them complex" if turning else ", all real"
-        rows.append((f"eigenvalues {which}", f"{len(values)}{kinds}"))
-    if analysis.lag is not None:
-        rows.append(("lag", f"{analysis.lag:.4g} lattice units behind equilibrium"))
+    rows = analysis.rows()
     name = f"analysis of {analysis.scene.experiment.name}"
     return _page(name, "", rows, analysis.warnings())
 
@@ -74,7 +63,7 @@ def _known(scene: Scene) -> tuple[list[tuple[str, str]], list[str]]:
     rows += _sizes(found)
     if not experiment.solver.makes_steps:
         return [*rows, ("solver", STRAIGHT)], found.warnings
-    return [*rows, *_verdict(found)], found.warnings
+    return [*rows, *verdict_of(found)], found.warnings
 
 
 def _sizes(found: Forecast) -> list[tuple[str, str]]:
@@ -84,22 +73,6 @@ def _sizes(found: Forecast) -> list[tuple[str, str]]:
         rows.append(("size", " × ".join(f"{side:.6g}" for side in found.size_mm) + " mm"))
     memory, output = f"{found.memory_mib:.3g} MiB", f"{found.output_mib:.3g} MiB"
     return [*rows, ("memory", f"about {memory}; the result about {output}")]
-
-
-def _verdict(found: Forecast | Analysis) -> list[tuple[str, str]]:
-    """What is known of stability."""
-    if found.spectral_radius is None:
-        return [("stability", "not known of this scene")]
-    near = "" if found.exact else ", linearised at the start"
-    near += ", estimated" if found.estimated else ""
-    verdict = "stable" if found.stable else "not stable"
-    rows = [("stability", f"{verdict}: spectral radius {found.spectral_radius:.9g}{near}")]
-    steps = ", ".join(f"to {t} in {n}" for t, n in found.steps_to.items() if n is not None)
-    if steps:
-        rows.append(("settles", f"{steps} steps"))
-    if (bound := found.largest_stable_relaxation) is not None:
-        rows.append(("relaxation", f"stable below {bound:.6g}"))
-    return rows
 
 
 def _figure(picture: Picture | None) -> str:

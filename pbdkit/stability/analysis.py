@@ -191,6 +191,28 @@ class Analysis:
         """Return the name of the experiment alone: everything else takes time or space."""
         return f"<pbdkit.Analysis of {self.scene.experiment.name}>"
 
+    def __str__(self) -> str:
+        """A summary: stability, steps to a tolerance, eigenvalues, lag and warnings."""
+        rows = [*self.rows(), *(("warning", text) for text in self.warnings())]
+        width = max(len(name) for name, _ in rows)
+        title = f"analysis of {self.scene.experiment.name}"
+        return "\n".join([title, *(f"  {name:<{width}}  {text}" for name, text in rows)])
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the summary as names and texts."""
+        rows = verdict_of(self)
+        if (spectrum := self.spectrum) is not None:
+            if (smallest := self.smallest_eigenvalue) is not None:
+                rows.append(("smallest eigenvalue", f"{smallest:.6g}"))
+            values = spectrum.eigenvalues
+            turning = int((abs(values.imag) > 1e-12).sum())
+            which = "estimated" if self.estimated else "known"
+            kinds = f", {turning} of them complex" if turning else ", all real"
+            rows.append((f"eigenvalues {which}", f"{len(values)}{kinds}"))
+        if self.lag is not None:
+            rows.append(("lag", f"{self.lag:.4g} lattice units behind equilibrium"))
+        return rows
+
     def _repr_html_(self) -> str:
         """Return the verdict and the eigenvalues for notebooks."""
         return str(import_module("pbdkit.plotting.notebook").analysis_html(self))
@@ -540,3 +562,19 @@ class StabilityEstimate:
             max(waves.smallest, -largest) if waves.smallest >= -1.0 - NEUTRAL else waves.smallest
         )
         return spectrum_of(np.array([smallest, largest], complex), system.how == "energy")
+
+
+def verdict_of(found: Any) -> list[tuple[str, str]]:
+    """Return what an Analysis or a Forecast says of stability, as names and texts."""
+    if found.spectral_radius is None:
+        return [("stability", "not known of this scene")]
+    near = "" if found.exact else ", linearised at the start"
+    near += ", estimated" if found.estimated else ""
+    verdict = "stable" if found.stable else "not stable"
+    rows = [("stability", f"{verdict}: spectral radius {found.spectral_radius:.9g}{near}")]
+    steps = ", ".join(f"to {t} in {n}" for t, n in found.steps_to.items() if n is not None)
+    if steps:
+        rows.append(("settles", f"{steps} steps"))
+    if (bound := found.largest_stable_relaxation) is not None:
+        rows.append(("relaxation", f"stable below {bound:.6g}"))
+    return rows

@@ -206,7 +206,7 @@ def test_what_the_data_cannot_tell_is_said(name, tmp_path):
     assert {path for path, estimate in found.values.items() if not estimate.identifiable} == untold
     for path in untold:
         assert found.as_dict()["values"][path]["value"] is None
-        assert f"{path}: not identifiable from the data" in list(found.lines())
+        assert f"{path}: not identifiable from the data" in str(found).splitlines()
 
 
 def in_series(**more):
@@ -254,7 +254,7 @@ def test_a_ratio_is_found_where_both_of_its_parts_are_not_told(noise, more, tmp_
     alone, together = one.values["rule.stiffness.half"], ratio.estimate
     assert together.value == pytest.approx(1.0 / alone.value, rel=0.02 * alone.error)
     assert together.error / together.value == pytest.approx(alone.error / alone.value, rel=0.02)
-    assert f"{product.name}: not identifiable from the data" in both.lines()
+    assert f"{product.name}: not identifiable from the data" in str(both).splitlines()
     assert both.as_dict()["combinations"][ratio.name]["exponents"] == {
         "rule.stiffness.otherwise": 1.0,
         "rule.stiffness.half": -1.0,
@@ -450,3 +450,25 @@ def test_the_picture_has_a_row_an_axis_and_no_text_over_another(tmp_path):
     assert not any(a.overlaps(b) for n, a in enumerate(boxes) for b in boxes[:n])
     left = found.field().residual
     assert np.std(left) == pytest.approx(NOISE, rel=0.1)
+
+
+def test_a_dataset_is_fitted_as_the_file_with_its_columns(tmp_path):
+    import xarray
+
+    made = plate()
+    measured(made, tmp_path / "field.csv", noise=NOISE, count=100)
+    columns = np.genfromtxt(tmp_path / "field.csv", delimiter=",", names=True)
+    table = xarray.Dataset({name: ("point", columns[name]) for name in columns.dtype.names})
+    fit = {"experiment": made, "unknown": {"rule.poisson_ratio": [0.0, 0.49]}, "modes": 0}
+    file = {"file": str(tmp_path / "field.csv"), "noise": NOISE}
+    of_file = pbdkit.fit(fit | {"measured": file})
+    of_table = pbdkit.fit(fit | {"measured": {"noise": NOISE}}, measured=table)
+    assert of_table.as_dict() == of_file.as_dict()
+    assert str(of_table).startswith("rule.poisson_ratio: 0.")
+    for wrong, said in (
+        (table.rename(ux="u_x"), "measured: the dataset has no variable 'ux'"),
+        (table.where(table.ux != table.ux[3]), "need finite numbers"),
+        (table.assign(uy=("other", [0.0])), "need one size: x 100, y 100, ux 100, uy 1"),
+    ):
+        with pytest.raises(pbdkit.ExperimentError, match=said):
+            pbdkit.fit(fit, measured=wrong)
