@@ -27,7 +27,7 @@ SLOWEST = 0.9
 """The slowest fall of the jumps that is extrapolated."""
 
 
-def best_of(krylov: Krylov, near: Sequence[Floats], b: Floats) -> Floats | float:
+def best_of(krylov: LatticeKrylov, near: Sequence[Floats], b: Floats) -> Floats | float:
     """The x among combinations of some fields that leaves nothing of K x = b along any of them, and
     least energy where K is symmetric (Galerkin); b is overwritten with what it leaves. 0 of none.
     """
@@ -86,7 +86,7 @@ class Descent(Found):
         return float(np.linalg.eigvalsh(T)[0])
 
 
-class Krylov(ABC):
+class LatticeKrylov(ABC):
     """Solves K x = b by the grids of K, or that of a coarser one."""
 
     name: str
@@ -118,7 +118,7 @@ class Krylov(ABC):
         """Iterates until `done`, or as far as it gets. b is overwritten with what is left of it."""
 
 
-class ConjugateGradients(Krylov):
+class ConjugateGradients(LatticeKrylov):
     """For a symmetric positive K."""
 
     name = "conjugate-gradients"
@@ -168,7 +168,7 @@ class Stabilised(Found):
         return max(self.jumps[-2:]) if len(self.jumps) > 1 else math.inf
 
 
-class BiconjugateGradients(Krylov):
+class BiconjugateGradients(LatticeKrylov):
     """For a K that is not symmetric (van der Vorst's BiCGStab)."""
 
     name = "bicgstab"

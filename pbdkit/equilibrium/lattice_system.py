@@ -24,7 +24,7 @@ from pbdkit.equilibrium.krylov import (
     ConjugateGradients,
     Descent,
     Found,
-    Krylov,
+    LatticeKrylov,
     best_of,
 )
 from pbdkit.equilibrium.multigrid import (
@@ -128,7 +128,7 @@ class SlowMode:
         return SlowMode(found, float((found * found).sum() / (found * force).sum()))
 
 
-def softest(grids: Multigrid, krylov: type[Krylov]) -> tuple[Floats, float]:
+def softest(grids: Multigrid, krylov: type[LatticeKrylov]) -> tuple[Floats, float]:
     """Of K⁻¹ about the largest eigenvalue and its field on the finest grid, up to some factor: by
     inverse iteration on ever finer grids, but for the two finest."""
     mode, softness = grids.softest_field(), 1.0
@@ -171,7 +171,7 @@ class LatticeSystem(System):
         grid = StencilGrid(matrix.code, matrix.kind, matrix.stencils, matrix.held)
         self._grids = grids_of(grid, rows)
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
-        self._solver: Krylov = kind(self._grids, rows=rows)
+        self._solver: LatticeKrylov = kind(self._grids, rows=rows)
         self.may_be_stable = not self._symmetric or self._grids.is_definite()
         """Not where coarse ways already lead downhill."""
         self._smallest = 1.0
