@@ -19,7 +19,7 @@ from PIL import Image
 from runs import Floats, Sheet
 
 from pbdkit.plotting.colours import KINDS
-from pbdkit.plotting.data import Recording, triangles_of, whole
+from pbdkit.plotting.data import Trajectory, triangles_of, whole
 from pbdkit.plotting.layers import INK, LINE
 
 FOLDER = Path(__file__).parent.parent / "pictures" / "reproduction"
@@ -43,7 +43,7 @@ class Shot:
 
 def shots_of(sheet: Sheet, steps: Sequence[int], color: str) -> list[Shot]:
     """Recorded steps, with that variable."""
-    recording = Recording(sheet.ds, color)
+    recording = Trajectory(sheet.ds, color)
     body = recording.body
     rows = np.flatnonzero(body.inside)
     triangles = rows[triangles_of(body.reference[rows])]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
-from pbdkit.plotting.data import Quantity
+from pbdkit.plotting.data import PlottedQuantity
 from pbdkit.plotting.style import Look
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Palette:
 OF_KINDS = Palette(KINDS, True)
 
 
-def palette_of(quantity: Quantity) -> Palette:
+def palette_of(quantity: PlottedQuantity) -> Palette:
     """That of a quantity that has words."""
     if quantity.variable == "kind":
         return OF_KINDS
@@ -84,7 +84,7 @@ class Scale:
     exponent: int
 
 
-def scale_of(quantity: Quantity, values: tuple[float, float], look: Look, filled: bool) -> Scale:
+def scale_of(quantity: PlottedQuantity, values: tuple[float, float], look: Look, filled: bool) -> Scale:
     """The scale of a quantity whose values lie between these two.
 
     Where they have both signs, and zero is neutral, it reaches as far on either side, unless `look`

@@ -18,10 +18,10 @@ from pbdkit.errors import ExperimentError, refuse_no_matplotlib
 from pbdkit.io.layout import in_this_layout
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale, palette_of, scale_of
 from pbdkit.plotting.data import (
-    Body,
+    ReferenceBody,
     Extent,
-    Quantity,
-    Recording,
+    PlottedQuantity,
+    Trajectory,
     Snapshot,
     extent_of,
     joined,
@@ -30,12 +30,12 @@ from pbdkit.plotting.data import (
 )
 from pbdkit.plotting.layers import (
     BondField,
-    Bonds,
+    BondLines,
     BondValues,
     Classes,
     Dots,
-    Field,
-    Grid,
+    PixelField,
+    PixelGrid,
     Layer,
     draw_numbers,
     draw_outline,
@@ -123,7 +123,7 @@ def draw(
     """Draw as `plot` does, with the options in `look`."""
     refuse_no_matplotlib()
 
-    recording = Recording(dataset, color or "kind")
+    recording = Trajectory(dataset, color or "kind")
     several = isinstance(time, Iterable)
     rows = [recording.row(one) for one in _listed(time)]
     if not rows:
@@ -235,7 +235,7 @@ def _side_by_side(
 ) -> list[Axes]:
     refuse_no_matplotlib()
 
-    recordings = [Recording(dataset, color or "kind") for dataset in datasets]
+    recordings = [Trajectory(dataset, color or "kind") for dataset in datasets]
     shown = [next(r.snapshots([r.row(time)])) for r in recordings]
     extent = joined([extent_of(r, [now], look) for r, now in zip(recordings, shown, strict=True)])
     titles = [
@@ -256,7 +256,7 @@ def difference_of(
     quantity, _ = (quantity_of(dataset, color) for dataset in reversed(both))
     if quantity.owner != "particle":
         raise ExperimentError(f"a difference is one of particles, and '{color}' is of bonds")
-    now = [d.isel(time=Recording(d).row(time)) for d in both]
+    now = [d.isel(time=Trajectory(d).row(time)) for d in both]
     numbers = np.intersect1d(now[0]["number"].values, now[1]["number"].values)
     if not len(numbers):
         raise ExperimentError("the two have no particle in common: no number is in both")
@@ -310,7 +310,7 @@ class Manner:
         return min(max(0.05 * self.apart, 0.25), 0.8)
 
 
-def manner_of(body: Body, quantity: Quantity, look: Look, apart: float) -> Manner:
+def manner_of(body: ReferenceBody, quantity: PlottedQuantity, look: Look, apart: float) -> Manner:
     """What is asked for, and else what is legible. Raises ExperimentError where what is asked for
     is not there or would be too much."""
     crowded = len(body.reference) > DETAILED or apart < CROWDED_PT
@@ -324,7 +324,7 @@ def manner_of(body: Body, quantity: Quantity, look: Look, apart: float) -> Manne
     return Manner(filled, crowded, _is_lined(body, of_bonds, filled, look, apart), dots, apart)
 
 
-def _is_filled(body: Body, quantity: Quantity, look: Look, apart: float) -> bool:
+def _is_filled(body: ReferenceBody, quantity: PlottedQuantity, look: Look, apart: float) -> bool:
     many = len(body.reference) > DETAILED
     can, asked = quantity.owner == "particle" and not quantity.words, look.contours or look.filled
     if asked and not can:
@@ -344,7 +344,7 @@ def _is_filled(body: Body, quantity: Quantity, look: Look, apart: float) -> bool
     return bool(wanted)
 
 
-def _is_lined(body: Body, of_bonds: bool, filled: bool, look: Look, apart: float) -> bool:
+def _is_lined(body: ReferenceBody, of_bonds: bool, filled: bool, look: Look, apart: float) -> bool:
     asked, many = look.bonds or look.broken, len(body.ends) > MANY_BONDS
     if asked and not len(body.ends):
         raise ExperimentError(
@@ -386,7 +386,7 @@ class Sheet:
 
     def __init__(
         self,
-        recordings: Sequence[Recording],
+        recordings: Sequence[Trajectory],
         titles: list[str],
         heading: str,
         extent: Extent,
@@ -445,17 +445,17 @@ class Sheet:
         values = self._extent.of_body if filled else self._extent.of_all
         return scale_of(self._quantity, values, self._look, filled)
 
-    def _layers(self, ax: Axes, recording: Recording) -> Iterator[Layer]:
+    def _layers(self, ax: Axes, recording: Trajectory) -> Iterator[Layer]:
         """What is drawn, from below."""
         body, scale, manner, grid = recording.body, self._scale, self._manner, self._grid(ax)
         if manner.filled and scale:
-            yield Field(ax, body, grid, scale, manner.alone)
+            yield PixelField(ax, body, grid, scale, manner.alone)
         elif self._palette and manner.crowded:
             yield Classes(ax, body, grid, self._palette)
         if manner.lined:
-            yield Bonds(ax, body, manner.line)
+            yield BondLines(ax, body, manner.line)
         if self._look.broken:
-            yield Bonds(ax, body, manner.line, broken=True)
+            yield BondLines(ax, body, manner.line, broken=True)
         if self._quantity.owner == "bond" and scale:
             many = len(body.ends) > MANY_BONDS
             width = 2.0 * manner.line
@@ -466,12 +466,12 @@ class Sheet:
             colours = {"values": scale, "classes": self._palette}.get(manner.dots)
             yield Dots(ax, manner.dot, colours or OF_KINDS, body.beyond & manner.filled)
 
-    def _grid(self, ax: Axes) -> Grid:
+    def _grid(self, ax: Axes) -> PixelGrid:
         """The pixels of a field, finer than those of the picture where cells are few."""
         extent = ax.get_window_extent()
         finer = 1 if len(self._body.reference) > DETAILED else self._finer
         across, up = (max(2, round(finer * side)) for side in (extent.width, extent.height))
-        return Grid(self._extent.box, across, up)
+        return PixelGrid(self._extent.box, across, up)
 
     def _key(self) -> None:
         """The bar of the scale, and a legend of the kinds where they are seen."""

@@ -73,7 +73,7 @@ def crack(dataset: xarray.Dataset, kind: Kind = "map", *, ax: Axes | None = None
 
 
 @dataclass(frozen=True)
-class Broken:
+class CrackBonds:
     """Broken bonds in the order of breaking: `step`, the `ends` (bond, end, axis) and the `middle`
     at rest, without those to the frame."""
 
@@ -82,7 +82,7 @@ class Broken:
     middle: Array
 
 
-def _broken(dataset: xarray.Dataset) -> Broken:
+def _broken(dataset: xarray.Dataset) -> CrackBonds:
     if "broken_step" not in dataset.variables:
         raise ExperimentError(
             "no bond could break: give the experiment `fracture` or `cuts`, and run again"
@@ -102,10 +102,10 @@ def _broken(dataset: xarray.Dataset) -> Broken:
     of_body = (dataset["role"].values[particles] == OF_BODY).all(axis=1)
     of_body = of_body if of_body.any() else np.ones_like(of_body)
     ends = dataset["reference"].values[particles[of_body]]
-    return Broken(steps[rows[of_body]], ends, ends.mean(axis=1))
+    return CrackBonds(steps[rows[of_body]], ends, ends.mean(axis=1))
 
 
-def _lengths(broken: Broken) -> Array:
+def _lengths(broken: CrackBonds) -> Array:
     """(bond,): how long the longest crack is once each bond is broken. Bonds that lie nearer to
     each other than APART lengths are of one crack."""
     from scipy.sparse import coo_array
@@ -135,7 +135,7 @@ def _extents(middle: Array) -> Array:
     return found
 
 
-def _map(dataset: xarray.Dataset, broken: Broken, title: str, ax: Axes | None) -> Axes:
+def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | None) -> Axes:
     from matplotlib.collections import LineCollection
 
     body = dataset["reference"].values[dataset["role"].values == OF_BODY]
@@ -185,7 +185,7 @@ def _axes_around(body: Array) -> Axes:
     return new_axes(width + BESIDE_IN, height + BESIDE_IN + below)
 
 
-def _coloured(ax: Axes, broken: Broken, *, below: bool) -> None:
+def _coloured(ax: Axes, broken: CrackBonds, *, below: bool) -> None:
     """Bonds that broke on the way, by their steps, with the scale, beside the body or below."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.collections import LineCollection

@@ -257,7 +257,7 @@ PLACES = ("position", "reference", "number", "particle", "site", *INDICES)
 
 
 @dataclass(frozen=True)
-class Quantity:
+class PlottedQuantity:
     """Values of each `owner`, particle or bond, out of the variable `variable`: its component
     number `component`, or the length where it is a vector and that is None, times `factor` in its
     `units`. `words` has the meanings of whole numbers that stand for words.
@@ -312,7 +312,7 @@ def component_of(dataset: xarray.Dataset, name: str) -> tuple[str, int | None]:
     return name, None
 
 
-def quantity_of(dataset: xarray.Dataset, name: str) -> Quantity:
+def quantity_of(dataset: xarray.Dataset, name: str) -> PlottedQuantity:
     """The quantity of that name: a variable, its length where it is a vector, or `u_x`, the
     component along x of a vector `u`. Raises ExperimentError for what cannot be drawn."""
     if not isinstance(name, str):
@@ -332,7 +332,7 @@ def quantity_of(dataset: xarray.Dataset, name: str) -> Quantity:
         meaning = (
             f"length of {meaning}" if component is None else f"{meaning}, along {axes[component]}"
         )
-    return Quantity(
+    return PlottedQuantity(
         variable,
         "bond" if "bond" in chosen.dims else "particle",
         meaning,
@@ -396,7 +396,7 @@ MEASURED = 50_000
 
 
 @dataclass(frozen=True)
-class Body:
+class ReferenceBody:
     """What does not change: `reference` (particle, axis), `site` (particle, index), `number`
     (particle,), which are of the body and not of the frame (particle,), the rows of both ends of
     each bond (bond, 2), and when each broke (bond,), -1 where it did not. Of the body `beyond` are
@@ -470,7 +470,7 @@ class Snapshot:
     broken: Array
 
 
-class Recording:
+class Trajectory:
     """The recorded steps of a dataset, with the quantity of that name, if any; in mm and so on
     where the dataset says its scale.
 
@@ -480,7 +480,7 @@ class Recording:
 
     def __init__(self, dataset: xarray.Dataset, color: str | None = None) -> None:
         self._dataset = of_one_run(dataset)
-        self.quantity: Quantity | None = None
+        self.quantity: PlottedQuantity | None = None
         if color is not None:
             has_kinds = "kind" in dataset.variables
             drawable = self._dataset if has_kinds else self._dataset.drop_vars("kind")
@@ -501,7 +501,7 @@ class Recording:
         return np.flatnonzero(np.isfinite(reference).all(axis=1))
 
     @cached_property
-    def body(self) -> Body:
+    def body(self) -> ReferenceBody:
         """What does not change."""
         dataset, rows = self._dataset, self._rows
         numbers = dataset["number"].values[rows]
@@ -520,7 +520,7 @@ class Recording:
         if "inside" in dataset.variables:
             beyond = inside & ~dataset["inside"].values[rows].astype(bool)
         shape = shape_of(dataset) if beyond.any() else None
-        return Body(
+        return ReferenceBody(
             reference, site, numbers, inside, ends, broken, beyond, shape, lattice_unit(dataset)
         )
 
@@ -642,7 +642,7 @@ class Extent:
     classes: frozenset[int]
 
 
-def extent_of(recording: Recording, shown: Iterable[Snapshot], look: Look) -> Extent:
+def extent_of(recording: Trajectory, shown: Iterable[Snapshot], look: Look) -> Extent:
     """What steps of a recording cover, looked at one after another. Raises
     ExperimentError where no particle has a place in them."""
     body, quantity = recording.body, recording.quantity

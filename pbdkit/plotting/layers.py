@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection, PathCollection
 from numpy.typing import NDArray
 
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale
-from pbdkit.plotting.data import Body, CutCells, Snapshot
+from pbdkit.plotting.data import ReferenceBody, CutCells, Snapshot
 from pbdkit.plotting.style import figure_of
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ MOST = 60_000_000
 
 
 @dataclass(frozen=True)
-class Grid:
+class PixelGrid:
     """The pixels of a picture: `box` (left, right, bottom, top) and how many `across` and `up`."""
 
     box: tuple[float, float, float, float]
@@ -43,7 +43,7 @@ class Grid:
         scale = np.array([self.across / (right - left), self.up / (top - bottom)], np.float32)
         return np.asarray((position - np.array([left, bottom])).astype(np.float32) * scale)
 
-    def mean(self, corners: Array, values: Array, cut: Cut | None = None) -> Array:
+    def mean(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
         """The values of cells, (up, across), between those at their corners, (cell, 4), in pixels
         (cell, 4, 2); NaN where no cell is, or what is `cut` off, and the mean where several are. No
         pixel within a cell is missed: samples lie no further apart than pixels are wide."""
@@ -57,7 +57,7 @@ class Grid:
         with np.errstate(invalid="ignore"):
             return (sums / counts).reshape(self.up, self.across)
 
-    def latest(self, corners: Array, values: Array, cut: Cut | None = None) -> Array:
+    def latest(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
         """The same of values that cannot be averaged: that of the nearest corner; of several in a
         pixel the largest."""
         found = np.full(self.across * self.up, -np.inf)
@@ -78,7 +78,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class Cut:
+class OutlineCut:
     """What an outline cuts off some cells: `row` (cell,) is the row of each in the cells that are
     cut, -1 where it is not."""
 
@@ -86,7 +86,7 @@ class Cut:
     row: Array
 
 
-def _kept(cut: Cut | None, cells: Array, middles: Array) -> Array | None:
+def _kept(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
     """Which samples of some cells are not cut off, (cell and sample,); None where all are."""
     rows = cut.row[cells] if cut else np.empty(0, int)
     some = np.flatnonzero(rows >= 0)
@@ -135,12 +135,12 @@ class Layer(ABC):
         """Shows that step in place of the one before."""
 
 
-class Field(Layer):
+class PixelField(Layer):
     """A quantity of particles over whole cells up to the outline, as pixels; particles in none are
     dots of a size in points, and a pixel where that is next to nothing. A corner beyond the outline
     that has no value takes the mean of the cells that meet there."""
 
-    def __init__(self, ax: Axes, body: Body, grid: Grid, scale: Scale, size: float) -> None:
+    def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale, size: float) -> None:
         self._body, self._grid = body, grid
         self._image = _image(ax, grid, scale)
         self._alone = ax.scatter([], [], size**2, zorder=2, edgecolors=INK, linewidths=0.08 * size)
@@ -166,7 +166,7 @@ class Field(Layer):
 class BondField(Layer):
     """A quantity of bonds too many for lines, as pixels."""
 
-    def __init__(self, ax: Axes, body: Body, grid: Grid, scale: Scale) -> None:
+    def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale) -> None:
         self._body, self._grid, self._image = body, grid, _image(ax, grid, scale)
         self.artists = [self._image]
 
@@ -182,7 +182,7 @@ class BondField(Layer):
 class Classes(Layer):
     """What has a name, of particles too many for dots, as pixels."""
 
-    def __init__(self, ax: Axes, body: Body, grid: Grid, palette: Palette) -> None:
+    def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, palette: Palette) -> None:
         from matplotlib.colors import ListedColormap, Normalize
 
         self._body, self._grid, self._palette = body, grid, palette
@@ -233,10 +233,10 @@ class Dots(Layer):
             self._dots.set_facecolor([colours[int(rank)] for rank in ranks[order]])
 
 
-class Bonds(Layer):
+class BondLines(Layer):
     """Lines between neighbours: those that are whole, or, `broken`, those that are not."""
 
-    def __init__(self, ax: Axes, body: Body, width: float, *, broken: bool = False) -> None:
+    def __init__(self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False) -> None:
         self._body, self._broken = body, broken
         style: dict[str, Any] = {"colors": LINE, "zorder": 1}
         if broken:
@@ -254,7 +254,7 @@ class Bonds(Layer):
 class BondValues(Layer):
     """A quantity of bonds, as the colours of lines; those without a value are not drawn."""
 
-    def __init__(self, ax: Axes, body: Body, width: float, scale: Scale) -> None:
+    def __init__(self, ax: Axes, body: ReferenceBody, width: float, scale: Scale) -> None:
         self._body = body
         self._lines = LineCollection(
             [], linewidths=width, cmap=scale.colours, norm=scale.norm, zorder=2, capstyle="round"
@@ -296,7 +296,7 @@ def draw_numbers(ax: Axes, numbers: Array, now: Snapshot, size: float) -> None:
         ax.annotate(text, place, beside, textcoords="offset points", fontsize=font, zorder=4)
 
 
-def _image(ax: Axes, grid: Grid, scale: Scale) -> AxesImage:
+def _image(ax: Axes, grid: PixelGrid, scale: Scale) -> AxesImage:
     """Of the pixels of a grid; nothing where there is no value."""
     return ax.imshow(
         np.full((2, 2), np.nan), cmap=scale.colours.with_extremes(bad=(0, 0, 0, 0)),
@@ -318,11 +318,11 @@ def _filled(values: Array, cells: Array, beyond: Array) -> Array:
     return np.where(taken, total / np.maximum(count, 1), values).astype(np.float32)
 
 
-def _cut(body: Body, chosen: Array, alone: int) -> Cut | None:
+def _cut(body: ReferenceBody, chosen: Array, alone: int) -> OutlineCut | None:
     """What the outline cuts off the chosen cells, with some after them that are not cut."""
     if body.cut is None:
         return None
-    return Cut(body.cut, np.append(body.cut.row[chosen], np.full(alone, -1)))
+    return OutlineCut(body.cut, np.append(body.cut.row[chosen], np.full(alone, -1)))
 
 
 def _alone(cells: Array, chosen: Array) -> Array:

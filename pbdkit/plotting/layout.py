@@ -96,7 +96,7 @@ class Panels:
 
 
 @dataclass(frozen=True)
-class Grid:
+class PanelGrid:
     """Rows of panels: the size of each, and the distance from each to the next, in inches."""
 
     columns: int
@@ -164,7 +164,7 @@ class Page:
         self._place_panels()
         self._place_keys(bar, legend)
 
-    def _best_grid(self, larger: float) -> Grid:
+    def _best_grid(self, larger: float) -> PanelGrid:
         """Return the grid with the largest panels and few places left empty."""
         count, shape = len(self.axes), self._panels.shape
         tall = SHORT_PAGE_HEIGHT_IN if 1 < count <= SHORT_PAGE_PANELS else PAGE_HEIGHT_IN
@@ -181,7 +181,7 @@ class Page:
                 math.sqrt(area * shape),
             )
             pitch = max(width + gap, title + GAP_IN), width / shape + GAP_IN + TITLE_IN
-            grids.append(Grid(columns, rows, width, width / shape, pitch))
+            grids.append(PanelGrid(columns, rows, width, width / shape, pitch))
         fitting = [grid for grid in grids if grid.size[0] <= wide + 1e-6] or grids[:1]
         best = max(fitting, key=lambda g: g.width * (count / (g.columns * g.rows)) ** 0.7)
         if min(best.width, best.height) < SMALLEST_PANEL_IN:

@@ -22,7 +22,7 @@ from pbdkit.errors import (
 )
 from pbdkit.io.atomic_file import NewFile, written
 from pbdkit.io.layout import as_step
-from pbdkit.plotting.data import Extent, Recording, Snapshot, extent_of
+from pbdkit.plotting.data import Extent, Trajectory, Snapshot, extent_of
 from pbdkit.plotting.style import Look
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def animate(
     look = Look(
         filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
     )  # fmt: skip
-    recording = Recording(dataset, color or "kind")
+    recording = Trajectory(dataset, color or "kind")
     rows = [*range(0, len(recording.steps), every)]
     rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
     moving = Moving(recording, rows, look, show)
@@ -163,7 +163,7 @@ def animation(
     look = Look(
         filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
     )  # fmt: skip
-    recording = Recording(dataset, color or "kind")
+    recording = Trajectory(dataset, color or "kind")
     last = len(recording.steps) - 1
     rows = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int)).tolist()
     moving = Moving(recording, rows, look, silent, alone=False)
@@ -191,7 +191,7 @@ class Moving:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: Trajectory,
         rows: Sequence[int],
         look: Look,
         show: Show,

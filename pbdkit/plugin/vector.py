@@ -156,18 +156,12 @@ def length(v: Vector[T]) -> T:
     return root
 
 
-if TYPE_CHECKING:
+class Numbers:
+    """Named numbers that an elementwise function sees as attributes; named tuples at run time."""
 
-    class Numbers:
-        """Named numbers that an elementwise function sees as attributes."""
+    if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Number: ...
-
-else:
-
-    class Numbers:
-        """Named numbers that an elementwise function sees as attributes; named tuples at run
-        time."""
 
 
 class Parameters(Numbers):

@@ -49,7 +49,7 @@ MIN_GAP = 1e-4
 """Lower end of the search for 1 - √b."""
 
 
-class Weights(NamedTuple):
+class StepWeights(NamedTuple):
     """Parameters of the solver: relaxation w and memory b."""
 
     relaxation: float
@@ -67,7 +67,7 @@ class HopelessError(ValueError):
 
 def best_weights(
     eigenvalues: Complex, relaxation: float | None = None, memory: float | None = None
-) -> Weights:
+) -> StepWeights:
     """Return the w and b of fastest decay for modes λ, except those with λ = 1.
 
     Parameters
@@ -84,7 +84,7 @@ def best_weights(
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z):
-        return Weights(relaxation or 1.0, memory or 0.0)
+        return StepWeights(relaxation or 1.0, memory or 0.0)
     if z.real.min() <= 0.0:
         raise HopelessError(f"the rule has a mode with the eigenvalue {1 - z.real.min():.6g}")
     if memory is not None and abs(memory) >= 1.0:
@@ -97,7 +97,7 @@ def best_weights(
     return weights
 
 
-def _best_for_real(m: float, M: float, w: float | None, b: float | None) -> Weights:
+def _best_for_real(m: float, M: float, w: float | None, b: float | None) -> StepWeights:
     """Return the optimum for real modes z from m to M.
 
     Both roots are real up to z = (1 - √b)² / w, complex to (1 + √b)² / w and real beyond.
@@ -106,28 +106,28 @@ def _best_for_real(m: float, M: float, w: float | None, b: float | None) -> Weig
         b = ((math.sqrt(M) - math.sqrt(m)) / (math.sqrt(M) + math.sqrt(m))) ** 2
     if w is None:
         assert b is not None
-        return Weights(2.0 * (1.0 + b) / (m + M), b)
+        return StepWeights(2.0 * (1.0 + b) / (m + M), b)
     if b is None:
         b = max((1.0 - math.sqrt(w * m)) ** 2, (1.0 - math.sqrt(w * M)) ** 2)
-    return Weights(w, b)
+    return StepWeights(w, b)
 
 
-def _best_for_complex(eigenvalues: Complex, w: float | None, b: float | None) -> Weights:
+def _best_for_complex(eigenvalues: Complex, w: float | None, b: float | None) -> StepWeights:
     """Search the optimum: over 1 - √b on a logarithmic scale, and over w below its bound for each
     b."""
     from pbdkit.linear.spectrum import largest_stable_relaxation
 
-    def weights_for(memory: float) -> Weights:
+    def weights_for(memory: float) -> StepWeights:
         if w is not None:
-            return Weights(w, memory)
+            return StepWeights(w, memory)
         bound = largest_stable_relaxation(eigenvalues, memory)
         assert bound is not None
         relaxation = _minimise(
-            lambda x: Weights(x, memory).rate(eigenvalues), SEARCH_START * bound, bound
+            lambda x: StepWeights(x, memory).rate(eigenvalues), SEARCH_START * bound, bound
         )
-        return Weights(relaxation, memory)
+        return StepWeights(relaxation, memory)
 
-    def weights_at(logarithm: float) -> Weights:
+    def weights_at(logarithm: float) -> StepWeights:
         return weights_for((1.0 - math.exp(logarithm)) ** 2)
 
     if b is not None:
@@ -180,7 +180,7 @@ def tuned(scene: Scene) -> Scene:
         raise scene.experiment.located(error) from None
 
 
-def chosen_weights(scene: Scene) -> Weights:
+def chosen_weights(scene: Scene) -> StepWeights:
     """Choose numbers for `auto`; prescribed numbers remain."""
     _refuse(scene)
     solver = scene.experiment.stepping

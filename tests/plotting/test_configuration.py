@@ -17,7 +17,7 @@ from matplotlib.text import Text
 
 from pbdkit.plotting import compare, plot
 from pbdkit.plotting.data import cells_of, distance_from, outline, whole
-from pbdkit.plotting.layers import Grid
+from pbdkit.plotting.layers import PixelGrid
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 SIDEWAYS = {"type": "velocity", "velocity": [0.3, 0.1], "steps": 10}
@@ -492,7 +492,7 @@ def test_a_field_has_the_value_of_its_place_and_holes_stay_holes():
         cells = cells_of(site, site.astype(float))
         assert cells.shape == (count**2, 4)
         gone = count // 2 * count + count // 2
-        grid = Grid((-0.2, 1.2, -0.2, 1.2), 140, 140)
+        grid = PixelGrid((-0.2, 1.2, -0.2, 1.2), 140, 140)
         corners, value = grid.places(x), (2 * x[:, 0] - x[:, 1]).astype(np.float32)
         found = grid.mean(corners[cells], value[cells])
         row, column = np.nonzero(np.isfinite(found))
@@ -516,7 +516,7 @@ def test_a_field_has_the_value_of_its_place_and_holes_stay_holes():
 )
 def test_no_pixel_within_a_sheared_cell_is_missed(corners):
     size, places = 59, np.array(corners, np.float32)
-    grid = Grid((0.0, 1.0, 0.0, 1.0), size, size)
+    grid = PixelGrid((0.0, 1.0, 0.0, 1.0), size, size)
     field = grid.mean(grid.places(places)[None], np.ones((1, 4)))
     y, x = np.mgrid[:size, :size] + 0.5
     inside = np.ones((size, size), bool)

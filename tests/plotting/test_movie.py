@@ -15,7 +15,7 @@ pytest.importorskip("matplotlib")
 import imageio_ffmpeg
 from PIL import Image
 
-from pbdkit.plotting.data import Recording
+from pbdkit.plotting.data import Trajectory
 from pbdkit.plotting.movie import Moving
 from pbdkit.plotting.style import Look
 
@@ -62,7 +62,7 @@ def test_every_recorded_step_is_there(torn, tmp_path, suffix):
 
 
 def test_a_frame_is_the_picture_of_its_step(torn):
-    recording = Recording(torn, "pe1_intact")
+    recording = Trajectory(torn, "pe1_intact")
     moving = Moving(recording, range(25), Look(**SMALL), lambda what, share: None)
     frames = [*moving.frames(range(25))]
     assert moving.sheet.axes[0].get_title().endswith("step 24")

@@ -29,7 +29,7 @@ import pbdkit
 from pbdkit.cli import main as program
 from pbdkit.errors import PbdkitError
 from pbdkit.io.open import reading
-from pbdkit.plotting.data import Recording
+from pbdkit.plotting.data import Trajectory
 
 PATIENCE_S, LONGEST_S = 120.0, 20.0
 """After so many seconds a case is ended, and so many it may take."""
@@ -60,7 +60,7 @@ def read_subject(path: Path) -> dict[str, Any]:
         dataset.load()
         seen = {name: variable.values.tobytes() for name, variable in dataset.variables.items()}
         seen |= {f"attribute {name}": str(value) for name, value in dataset.attrs.items()}
-        recording = Recording(dataset, "pe1")
+        recording = Trajectory(dataset, "pe1")
         seen["snapshot"] = repr([*recording.snapshots([recording.row(None)])])
     return seen
 

@@ -15,7 +15,7 @@ import pbdkit
 from pbdkit.linear.spectrum import has_symmetric_rows
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stability.analysis import Analysis
-from pbdkit.stability.relaxation import MARGIN, HopelessError, Weights, best_weights, tuned
+from pbdkit.stability.relaxation import MARGIN, HopelessError, StepWeights, best_weights, tuned
 
 AUTO = {"type": "stepping", "engine": "numpy", "relaxation": "auto", "memory": "auto"}
 OTHERS = {"none": {"type": "none"}, "mean": FRAMES["mean"], "first": FRAMES["first"],
@@ -36,8 +36,8 @@ def scene_of(columns: int = 6, rows: int = 5, **parts: Any) -> Scene:
     return build_scene(pbdkit.Experiment(**experiment(columns, rows, **given)))
 
 
-def chosen(scene: Scene) -> Weights:
-    return Weights(*(getattr(scene.experiment.stepping, name) for name in Weights._fields))
+def chosen(scene: Scene) -> StepWeights:
+    return StepWeights(*(getattr(scene.experiment.stepping, name) for name in StepWeights._fields))
 
 
 def rate(scene: Scene) -> float:
@@ -77,7 +77,7 @@ def test_no_numbers_nearby_are_better():
         modes = np.concatenate([1 - z, 1 - z.conj()])
         best = best_weights(modes)
         for dw, db in product((-0.01, 0.0, 0.01), repeat=2):
-            near = Weights(best.relaxation + dw, best.memory + db)
+            near = StepWeights(best.relaxation + dw, best.memory + db)
             assert near.rate(modes) > best.rate(modes) - 1e-5
 
 
