@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import xarray
     from distributed import Client
 
-    from pbdkit.fitting.result import Fitted
+    from pbdkit.fitting.fit_result import Fitted
     from pbdkit.fitting.strength import FittedStrength
-    from pbdkit.identification.report import Identity
+    from pbdkit.identification.identity import Identity
     from pbdkit.model.loading import ComponentClasses, ExperimentLike
     from pbdkit.model.reading import Settings
     from pbdkit.stability.analysis import Analysis
@@ -435,7 +435,7 @@ def fit(
     """
     from pbdkit.equilibrium.certificate import UnconvergedError
     from pbdkit.fitting.fit import fit_experiment
-    from pbdkit.fitting.specification import described_fit
+    from pbdkit.fitting.fit_file import described_fit
 
     asked, source = described_fit(description, given=experiment is not None, measured=measured)
     found = as_experiment(experiment, components) if experiment is not None else None

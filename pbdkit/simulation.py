@@ -851,8 +851,8 @@ def _located(scene: Scene) -> Iterator[None]:
 
 
 class Execution:
-    """Where runs are carried out: by one process, or, in `pbdkit.mpi.run`, by all processes of a
-    communicator, which make each call together."""
+    """Where runs are carried out: by one process, or, in `pbdkit.mpi.distributed_run`, by all
+    processes of a communicator, which make each call together."""
 
     def __init__(self, communicator: Communicator = SERIAL) -> None:
         self.communicator = communicator

@@ -16,7 +16,7 @@ from tests.model.test_boundary_conditions import PLATE, cut
 from tests.plugin import test_lattice as test_axes
 from tests.plugin import test_schedule as test_courses
 from tests.scene import test_loads
-from tests.scene.test_leaders_directions import CASES, vanes
+from tests.scene.test_leader_groups_directions import CASES, vanes
 from tests.scene.test_materials import FIELDS, REGIONS
 from tests.stepping.numba_engine.test_engine import (
     CUT,

@@ -16,7 +16,7 @@ from pbdkit.equilibrium.system import Moves, one_thread
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting
 from pbdkit.lattice.raster import FOLLOWER
-from pbdkit.scene.leaders import guided_at, kinds_of_places
+from pbdkit.scene.leader_groups import guided_at, kinds_of_places
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import initial_state

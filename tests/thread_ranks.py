@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from queue import Queue
 from typing import Any
 
-from pbdkit.mpi.run import DistributedExecution
+from pbdkit.mpi.distributed_run import DistributedExecution
 
 PATIENCE_S = 120.0
 

@@ -36,7 +36,7 @@ from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.bodies import Grid
 from pbdkit.model.experiment import Experiment
 from pbdkit.progress import Watch
-from pbdkit.scene.leaders import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import peak_memory
 from pbdkit.stability.relaxation import tuned

@@ -16,7 +16,7 @@ from pbdkit.cli.options import experiment_argument, json_option, set_option, ver
 from pbdkit.plugin.units import BODY_FORCE, FORCE, in_lengths
 
 if TYPE_CHECKING:
-    from pbdkit.identification.report import Identity
+    from pbdkit.identification.identity import Identity
     from pbdkit.model.boundary_conditions import Driven, LeaderGroup, Load
     from pbdkit.model.experiment import Experiment
     from pbdkit.plugin.units import Units
@@ -303,7 +303,7 @@ def identify(experiment: str, settings: tuple[str, ...], verbose: bool, as_json:
 def _show(identity: Identity, materials: str, verbose: bool) -> None:
     """Print the table of one material, or of several with the same identity."""
     from pbdkit.cli.options import show_table
-    from pbdkit.identification.report import table
+    from pbdkit.identification.identity import table
 
     remark = f" ({materials})" if materials else ""
     click.echo(

@@ -169,8 +169,8 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         click.echo(str(result))
         click.echo(f"{path} written")
     if picture:
-        from pbdkit.fitting.result import Fitted
-        from pbdkit.plotting.fit import draw_fit
+        from pbdkit.fitting.fit_result import Fitted
+        from pbdkit.plotting.fit_figures import draw_fit
 
         assert isinstance(result, Fitted)
         save(picture, draw_fit(result), replace=force, quiet=quiet)
@@ -237,7 +237,7 @@ def init(file: Path | None, origin: str | None) -> None:
 def schema(what: str, builtin: bool) -> None:
     """Print the JSON Schema of experiments, datasets, sweeps or fits, with all installed
     components."""
-    from pbdkit.fitting.schema import fit_schema
+    from pbdkit.fitting.fit_schema import fit_schema
     from pbdkit.io.layout import dataset_schema
     from pbdkit.model.schema import experiment_schema
     from pbdkit.plugin.registry import Registry

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from pbdkit.errors import ExperimentError
 from pbdkit.plugin import Diagnostic, Moment, TouchingRows, Variable, Vector, length
 from pbdkit.plugin.diagnostic import Need
-from pbdkit.plugin.fracture import breaking_order
+from pbdkit.plugin.fracture_model import breaking_order
 from pbdkit.plugin.lattice import area_share
 from pbdkit.plugin.units import AREA, ENERGY, FORCE, LENGTH, STRESS, FromUnits, Place, unset
 

@@ -42,7 +42,7 @@ from pbdkit.plugin import (
     where,
 )
 from pbdkit.plugin.component import Drawn
-from pbdkit.plugin.fracture import Segment
+from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.schedule import COURSE, PLAIN, Course, at, form_of, last
 from pbdkit.plugin.units import LENGTH, STRESS
 

@@ -30,14 +30,14 @@ from pbdkit.linear.response import by_sublattice
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import RenewsBonds, SoftensCells
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.progress import Watch
 from pbdkit.scene.constants import Home
-from pbdkit.scene.leaders import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.memory_estimate import LARGEST_ANEW
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.engine_choice import PATIENCE_S, obstacle
-from pbdkit.stepping.frame import FollowFrame
+from pbdkit.stepping.frame_following import FollowFrame
 from pbdkit.stepping.kernel import Function
 from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.numba_engine.arrays import Arrays, constant_arrays, find_runs, state_arrays

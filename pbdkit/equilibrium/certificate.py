@@ -24,8 +24,8 @@ from pbdkit.errors import ExperimentError
 from pbdkit.model.solver import Settle
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.bond_breaking import Fracturing
 from pbdkit.stepping.divergence import way_of
-from pbdkit.stepping.fracture import Fracturing
 from pbdkit.stepping.leaders import bends_of, is_cut_short, last_event
 from pbdkit.stepping.state import Floats, State
 

@@ -54,7 +54,7 @@ def linearised(
     if rows.strip:
         return _shared(scene, state, math.ceil(moment), watch, rows)
     if scene.barriers:
-        from pbdkit.equilibrium.contact import ContactSystem
+        from pbdkit.equilibrium.contact_system import ContactSystem
 
         return ContactSystem(scene, state, moment, method, watch, moves or Moves(scene))
     step = math.ceil(moment)

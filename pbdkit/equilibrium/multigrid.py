@@ -69,9 +69,7 @@ class StencilGrid:
         middle = self._inverses
         same = tuple(tuple(map(precision, row)) for row in self.stencils[0].reshape(3, 12))
         own, inverse = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
-        return kernels().Grid(
-            *self.lists, same, own, tuple(map(precision, middle[0])), inverse
-        )
+        return kernels().Grid(*self.lists, same, own, tuple(map(precision, middle[0])), inverse)
 
     @cached_property
     def _inverses(self) -> Floats:

@@ -24,7 +24,7 @@ from pbdkit.equilibrium.certificate import (
     UnconvergedError,
     spacing_of,
 )
-from pbdkit.equilibrium.contact import ContactSystem
+from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.linearise import linearised, mismatch_at_rest
 from pbdkit.equilibrium.sparse import MatrixSystem
 from pbdkit.equilibrium.system import (

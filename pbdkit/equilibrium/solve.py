@@ -29,9 +29,9 @@ from pbdkit.linear.operator import step_operator
 from pbdkit.linear.spectrum import TooDearError, excess, spectrum
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.bond_breaking import Fracturing
 from pbdkit.stepping.divergence import Guard, most_of, size_of, way_of
 from pbdkit.stepping.engine_choice import chosen_engine, obstacle
-from pbdkit.stepping.fracture import Fracturing
 from pbdkit.stepping.leaders import bends_of, last_event, place, prescribe
 from pbdkit.stepping.state import State, cut_bonds, initial_state
 

@@ -22,10 +22,10 @@ from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, slot_step
 from pbdkit.linear.block_matrix import frame_matrices
 from pbdkit.linear.response import LinearResponse, by_sublattice, respond
 from pbdkit.plugin import Slot
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.rule import material_of
-from pbdkit.scene.leaders import guided_at, kinds_of_places
+from pbdkit.scene.leader_groups import guided_at, kinds_of_places
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 

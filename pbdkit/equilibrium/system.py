@@ -28,7 +28,7 @@ from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.motions import Hold
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import RenewsParticles
-from pbdkit.scene.leaders import Leading, kinds_at
+from pbdkit.scene.leader_groups import Leading, kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.engine_choice import Choice, make_engine, obstacle

@@ -10,11 +10,11 @@ import numpy as np
 
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
+from pbdkit.fitting.fit_file import Fit
+from pbdkit.fitting.fit_result import Fitted, fitted
 from pbdkit.fitting.observations import FieldObservation, Observation
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import Problem, Solution, Unknown, solved
-from pbdkit.fitting.result import Fitted, fitted
-from pbdkit.fitting.specification import Fit
 from pbdkit.fitting.uncertainty import (
     Candidate,
     Posed,

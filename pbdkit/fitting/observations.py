@@ -50,8 +50,8 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Measured
 from pbdkit.model.solver import Record
 from pbdkit.plugin import Lattice
-from pbdkit.plugin.frame import Indices
-from pbdkit.scene.leaders import Leading
+from pbdkit.plugin.frame_policy import Indices
+from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import FAILED, Simulation
 from pbdkit.stepping.state import Floats, State, initial_state

@@ -39,10 +39,10 @@ from pbdkit.components.diagnostics import reactions
 from pbdkit.equilibrium.solve import finder_of, increments, moments
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
+from pbdkit.fitting.fit_file import FOLDER, Bounds, Positive
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import TELLS
 from pbdkit.fitting.sensitivity import scene_like
-from pbdkit.fitting.specification import FOLDER, Bounds, Positive
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import FOLLOWER, Mask, Places
 from pbdkit.model.experiment import Experiment, Version, given_classes

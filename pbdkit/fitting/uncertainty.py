@@ -45,7 +45,6 @@ from pbdkit.fitting.problem import (
     rise_of_loss,
     solved,
 )
-from pbdkit.fitting.specification import Force
 from pbdkit.plugin.units import STRESS
 from pbdkit.stepping.state import Floats
 

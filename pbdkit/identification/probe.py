@@ -21,7 +21,7 @@ from pbdkit.identification.elastic_constants import (
     elasticity,
     second_order,
 )
-from pbdkit.identification.report import Identity, notes_on
+from pbdkit.identification.identity import Identity, notes_on
 from pbdkit.identification.waves import (
     LongWaves,
     Primitive,

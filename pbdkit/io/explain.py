@@ -14,7 +14,7 @@ from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.io.layout import OF_FRAME, as_step
 from pbdkit.lattice.raster import Places
 from pbdkit.plugin import Bonds, BreaksAtStrain, FractureModel
-from pbdkit.plugin.fracture import breaking_order
+from pbdkit.plugin.fracture_model import breaking_order
 from pbdkit.scene.constants import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import describe_bonds

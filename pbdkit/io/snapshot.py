@@ -45,7 +45,7 @@ from pbdkit.plugin import (
 )
 from pbdkit.plugin.diagnostic import BondHistory, CellValues, ForceValues
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Side, area_share, corner_share, signed_area
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import (
@@ -55,7 +55,7 @@ from pbdkit.scene.constants import (
     signed_distance,
     values_at,
 )
-from pbdkit.scene.leaders import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.materials import PLACES, regions_of, stiffness_at
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.selection import Selecting

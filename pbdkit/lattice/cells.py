@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pbdkit.lattice.raster import FOLLOWER, Block, Floats, Mask, Raster, Where
 from pbdkit.plugin import Cell, Offset, Slot, Vector
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import CellPolygon, Index, Side, Tiling
 
 Slots = tuple[tuple[Slot, ...], ...]

@@ -37,7 +37,7 @@ from pbdkit.lattice.raster import (
 )
 from pbdkit.model.bodies import Body, Box, Floats, Sites
 from pbdkit.plugin import Cell, Lattice, Vector
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import CellPolygon, Index, Offset, Tiling
 
 Lines = tuple[int, int]

@@ -28,8 +28,8 @@ from pbdkit.lattice.raster import (
     positions,
 )
 from pbdkit.plugin import Cell, Lattice, NeighbourMetric, Offset, Setting, Slot, Vector
-from pbdkit.plugin.fracture import Segment
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.fracture_model import Segment
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Index, Tiling
 from pbdkit.plugin.vector import vector
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.plugin import Cell, Lattice, Offset, Slot
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.vector import vector
 

@@ -22,8 +22,8 @@ from pbdkit.lattice.raster import EMPTY, FOLLOWER, FRAME, LEADER, slot_step
 from pbdkit.linear.block_matrix import BlockMatrix, CoordinateMatrix, frame_matrices
 from pbdkit.linear.response import by_sublattice, has_neighbours, respond
 from pbdkit.model.solver import Stepping
-from pbdkit.plugin.frame import Indices
-from pbdkit.scene.leaders import kinds_at
+from pbdkit.plugin.frame_policy import Indices
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.leaders import Guidance

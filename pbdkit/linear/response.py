@@ -20,7 +20,7 @@ from pbdkit.lattice.raster import EMPTY, Places, slot_step
 from pbdkit.linear.stencil import SMALL, array_of, derivative
 from pbdkit.plugin import Here, Slot, Softens, SoftensCells, Vector
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.rule_evaluation import Contributions, Evaluator, Surroundings, summed

@@ -27,7 +27,7 @@ from pbdkit.model.motions import AnyMotion, Hold, Measured, Newton
 from pbdkit.model.validation import closed_part, fault
 from pbdkit.plugin import Component, Pair
 from pbdkit.plugin.component import Strict
-from pbdkit.plugin.fracture import Segment
+from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.particles import Selection
 from pbdkit.plugin.schedule import BodyForce, Course, Force, at
 from pbdkit.plugin.units import LENGTH, Place

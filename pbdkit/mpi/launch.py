@@ -43,7 +43,7 @@ def launched() -> Iterator[Execution]:
             )
         yield Execution()
         return
-    from pbdkit.mpi.run import DistributedExecution
+    from pbdkit.mpi.distributed_run import DistributedExecution
 
     execution = DistributedExecution(MPI.COMM_WORLD)
     with execution.communicator.root_speaks():

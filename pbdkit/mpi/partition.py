@@ -36,11 +36,11 @@ from pbdkit.lattice.raster import (
     hull,
 )
 from pbdkit.mpi.communicator import MPICommunicator
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Index
 from pbdkit.scene.constants import SceneConstants
 from pbdkit.scene.frame import Frame
-from pbdkit.scene.leaders import Leading
+from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.loads import Loads
 from pbdkit.scene.operations import Operated
 from pbdkit.scene.scene import Ground, Scene

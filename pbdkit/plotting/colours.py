@@ -84,7 +84,9 @@ class Scale:
     exponent: int
 
 
-def scale_of(quantity: PlottedQuantity, values: tuple[float, float], look: Look, filled: bool) -> Scale:
+def scale_of(
+    quantity: PlottedQuantity, values: tuple[float, float], look: Look, filled: bool
+) -> Scale:
     """The scale of a quantity whose values lie between these two.
 
     Where they have both signs, and zero is neutral, it reaches as far on either side, unless `look`

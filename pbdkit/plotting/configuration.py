@@ -18,29 +18,29 @@ from pbdkit.errors import ExperimentError, refuse_no_matplotlib
 from pbdkit.io.layout import in_this_layout
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale, palette_of, scale_of
 from pbdkit.plotting.data import (
-    ReferenceBody,
     Extent,
     PlottedQuantity,
-    Trajectory,
+    ReferenceBody,
     Snapshot,
+    Trajectory,
     extent_of,
     joined,
     of_one_run,
     quantity_of,
 )
+from pbdkit.plotting.figure_layout import Page, Panels, legend_handles, style_bar
 from pbdkit.plotting.layers import (
     BondField,
     BondLines,
     BondValues,
     Classes,
     Dots,
+    Layer,
     PixelField,
     PixelGrid,
-    Layer,
     draw_numbers,
     draw_outline,
 )
-from pbdkit.plotting.layout import Page, Panels, legend_handles, style_bar
 from pbdkit.plotting.style import Look, figure_of, label
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ def plot_experiment(
     matplotlib is missing.
     """
     refuse_no_matplotlib()
-    from pbdkit.plotting.scene import draw_on_axes
+    from pbdkit.plotting.scene_figure import draw_on_axes
     from pbdkit.scene.scene import build_scene
 
     look, scene = Look(figsize=figsize, dpi=dpi), build_scene(experiment)

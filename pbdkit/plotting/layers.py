@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection, PathCollection
 from numpy.typing import NDArray
 
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale
-from pbdkit.plotting.data import ReferenceBody, CutCells, Snapshot
+from pbdkit.plotting.data import CutCells, ReferenceBody, Snapshot
 from pbdkit.plotting.style import figure_of
 
 if TYPE_CHECKING:
@@ -140,7 +140,9 @@ class PixelField(Layer):
     dots of a size in points, and a pixel where that is next to nothing. A corner beyond the outline
     that has no value takes the mean of the cells that meet there."""
 
-    def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale, size: float) -> None:
+    def __init__(
+        self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale, size: float
+    ) -> None:
         self._body, self._grid = body, grid
         self._image = _image(ax, grid, scale)
         self._alone = ax.scatter([], [], size**2, zorder=2, edgecolors=INK, linewidths=0.08 * size)
@@ -236,7 +238,9 @@ class Dots(Layer):
 class BondLines(Layer):
     """Lines between neighbours: those that are whole, or, `broken`, those that are not."""
 
-    def __init__(self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False) -> None:
+    def __init__(
+        self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False
+    ) -> None:
         self._body, self._broken = body, broken
         style: dict[str, Any] = {"colors": LINE, "zorder": 1}
         if broken:

@@ -22,7 +22,7 @@ from pbdkit.errors import (
 )
 from pbdkit.io.atomic_file import NewFile, written
 from pbdkit.io.layout import as_step
-from pbdkit.plotting.data import Extent, Trajectory, Snapshot, extent_of
+from pbdkit.plotting.data import Extent, Snapshot, Trajectory, extent_of
 from pbdkit.plotting.style import Look
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from html import escape
 
 from pbdkit.errors import PbdkitError
-from pbdkit.identification.report import Identity, rows_of
+from pbdkit.identification.identity import Identity, rows_of
 from pbdkit.model.experiment import Experiment
-from pbdkit.plotting.scene import Picture, picture_of
+from pbdkit.plotting.scene_figure import Picture, picture_of
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stability.analysis import Analysis, verdict_of
 from pbdkit.stability.forecast import Forecast, forecast

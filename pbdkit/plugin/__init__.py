@@ -40,7 +40,7 @@ from pbdkit.plugin.diagnostic import (
     TouchingRows,
     Variable,
 )
-from pbdkit.plugin.fracture import (
+from pbdkit.plugin.fracture_model import (
     BreaksAtStrain,
     CellStress,
     FractureModel,
@@ -51,7 +51,7 @@ from pbdkit.plugin.fracture import (
     SoftensCells,
     StartsCracked,
 )
-from pbdkit.plugin.frame import Anchors, FrameMap, FramePolicy, FrameSites
+from pbdkit.plugin.frame_policy import Anchors, FrameMap, FramePolicy, FrameSites
 from pbdkit.plugin.hooks import GROUP, Command, hookimpl
 from pbdkit.plugin.lattice import (
     BasisSite,

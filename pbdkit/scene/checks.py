@@ -23,7 +23,7 @@ from pbdkit.scene.constants import signed_distance
 from pbdkit.scene.selection import Selecting
 
 if TYPE_CHECKING:
-    from pbdkit.scene.leaders import Leading
+    from pbdkit.scene.leader_groups import Leading
     from pbdkit.scene.loads import Loads
     from pbdkit.scene.obstacles import Barrier
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER, FRAME, Raster, bounds, distinct
 from pbdkit.plugin import FollowerRule, FrameMap, FramePolicy, FrameSites
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 
 Floats = NDArray[np.floating[Any]]
 """Type of arrays of floating-point numbers."""

@@ -21,8 +21,8 @@ from pbdkit.model.boundary_conditions import AnyShape, Facing, Obstacle
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Newton
 from pbdkit.plugin import where
-from pbdkit.plugin.frame import Indices
-from pbdkit.scene.leaders import Leading
+from pbdkit.plugin.frame_policy import Indices
+from pbdkit.scene.leader_groups import Leading
 
 Floats = NDArray[np.float64]
 """Type of arrays of double precision."""

@@ -10,7 +10,7 @@ from pbdkit.lattice.raster import Raster
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import ParticleOperation
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.scene.selection import Selecting
 
 

@@ -46,7 +46,7 @@ from pbdkit.plugin import (
     Vector,
 )
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.fracture import Segment
+from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.schedule import Course
 from pbdkit.scene.checks import (
@@ -61,7 +61,7 @@ from pbdkit.scene.checks import (
 )
 from pbdkit.scene.constants import SceneConstants, check_diagnostics, scene_constants, with_fields
 from pbdkit.scene.frame import Frame, build_frame
-from pbdkit.scene.leaders import Leading, build_leading, check_directions
+from pbdkit.scene.leader_groups import Leading, build_leading, check_directions
 from pbdkit.scene.loads import Loads, build_loads
 from pbdkit.scene.materials import weighed
 from pbdkit.scene.memory_estimate import refuse_too_large

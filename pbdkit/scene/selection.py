@@ -13,7 +13,7 @@ from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.lattice.raster import FOLLOWER, NOWHERE, Floats, Raster, distinct
 from pbdkit.model.bodies import Body
 from pbdkit.plugin import Pair
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.particles import Selection
 from pbdkit.scene.constants import signed_distance
 

@@ -29,9 +29,9 @@ from pbdkit.linear.stencil import NO_REMEDY, Bound, bounds_the_body, wave_bound
 from pbdkit.memory import machine_memory
 from pbdkit.model.motions import Newton
 from pbdkit.plugin import Anchors, Calibrated
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.units import LENGTH
-from pbdkit.scene.leaders import kinds_at, kinds_of_places
+from pbdkit.scene.leader_groups import kinds_at, kinds_of_places
 from pbdkit.scene.memory_estimate import LARGEST_ANEW, MIB, Sizes, sizes_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.engine_choice import choose, seconds_of

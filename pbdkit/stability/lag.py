@@ -33,9 +33,9 @@ from pbdkit.linear.block_matrix import BlockMatrix
 from pbdkit.linear.operator import Guiding, moves_and_couplings, step_operator
 from pbdkit.linear.spectrum import excess
 from pbdkit.model.motions import Oscillation
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.units import Units, in_lengths
-from pbdkit.scene.leaders import Leading, kinds_of_places
+from pbdkit.scene.leader_groups import Leading, kinds_of_places
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 

@@ -38,7 +38,7 @@ from pbdkit.linear.stencil import LITTLE_MEMORY
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import Calibrated
 from pbdkit.progress import Watch
-from pbdkit.scene.leaders import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, initial_state
 

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.lattice.raster import FOLLOWER, Block, Mask, Places, distinct
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import length, vector
-from pbdkit.scene.leaders import guided_at, has_guides, kinds_at
+from pbdkit.scene.leader_groups import guided_at, has_guides, kinds_at
 from pbdkit.scene.obstacles import SLACK, Outline, Walls, leave, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbdkit.scene.leaders import Leading
+from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.obstacles import Barrier
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Engine

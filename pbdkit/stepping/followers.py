@@ -17,11 +17,11 @@ from pbdkit.lattice.raster import positions
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import Here, StoresEnergy, Vector
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.frame import FollowFrame
+from pbdkit.stepping.frame_following import FollowFrame
 from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.rule_evaluation import (
     Contributions,

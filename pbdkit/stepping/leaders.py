@@ -25,9 +25,9 @@ import numpy as np
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import Places
 from pbdkit.model.motions import Newton
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.rule import material_of
-from pbdkit.scene.leaders import Guided, Leading, guided_at, has_guides, rotations_of
+from pbdkit.scene.leader_groups import Guided, Leading, guided_at, has_guides, rotations_of
 from pbdkit.scene.obstacles import Barrier
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact, stiffnesses

@@ -10,7 +10,7 @@ import numpy as np
 
 from pbdkit.plugin.component import as_vector
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter

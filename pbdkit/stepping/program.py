@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.bond_breaking import BreakBonds, CutBonds
 from pbdkit.stepping.contact import PushOut
 from pbdkit.stepping.followers import MoveFollowers
-from pbdkit.stepping.fracture import BreakBonds, CutBonds
-from pbdkit.stepping.frame import FollowFrame
+from pbdkit.stepping.frame_following import FollowFrame
 from pbdkit.stepping.leaders import (
     CorrectGuided,
     GuideLeaders,

@@ -26,9 +26,9 @@ from pbdkit.plugin import (
     StartsCracked,
 )
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.fracture import Segment
+from pbdkit.plugin.fracture_model import Segment
 from pbdkit.scene.constants import bond_numbers, particle_numbers
-from pbdkit.scene.leaders import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 
 BrokenSteps = NDArray[np.integer[Any]]

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, Self
 
 from numpy.typing import NDArray
 
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.state import Floats, State

@@ -49,7 +49,7 @@ from pbdkit.plugin import (
 )
 from pbdkit.scene.constants import bond_numbers, remembered_names
 from pbdkit.scene.frame import sites_of_frame
-from pbdkit.scene.leaders import rotations_of
+from pbdkit.scene.leader_groups import rotations_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.rule_evaluation import Evaluator
 from pbdkit.testing.states import (

@@ -25,7 +25,7 @@ from pbdkit.plugin import (
     TurnsParticles,
 )
 from pbdkit.plugin.rule import material_of
-from pbdkit.scene.leaders import rotations_of
+from pbdkit.scene.leader_groups import rotations_of
 from pbdkit.scene.scene import Scene
 from pbdkit.simulation import Simulation, record
 from pbdkit.stepping.engine_choice import obstacle

@@ -52,7 +52,7 @@ from pbdkit.model.reading import Source, yaml_text
 from pbdkit.plotting.data import cells_of, distance_from, lattice_unit, shape_of, triangles_of
 from pbdkit.plotting.style import LONGEST, in_its_units, signed
 from pbdkit.plugin.discovery import retired_parts
-from pbdkit.plugin.fracture import breaking_order
+from pbdkit.plugin.fracture_model import breaking_order
 from pbdkit.scene.scene import Scene
 from pbdkit.stability.analysis import Analysis
 from pbdkit.stability.relaxation import tuned

@@ -25,8 +25,8 @@ from pbdkit.io.atomic_file import write_together
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Floats, Motion, Path
 from pbdkit.model.reading import MAX_BYTES, MAX_NODES, yaml_text
-from pbdkit.plugin.fracture import Segment
-from pbdkit.web.frames import AdjustableNumber, numbers_of, placed
+from pbdkit.plugin.fracture_model import Segment
+from pbdkit.web.view_frames import AdjustableNumber, numbers_of, placed
 
 Way = tuple[float, float]
 

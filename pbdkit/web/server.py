@@ -33,10 +33,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from pbdkit.errors import ExperimentError, PbdkitError
-from pbdkit.web.commands import LONGEST, Command, PictureReceived, Rewind, command_of, obey
-from pbdkit.web.frames import ViewFrame
 from pbdkit.web.page import script, source
+from pbdkit.web.requests import LONGEST, Command, PictureReceived, Rewind, command_of, obey
 from pbdkit.web.session import Judge, Judgement, Message, Session, scenery, standing
+from pbdkit.web.view_frames import ViewFrame
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")

@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.lattice.raster import FRAME
 from pbdkit.model.experiment import Experiment
-from pbdkit.plugin.fracture import Segment
-from pbdkit.scene.leaders import Leading, build_leading
+from pbdkit.plugin.fracture_model import Segment
+from pbdkit.scene.leader_groups import Leading, build_leading
 from pbdkit.scene.scene import Scene, build_scene, renumbered
 from pbdkit.stability.analysis import Analysis
 from pbdkit.stability.relaxation import tuned
@@ -41,8 +41,8 @@ from pbdkit.stepping.divergence import Guard
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state, unmoved_state
-from pbdkit.web.frames import COLOURS, Camera, ViewFrame
 from pbdkit.web.script import NEVER, Led, Saved, Script, Way, saved
+from pbdkit.web.view_frames import COLOURS, Camera, ViewFrame
 
 LARGEST = 4000
 """Particles of which the spectrum is found in about a second."""

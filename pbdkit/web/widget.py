@@ -9,8 +9,8 @@ import anywidget
 
 from pbdkit.errors import ExperimentError, refuse_without
 from pbdkit.model.loading import as_experiment
-from pbdkit.web.commands import command_of
 from pbdkit.web.page import script, source
+from pbdkit.web.requests import command_of
 from pbdkit.web.server import Conductor, Viewer
 from pbdkit.web.session import Message, Session
 

@@ -15,9 +15,9 @@ from typing import Any
 
 from sheets import Running, moving, scene_of
 
+from pbdkit.mpi.distributed_run import DistributedExecution
 from pbdkit.mpi.driver import DividedStepper, Division
 from pbdkit.mpi.partition import MOST_STEPS, subdomains
-from pbdkit.mpi.run import DistributedExecution
 from pbdkit.simulation import peak_memory
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 

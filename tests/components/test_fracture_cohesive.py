@@ -9,8 +9,8 @@ import pytest
 import pbdkit
 from pbdkit.plugin.lattice import signed_area
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.bond_breaking import Fracturing
 from pbdkit.stepping.followers import SlotFollowers
-from pbdkit.stepping.fracture import Fracturing
 from pbdkit.stepping.state import initial_state
 
 sys.path.append(str(Path(__file__).parents[1] / "reliability"))

@@ -16,7 +16,7 @@ from pbdkit.equilibrium.solve import events, moments, settle
 from pbdkit.equilibrium.system import Moves
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.fracture import Fracturing
+from pbdkit.stepping.bond_breaking import Fracturing
 from pbdkit.stepping.state import initial_state
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

@@ -426,7 +426,7 @@ def test_one_point_at_rest_tells_nothing_and_breaks_nothing(noise, tmp_path):
 
 def test_the_picture_has_a_row_an_axis_and_no_text_over_another(tmp_path):
     pytest.importorskip("matplotlib")
-    from pbdkit.plotting.fit import draw_fit
+    from pbdkit.plotting.fit_figures import draw_fit
 
     made = plate()
     measured(made, tmp_path / "field.csv", noise=NOISE)

@@ -10,9 +10,9 @@ import pytest
 
 import pbdkit
 from pbdkit.fitting.fit import problem_of
+from pbdkit.fitting.fit_file import described_fit
 from pbdkit.fitting.observations import TracksObservation
-from pbdkit.fitting.specification import described_fit
-from pbdkit.plotting.fit import draw_fit
+from pbdkit.plotting.fit_figures import draw_fit
 from pbdkit.simulation import Simulation
 
 WIDTH, HEIGHT, STEPS = 8.0, 4.0, 16

@@ -18,7 +18,7 @@ from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.plugin import BUILTIN, FollowerRule, FramePolicy
 from pbdkit.plugin.registry import Registry
 from pbdkit.scene import constants as homes
-from pbdkit.scene.leaders import kinds_of_places
+from pbdkit.scene.leader_groups import kinds_of_places
 from pbdkit.scene.scene import build_scene, renumbered
 from pbdkit.stepping.followers import SlotFollowers
 

@@ -9,8 +9,8 @@ import pytest
 
 import pbdkit
 from pbdkit.fitting.fit import problem_of
+from pbdkit.fitting.fit_file import described_fit
 from pbdkit.fitting.problem import rise_of_loss
-from pbdkit.fitting.specification import described_fit
 from pbdkit.fitting.uncertainty import _marginal
 from tests.fitting.test_fit import NOISE, fitted, in_series, measured, plate
 

@@ -8,8 +8,8 @@ import pytest
 from scene_strategies import in_turn
 
 import pbdkit
-from pbdkit.fitting.schema import fit_schema
-from pbdkit.fitting.specification import shipped_fits
+from pbdkit.fitting.fit_file import shipped_fits
+from pbdkit.fitting.fit_schema import fit_schema
 from pbdkit.io.layout import dataset_schema
 from pbdkit.model.reading import read_file
 from pbdkit.model.schema import experiment_schema

@@ -23,7 +23,7 @@ from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Execution
 from tests.equilibrium.test_multigrid import Skew
-from tests.mpi.test_run import (
+from tests.mpi.test_distributed_run import (
     assert_same,
     needs_mpi,
     on,

@@ -13,11 +13,11 @@ from scene_strategies import calibrated_experiments, experiments, samples
 from thread_ranks import on_ranks
 
 import pbdkit
+from pbdkit.mpi.distributed_run import CUTS
 from pbdkit.mpi.partition import part_of
-from pbdkit.mpi.run import CUTS
-from pbdkit.plugin.frame import FrameMap, FramePolicy
+from pbdkit.plugin.frame_policy import FrameMap, FramePolicy
 from pbdkit.scene.scene import build_scene
-from tests.mpi.test_run import CASES, OTHERS, assert_same, sheet, written
+from tests.mpi.test_distributed_run import CASES, OTHERS, assert_same, sheet, written
 
 LEFT_OUT = {
     "experiment",

@@ -25,7 +25,7 @@ from scene_strategies import calibrated_experiments, experiments, pulled_apart  
 from pbdkit.errors import PbdkitError
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.model.experiment import Experiment
-from pbdkit.mpi.run import DistributedExecution
+from pbdkit.mpi.distributed_run import DistributedExecution
 from pbdkit.progress import Watch
 from pbdkit.simulation import Execution, record
 

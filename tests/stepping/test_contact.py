@@ -11,7 +11,7 @@ import pytest
 
 import pbdkit
 from pbdkit.equilibrium import solve as increments
-from pbdkit.equilibrium.contact import NO_FACE, hold
+from pbdkit.equilibrium.contact_system import NO_FACE, hold
 from pbdkit.scene.obstacles import outlines_at
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.contact import Contact

@@ -21,7 +21,7 @@ from pbdkit.stepping import engine_choice as choice
 from pbdkit.stepping import engine_choice as limits
 from pbdkit.stepping.engine_choice import choose, make_engine, what_gpus_lack, what_is_missing
 from pbdkit.stepping.numba_engine.plan import functions_of
-from tests.scene.test_leaders_directions import CASES, vanes
+from tests.scene.test_leader_groups_directions import CASES, vanes
 from tests.stepping.numba_engine.test_engine import ANEW, sheet
 
 ASKED = {"solver": {"type": "stepping", "engine": "gpu"}}

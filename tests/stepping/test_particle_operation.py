@@ -22,7 +22,7 @@ from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numba_engine.time_skewing import single_steps
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from tests.mpi.test_run import assert_same, written
+from tests.mpi.test_distributed_run import assert_same, written
 from tests.stepping.numba_engine.test_engine import TORN, assert_bitwise_equal, sheet
 from tests.stepping.numba_engine.test_time_skewing import small_passes
 from tests.test_restart import assert_same as assert_same_file

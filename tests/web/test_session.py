@@ -30,7 +30,7 @@ from pbdkit.web import script as saving
 from pbdkit.web import session as history
 from pbdkit.web import session as stage
 from pbdkit.web.command_line import live
-from pbdkit.web.commands import FARTHEST, LONGEST, command_of, obey
+from pbdkit.web.requests import FARTHEST, LONGEST, command_of, obey
 from pbdkit.web.server import Access, Conductor, SessionServer, SocketViewer
 from pbdkit.web.session import Session, judged, scenery, standing
 from pbdkit.web.widget import LiveWidget

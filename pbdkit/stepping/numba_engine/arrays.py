@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pbdkit.lattice.neighbourhood import BondPlane, plane_block
 from pbdkit.lattice.raster import FOLLOWER, Block, slot_step
 from pbdkit.plugin import Slot
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.scene.frame import Frame
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses

@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 
-from pbdkit.stepping.frame import FollowFrame
+from pbdkit.stepping.frame_following import FollowFrame
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
 from pbdkit.stepping.leaders import GuideLeaders
 from pbdkit.stepping.numba_engine.boundary import held

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pbdkit.lattice.raster import FOLLOWER, Raster
 from pbdkit.model.boundary_conditions import Load
 from pbdkit.model.motions import Hold, Motion, Newton, Oscillation, Rotation
-from pbdkit.plotting.layout import Page, Panels, handle
+from pbdkit.plotting.figure_layout import Page, Panels, handle
 from pbdkit.plotting.style import Look, figure_of, label, plain
 from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.constants import signed_distance

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from pbdkit.fitting.specification import Fit
+from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.strength import StrengthFit
 from pbdkit.model.schema import DIALECT
 

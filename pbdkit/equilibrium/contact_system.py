@@ -34,7 +34,7 @@ from pbdkit.equilibrium.sparse import (
 from pbdkit.equilibrium.system import PUSH, Moves, NoEquilibriumError, System
 from pbdkit.linear.block_matrix import connected, one_minus
 from pbdkit.linear.operator import step_operator
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.progress import Watch
 from pbdkit.scene.obstacles import FLAT, ROUNDING, STRAIGHTEST, Face, outlines_at
 from pbdkit.scene.scene import Scene

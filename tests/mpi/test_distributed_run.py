@@ -407,7 +407,7 @@ def test_processes_that_do_not_find_each_other_are_refused(names, monkeypatch, c
     """As where the launcher is of one MPI and mpi4py of another."""
     for name in names:
         monkeypatch.setenv(name, "2")
-    monkeypatch.setattr("pbdkit.mpi.run.refuse_without", lambda *missing: None)
+    monkeypatch.setattr("pbdkit.mpi.distributed_run.refuse_without", lambda *missing: None)
     monkeypatch.setitem(sys.modules, "mpi4py", SimpleNamespace(MPI=Alone))
     done = call("run", "e.json")
     assert done.code == 2

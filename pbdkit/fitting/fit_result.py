@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.observations import (
     CurveObservation,
     FieldObservation,
@@ -15,7 +16,6 @@ from pbdkit.fitting.observations import (
     TracksObservation,
 )
 from pbdkit.fitting.problem import MODULUS, Loss, Problem, Solution, spread_of
-from pbdkit.fitting.specification import Fit
 from pbdkit.fitting.uncertainty import (
     Candidate,
     Combination,

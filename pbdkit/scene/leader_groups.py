@@ -19,7 +19,7 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Measured, Newton, Rotation
 from pbdkit.plugin import TurnsParticles
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.scene.constants import particle_numbers
 from pbdkit.scene.selection import Selecting, shares_of, spacing

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-    from pbdkit.fitting.result import Fitted
+    from pbdkit.fitting.fit_result import Fitted
 
 
 Floats = NDArray[np.floating[Any]]

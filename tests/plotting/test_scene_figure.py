@@ -15,7 +15,7 @@ from pbdkit import progress
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.shipped import shipped_names
 from pbdkit.plotting import notebook, plot_experiment
-from pbdkit.plotting.scene import Svg, edge_of, extreme, picture_of
+from pbdkit.plotting.scene_figure import Svg, edge_of, extreme, picture_of
 from pbdkit.plotting.style import figure_of
 from pbdkit.scene.scene import build_scene
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import PbdkitError
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin.schedule import NumberCourse
-from pbdkit.scene.leaders import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
