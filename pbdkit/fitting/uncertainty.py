@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError, refuse_without
+from pbdkit.fitting.fit_file import Force
 from pbdkit.fitting.observations import FieldPrediction, GroupReaction
 from pbdkit.fitting.problem import (
     MODULUS,
