@@ -87,7 +87,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     ),
     ((ANEW,), ("solver: equilibrium",), "the limit of the steps is not defined if neighbours are"),
     ((ANEW,), ("solver settle",), "the distance from equilibrium has no bound if neighbours are"),
-    ((ANEW,), FIELDS_OF_RULE[:2], "found anew; set neighbours.reevaluate: false"),
+    ((ANEW,), FIELDS_OF_RULE[:2], "fixed neighbours for varying parameters; set"),
     (
         (ANEW,),
         ("frame: natural", "motion: newton", *(f"rule: {name}" for name in CALIBRATED)),
