@@ -73,8 +73,8 @@ from pbdkit.plugin import (
 )
 from pbdkit.simulation import Simulation as Simulation
 from pbdkit.sweeps.combine import concat as concat
+from pbdkit.web import live as live
 from pbdkit.web.report import report as report
-from pbdkit.web.widget import live as live
 
 __version__: str
 __all__: list[str]

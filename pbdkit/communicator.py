@@ -10,10 +10,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager, nullcontext
 from platform import node
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 class Communicator(ABC):
@@ -54,10 +54,14 @@ class Communicator(ABC):
 
     def largest(self, value: float) -> float:
         """Return the largest number of all processes; not a number where one is none."""
+        import numpy as np  # a command that ends before a scene is built needs none
+
         return float(np.max(self.allgather(value)))
 
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
         """Return the elementwise minimum over arrays of one shape."""
+        import numpy as np
+
         return np.asarray(np.min(self.allgather(numbers), axis=0))
 
     def processes_on_machine(self) -> int:

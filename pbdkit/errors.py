@@ -223,6 +223,10 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str:
     return f"; did you mean {first}{names[-1]}?"
 
 
+class AnswerError(TypeError):
+    """A function returned an object of the wrong kind; the message contains the correct kind."""
+
+
 LONGEST_LINE = 400
 """Maximum number of characters of a message that is quoted."""
 

@@ -14,10 +14,12 @@ from typing import Any
 
 from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
+from pbdkit.execution import Execution
 from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import SCHEMA_VERSION, Column, Values, When
 from pbdkit.io.netcdf import FINAL_STATE, NetcdfSink
-from pbdkit.io.open import reading, refuse_other_file, refuse_store
+from pbdkit.io.open import reading
+from pbdkit.io.other_files import refuse_other_file, refuse_store
 from pbdkit.io.paged_file import PiecedArray
 from pbdkit.io.recorder import Recorder, columns_of
 from pbdkit.io.run_store import UnfinishedRun, is_unfinished, make_room
@@ -28,7 +30,7 @@ from pbdkit.model.shipped import read_experiment
 from pbdkit.plugin.discovery import refuse_retired
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.simulation import Driver, Execution, RunReport, Simulation, record
+from pbdkit.simulation import Driver, RunReport, Simulation, record
 from pbdkit.stability.relaxation import with_solver
 
 

@@ -16,15 +16,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import DivergedError, ExperimentError, warn_caller
+from pbdkit.hooks import worded
 from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.recorder import Recorder, RunOutcome, Snapshots
 from pbdkit.io.sinks import KeepingSink, MemorySink, OverlappingSink, Sink
 from pbdkit.linear.stencil import Bound, wave_bound
 from pbdkit.model.loading import as_experiment
 from pbdkit.model.solver import Equilibrium, Solver, Stepping
-from pbdkit.plugin.discovery import worded
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stability.forecast import outlook, prediction, quick_warnings
@@ -848,27 +847,3 @@ def _located(scene: Scene) -> Iterator[None]:
         yield
     except ExperimentError as error:
         raise scene.experiment.located(error) from None
-
-
-class Execution:
-    """Where runs are carried out: by one process, or, in `pbdkit.mpi.distributed_run`, by all
-    processes of a communicator, which make each call together."""
-
-    def __init__(self, communicator: Communicator = SERIAL) -> None:
-        self.communicator = communicator
-
-    def scene(self, experiment: Experiment) -> Scene:
-        """Return what this process needs of an experiment's scene."""
-        return build_scene(experiment)
-
-    def tuned(self, scene: Scene) -> Scene:
-        """Return the scene with numbers in place of `auto`."""
-        return tuned(scene)
-
-    def by_root(self, work: Callable[[], int]) -> int:
-        """Return what the root alone comes to."""
-        return work()
-
-    def run(self, scene: Scene, watch: Watch) -> Simulation:
-        """Return the run of a scene."""
-        return Simulation.of_scene(scene, watch=watch)

@@ -18,6 +18,7 @@ ORDER = [
     "memory",
     "progress",
     "communicator",
+    "hooks",
     "plugin",
     "untrusted_files",
     "components",
@@ -31,6 +32,7 @@ ORDER = [
     "equilibrium",
     "stability",
     "simulation",
+    "execution",
     "restart",
     "mpi",
     "sweeps",
@@ -132,6 +134,6 @@ def test_the_kernel_on_the_page_is_the_one_that_is_generated(monkeypatch):
     monkeypatch.setattr(engine, "load_blamed", lambda levels, source, given: sources.append(source))
     engine.CompiledStepper(build_scene(pbdkit.load("paper/a")))
     lines = sources[0].splitlines()
-    for line in PAGE.split("```python\n")[1].split("```")[0].splitlines():
+    for line in PAGE.split("```text\n")[1].split("```")[0].splitlines():
         assert line in lines, line
         del lines[: lines.index(line) + 1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pbdkit.plugin import Command, hookimpl
+from pbdkit.hooks import Command, hookimpl
 
 
 @hookimpl

@@ -16,14 +16,18 @@ import pluggy
 
 from pbdkit.cli.options import with_no_plugins
 from pbdkit.errors import PbdkitError, PluginError, did_you_mean
-from pbdkit.plugin.discovery import (
+from pbdkit.hooks import (
+    COMMAND_GROUP,
     DISABLE,
+    GROUP,
+    Command,
+    Hooks,
     Plugin,
+    hookimpl,
     installed_plugins,
     with_commands,
     worded,
 )
-from pbdkit.plugin.hooks import COMMAND_GROUP, GROUP, Command, Hooks, hookimpl
 
 T = TypeVar("T")
 OWN_MODULES = ("pbdkit.cli.commands", "pbdkit.web", "pbdkit.bench")

@@ -143,7 +143,7 @@ NO_PLUGINS = click.Option(
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_setting("pbdkit.plugin.discovery", "DISABLE"),
+    callback=_setting("pbdkit.hooks", "DISABLE"),
     help="Load no plugins, as if pbdkit alone were installed.",
 )
 

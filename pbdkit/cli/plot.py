@@ -106,7 +106,8 @@ def plot(
     """
     from pbdkit.cli.options import refuse_output, refuse_unwritable, save
     from pbdkit.errors import ExperimentError
-    from pbdkit.io.open import is_experiment, reading, refuse_other_file
+    from pbdkit.io.open import reading
+    from pbdkit.io.other_files import is_experiment, refuse_other_file
     from pbdkit.plotting.configuration import plot as draw
 
     if is_experiment(file):
@@ -186,7 +187,8 @@ def _plot_set_up(
 def animate(file: Path, output: Path | None, at: dict[str, str], force: bool, **look: Any) -> None:
     """Make a movie of a result: every recorded step, with one colour scale."""
     from pbdkit.cli.options import refuse_output, refuse_unwritable
-    from pbdkit.io.open import reading, refuse_other_file
+    from pbdkit.io.open import reading
+    from pbdkit.io.other_files import refuse_other_file
     from pbdkit.plotting.movie import animate as write
     from pbdkit.plotting.movie import refuse_no_movie
     from pbdkit.progress import progress_bar
@@ -257,7 +259,8 @@ def curve(
     and with --particle or --bond its history there. Results of sweeps have a line for each member.
     """
     from pbdkit.cli.options import refuse_output, refuse_unwritable, save
-    from pbdkit.io.open import reading, refuse_other_file
+    from pbdkit.io.open import reading
+    from pbdkit.io.other_files import refuse_other_file
 
     refuse_other_file(file)
     path = output or file.with_name(f"{file.stem}-{_default_name(kind, options)}.png")

@@ -21,13 +21,13 @@ from pbdkit import __version__
 from pbdkit.cli.commands import own_commands, plugins_with_commands
 from pbdkit.cli.options import json_option
 from pbdkit.errors import ExperimentError
+from pbdkit.hooks import canonical
 from pbdkit.io.atomic_file import write_folder
 from pbdkit.plugin import BUILTIN, INTERFACES, LISTS
-from pbdkit.plugin.discovery import canonical
 from pbdkit.plugin.registry import Registry
 
 if TYPE_CHECKING:
-    from pbdkit.plugin.discovery import Plugin
+    from pbdkit.hooks import Plugin
     from pbdkit.testing import Report
 
 
@@ -160,8 +160,8 @@ def _selected_plugins(distributions: tuple[str, ...]) -> list[Plugin]:
         For a distribution that is not installed, or if there is no plugin.
     """
     from pbdkit.errors import PluginError, did_you_mean
+    from pbdkit.hooks import canonical
     from pbdkit.plugin import BUILTIN
-    from pbdkit.plugin.discovery import canonical
     from pbdkit.plugin.registry import Registry
 
     by_distribution: dict[str, list[Plugin]] = {}

@@ -44,7 +44,8 @@ def _fault_of(file: Path) -> str:
     """Return the fault of a result, or an empty string."""
     from pbdkit.cli.options import refusals_as
     from pbdkit.errors import StorageError
-    from pbdkit.io.open import UNSEALED, other_file, refuse_no_file
+    from pbdkit.io.open import UNSEALED, refuse_no_file
+    from pbdkit.io.other_files import other_file
     from pbdkit.io.seal import SealedFile
     from pbdkit.untrusted_files import refuse_no_result
 
@@ -84,7 +85,7 @@ def _refuse_elsewhere(file: Path) -> None:
 def status(output: Path, as_json: bool) -> None:
     """Report the progress of an unfinished run: step, rate and remaining time."""
     from pbdkit.errors import ExperimentError
-    from pbdkit.io.open import refuse_other_file, refuse_store
+    from pbdkit.io.other_files import refuse_other_file, refuse_store
     from pbdkit.io.run_store import status_of
 
     refuse_store(output)
@@ -262,7 +263,8 @@ def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> 
     """
     from pbdkit.cli.options import refuse_output
     from pbdkit.errors import ExperimentError, StorageError
-    from pbdkit.io.open import reading, refuse_other_file
+    from pbdkit.io.open import reading
+    from pbdkit.io.other_files import refuse_other_file
     from pbdkit.io.vtkhdf import export as write
 
     refuse_other_file(file)

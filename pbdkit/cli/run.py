@@ -19,10 +19,11 @@ from pbdkit.cli.options import PATH, experiment_argument, json_option, result_ar
 from pbdkit.errors import ExperimentError, NotSharedError, PbdkitWarning
 
 if TYPE_CHECKING:
+    from pbdkit.execution import Execution
     from pbdkit.io.netcdf import NetcdfSink
     from pbdkit.io.recorder import RunOutcome
     from pbdkit.progress import Watch
-    from pbdkit.simulation import Execution, RunReport, Simulation
+    from pbdkit.simulation import RunReport, Simulation
 
 
 SIGNAL_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
@@ -184,7 +185,7 @@ def _shared(execution: Execution, quiet: bool, work: Callable[[Execution, bool],
     except NotSharedError as error:
         text = str(error).replace("; run it in one process", "; the first of them runs it alone")
         _warn([text], quiet)
-    from pbdkit.simulation import Execution
+    from pbdkit.execution import Execution
 
     # A signal that is sent to all processes must not end those that wait.
     with nullcontext() if execution.communicator.is_root else stop_on_signals():

@@ -31,6 +31,7 @@ from pbdkit.fitting.observations import (
     TracksObservation,
 )
 from pbdkit.fitting.problem import Loss
+from pbdkit.model.base import Base, base_source
 from pbdkit.model.experiment import Experiment, Version
 from pbdkit.model.motions import read_columns
 from pbdkit.model.reading import (
@@ -42,7 +43,6 @@ from pbdkit.model.reading import (
     of_kind,
     read_file,
 )
-from pbdkit.model.shipped import Base, base_source
 from pbdkit.model.solver import Equilibrium
 from pbdkit.model.validation import closed_part, report
 from pbdkit.plugin.component import Component, Strict

@@ -45,10 +45,10 @@ from pbdkit.fitting.problem import TELLS
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import FOLLOWER, Mask, Places
+from pbdkit.model.base import Base, base_source
 from pbdkit.model.experiment import Experiment, Version, given_classes
 from pbdkit.model.motions import read_columns
 from pbdkit.model.reading import FIT, OF_PROGRAM, Source, of_kind, read_file, with_value
-from pbdkit.model.shipped import Base, base_source
 from pbdkit.model.solver import Equilibrium
 from pbdkit.model.validation import fault, report
 from pbdkit.plugin import BreaksAtStrain, Calibrated, Softens

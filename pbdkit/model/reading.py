@@ -17,8 +17,6 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-import numpy as np
-from pydantic import BaseModel
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import (
@@ -490,6 +488,10 @@ def _leaves(data: Any, changes: Mapping[Any, Any], where: Where) -> Iterator[tup
 
 def plain(value: Any) -> Any:
     """Convert arrays and components to the values that a file would contain."""
+    # Imported here: a mistyped name is answered without either.
+    import numpy as np
+    from pydantic import BaseModel
+
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", by_alias=True)
     if isinstance(value, (np.ndarray, np.generic)):

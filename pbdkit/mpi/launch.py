@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from pbdkit.errors import ExperimentError, refuse_without
-from pbdkit.simulation import Execution
+from pbdkit.execution import Execution
 
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
 """How many processes launchers of MPI programs say in the environment that there are."""

@@ -19,6 +19,7 @@ Examples
 
 from __future__ import annotations
 
+from pbdkit.hooks import GROUP, Command, hookimpl
 from pbdkit.plugin.component import (
     Bonds,
     Component,
@@ -52,7 +53,6 @@ from pbdkit.plugin.fracture_model import (
     StartsCracked,
 )
 from pbdkit.plugin.frame_policy import Anchors, FrameMap, FramePolicy, FrameSites
-from pbdkit.plugin.hooks import GROUP, Command, hookimpl
 from pbdkit.plugin.lattice import (
     BasisSite,
     Cell,

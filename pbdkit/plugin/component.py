@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from pbdkit.errors import did_you_mean, printable
+from pbdkit.errors import AnswerError, did_you_mean, printable
 from pbdkit.plugin.vector import Vector
 
 Pair = Annotated[tuple[float, float], Field(strict=False)]
@@ -112,10 +112,6 @@ class Component(Strict, ABC):
         """Return the numeric and boolean parameters by name, for elementwise functions."""
         values: dict[str, Any] = {name: getattr(self, name) for name in type(self).model_fields}
         return {k: v for k, v in values.items() if isinstance(v, (int, float))}
-
-
-class AnswerError(TypeError):
-    """A function returned an object of the wrong kind; the message contains the correct kind."""
 
 
 def as_vector(answer: Any, what: str, like: Any) -> Any:

@@ -7,22 +7,18 @@ from dataclasses import replace
 from functools import cached_property
 
 from pbdkit.errors import ExperimentError, PluginError, did_you_mean, one_line
-from pbdkit.plugin import BUILTIN, Component
-from pbdkit.plugin.discovery import (
+from pbdkit.hooks import (
     ALL,
+    COMMAND_GROUP,
     DISABLE,
     Offer,
     Plugin,
     canonical,
-    checked,
     disabled_names,
     installed_plugins,
-    interface_of,
-    is_retired,
-    load_builtin,
-    loaded,
 )
-from pbdkit.plugin.hooks import COMMAND_GROUP
+from pbdkit.plugin import BUILTIN, Component
+from pbdkit.plugin.discovery import checked, interface_of, is_retired, load_builtin, loaded
 
 GIVEN = "components"
 """Name of the plugin with the classes that are passed as Python objects."""

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.hooks import worded
 from pbdkit.io.atomic_file import WHOLE
 from pbdkit.io.layout import Column, Values, When
 from pbdkit.io.sinks import MemorySink
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source
 from pbdkit.plugin import Component
-from pbdkit.plugin.discovery import worded
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation, record

@@ -12,8 +12,8 @@ from functools import cache
 from typing import Any, Literal
 
 from pbdkit.errors import PluginError
+from pbdkit.hooks import worded
 from pbdkit.plugin import Component, Lattice, NeighbourMetric
-from pbdkit.plugin.discovery import worded
 from pbdkit.testing import component_properties, mechanics_properties, step_properties
 from pbdkit.testing.subject import (
     NotAskedError,

@@ -81,7 +81,8 @@ def report(
     """Write one page to share: the moving lattice, histories, curves, what was predicted, what
     broke, how to run it again; of a sweep its map and its members. It needs no network."""
     from pbdkit.cli.options import refuse_output, refuse_unwritable
-    from pbdkit.io.open import reading, refuse_other_file
+    from pbdkit.io.open import reading
+    from pbdkit.io.other_files import refuse_other_file
     from pbdkit.web.report import BUDGET
     from pbdkit.web.report import report as write
 

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import anywidget
 
-from pbdkit.errors import ExperimentError, refuse_without
-from pbdkit.model.loading import as_experiment
+from pbdkit.errors import ExperimentError
 from pbdkit.web.page import script, source
 from pbdkit.web.requests import command_of
 from pbdkit.web.server import Conductor, Viewer
 from pbdkit.web.session import Message, Session
-
-if TYPE_CHECKING:
-    from pbdkit.model.loading import ComponentClasses, ExperimentLike
 
 
 class _Cells(Viewer):
@@ -61,37 +56,3 @@ class LiveWidget(anywidget.AnyWidget):
             self._conductor.ask(self._cells, command_of(message))
         except ExperimentError as error:
             self._cells.tell({"is": "error", "text": str(error)})
-
-
-def live(
-    experiment: ExperimentLike,
-    *,
-    components: ComponentClasses = (),
-    output: str | Path | None = None,
-) -> LiveWidget:
-    """Return a widget for a notebook, in which the body of an experiment answers to the mouse.
-
-    Parameters
-    ----------
-    experiment : Experiment, mapping, str or path
-        As `pbdkit.run` takes it.
-    components : iterable of classes
-        As in `pbdkit.load`.
-    output : str or path, optional
-        Where what is done to the body can be saved as an experiment that repeats it bit for bit; by
-        default NAME-live.yaml.
-
-    Returns
-    -------
-    LiveWidget
-        Shown by the notebook; ``close()`` ends it.
-
-    Raises
-    ------
-    ExperimentError, PluginError
-        Where anywidget is missing, or the experiment is wrong.
-    """
-    refuse_without("anywidget", "live", "live needs anywidget")
-
-    found = as_experiment(experiment, components)
-    return LiveWidget(Session(found, Path(output) if output else None))

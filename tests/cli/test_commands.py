@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from plugin_sources import rule
 
-from pbdkit.plugin.discovery import DISABLE
+from pbdkit.hooks import DISABLE
 
 Install = Callable[..., None]
 Call = Callable[..., Any]

@@ -18,8 +18,8 @@ from plugin_sources import hook, listed, rule
 
 import pbdkit
 from pbdkit.cli import program
+from pbdkit.hooks import DISABLE, installed_plugins
 from pbdkit.model.schema import experiment_schema
-from pbdkit.plugin.discovery import DISABLE, installed_plugins
 from pbdkit.plugin.registry import Registry
 
 Install = Callable[..., None]

@@ -18,8 +18,8 @@ from interpreted_kernels import interpreting
 
 import pbdkit
 import pbdkit.testing
+from pbdkit.hooks import Hooks
 from pbdkit.plugin import INTERFACES, Component
-from pbdkit.plugin.hooks import Hooks
 from pbdkit.testing import PROPERTIES, examine, examples_of
 
 PAGES = Path(__file__).parents[2] / "docs" / "extending"

@@ -23,11 +23,12 @@ from trials import differences, row
 from scene_strategies import calibrated_experiments, experiments, pulled_apart  # beside trials
 
 from pbdkit.errors import PbdkitError
+from pbdkit.execution import Execution
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.model.experiment import Experiment
 from pbdkit.mpi.distributed_run import DistributedExecution
 from pbdkit.progress import Watch
-from pbdkit.simulation import Execution, record
+from pbdkit.simulation import record
 
 Parts = dict[str, Any]
 ENGINES = st.sampled_from(["numpy", "numpy", "numpy", "compiled"])

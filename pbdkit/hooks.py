@@ -1,0 +1,394 @@
+"""Hooks and plugins: what a distribution may implement, which are installed, and the guard in which
+each is loaded, so that an error in its code becomes a message that names it.
+
+Nothing here imports the interfaces, so that a command starts without them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Callable
+from contextlib import chdir, redirect_stdout, suppress
+from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.metadata import Distribution, EntryPoint, distribution, distributions, version
+from pathlib import PurePath, PureWindowsPath
+from typing import Any
+
+import pluggy
+
+from pbdkit.errors import AnswerError, did_you_mean, one_line
+
+GROUP = "pbdkit"
+"""The entry-point group of plugins, and the project name of their hook markers."""
+COMMAND_GROUP = "pbdkit.commands"
+"""The entry-point group of modules that implement `pbdkit_commands`. They are imported to list
+commands, those of the group "pbdkit" are not."""
+
+hookspec = pluggy.HookspecMarker(GROUP)
+hookimpl = pluggy.HookimplMarker(GROUP)
+"""Marks a function of a plugin as the implementation of a hook of the same name."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the program `pbdkit`.
+
+    Parameters
+    ----------
+    name : str
+        The word after `pbdkit`: lower-case letters, digits and hyphens.
+    target : str
+        The click command, as ``module:attribute``.
+    does : str
+        One sentence for `pbdkit --help`.
+    group : str
+        Heading in `pbdkit --help` under which the command is listed.
+    """
+
+    name: str
+    target: str
+    does: str
+    group: str = "Plugins"
+
+    def load(self) -> Any:
+        """Import the click command."""
+        module, _, attribute = self.target.partition(":")
+        return getattr(import_module(module), attribute)
+
+
+class Hooks:
+    """What a plugin may implement, as functions of the module that its entry point names."""
+
+    @hookspec
+    def pbdkit_components(self) -> list[type[Any]]:
+        """The component classes that the distribution offers."""
+        raise NotImplementedError  # a specification only: pluggy never calls it
+
+    @hookspec
+    def pbdkit_commands(self) -> list[Command]:
+        """Return the commands that the distribution adds to the program `pbdkit`. The modules of
+        the commands are imported when they are called, so the module of this hook should import
+        nothing but `pbdkit.plugin`."""
+        raise NotImplementedError
+
+
+NUMBERS = {"Parameters": "p", "Weights": "w", "Constants": "c", "Own": "here.own"}
+"""Names of the arguments of elementwise functions, by the class of their named tuple."""
+
+NO_REFERENCE = (
+    "`here.X` and `here.centred` are given to rules that declare "
+    "`uses_reference: ClassVar[bool] = True`"
+)
+"""Message about reference positions in rules that do not declare their use."""
+
+
+def worded(error: BaseException, package: str = "", component: type[Any] | None = None) -> str:
+    """Return ``Type: message`` of an error in foreign code.
+
+    The text is on one line, without control characters, and shortened if it is long.
+
+    Parameters
+    ----------
+    error
+        The error.
+    package
+        Package for which the last place in the traceback is appended.
+    component
+        Component for which a remedy is appended.
+    """
+    try:
+        message = str(error)
+    except Exception:  # `__str__` of an error class of a plugin can fail
+        message = "(its message is not available)"
+    if isinstance(error, AnswerError):
+        return one_line(message)
+    text = f"{type(error).__name__}: {message}" if message else type(error).__name__
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if package and str(frame.f_globals.get("__name__")).split(".")[0] == package:
+            # PureWindowsPath accepts the separators of every system
+            place = f" ({PureWindowsPath(frame.f_code.co_filename).name}, line {line})"
+    advice = ""
+    with suppress(Exception):  # attributes of foreign errors and objects can fail
+        advice = remedy(error, component)
+    return one_line(text) + advice + place
+
+
+def remedy(error: BaseException, component: type[Any] | None = None) -> str:
+    """Return the remedy for frequent errors in elementwise functions."""
+    if isinstance(error, ValueError) and "truth value of an array" in str(error):
+        return "; choose with `pbdkit.plugin.where` in the place of `if`, `and` and `or`"
+    of_none = isinstance(error, AttributeError | TypeError) and "'NoneType'" in str(error)
+    if of_none and not getattr(component, "uses_reference", True):
+        return f"; {NO_REFERENCE}"
+    if not isinstance(error, AttributeError):
+        return ""
+    name, kind = str(error.name), type(error.obj).__name__
+    if kind in NUMBERS and component and name in component.model_fields:
+        return (
+            f"; `{NUMBERS[kind]}` contains numbers, and the parameter '{name}' is not a number: "
+            "convert it in `parameters` or `weights`"
+        )
+    names = [n for n in getattr(error.obj, "_fields", dir(error.obj)) if not n.startswith("_")]
+    content = ""
+    if kind in NUMBERS:
+        content = f"; `{NUMBERS[kind]}` contains {', '.join(names) or 'nothing'}"
+    return did_you_mean(name, names) or content
+
+
+API = 1
+"""Version of the hooks and the interfaces.
+
+A plugin can declare the version that it implements as `pbdkit_api`, in the module or on the object
+of its entry point.
+"""
+
+DISABLE, ALL = "PBDKIT_DISABLE_PLUGINS", "*"
+"""The variable that lists what is not to be loaded, distributions or entry points, and its value
+for: nothing at all."""
+
+SEVERITY = ("ok", "conflict", "broken")
+"""States of an offer in increasing severity; the state of a plugin is the most severe."""
+
+
+@dataclass(frozen=True)
+class Offer:
+    """Component of a plugin.
+
+    Parameters
+    ----------
+    name
+        Type of the component.
+    interface
+        Interface, if it is known.
+    component
+        Class; None if it is not usable.
+    reason
+        Why it is not usable, or in conflict with others.
+    """
+
+    name: str
+    interface: type[Any] | None = None
+    component: type[Any] | None = None
+    reason: str = ""
+
+    @property
+    def state(self) -> str:
+        """State: ok, conflict or broken."""
+        usable = "conflict" if self.reason else "ok"
+        return usable if self.component else "broken"
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """Entry point of a distribution, with the components and commands that it provides.
+
+    Parameters
+    ----------
+    name
+        Name of the entry point.
+    distribution, version
+        Name and version of the distribution.
+    entry
+        Entry point.
+    offers
+        Components, after loading.
+    commands
+        Commands, after loading.
+    unusable
+        State if the plugin cannot be used.
+    why
+        Reason of that state.
+    """
+
+    name: str
+    distribution: str
+    version: str
+    entry: EntryPoint | None = None
+    offers: tuple[Offer, ...] = ()
+    commands: tuple[Command, ...] = ()
+    unusable: str = ""
+    why: str = ""
+
+    @property
+    def state(self) -> str:
+        """State: ok, disabled, broken (in whole or in part), incompatible or conflict."""
+        states = [offer.state for offer in self.offers]
+        return self.unusable or max(states, key=SEVERITY.index, default="ok")
+
+    @property
+    def reason(self) -> str:
+        """Reason of the state, empty if it is ok."""
+        return self.why or "; ".join(dict.fromkeys(o.reason for o in self.offers if o.reason))
+
+    @property
+    def fault(self) -> str:
+        """State and reason if the plugin cannot be used, otherwise empty."""
+        return "" if self.state in ("ok", "conflict") else f"{self.state}: {self.reason}"
+
+    @property
+    def components(self) -> tuple[type[Any], ...]:
+        """Usable component classes."""
+        return tuple(o.component for o in self.offers if o.component)
+
+    def answers_to(self, name: str) -> bool:
+        """Return whether a name is that of the distribution or of the entry point."""
+        return canonical(name) in (canonical(self.distribution), canonical(self.name))
+
+    def __str__(self) -> str:
+        return f"{self.distribution} {self.version}".strip()
+
+
+def installed_plugins(group: str = GROUP) -> list[Plugin]:
+    """Return the entry points in a group of all other distributions, sorted by name, without
+    loading them.
+
+    A distribution with unreadable metadata becomes a broken plugin, one that the user disables a
+    disabled plugin. Of two distributions with the same name, the first on the Python path counts.
+    """
+    names: set[str] = set()
+    plugins: list[Plugin] = []
+    for candidate in distributions():
+        try:
+            if f"[{group}]" in (candidate.read_text("entry_points.txt") or ""):
+                names.add(canonical(_field(candidate, "Name")))
+        except Exception as error:
+            folder = PurePath(str(getattr(candidate, "_path", "(no name)"))).name
+            plugins.append(_damaged(folder, error))
+    for name in sorted(names - {GROUP}):
+        try:
+            source = distribution(name)
+            label = _field(source, "Name"), _field(source, "Version")
+            points = source.entry_points.select(group=group)
+            plugins += [_with_state(Plugin(point.name, *label, point)) for point in points]
+        except Exception as error:
+            plugins.append(_damaged(name or "(no name)", error))
+    return sorted(plugins, key=lambda plugin: (plugin.distribution, plugin.name))
+
+
+def _field(source: Distribution, name: str) -> str:
+    """Return a field of the metadata, or an empty string.
+
+    The backport importlib_metadata, which replaces Python's reader once it is imported, raises if
+    there are no metadata.
+    """
+    metadata: Any = None
+    with suppress(FileNotFoundError):
+        metadata = source.metadata
+    return (metadata and metadata.get(name)) or ""
+
+
+def _damaged(distribution: str, error: Exception) -> Plugin:
+    why = f"its metadata cannot be read: {worded(error)}"
+    return Plugin("", distribution, "", unusable="broken", why=why)
+
+
+def _with_state(plugin: Plugin) -> Plugin:
+    """Disable the plugin if the user demands it."""
+    why = ""
+    if ALL in (names := disabled_names()):
+        why = f"all plugins are disabled (--no-plugins or {DISABLE}={ALL})"
+    elif any(map(plugin.answers_to, names)):
+        why = f"{DISABLE} contains it"
+    return replace(plugin, unusable="disabled", why=why) if why else plugin
+
+
+def disabled_names() -> list[str]:
+    """Return the names in the environment variable `DISABLE`."""
+    return [word.strip() for word in os.environ.get(DISABLE, "").split(",") if word.strip()]
+
+
+def canonical(name: str) -> str:
+    """Return the normalised name of a distribution."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+class IncompatibleError(Exception):
+    """The plugin implements another version of the plugin API."""
+
+
+def with_commands(plugin: Plugin) -> Plugin:
+    """Import a plugin and call its hook `pbdkit_commands`.
+
+    Errors become state and reason of the plugin; disabled plugins are not imported.
+    """
+
+    def load(entry: EntryPoint, package: str) -> Plugin:
+        answer = hook_answer(entry, "pbdkit_commands", "commands")
+        return replace(plugin, commands=tuple(map(_checked_command, answer)))
+
+    return guarded(plugin, load)
+
+
+def guarded(plugin: Plugin, load: Callable[[EntryPoint, str], Plugin]) -> Plugin:
+    """Load a plugin; errors become its state and reason.
+
+    Output of the plugin at import goes to standard error; its warning filters and working folder
+    are isolated.
+    """
+    if plugin.unusable or plugin.entry is None:
+        return plugin
+    package = plugin.entry.value.split(":")[0].split(".")[0].strip()
+    try:
+        with chdir("."), redirect_stdout(sys.stderr), warnings.catch_warnings():
+            return load(plugin.entry, package)
+    except IncompatibleError as error:
+        return replace(plugin, unusable="incompatible", why=str(error))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"while {plugin.distribution} was loaded") from None
+    except BaseException as error:  # includes SystemExit at import
+        return replace(plugin, unusable="broken", why=worded(error, package))
+
+
+def hook_answer(entry: EntryPoint, hook: str, elements: str) -> list[Any]:
+    """Return the list of `elements` that a hook of the module of an entry point returns."""
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(Hooks)
+    module = entry.load()
+    declared = getattr(module, "pbdkit_api", None)
+    if declared is None:  # the entry point can refer to an object in the module
+        declared = getattr(sys.modules.get(entry.module), "pbdkit_api", API)
+    if type(declared) is not int:
+        raise TypeError(f"its `pbdkit_api` should be a whole number, got {declared!r}")
+    if declared != API:
+        raise IncompatibleError(
+            f"it implements version {declared} of the plugin API, but pbdkit {version(GROUP)} "
+            f"has version {API}; install compatible versions of both"
+        )
+    manager.register(module, entry.name)
+    manager.check_pending()
+    caller = getattr(manager.hook, hook)
+    if not caller.get_hookimpls():
+        raise TypeError(f"its module implements no hook `{hook}`")
+    answers = caller()
+    if not answers or not isinstance(answers[0], list):
+        raise TypeError(f"its hook `{hook}` must return a list of {elements}")
+    return answers[0]
+
+
+def _checked_command(command: Any) -> Command:
+    """Return the command if it is usable.
+
+    Raises
+    ------
+    TypeError
+        If it is not, with the remedy.
+    """
+    if not isinstance(command, Command):
+        raise TypeError(f"{command!r} is not a pbdkit.plugin.Command")
+    if not re.fullmatch(r"[a-z][a-z0-9-]*", command.name):
+        raise TypeError(
+            f"'{command.name}' is not a valid name of a command; it must begin with a lower-case "
+            "letter and contain only lower-case letters, digits and '-'"
+        )
+    if not re.fullmatch(r"[\w.]+:\w+", command.target):
+        raise TypeError(
+            f"the target of the command '{command.name}' is '{command.target}'; write "
+            "'module:attribute'"
+        )
+    return command

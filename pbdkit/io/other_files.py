@@ -1,0 +1,71 @@
+"""Files that are no results: what they are, by their content, and which command reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pbdkit.errors import ExperimentError
+from pbdkit.io.run_store import STORE
+from pbdkit.model.reading import EXPERIMENT, kind_of, read_file, what_takes
+from pbdkit.model.shipped import shipped_names
+from pbdkit.untrusted_files import BEGINNINGS
+
+TEXTS = (".yaml", ".yml", ".json")
+FAULTY = "faulty"
+"""The kind of what is no text, or of a text at fault."""
+
+
+def refuse_other_file(path: Path) -> None:
+    """Raises ExperimentError where it is known what a path leads to, and that is no result."""
+    if told := other_file(path):
+        raise ExperimentError(f"{path}: {told}")
+
+
+def other_file(path: Path) -> str:
+    """What it is and what takes it; empty for results, for nothing and for what nobody knows."""
+    if path.is_dir():
+        inner = path / "sweep.nc"
+        sweep = f"is the folder of a sweep; its dataset is {inner}"
+        return sweep if inner.is_file() else "is a folder, no result of pbdkit"
+    if not path.is_file():
+        known = path.as_posix() in shipped_names()
+        return f"is a shipped experiment; `pbdkit run {path}` makes a result of it" * known
+    kind = _kind_of_text(path)
+    if kind is None:
+        return ""
+    if kind == FAULTY:
+        return "is no result, by its name an experiment" if path.suffix in TEXTS else ""
+    if kind == EXPERIMENT:
+        return f"is an experiment; `pbdkit run {path}` makes a result of it, and says where"
+    takes = f"is {kind}, no result; {what_takes(kind, str(path))}"
+    return takes if kind else "is no result: those end in .nc"
+
+
+def is_experiment(path: Path) -> bool:
+    """Return whether a path leads to an experiment, in a file or shipped: one that cannot be read
+    is told by its name."""
+    if not path.is_file():
+        return path.as_posix() in shipped_names()
+    kind = _kind_of_text(path)
+    return kind == EXPERIMENT or (kind == FAULTY and path.suffix in TEXTS)
+
+
+def _kind_of_text(path: Path) -> str | None:
+    """What a text describes, FAULTY where it is no text of YAML; None for results, and what cannot
+    be read."""
+    try:
+        with path.open("rb") as file:
+            if file.read(8).startswith(BEGINNINGS):
+                return None
+        return kind_of(read_file(path).data)
+    except OSError:
+        return None
+    except ExperimentError:  # no text, or text that is at fault
+        return FAULTY
+
+
+def refuse_store(path: Path) -> None:
+    """Raises ExperimentError for the store of an unfinished run in place of its output."""
+    if path.name.endswith(STORE) and path.is_file():
+        output = path.with_name(path.name.removesuffix(STORE))
+        raise ExperimentError(f"{path}: is what was kept of an unfinished run; name {output}")
