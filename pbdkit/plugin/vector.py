@@ -141,7 +141,9 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
 def dot(a: Vector[T], b: Vector[T]) -> T:
     """Return a·b = a_x b_x + a_y b_y."""
     products: list[Any] = [one * other for one, other in zip(a, cast(Any, b), strict=True)]
-    return cast(T, sum(products[1:], products[0]))
+    # No name of a type here: the kernel cache keys functions by what they refer to.
+    total: T = sum(products[1:], products[0])
+    return total
 
 
 def squared_length(v: Vector[T]) -> T:

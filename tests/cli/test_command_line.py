@@ -414,7 +414,7 @@ def test_a_copy_takes_the_name_of_the_shipped_experiment_and_replaces_nothing(ca
     assert "f1.yaml written; next: pbdkit check f1.yaml" in call("init", "--from", "paper/f1").out
     Path("measured-boundary.csv").write_text("mine")
     refused = call("init", "--from", "modelling/measured-boundary")
-    assert (refused.code, "measured-boundary.csv: exists and is left as" in refused.err) == (
+    assert (refused.code, "measured-boundary.csv: exists and is not changed" in refused.err) == (
         2,
         True,
     )

@@ -150,7 +150,7 @@ def test_another_api_version_is_incompatible(install: Install, call: Call) -> No
     result = call("run", "e.json", "--set=rule={type: newer}")
     assert result.code == 2
     assert "unknown type 'newer'" in result.err
-    assert "; pbdkit-newer 9.0 is incompatible: it is written" in result.err
+    assert "; pbdkit-newer 9.0 is incompatible: it implements version 2" in result.err
 
 
 def test_this_api_version_is_fine(install: Install) -> None:

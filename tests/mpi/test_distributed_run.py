@@ -332,7 +332,7 @@ def test_what_is_damaged_of_a_state_is_said_in_all_processes(tmp_path):
     """Also where the first process comes upon it while others wait for their parts."""
     path = tmp_path / "out.nc"
     begin = partial(written, sheet(), path, watch=stopping_after(3))
-    assert on_ranks(3, lambda ranks: begin(execution=ranks).status)[0] == "interrupted"
+    assert on_ranks(3, lambda ranks: begin(processes=ranks).status)[0] == "interrupted"
     with closing(sqlite3.connect(f"{path}.run")) as store:
         changed = store.execute("UPDATE pieces SET data = x'00' WHERE key LIKE 'array/%.u/0'")
         assert changed.rowcount == 1
@@ -408,7 +408,7 @@ def test_processes_that_do_not_find_each_other_are_refused(names, monkeypatch, c
     """As where the launcher is of one MPI and mpi4py of another."""
     for name in names:
         monkeypatch.setenv(name, "2")
-    monkeypatch.setattr("pbdkit.mpi.distributed_run.refuse_without", lambda *missing: None)
+    monkeypatch.setattr("pbdkit.mpi.launch.refuse_without", lambda *missing: None)
     monkeypatch.setitem(sys.modules, "mpi4py", SimpleNamespace(MPI=Alone))
     done = call("run", "e.json")
     assert done.code == 2

@@ -216,7 +216,7 @@ def test_the_step_operator_knows_loads(frame):
         of.reshape(2, -1)[:, at].T.ravel()
         for of, at in ((state.u, place), (state.previous, place), (state.u, led))
     )
-    expected = known.now @ u + known.before @ previous + known.led @ w + known.source
+    expected = known.current @ u + known.previous @ previous + known.leader @ w + known.source
     after = Stepper(scene).advance(state).u.reshape(2, -1)[:, place].T.ravel()
     np.testing.assert_allclose(after, expected, atol=1e-13)
 
