@@ -325,5 +325,5 @@ def test_stress_of_a_rule_without_a_material_is_refused(rule):
 
 
 def test_strain_of_a_body_without_cells_is_refused():
-    with pytest.raises(pbdkit.ExperimentError, match=r"^diagnostics\.0: 'strain' needs cells"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"^diagnostics\.0: 'strain' requires cells"):
         pbdkit.run(experiment(6, 1, diagnostics=FIELDS[:1]), progress=False)

@@ -289,7 +289,7 @@ class Forceless(pbdkit.plugin.Calibrated, pbdkit.FollowerRule):
 
 def test_a_calibrated_rule_without_forces_is_named():
     parts = SQUARE | {"rule": {"type": "forceless"}, "frame": {"type": "none"}}
-    with pytest.raises(pbdkit.ExperimentError, match="components: Forceless lacks force"):
+    with pytest.raises(pbdkit.ExperimentError, match="components: Forceless does not define force"):
         pbdkit.run(pulled(parts), components=[Forceless], progress=False)
 
 

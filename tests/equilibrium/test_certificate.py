@@ -459,7 +459,7 @@ def test_parts_that_remember_have_no_known_distance():
         fracture={"type": "damage", "onset": 0.1, "failure": 0.5},
         solver={"type": "stepping", "settle": {"tolerance": 1e-4}},
     )
-    with pytest.raises(pbdkit.ExperimentError, match="'damage' remembers") as refused:
+    with pytest.raises(pbdkit.ExperimentError, match="'damage' depends on the history") as refused:
         pbdkit.Experiment(**given)
     assert "leave solver.settle out" in str(refused.value)
 

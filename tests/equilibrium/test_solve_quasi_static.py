@@ -207,7 +207,7 @@ def test_what_a_separated_run_recorded_is_kept_in_its_file(call, tmp_path):
         assert len(ds.time) > 1
     refused = call("resume", str(out), "--steps", "20")
     assert refused.code == 2
-    assert "is separated" in refused.err
+    assert "has status separated" in refused.err
 
 
 def test_a_refusal_on_the_way_is_no_run_to_resume(call, tmp_path, monkeypatch):
@@ -221,7 +221,7 @@ def test_a_refusal_on_the_way_is_no_run_to_resume(call, tmp_path, monkeypatch):
     ended = call("run", str(path), "-o", str(out))
     assert ended.code == 2
     assert "nothing holds a part of" in ended.err
-    assert "would be refused in the same way" in ended.err
+    assert "would fail in the same way" in ended.err
     assert "continues it" not in ended.err
 
 

@@ -319,7 +319,7 @@ def test_a_step_is_linearised_alike_in_all_units(rule, a):
         return step_operator(build_scene(pbdkit.Experiment(**given)))
 
     one, other = operator(1.0), operator(a)
-    for name in ("now", "led"):
+    for name in ("current", "leader"):
         matrix, scaled = getattr(one, name).toarray(), getattr(other, name).toarray()
         np.testing.assert_allclose(scaled, matrix, rtol=1e-14, atol=1e-15, err_msg=name)
     np.testing.assert_allclose(other.source / a, one.source, rtol=1e-14, atol=1e-15)
