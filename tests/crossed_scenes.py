@@ -98,8 +98,12 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
         ("rule number in time", "fracture number in time"),
         "'auto' needs constant parameters, and some depend on time",
     ),
-    (("memory auto",), (ANEW,), "'auto' needs a spectrum, and neighbours that are found anew"),
-    (UNCALIBRATED, ("loads", "body force"), r"loads: the rule '[a-z-]+' .* knows no forces"),
+    (("memory auto",), (ANEW,), "'auto' needs a spectrum, and there is none if neighbours are"),
+    (
+        UNCALIBRATED,
+        ("loads", "body force"),
+        r"loads: the rule '[a-z-]+' .* defines moves, but no forces",
+    ),
     (
         UNCALIBRATED,
         ("motion: newton",),
@@ -117,9 +121,13 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (
         ("rule: strain-gradient",),
         (*FRACTURES, *OF_FRACTURE),
-        "applies a rule to the moves of another, which is incompatible with this fracture",
+        "applies a rule to the moves of another, which is incompatible with this setting of fracture",
     ),
-    (("rule: strain-gradient",), ("cuts",), "which is incompatible with such cuts; use cuts:"),
+    (
+        ("rule: strain-gradient",),
+        ("cuts",),
+        "which is incompatible with this setting of cuts; use cuts:",
+    ),
     (
         ("fracture: threshold",),
         ("fracture field by region",),

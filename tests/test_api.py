@@ -205,7 +205,7 @@ def test_warnings_are_silenced_one_by_one(tensile):
         pbdkit.run(parts, progress=False)
     kinds = {w.category.__name__: str(w.message) for w in told}
     assert kinds["StabilityWarning"].startswith("solver.relaxation: 2.5 can diverge")
-    assert kinds["SceneWarning"].startswith("regions.nowhere: nothing names it")
+    assert kinds["SceneWarning"].startswith("regions.nowhere: not referenced")
     with warnings.catch_warnings(record=True) as left:
         warnings.simplefilter("always")
         warnings.simplefilter("ignore", pbdkit.errors.StabilityWarning)

@@ -120,8 +120,8 @@ def test_a_large_file_is_read_in_pieces(tmp_path):
     path, values = tmp_path / "large.nc", np.zeros((300, 2**17))
     xarray.Dataset({"x": (("t", "n"), values)}).to_netcdf(path)
     code = (
-        "import sys; from pathlib import Path; from pbdkit.resources import trial\n"
-        "trial._read(Path(sys.argv[1])); from pbdkit.simulation import peak_memory\n"
+        "import sys; from pathlib import Path; from pbdkit import untrusted_files\n"
+        "untrusted_files._read(Path(sys.argv[1])); from pbdkit.simulation import peak_memory\n"
         "print(peak_memory())"
     )
     done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)

@@ -451,7 +451,7 @@ def with_inner(scene: Scene) -> Scene:
         if clash:
             raise ExperimentError(
                 f"'{rule.type}' applies a rule to the moves of another, which is incompatible with "
-                f"{'such' if part == 'cuts' else 'this'} {part}; use {part}: {remedy}",
+                f"this setting of {part}; use {part}: {remedy}",
                 (part,),
             )
     experiment = experiment.model_copy(update={"rule": inner})

@@ -299,7 +299,10 @@ def test_the_remedies_for_a_large_spacing_are_true():
     with pytest.raises(pbdkit.ExperimentError) as error:
         build_scene(pbdkit.Experiment(**body(14.0)))
     words = str(error.value).split()
-    share, onset = float(words[words.index("than") + 1].strip(",;")), float(words[words.index("below") + 1][:6])
+    share, onset = (
+        float(words[words.index("than") + 1].strip(",;")),
+        float(words[words.index("below") + 1][:6]),
+    )
     for size, more in ((14.0 * share * 0.99, {}), (14.0, {"onset": onset * 0.99})):
         build_scene(pbdkit.Experiment(**body(size, fracture=COHESIVE | more)))
 

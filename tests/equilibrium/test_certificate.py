@@ -461,7 +461,7 @@ def test_parts_that_remember_have_no_known_distance():
     )
     with pytest.raises(pbdkit.ExperimentError, match="'damage' depends on the history") as refused:
         pbdkit.Experiment(**given)
-    assert "leave solver.settle out" in str(refused.value)
+    assert "remove solver.settle" in str(refused.value)
 
 
 @pytest.mark.parametrize("memory", [0.9, 0.97])

@@ -295,6 +295,8 @@ def test_simulation_finds_the_strengths_of_chains_torn_in_closed_form(monkeypatc
 
     monkeypatch.setattr(Specimens, "tear", torn)
     monkeypatch.setattr("pbdkit.fitting.strength.has_forces", lambda scene: True)
+    nothing = np.full((2, 2), np.nan)
+    monkeypatch.setattr("pbdkit.fitting.strength.reactions", lambda moment: nothing)
     monkeypatch.setattr(strength_simulation, "MIN_LOAD_RATIO", 0.0)
     narrow = {"fracture.scale": [0.01, 0.05], "fracture.modulus": [3.0, 20.0]}
     fit = fit_of(peaks, experiment=made, unknown=narrow, method="simulation", simulations=2000)

@@ -198,7 +198,7 @@ def test_what_is_no_run_is_not_concatenated(sheet):
 def test_parameters_are_coordinates_of_a_sweep():
     given = experiment(leaders=[HELD, pull_right(0.3, 0.0)], steps=3)
     vary, keep = {"solver.relaxation": [0.5, 1.0]}, {"variables": ["u"]}
-    found = pbdkit.sweep(given, vary, keep=keep, workers=1, progress=False)
+    found = pbdkit.sweep(given, vary=vary, keep=keep, workers=1, progress=False)
     assert found.relaxation.values.tolist() == [0.5, 1.0]
     ones = [pbdkit.run(given | {"solver": {"type": "stepping", "relaxation": r}}, progress=False)
             for r in (0.5, 1.0)]  # fmt: skip
@@ -213,7 +213,9 @@ def test_members_of_a_sweep_are_joined_along_their_cracks():
     given = experiment(leaders=[HELD, pull_right(0.3, 0.0, 8)], steps=10,
                        diagnostics=[{"type": "crack-path"}],
                        fracture={"type": "threshold", "thresholds": [1.4]})  # fmt: skip
-    found = pbdkit.sweep(given, {"fracture.thresholds": [[1.4], [9.0]]}, workers=1, progress=False)
+    found = pbdkit.sweep(
+        given, vary={"fracture.thresholds": [[1.4], [9.0]]}, workers=1, progress=False
+    )
     assert found.crack_step.dims == ("thresholds", "crack")
     assert found.crack.values.tolist() == list(range(1, found.sizes["crack"] + 1))
     assert found.bond_ends.dims == ("bond", "end")

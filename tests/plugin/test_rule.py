@@ -116,11 +116,11 @@ def test_the_operator_is_the_step(frame):
 @pytest.mark.parametrize(
     ("setting", "remedy"),
     [
-        ("frame={type: mean, lag: 1}", "take frame: lag: 0"),
-        ("fracture={type: threshold, thresholds: [2.0]}", "take fracture: {type: none}"),
+        ("frame={type: mean, lag: 1}", "use frame: lag: 0"),
+        ("fracture={type: threshold, thresholds: [2.0]}", "use fracture: {type: none}"),
         (
             "neighbours={type: euclidean, radius: 1.2, reevaluate: true}",
-            "take neighbours: reevaluate",
+            "use neighbours: reevaluate",
         ),
     ],
 )

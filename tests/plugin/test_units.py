@@ -172,7 +172,9 @@ def test_check_says_how_large_the_body_is(call: Any) -> None:
 def test_a_sweep_over_the_lattice_unit_refines_what_is_written_in_mm() -> None:
     vary = {"units.length": ["0.25 mm", "0.5 mm"], "units.youngs_modulus": ["206 GPa", "70 GPa"]}
     bar = changed(lattice={"type": "square", "a": 2.0}, diagnostics=BAR["diagnostics"][:3])
-    ds = pbdkit.sweep(bar, vary=vary, keep={"times": "last"}, workers=1, progress=False).isel(time=-1)
+    ds = pbdkit.sweep(bar, vary=vary, keep={"times": "last"}, workers=1, progress=False).isel(
+        time=-1
+    )
     force = ds.reaction.isel(leader_group=1, axis=0)
     assert force.values == pytest.approx(2 * 3.05 * np.array([[206.0, 70.0]] * 2))
     assert ds.u_mm.max("particle").values[..., 0] == pytest.approx(np.full((2, 2), 4e-3))

@@ -125,7 +125,7 @@ def test_check_knows_the_lightest_mass(damping):
 
     def warned(mass):
         found = forecast(build_scene(pbdkit.Experiment(**data(mass)))).warnings
-        return any("too light" in text for text in found)
+        return any("is too small" in text for text in found)
 
     stiffness = 2.5  # Σ W over both axes, for ν = 0
     least = stiffness / 4 + damping / 2

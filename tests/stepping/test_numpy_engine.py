@@ -26,8 +26,7 @@ from property_cases import (
 )
 
 import pbdkit
-from pbdkit.stepping import numpy_engine as bond_breaker
-from pbdkit.stepping import rule_evaluation as surroundings
+from pbdkit.stepping import bond_breaking, rule_evaluation
 
 few = settings(max_examples=4, deadline=None, derandomize=True)
 small = st.floats(-2.0, 2.0, allow_subnormal=False)
@@ -230,9 +229,9 @@ def test_two_runs_and_any_cut_into_row_blocks_agree_bitwise(lattice, rule, fract
     once = pbdkit.run(given, progress=False)
     if fracture:
         assert (once.broken_step > 0).any()
-    for cells in (surroundings.BLOCK_CELLS, 20, 1):
-        monkeypatch.setattr(surroundings, "BLOCK_CELLS", cells)
-        monkeypatch.setattr(bond_breaker, "BLOCK_CELLS", cells)
+    for cells in (rule_evaluation.BLOCK_CELLS, 20, 1):
+        monkeypatch.setattr(rule_evaluation, "BLOCK_CELLS", cells)
+        monkeypatch.setattr(bond_breaking, "BLOCK_CELLS", cells)
         again = pbdkit.run(given, progress=False)
         assert once.drop_attrs().identical(again.drop_attrs())
 

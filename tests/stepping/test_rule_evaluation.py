@@ -141,7 +141,7 @@ MISTAKES = {
     HasTable: ("`p` contains numbers, and the param", NO_NUMBER, "evaluation.py, line "),
     HasMode: ("`p` contains numbers, and the parameter 'mode'", NO_NUMBER, "evaluation.py, line "),
     HasWeights: ("did you mean 'nearness'?", "evaluation.py, line "),
-    StartsAtVector: ("the initial value of 'way' is Vector", "is one number", "as way_x and way_y"),
+    StartsAtVector: ("the initial value of 'way' is Vector", "not a number", "as way_x and way_y"),
     Array: ("Diagnostic 'array' failed at step 0: `measure` returned ndarray", TUPLE),
     Alone: ("Diagnostic 'alone' failed", "`variables` returned Variable", TUPLE),
     Misspelt: ("no attribute 'displacment'; did you mean 'displacement'?", "evaluation.py, line "),
