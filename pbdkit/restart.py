@@ -452,7 +452,7 @@ def _refuse_other_weights(
     They depend on the roles of the last step.
     """
     stepping = scene.experiment.stepping
-    auto = stepping.model_copy(update={f"asked_{name}": "auto" for name in chosen})
+    auto = stepping.model_copy(update={f"{name}_setting": "auto" for name in chosen})
     new_stepping = (
         execution.tuned(with_solver(scene, auto)).experiment.stepping if chosen else stepping
     )

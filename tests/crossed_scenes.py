@@ -121,7 +121,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (
         ("rule: strain-gradient",),
         (*FRACTURES, *OF_FRACTURE),
-        "applies a rule to the moves of another, which is incompatible with this setting of fracture",
+        "the moves of another, which is incompatible with this setting of fracture",
     ),
     (
         ("rule: strain-gradient",),

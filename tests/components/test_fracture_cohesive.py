@@ -281,7 +281,8 @@ def test_kernels_soften_as_numpy_does(interpreted):
     [
         (body(14.0), ["0.0006 is too small for this spacing", "multiply the spacing by less than"]),
         (body(0.1, {"type": "barycentre"}) | {"frame": {"type": "mean"}},
-         ["'cohesive' requires a rule that is calibrated to a material", "'barycentre' with these parameters is not",
+         ["'cohesive' requires a rule that is calibrated to a material",
+          "'barycentre' with these parameters is not",
           "or fracture: {type: damage}"]),
         (body(0.1) | {"frame": {"type": "none"}},
          ["'cohesive' softens the cells of the body", "frame 'none'", "{type: natural}"]),
