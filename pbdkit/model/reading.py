@@ -374,7 +374,7 @@ COMMON_KEYS = {"version", "name", "seed", "units", "steps", "record"}
 """Keys of experiments that other files may have too."""
 PARTS = COMMON_KEYS | {
     *("lattice", "body", "regions", "neighbours", "rule", "frame", "fracture", "cuts", "initial"),
-    *("leaders", "loads", "obstacles", "diagnostics", "solver"),
+    *("leaders", "loads", "obstacles", "operations", "diagnostics", "solver"),
 }
 """All keys of experiments."""
 EXPERIMENT = "an experiment"
