@@ -154,7 +154,7 @@ FAULTS = [
     (remembering.Misstates, "breaks-beyond-its-strain", "`breaking_strain` and `breaks` disagree"),
     (remembering.Sags, "rests", "a body at rest moves by"),
     (directions.Compass, "follows-rotations", "count its neighbours' places from its own"),
-    (directions.PointsNowhere, "declares-what-it-remembers", "names 'vane_tan' in `rotations`"),
+    (directions.PointsNowhere, "declares-what-it-remembers", "has 'vane_tan' in `rotations`"),
     (directions.WritesThere, "changes-no-input", "`gather` writes into `shared"),
     (directions.Creeps, "rests", "a body at rest moves by 1e-09"),
     (remembering.Ragged, "measures-what-it-declares", "'last_square' has the shape"),
