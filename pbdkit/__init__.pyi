@@ -69,6 +69,9 @@ from pbdkit.plugin import (
     NeighbourMetric as NeighbourMetric,
 )
 from pbdkit.plugin import (
+    ParticleOperation as ParticleOperation,
+)
+from pbdkit.plugin import (
     hookimpl as hookimpl,
 )
 from pbdkit.simulation import Simulation as Simulation

@@ -409,7 +409,7 @@ def test_check_warns_where_loads_have_no_time_to_come_to_rest(call, tmp_path):
     given_ = SHEET | {"leaders": [HELD], "loads": FORCE, "frame": NATURAL}
     (tmp_path / "hasty.yaml").write_text(json.dumps(given_))
     said = json.loads(call("check", str(tmp_path / "hasty.yaml"), "--json").out)["warnings"]
-    assert any(w.startswith("steps: under its loads the body comes to rest in") for w in said)
+    assert any(w.startswith("steps: under its loads the body converges in") for w in said)
 
 
 class Leaning(pbdkit.FramePolicy):
