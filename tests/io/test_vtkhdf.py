@@ -187,7 +187,7 @@ def test_the_command_writes_beside_the_result(call, tmp_path, monkeypatch):
     assert "a.vtkhdf: exists" in call("export", "a.nc").err
     assert call("export", "a.nc", "--force").code == 0
     refused = call("export", "a.nc", "-o", "a.vtk")
-    assert (refused.code, "ends in .vtkhdf" in refused.err) == (2, True)
+    assert (refused.code, "must end in .vtkhdf" in refused.err) == (2, True)
     nowhere = call("export", "a.nc", "-o", "none/a.vtkhdf")
     assert (nowhere.code, "there is no folder none" in nowhere.err) == (6, True)
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_file()) == ["a.nc", "a.vtkhdf"]
