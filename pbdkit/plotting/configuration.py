@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.transforms import ScaledTranslation
 
 from pbdkit.errors import ExperimentError, refuse_no_matplotlib
 from pbdkit.io.layout import in_this_layout
@@ -485,6 +483,8 @@ class Sheet:
             page.arrange(scale, text, handles, self._larger)
             return
         if scale:
+            from matplotlib.cm import ScalarMappable
+
             bar_of = self.figure.colorbar(
                 ScalarMappable(scale.norm, scale.colours), ax=self.axes, extend=scale.extend
             )
@@ -502,6 +502,8 @@ class Sheet:
 
     def _add_legend(self, palette: Palette) -> None:
         """Below axes that were given."""
+        from matplotlib.transforms import ScaledTranslation
+
         below = self.axes[0].transAxes + ScaledTranslation(0, -0.45, self.figure.dpi_scale_trans)
         handles = legend_handles(palette, set(self._extent.kinds | self._extent.classes))
         self.axes[0].legend(

@@ -12,11 +12,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, Locator, MaxNLocator
-from matplotlib.transforms import Bbox
 
 from pbdkit.errors import ExperimentError
 from pbdkit.plotting.colours import Palette, Scale
@@ -26,8 +21,12 @@ from pbdkit.plotting.style import new_figure, renderer_of
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from matplotlib.axes import Axes
     from matplotlib.legend import Legend
+    from matplotlib.lines import Line2D
     from matplotlib.text import Text
+    from matplotlib.ticker import Locator
+    from matplotlib.transforms import Bbox
 
 PAGE_WIDTH_IN = 7.2
 """Width of a page."""
@@ -75,6 +74,8 @@ def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
 
 def handle(name: str, colour: str) -> Line2D:
     """Return a dot with a name."""
+    from matplotlib.lines import Line2D
+
     return Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)
 
 
@@ -193,6 +194,8 @@ class Page:
 
     def _place_panels(self) -> None:
         """Set the size of the figure, and place panels, heading and labels of the axes."""
+        from matplotlib.transforms import Bbox
+
         grid, (width, height) = self._grid, self._grid.size
         least = self._before + self._after + (width, height)
         page = np.array(self._size or least)
@@ -232,6 +235,8 @@ class Page:
 
     def _bar(self, scale: Scale, text: str) -> Any:
         """Return the colour bar; it stands beside panels that are tall enough for its label."""
+        from matplotlib.cm import ScalarMappable
+
         width, height = self._grid.size
         broad = int(min(height, BAR_LENGTH_IN) * CHARACTERS_PER_IN)
         lines = textwrap.wrap(text, max(1, broad), break_long_words=False)
@@ -281,6 +286,8 @@ class Page:
 
     def _drawn(self, artists: Iterable[Any], **more: Any) -> Bbox:
         """Return the box around artists with all that belongs to them, in inches."""
+        from matplotlib.transforms import Bbox
+
         renderer = renderer_of(self.figure)
         boxes = [box for artist in artists if (box := artist.get_tightbbox(renderer, **more))]
         return Bbox(Bbox.union(boxes).get_points() / self.figure.dpi)
@@ -302,6 +309,8 @@ class Page:
 
 def _locator(low: float, high: float, length: float, distance: float) -> Locator:
     """Return a locator of ticks at a distance in inches at least; of one tick on short axes."""
+    from matplotlib.ticker import FixedLocator, MaxNLocator
+
     if length < SHORT_AXIS_IN:
         return FixedLocator([0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.1g}")])
     return MaxNLocator(max(1, int(length / distance)), steps=[1, 2, 5, 10])

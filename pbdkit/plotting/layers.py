@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.collections import LineCollection, PathCollection
 from numpy.typing import NDArray
 
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale
@@ -19,6 +18,7 @@ from pbdkit.plotting.style import figure_of
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.collections import PathCollection
     from matplotlib.image import AxesImage
 
 
@@ -241,6 +241,8 @@ class BondLines(Layer):
     def __init__(
         self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False
     ) -> None:
+        from matplotlib.collections import LineCollection
+
         self._body, self._broken = body, broken
         style: dict[str, Any] = {"colors": LINE, "zorder": 1}
         if broken:
@@ -259,6 +261,8 @@ class BondValues(Layer):
     """A quantity of bonds, as the colours of lines; those without a value are not drawn."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, width: float, scale: Scale) -> None:
+        from matplotlib.collections import LineCollection
+
         self._body = body
         self._lines = LineCollection(
             [], linewidths=width, cmap=scale.colours, norm=scale.norm, zorder=2, capstyle="round"
@@ -276,6 +280,8 @@ class BondValues(Layer):
 
 def draw_outline(ax: Axes, sides: Array) -> None:
     """Lines, (side, end, axis), that stay."""
+    from matplotlib.collections import LineCollection
+
     lines = LineCollection(list(sides), colors=REST, linewidths=0.7, zorder=2.5)
     ax.add_collection(lines, autolim=False)
 

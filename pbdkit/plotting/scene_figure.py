@@ -9,12 +9,9 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from pbdkit.lattice.raster import FOLLOWER, Raster
@@ -27,6 +24,9 @@ from pbdkit.scene.constants import signed_distance
 from pbdkit.scene.obstacles import CIRCLES, HALF_PLANE, Barrier, Outline
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.selection import spacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Floats = NDArray[np.floating[Any]]
 HEAD = 7.0
@@ -417,6 +417,9 @@ class AxesCanvas:
 
     def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
         """Fill what lies between closed outlines: an inner one is a hole."""
+        from matplotlib.patches import PathPatch
+        from matplotlib.path import Path
+
         turned = [line[:: 1 if n == 0 else -1] for n, line in enumerate(outlines)]
         path = Path.make_compound_path(
             *(Path(self._unit * o, closed=False) for o in map(_closed, turned))

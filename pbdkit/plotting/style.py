@@ -9,17 +9,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from numbers import Real
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backend_bases import RendererBase
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from pbdkit.errors import ExperimentError, one_line
 from pbdkit.io.physical import FACTOR, UNITS
 from pbdkit.progress import in_notebook
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.backend_bases import RendererBase
+    from matplotlib.figure import Figure
 
 PYPLOT = "matplotlib.pyplot"
 
@@ -47,6 +48,9 @@ def new_figure(*, alone: bool = False, **how: Any) -> Figure:
         if hasattr(found.canvas, "get_renderer"):
             return found
         pyplot.close(found)  # of a backend that cannot measure text
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     found = Figure(**how)
     FigureCanvasAgg(found)
     return found

@@ -39,11 +39,10 @@ def live(
     """
     from pbdkit.api import load
     from pbdkit.errors import refuse_without
-    from pbdkit.web.server import Conductor
-    from pbdkit.web.session import Session
 
     refuse_without("websockets", "live", "live needs websockets")
-    from pbdkit.web.server import SessionServer
+    from pbdkit.web.server import Conductor, SessionServer
+    from pbdkit.web.session import Session
 
     loaded = load(experiment, settings=settings)
     conductor = Conductor(Session(loaded, output))

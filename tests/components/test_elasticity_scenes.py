@@ -70,12 +70,12 @@ UNFIT = {
     "gradient with a frame that lags": (
         {"rule": GRADIENT, "frame": {"type": "mean", "lag": 1}},
         "frame",
-        "is incompatible with this frame; use frame: lag: 0",
+        "is incompatible with this setting of frame; use frame: lag: 0",
     ),
     "gradient with fracture": (
         {"rule": GRADIENT, "fracture": {"type": "threshold", "thresholds": [2.0]}},
         "fracture",
-        "is incompatible with this fracture; use fracture: {type: none}",
+        "is incompatible with this setting of fracture; use fracture: {type: none}",
     ),
     "cells of a rule that has none": (
         {"rule": {"type": "barycentre"}},

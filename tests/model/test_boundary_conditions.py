@@ -202,7 +202,7 @@ def test_it_runs_again_from_its_dataset():
           "neighbours": {"type": "euclidean", "radius": 1.5, "reevaluate": True}},
          "bonds cannot be cut if neighbours are re-evaluated"),
         ({"cuts": cut(3), "rule": {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 1.0}},
-         "which is incompatible with such cuts; use cuts: "),
+         "which is incompatible with this setting of cuts; use cuts: "),
     ],
 )  # fmt: skip
 def test_wrong_cuts_are_told(parts, words):

@@ -384,7 +384,7 @@ def test_numbers_from_which_others_are_drawn_are_not_turned(tmp_path):
 def test_cuts_are_refused_where_the_rule_takes_none(tmp_path):
     session, _ = session_of("material/gradient-layer", tmp_path)
     line = {"from": [0.3, -1.0], "to": [0.3, 5.0]}
-    with pytest.raises(pbdkit.ExperimentError, match="is incompatible with such cuts"):
+    with pytest.raises(pbdkit.ExperimentError, match="is incompatible with this setting of cuts"):
         do(session, do="cut", **line)
     session.advance(1)
     assert not session.script.cuts
