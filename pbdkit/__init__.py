@@ -7,8 +7,8 @@ importing pbdkit costs next to nothing. What authors of components need is in `p
 from __future__ import annotations
 
 from importlib import import_module
-
 from itertools import pairwise
+
 from pbdkit.lazy_accessor import register_accessor
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import DivergedError, ExperimentError, ReproducibilityWarning, warn_caller
-from pbdkit.io.layout import carried
-from pbdkit.io.layout import experiment_of as experiment_of
+from pbdkit.io.layout import carried, experiment_of as experiment_of
 from pbdkit.io.sinks import MemorySink, Sink
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.loading import as_experiment, but_got, load_experiment

@@ -13,8 +13,7 @@ import pbdkit
 from pbdkit.scene.scene import build_scene
 from tests.components.test_fracture_cohesive import COHESIVE
 from tests.model.test_boundary_conditions import PLATE, cut
-from tests.plugin import test_lattice as test_axes
-from tests.plugin import test_schedule as test_courses
+from tests.plugin import test_lattice as test_axes, test_schedule as test_courses
 from tests.scene import test_loads
 from tests.scene.test_leader_groups_directions import CASES, vanes
 from tests.scene.test_materials import FIELDS, REGIONS

@@ -4,8 +4,7 @@ Steps are few and thresholds lie off round numbers, so that no unstable mode and
 length and a threshold magnifies rounding into a difference.
 """
 
-from hypothesis import HealthCheck, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, settings, strategies as st
 
 from pbdkit import Lattice, NeighbourMetric
 from pbdkit.lattice.neighbourhood import build_neighbourhood

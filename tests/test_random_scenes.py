@@ -7,8 +7,7 @@ at a time.
 import numpy as np
 import plain_loops
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from scene_strategies import experiments, grids, initials, pulled_apart, samples
 
 import pbdkit

@@ -189,8 +189,7 @@ def animate(file: Path, output: Path | None, at: dict[str, str], force: bool, **
     from pbdkit.cli.options import refuse_output, refuse_unwritable
     from pbdkit.io.open import reading
     from pbdkit.io.other_files import refuse_other_file
-    from pbdkit.plotting.movie import animate as write
-    from pbdkit.plotting.movie import refuse_no_movie
+    from pbdkit.plotting.movie import animate as write, refuse_no_movie
     from pbdkit.progress import progress_bar
 
     refuse_other_file(file)

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import did_you_mean
 from pbdkit.lattice.cells import Patch
 from pbdkit.lattice.fill import tolerance_of
-from pbdkit.lattice.raster import FOLLOWER, Places, Raster
-from pbdkit.lattice.raster import Floats as RasterFloats
+from pbdkit.lattice.raster import FOLLOWER, Floats as RasterFloats, Places, Raster
 from pbdkit.model.bodies import Sites
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (

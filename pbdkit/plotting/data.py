@@ -19,8 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.io.layout import INDICES, OF_BODY, as_step, broken_by, carried, makers_of, rows_of
 from pbdkit.lattice.raster import FRAME
-from pbdkit.model.bodies import AnyBody, Sites
-from pbdkit.model.bodies import Body as Shape
+from pbdkit.model.bodies import AnyBody, Body as Shape, Sites
 from pbdkit.plotting.style import Look, in_its_units, is_number, label, plain
 from pbdkit.plugin import Vector
 

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
     ConfigDict,
+    Field as ModelField,
     PrivateAttr,
     RootModel,
     ValidationError,
     ValidationInfo,
     model_validator,
 )
-from pydantic import Field as ModelField
 from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.errors import did_you_mean

@@ -30,8 +30,7 @@ from pbdkit.model.shipped import shipped_names, shipped_text
 from pbdkit.model.validation import brief, fault, report
 from pbdkit.plugin import Component
 from pbdkit.plugin.component import Strict
-from pbdkit.plugin.units import TEXT as WITH_UNIT
-from pbdkit.plugin.units import Quantity
+from pbdkit.plugin.units import TEXT as WITH_UNIT, Quantity
 
 MAX_MEMBERS = 100_000
 """Largest number of members. Each takes about a millisecond for validation, and some kilobytes

@@ -82,8 +82,7 @@ def report(
     from pbdkit.cli.options import refuse_output, refuse_unwritable
     from pbdkit.io.open import reading
     from pbdkit.io.other_files import refuse_other_file
-    from pbdkit.web.report import BUDGET
-    from pbdkit.web.report import report as write
+    from pbdkit.web.report import BUDGET, report as write
 
     refuse_other_file(file)
     path = output or file.with_suffix(".html")

@@ -9,8 +9,7 @@ import pytest
 from interpreted_kernels import interpreting
 
 import pbdkit
-from pbdkit.equilibrium import breaking_kernel as choice
-from pbdkit.equilibrium import solve as increments
+from pbdkit.equilibrium import breaking_kernel as choice, solve as increments
 from pbdkit.equilibrium.breaking_kernel import Settler
 from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.progress import Watch

@@ -9,8 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from property_cases import BOTH_ENDS_HELD, HOLD_LEFT, LATTICES, experiment, pull_right
 from scene_strategies import experiments, samples
 

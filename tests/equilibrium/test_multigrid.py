@@ -8,10 +8,12 @@ import pytest
 from turning_frame import Turning
 
 import pbdkit
-from pbdkit.equilibrium import linear_solver
-from pbdkit.equilibrium import linearise as linearisation
-from pbdkit.equilibrium import solve as increments
-from pbdkit.equilibrium import system as moves
+from pbdkit.equilibrium import (
+    linear_solver,
+    linearise as linearisation,
+    solve as increments,
+    system as moves,
+)
 from pbdkit.equilibrium.solve import settle
 from pbdkit.plugin import FollowerRule, Vector
 from pbdkit.scene import memory_estimate as solver_sizes

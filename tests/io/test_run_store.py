@@ -18,14 +18,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scene_strategies import experiments, pulled_apart, samples
 
 import pbdkit
-from pbdkit.io import netcdf as netcdf_sink
-from pbdkit.io import run_store as run_store
-from pbdkit.io import sqlite_file
+from pbdkit.io import netcdf as netcdf_sink, run_store as run_store, sqlite_file
 from pbdkit.io.atomic_file import is_local
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.io.run_store import RunStore, UnfinishedRun, status_of, store_of

@@ -10,8 +10,7 @@ import warnings
 import numpy as np
 import pytest
 import xarray
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scene_strategies import samples
 
 import pbdkit

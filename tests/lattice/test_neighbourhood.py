@@ -4,8 +4,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from property_cases import LATTICES, LATTICES_AND_NEIGHBOURS, NEIGHBOURS, scene_of
 
 import pbdkit

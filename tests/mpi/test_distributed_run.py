@@ -17,8 +17,7 @@ from typing import ClassVar, Literal
 import h5netcdf
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from property_cases import HOLD_LEFT, pull_right
 from remembering_parts import Tiring, Weakest
 from scene_strategies import calibrated_experiments, experiments, pulled_apart, samples

@@ -6,8 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from property_cases import HOLD_LEFT, pull_right
 from scene_strategies import samples
 from thread_ranks import on_ranks

@@ -6,8 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from property_cases import HOLD_LEFT, pull_right
 from scene_strategies import calibrated_experiments, experiments, samples
 from thread_ranks import on_ranks

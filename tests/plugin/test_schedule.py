@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from thread_ranks import on_ranks
 
 import pbdkit

@@ -38,8 +38,7 @@ from trials import (
 )
 
 from pbdkit.errors import PbdkitError
-from pbdkit.io import run_store, sqlite_file
-from pbdkit.io import run_store as unfinished
+from pbdkit.io import run_store, run_store as unfinished, sqlite_file
 from pbdkit.io.atomic_file import is_local
 from pbdkit.io.run_store import status_of
 

@@ -19,8 +19,17 @@ import tempfile
 import time
 from pathlib import Path
 
-from trials import BASE, BREAKING, OUTPUT, debris, differences, often, reference, row
-from trials import write_experiment as written
+from trials import (
+    BASE,
+    BREAKING,
+    OUTPUT,
+    debris,
+    differences,
+    often,
+    reference,
+    row,
+    write_experiment as written,
+)
 
 from pbdkit.cli import main as program
 from pbdkit.io.run_store import is_unfinished

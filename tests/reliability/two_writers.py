@@ -35,8 +35,7 @@ from trials import (
     write_experiment,
 )
 
-from pbdkit.io import atomic_file as destination
-from pbdkit.io import run_store as unfinished
+from pbdkit.io import atomic_file as destination, run_store as unfinished
 from pbdkit.io.run_store import has_committed
 
 PARTS = {"small": BASE | BREAKING, "large": BASE | LARGE}

@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from property_cases import LATTICES, RULES
 from scene_strategies import calibrated_experiments, experiments, in_turn, samples
 

@@ -9,8 +9,7 @@ that changes by a million by prediction. The excess over the prediction, a facto
 import math
 
 import numpy as np
-from hypothesis import HealthCheck, Phase, assume, event, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, Phase, assume, event, given, settings, strategies as st
 from property_cases import (
     BOTH_ENDS_HELD,
     HOLD_LEFT,

@@ -16,9 +16,7 @@ from property_cases import HOLD_LEFT
 import pbdkit
 from pbdkit.components import pbdkit_components
 from pbdkit.plugin import FollowerRule, FractureModel, FramePolicy
-from pbdkit.stepping import cuda_engine as program
-from pbdkit.stepping import engine_choice as choice
-from pbdkit.stepping import engine_choice as limits
+from pbdkit.stepping import cuda_engine as program, engine_choice as choice, engine_choice as limits
 from pbdkit.stepping.engine_choice import choose, make_engine, what_gpus_lack, what_is_missing
 from pbdkit.stepping.numba_engine.plan import functions_of
 from tests.scene.test_leader_groups_directions import CASES, vanes

@@ -25,8 +25,7 @@ from pbdkit.stepping.state import initial_state
 from tests.mpi.test_distributed_run import assert_same, written
 from tests.stepping.numba_engine.test_engine import TORN, assert_bitwise_equal, sheet
 from tests.stepping.numba_engine.test_time_skewing import small_passes
-from tests.test_restart import assert_same as assert_same_file
-from tests.test_restart import run_in_parts
+from tests.test_restart import assert_same as assert_same_file, run_in_parts
 
 MIDDLE = {"box": [2.5, 1.5, 6.5, 5.5]}
 CASES = {

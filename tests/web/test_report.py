@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import until
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from PIL import Image
 
 import pbdkit
@@ -19,8 +18,7 @@ from pbdkit.io.explain import Explained
 from pbdkit.io.layout import carried
 from pbdkit.model.reading import read_text
 from pbdkit.scene.scene import build_scene
-from pbdkit.web import report
-from pbdkit.web import report as bonds
+from pbdkit.web import report, report as bonds
 from pbdkit.web.page import packed, script
 from pbdkit.web.report import RunContent, experiment_text, moves_of
 

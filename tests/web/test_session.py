@@ -26,9 +26,7 @@ from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation
-from pbdkit.web import script as saving
-from pbdkit.web import session as history
-from pbdkit.web import session as stage
+from pbdkit.web import script as saving, session as history, session as stage
 from pbdkit.web.command_line import live
 from pbdkit.web.requests import FARTHEST, LONGEST, command_of, obey
 from pbdkit.web.server import Access, Conductor, SessionServer, SocketViewer

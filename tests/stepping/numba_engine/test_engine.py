@@ -5,8 +5,7 @@ import time
 import numba
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from interpreted_kernels import interpreting
 from property_cases import FRAMES, LATTICES, NEIGHBOURS, RULES, pull_right
 from remembering_parts import Tiring, Weakest
@@ -17,8 +16,7 @@ import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import engine_choice as choice
 from pbdkit.stepping.engine_choice import choose, make_engine
-from pbdkit.stepping.numba_engine import arrays as stretches
-from pbdkit.stepping.numba_engine import engine as compiled_stepper
+from pbdkit.stepping.numba_engine import arrays as stretches, engine as compiled_stepper
 from pbdkit.stepping.numba_engine.cache import source_key
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper

@@ -4,8 +4,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from interpreted_kernels import interpreting
 from property_cases import HOLD_LEFT, pull_right
 from remembering_parts import Vanes
@@ -15,8 +14,7 @@ import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import engine_choice as choice
 from pbdkit.stepping.engine_choice import choose
-from pbdkit.stepping.numba_engine import plan as bands
-from pbdkit.stepping.numba_engine import time_skewing as passes
+from pbdkit.stepping.numba_engine import plan as bands, time_skewing as passes
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numba_engine.time_skewing import AxisSkew, Skew, single_steps
 from tests.stepping.numba_engine.test_engine import (
