@@ -84,8 +84,8 @@ class PbdAccessor:
         return member(self._dataset, choice)
 
     def at(self, **index: int) -> xarray.Dataset:
-        """What stands at site indices: ``at(i=3, j=4)`` is one particle, as ``sel(particle=...)``
-        gives it, ``at(j=0)`` all of a line.
+        """Select particles by site indices: ``at(i=3, j=4)`` is one particle, as
+        ``sel(particle=...)`` selects it, ``at(j=0)`` all particles of a line.
 
         Every site has indices of its own, those of one repeat cell too. Raises ExperimentError
         where no particle is, and for what is no index.

@@ -41,7 +41,7 @@ SYSTEM |= dict.fromkeys(
     (errno.EMFILE, errno.ENFILE),
     "; raise the limit (`ulimit -n`), or let fewer processes work at once",
 )
-"""What the system may refuse whatever is done, which is no bug of pbdkit, and the remedy."""
+"""Remedies for errors of the operating system by number; they are no defects of pbdkit."""
 MORE = """\
 `pbdkit COMMAND --help` says what a command takes; `pbdkit --help` has the rest."""
 

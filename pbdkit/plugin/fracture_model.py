@@ -131,7 +131,7 @@ class SoftensCells(RenewsBonds):
 
     @staticmethod
     @abstractmethod
-    def update(  # type: ignore[override]  # it is given the cells besides
+    def update(  # type: ignore[override]  # receives the cells too
         d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
     ) -> tuple[Number, ...]:
         """The new values of the numbers that change, in their order, from the stress of the cell

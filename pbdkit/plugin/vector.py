@@ -80,7 +80,7 @@ class Vector(_Plane[T]):
     def __mul__(self, factor: Number) -> Self:  # type: ignore[override]  # no repetition
         return self._of([component * factor for component in cast(Any, self)])
 
-    def __rmul__(self, factor: Number) -> Self:  # type: ignore[override]
+    def __rmul__(self, factor: Number) -> Self:  # type: ignore[override]  # no repetition
         return self._of([factor * component for component in cast(Any, self)])
 
     def __truediv__(self, divisor: Number) -> Self:

@@ -193,6 +193,6 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
         if outcome.state == "failed":
             pytest.fail(f"{report.component}: {asked}: {outcome.reason}", pytrace=False)
         if outcome.state == "skipped":
-            pytest.skip(outcome.reason)  # it is not asked of this component, and says why
+            pytest.skip(outcome.reason)  # the property does not apply to this component
 
     return test_conformance
