@@ -168,7 +168,7 @@ class Row:
 
     @property
     def line(self) -> str:
-        """What rows of one colour in a picture have in common."""
+        """Return the fields that rows of one colour in a picture share."""
         return self.method + (f", {self.threads} threads" if (self.threads or 1) > 1 else "")
 
 
@@ -180,7 +180,7 @@ def engines() -> list[tuple[str, str, int]]:
 
 
 def ways(asked: Experiment) -> int:
-    """So many rows `measure` gives of a size, or a few less."""
+    """Return the maximum number of rows that `measure` returns for a size."""
     if asked.solver.makes_steps:
         return len(engines())
     return 2 + len(TOLERANCES) * len(METHODS)
@@ -333,12 +333,12 @@ COLUMNS = {n: (n, "", "") for n in ("size", "particles", "method", "precision", 
     "certified": ("certified", ".1e", "what the certificate says; *: it misses the tolerance"),
     "error": ("error", ".1e", "at most, as a share: the largest distance from the first row"),
 }
-"""Of each field of a row: its heading, its form and what it is."""
+"""Heading, format and meaning of each field of a row."""
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Of Okabe and Ito, one a line."""
+"""Colours of lines, after Okabe and Ito."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
 FLOOR = 1e-18
-"""Where errors of exactly zero are drawn."""
+"""Position on the axis of errors at which errors of exactly zero are drawn."""
 
 
 def table(rows: Sequence[Row]) -> Table:
@@ -374,7 +374,7 @@ def _cell(row: Row, name: str) -> str:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """What the columns are, and why rows are left out."""
+    """Return the meaning of the columns, and the reason for each missing row."""
     told = [f"{COLUMNS[n][0]}: {COLUMNS[n][2]}" for n in _shown(rows) if COLUMNS[n][2]]
     for row in (row for row in rows if row.reason):
         place = f"size {_cell(row, 'size')}" + (f", {row.tolerance:.0e}" if row.tolerance else "")
@@ -383,7 +383,7 @@ def lines(rows: Sequence[Row]) -> list[str]:
 
 
 def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row]) -> dict[str, Any]:
-    """What ``--json`` writes (docs/performance.md lists the keys)."""
+    """Return the content of the ``--json`` file (docs/performance.md lists the keys)."""
     machine = {"processor": platform.processor() or platform.machine(), "processors": processors()}
     machine |= {"system": platform.system(), "python": sys.version.split()[0]}
     figures = [{k: v if v != inf else None for k, v in asdict(row).items()} for row in rows]
