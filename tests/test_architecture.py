@@ -14,6 +14,7 @@ from pbdkit.stepping.program import ORDER as ORDER_OF_A_STEP
 
 PACKAGE = Path(__file__).parent.parent / "pbdkit"
 ORDER = [
+    "array_types",
     "errors",
     "memory",
     "progress",

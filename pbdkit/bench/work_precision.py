@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.api import load
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, scale_of
 from pbdkit.equilibrium.lattice_system import SlowMode
 from pbdkit.equilibrium.linearise import linearised
@@ -435,7 +436,6 @@ def _x(row: Row) -> float:
     return row.ns_per_particle_step or row.cpu_s or 0.0
 
 
-Floats = NDArray[np.floating[Any]]
 Task = dict[str, Any]
 REPEATS, TASK_PATIENCE_S = 7, 2.0
 """A way is gone so often, unless that takes longer; the best counts."""

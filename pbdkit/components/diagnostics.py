@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.plugin import Diagnostic, Moment, TouchingRows, Variable, Vector, length
 from pbdkit.plugin.diagnostic import Need
@@ -208,8 +209,6 @@ def refuse_numbers_beyond(particles: int, numbers: tuple[int, ...]) -> None:
             raise ExperimentError(text, ("numbers", n))
 
 
-Floats = NDArray[np.floating[Any]]
-"""Type of arrays of floating-point numbers."""
 Measure = Annotated[
     Literal["small", "green-lagrange"],
     Field(

@@ -12,9 +12,9 @@ from functools import cache
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.plugin import (
     AppliesTwice,
@@ -36,9 +36,6 @@ from pbdkit.plugin import (
 )
 from pbdkit.plugin.lattice import Tiling
 from pbdkit.plugin.units import LENGTH
-
-Floats = NDArray[np.float64]
-"""Type of arrays of double precision."""
 
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 """Corners of a rectangular cell relative to its centre, counterclockwise, in half side lengths."""
@@ -357,7 +354,7 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
         weights = self.weights(slot, setting)
         return dict.fromkeys(weights, 0.0) | {"spring": weights["spring"]}
 
-    def spring_share(self, c: NDArray[np.float64], setting: Setting) -> NDArray[np.float64]:
+    def spring_share(self, c: Floats, setting: Setting) -> Floats:
         """Return the largest multiple of the springs that the stiffnesses exceed."""
         modulus, material = self.material()
         return springs_in(c / (self.stiffness * modulus), material, setting.cells)

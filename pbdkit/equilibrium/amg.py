@@ -12,11 +12,9 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+from pbdkit.array_types import Floats, Indices, Mask
+
 COARSEST = 400
 """Unknowns up to which a grid is solved with its inverse."""
 MOST_GRIDS = 20

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.equilibrium.certificate import LINEAR
 from pbdkit.equilibrium.sparse import SOFT
 from pbdkit.equilibrium.system import ROUNDING
@@ -30,7 +30,6 @@ from pbdkit.linear.response import by_sublattice
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import RenewsBonds, SoftensCells
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.progress import Watch
 from pbdkit.scene.constants import Home
 from pbdkit.scene.leader_groups import kinds_at
@@ -227,7 +226,6 @@ def _seconds(scene: Scene) -> float:
     return settlings * (SETTLING_S + PARTICLE_S * scene.raster.count)
 
 
-Floats = NDArray[np.floating[Any]]
 Entry = tuple[Indices, Indices, Indices, Floats]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.linearise import linearised
 from pbdkit.equilibrium.system import (
     ALL,
@@ -27,7 +28,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaking import Fracturing
 from pbdkit.stepping.divergence import way_of
 from pbdkit.stepping.leaders import bends_of, is_cut_short, last_event
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import State
 
 WAYS = {
     "inverse": "the solution for what is left of the moves, and the inverse for their rounding",

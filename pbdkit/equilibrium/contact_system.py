@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.equilibrium.linear_solver import Coordinates
 from pbdkit.equilibrium.sparse import (
     ConstrainedSubsystem,
@@ -34,14 +35,12 @@ from pbdkit.equilibrium.sparse import (
 from pbdkit.equilibrium.system import PUSH, Moves, NoEquilibriumError, System
 from pbdkit.linear.block_matrix import connected, one_minus
 from pbdkit.linear.operator import step_operator
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.progress import Watch
 from pbdkit.scene.obstacles import FLAT, ROUNDING, STRAIGHTEST, Face, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.state import State
 
-Floats = NDArray[np.floating[Any]]
 WEAK = 1e-6
 """The stiffness of springs to where particles are, as a share of that of their neighbours."""
 NO_FACE = -1

@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.multigrid import Grids
 from pbdkit.equilibrium.stencil_matrix import kernels
 from pbdkit.equilibrium.system import ALL, Rows
 
-Floats = NDArray[np.floating[Any]]
 MOST = 400
 """Turns of an iteration."""
 ALIKE = 1e-13

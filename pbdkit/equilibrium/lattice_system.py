@@ -17,8 +17,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.krylov import (
     BiconjugateGradients,
     ConjugateGradients,
@@ -82,9 +82,6 @@ def compliance(grids: Multigrid | PartedGrids) -> float:
     b[axis, i, j] = 1.0
     x = ConjugateGradients(coarse, depth).solve(b, lambda d: len(d.steps) >= ENOUGH).x
     return found + max(0.0, float(x[axis, i, j]) - found) * last
-
-
-Floats = NDArray[np.floating[Any]]
 
 
 def field_of(matrix: StencilMatrix, planes: Floats) -> Floats:

@@ -21,13 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.equilibrium.amg import SparseGrids
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.linear.block_matrix import DENSE
 from pbdkit.progress import Watch
 
-Floats = NDArray[np.floating[Any]]
-Indices = NDArray[np.intp]
 Preconditioner = Callable[[Floats], Floats]
 MAX_ITERATIONS = 400
 """Maximum number of Krylov iterations with a preconditioner."""

@@ -10,10 +10,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.sparse import MatrixSystem
 from pbdkit.equilibrium.system import (
     ALL,
-    Floats,
     IndefiniteError,
     Moves,
     Rows,

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Array, Floats
 from pbdkit.equilibrium.stencil_matrix import (
     OUTSIDE,
     OWN,
@@ -30,7 +31,6 @@ from pbdkit.equilibrium.stencil_matrix import (
 )
 from pbdkit.equilibrium.system import Rows, Strip, coarser_size, outside
 
-Floats = NDArray[np.floating[Any]]
 PRECISION = np.float32
 """Of cycles."""
 WEIGHT = 0.8
@@ -291,7 +291,6 @@ class Multigrid(Grids):
         return i, j
 
 
-Array = NDArray[Any]
 SMALL = 100 * COARSEST
 """Unknowns of a grid that is not worth sharing: more than four times those of the coarsest, so that
 all processes have two grids at least where any is parted."""

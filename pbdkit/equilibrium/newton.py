@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.certificate import (
     FIRST_ORDER,
     LINEAR,
@@ -38,7 +39,7 @@ from pbdkit.equilibrium.system import (
 )
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import State
 
 MOST_CORRECTIONS = 12
 LOOSEST = 0.1

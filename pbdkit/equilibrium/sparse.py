@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.equilibrium.linear_solver import (
     Coordinates,
     Dense,
@@ -35,8 +35,6 @@ from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-Floats = NDArray[np.floating[Any]]
-Mask = NDArray[np.bool_]
 SAFETY = 3.0
 """What an estimate that may come out too small is multiplied with."""
 ACCURACY = 1e-9
@@ -322,7 +320,6 @@ class DiagonalBlock:
     into: Any = None
 
 
-Indices = NDArray[np.intp]
 DRIFTS = (
     "there is no equilibrium: nothing holds a part of {}, and it is pushed on for ever; let a "
     "leader hold it"

@@ -17,20 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices, Integers
 from pbdkit.equilibrium.system import ALL, Moves, Rows, outside
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, slot_step
 from pbdkit.linear.block_matrix import frame_matrices
 from pbdkit.linear.response import LinearResponse, by_sublattice, respond
 from pbdkit.plugin import Slot
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.leader_groups import guided_at, kinds_of_places
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-Floats = NDArray[np.floating[Any]]
-Integers = NDArray[np.signedinteger[Any]]
 CANDIDATES = 16
 """Stencils among which it is chosen, each process's most frequent."""
 SAME = 1e-12

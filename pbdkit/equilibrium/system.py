@@ -16,12 +16,12 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from pbdkit.array_types import Array, Floats
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER
@@ -195,10 +195,6 @@ class Strip:
             self.last // 2 if self.last < self.count else count,
             self.depth - 1,
         )
-
-
-Array = NDArray[Any]
-Floats = NDArray[np.floating[Any]]
 
 
 class Rows:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.fit_file import Fit
@@ -26,7 +27,6 @@ from pbdkit.fitting.uncertainty import (
 from pbdkit.model.experiment import Experiment, given_classes
 from pbdkit.model.reading import with_value
 from pbdkit.plugin.component import Component
-from pbdkit.stepping.state import Floats
 
 ComponentClasses = Iterable[type[Component]]
 BASE_MODEL = "as given"

@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.fitting.observations import (
     CurveObservation,
@@ -47,7 +48,6 @@ from pbdkit.model.solver import Equilibrium
 from pbdkit.model.validation import closed_part, report
 from pbdkit.plugin.component import Component, Strict
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.stepping.state import Floats
 
 if TYPE_CHECKING:
     import xarray

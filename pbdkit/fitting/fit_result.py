@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.array_types import Floats
 from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.observations import (
     CurveObservation,
@@ -26,7 +27,6 @@ from pbdkit.fitting.uncertainty import (
     youngs_modulus,
 )
 from pbdkit.plugin.units import FORCE, LENGTH
-from pbdkit.stepping.state import Floats
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.components.diagnostics import reactions
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError
@@ -50,11 +51,10 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Measured
 from pbdkit.model.solver import Record
 from pbdkit.plugin import Lattice
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import FAILED, Simulation
-from pbdkit.stepping.state import Floats, State, initial_state
+from pbdkit.stepping.state import State, initial_state
 
 STRAIGHT = 1e-6
 """Largest deviation of a group from a line, relative to its length."""

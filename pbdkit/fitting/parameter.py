@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pbdkit.errors import ExperimentError, did_you_mean
@@ -16,7 +15,6 @@ from pbdkit.model.experiment import Experiment, given_classes
 from pbdkit.model.reading import with_value
 from pbdkit.plugin.fields import ByRegion, TakesFields
 
-Floats = NDArray[np.floating[Any]]
 ORDER_4 = (2 / 3, -1 / 12)
 """Weights of central differences of order 4, over 1 and 2 steps (Fornberg)."""
 WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)

@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.equilibrium.system import Moves
 from pbdkit.errors import ExperimentError
@@ -24,7 +25,7 @@ from pbdkit.fitting.observations import FieldObservation, NearbyPrediction, Obse
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.model.experiment import Experiment
-from pbdkit.stepping.state import Floats, initial_state
+from pbdkit.stepping.state import initial_state
 
 GAP_ITERATIONS = 3
 """Number of linear problems for the initial guess."""

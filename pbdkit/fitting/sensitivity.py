@@ -14,11 +14,12 @@ from functools import cached_property
 
 import numpy as np
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.certificate import Certificate, spacing_of
 from pbdkit.equilibrium.linearise import linearised
 from pbdkit.equilibrium.newton import Finder
 from pbdkit.equilibrium.solve import finder_of, settle
-from pbdkit.equilibrium.system import Floats, Moves, System, one_thread
+from pbdkit.equilibrium.system import Moves, System, one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.parameter import STEP, WEIGHTS, Parameter
 from pbdkit.model.experiment import Experiment

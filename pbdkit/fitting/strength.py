@@ -35,6 +35,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, model_validator
 
+from pbdkit.array_types import Floats, Mask
 from pbdkit.components.diagnostics import reactions
 from pbdkit.equilibrium.solve import finder_of, increments, moments
 from pbdkit.equilibrium.system import one_thread
@@ -44,7 +45,7 @@ from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import TELLS
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.io.snapshot import StateMoment, Tables
-from pbdkit.lattice.raster import FOLLOWER, Mask, Places
+from pbdkit.lattice.raster import FOLLOWER, Places
 from pbdkit.model.base import Base, base_source
 from pbdkit.model.experiment import Experiment, Version, given_classes
 from pbdkit.model.motions import read_columns
@@ -56,7 +57,7 @@ from pbdkit.plugin.component import Strict
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.leaders import place, prescribe
-from pbdkit.stepping.state import Floats, State, initial_state, unmoved_state
+from pbdkit.stepping.state import State, initial_state, unmoved_state
 
 KIND = "strength"
 """Value of `kind` in strength fits."""

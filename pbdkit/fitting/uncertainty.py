@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError, refuse_without
 from pbdkit.fitting.fit_file import Force
@@ -47,7 +48,6 @@ from pbdkit.fitting.problem import (
     solved,
 )
 from pbdkit.plugin.units import STRESS
-from pbdkit.stepping.state import Floats
 
 
 @dataclass(frozen=True)

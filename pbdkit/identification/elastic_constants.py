@@ -21,9 +21,9 @@ from itertools import combinations, combinations_with_replacement
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pbdkit.array_types import Floats
+
 PAIRS = ((0, 0), (1, 1), (0, 1))
 """Pairs of axes xx, yy and xy."""
 HUANG = tuple(combinations(PAIRS, 2))

@@ -9,8 +9,8 @@ from itertools import product
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.identification.elastic_constants import (
     DIFFUSION,
@@ -39,7 +39,6 @@ from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 
-Floats = NDArray[np.float64]
 Slots = tuple[Slot, ...]
 Differences = dict[Slot, Floats]
 ROUNDING = 1e-9

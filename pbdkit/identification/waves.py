@@ -39,12 +39,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.identification.elastic_constants import Elasticity
 from pbdkit.linear.spectrum import Complex, largest_stable_relaxation
 from pbdkit.linear.stencil import Stencil
 from pbdkit.plugin import Cell
 
-Floats = NDArray[np.float64]
 NEAR = 1e-6
 """Distance below which two places coincide, in units of the spacing."""
 ALIKE = 1e-8

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.io.layout import OF_FRAME, as_step
 from pbdkit.lattice.raster import Places
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     import xarray
 
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 

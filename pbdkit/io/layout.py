@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Array
 from pbdkit.components.diagnostics import CrackPath
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
@@ -362,9 +362,6 @@ def experiment_of(
         if given is None or components:
             raise
         raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
-
-
-Array = NDArray[Any]
 
 
 def indices_of(dataset: xarray.Dataset) -> list[str]:

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Array
 from pbdkit.errors import StorageError, WriteError
 from pbdkit.io.atomic_file import FULL, Destination, is_full
 from pbdkit.io.checkpoint import Checkpoint
@@ -35,7 +35,6 @@ LABELS = "coordinates"
 FIRST_LENGTH = 1024
 """Of a dimension that grows, until there is more."""
 
-Array = NDArray[Any]
 Waiting = dict[str, list[Array]]
 """Entries by column that fill no chunk yet."""
 

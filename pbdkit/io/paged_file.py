@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xxhash
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Array, Bytes
 from pbdkit.errors import StorageError
 from pbdkit.io.atomic_file import NewFile, write_all
 from pbdkit.io.seal import BLOCK, BrokenSealError, ByteRange, digest, is_whole, put_seal
@@ -235,10 +235,6 @@ def _overlaps(
         first, last = max(begin, page * PAGE), min(end, (page + 1) * PAGE)
         inside = slice(first - page * PAGE, last - page * PAGE)
         yield page, inside, slice(first - begin, last - begin)
-
-
-Array = NDArray[Any]
-Bytes = NDArray[np.uint8]
 
 
 class PiecedArray:

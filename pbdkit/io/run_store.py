@@ -22,13 +22,13 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.io.atomic_file import FULL, is_full, lock, opened_alone, sync_folder
 from pbdkit.io.checkpoint import Arrays, Checkpoint
 from pbdkit.io.paged_file import (
     PAGE,
     SETTLED,
-    Array,
     Header,
     PagedFile,
     PiecedArray,

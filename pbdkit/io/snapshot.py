@@ -22,10 +22,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.errors import did_you_mean
 from pbdkit.lattice.cells import Patch
 from pbdkit.lattice.fill import tolerance_of
-from pbdkit.lattice.raster import FOLLOWER, Floats as RasterFloats, Places, Raster
+from pbdkit.lattice.raster import FOLLOWER, Places, Raster
 from pbdkit.model.bodies import Sites
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
@@ -44,7 +45,6 @@ from pbdkit.plugin import (
 )
 from pbdkit.plugin.diagnostic import BondHistory, CellValues, ForceValues
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Side, area_share, corner_share, signed_area
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import (
@@ -62,8 +62,6 @@ from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.rule_evaluation import Evaluator, Neighbour, Surroundings, blocks, summed
 from pbdkit.stepping.state import State, describe_bonds
-
-Floats = NDArray[np.floating[Any]]
 
 
 def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
@@ -155,7 +153,7 @@ def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness 
     return Stiffness(**{name: matrices[(slice(None), *at)] for name, at in PLACES.items()})
 
 
-def through_thickness_of_particles(experiment: Experiment, raster: Raster) -> RasterFloats | float:
+def through_thickness_of_particles(experiment: Experiment, raster: Raster) -> Floats | float:
     """σ_zz over σ_xx + σ_yy at each particle, (particle,); that of the rule where it is one."""
     rule = experiment.rule
     if not isinstance(rule, Calibrated):
@@ -614,7 +612,7 @@ class StateMoment(Moment):
         steps: NDArray[np.int32] = self._of_bonds(broken)
         return np.where(steps > self._no_later_than, np.int32(-1), steps)
 
-    def broken_strain(self) -> NDArray[np.float64]:
+    def broken_strain(self) -> Floats:
         """From the lengths, in float64 whatever the run's precision; what was cut has none."""
         scene, lengths, steps = self._scene, self._state.broken_length, self.broken_step()
         if lengths is None:

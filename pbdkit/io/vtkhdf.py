@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError
 from pbdkit.io.atomic_file import NewFile, written
 from pbdkit.io.layout import broken_by
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pbdkit.scene.scene import Scene
 
 
-Array = NDArray[Any]
 PARTICLE, BOND, CELL = 0, 1, 2
 """What a cell of the grid stands for."""
 VERTEX, LINE, TRIANGLE, POLYGON, QUAD = 1, 3, 5, 7, 9

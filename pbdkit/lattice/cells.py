@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.lattice.raster import FOLLOWER, Block, Floats, Mask, Raster, Where
+from pbdkit.array_types import Floats, Indices, Mask
+from pbdkit.lattice.raster import FOLLOWER, Block, Raster, Where
 from pbdkit.plugin import Cell, Offset, Slot, Vector
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import CellPolygon, Index, Side, Tiling
 
 Slots = tuple[tuple[Slot, ...], ...]

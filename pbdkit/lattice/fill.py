@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.cells import WeighedCells
 from pbdkit.lattice.raster import (
@@ -26,7 +27,6 @@ from pbdkit.lattice.raster import (
     FOLLOWER,
     FRAME,
     LeftOut,
-    Mask,
     Raster,
     bounds,
     cells_of_sites,
@@ -35,9 +35,8 @@ from pbdkit.lattice.raster import (
     positions,
     sublattices,
 )
-from pbdkit.model.bodies import Body, Box, Floats, Sites
+from pbdkit.model.bodies import Body, Box, Sites
 from pbdkit.plugin import Cell, Lattice, Vector
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import CellPolygon, Index, Offset, Tiling
 
 Lines = tuple[int, int]

@@ -14,22 +14,12 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.cells import CellsAround, cells_around, tiling_of
-from pbdkit.lattice.raster import (
-    EMPTY,
-    FOLLOWER,
-    Block,
-    Floats,
-    Mask,
-    Raster,
-    common,
-    hull,
-    positions,
-)
+from pbdkit.lattice.raster import EMPTY, FOLLOWER, Block, Raster, common, hull, positions
 from pbdkit.plugin import Cell, Lattice, NeighbourMetric, Offset, Setting, Slot, Vector
 from pbdkit.plugin.fracture_model import Segment
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Index, Tiling
 from pbdkit.plugin.vector import vector
 

@@ -15,16 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Indices, Mask
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.plugin import Cell, Lattice, Offset, Slot
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.vector import vector
-
-Floats = NDArray[np.float64]
-"""Type of arrays of double precision."""
-Mask = NDArray[np.bool_]
-"""Type of arrays of truth values."""
 
 
 def distinct(numbers: NDArray[np.integer[Any]]) -> Indices:

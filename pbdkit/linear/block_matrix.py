@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
-Indices = NDArray[np.signedinteger[Any]]
+from pbdkit.array_types import Floats, Integers
 
 DENSE = 500
 """Largest number of rows of matrices that are stored densely."""
@@ -35,7 +34,7 @@ class CoordinateMatrix:
         values = np.concatenate([self.values, factor * other.values])
         return CoordinateMatrix(rows, columns, values, other.shape)
 
-    def without(self, unknowns: Indices) -> CoordinateMatrix:
+    def without(self, unknowns: Integers) -> CoordinateMatrix:
         """Return the matrix without the rows and columns of some unknowns."""
         is_kept = np.ones(self.shape[0], bool)
         is_kept[unknowns] = False
@@ -74,7 +73,7 @@ def one_minus(matrix: Any) -> Any:
     return difference if isinstance(matrix, np.ndarray) else difference.tocsr()
 
 
-def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
+def connected(matrix: Any, *, strongly: bool) -> tuple[int, Integers]:
     """Find the connected components of a matrix, seen as a directed graph.
 
     Parameters
@@ -110,7 +109,7 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
     return len(names), label
 
 
-def _undirected_components(reach: NDArray[np.bool_]) -> tuple[int, Indices]:
+def _undirected_components(reach: NDArray[np.bool_]) -> tuple[int, Integers]:
     """Find the components of a symmetric graph by breadth-first search."""
     count, label = 0, np.full(len(reach), -1)
     while (unlabelled := label < 0).any():
@@ -139,14 +138,14 @@ class BlockMatrix:
 
     shape: tuple[int, int]
     axes: int
-    parts: list[tuple[Indices, Indices, Floats]] = field(default_factory=list)
+    parts: list[tuple[Integers, Integers, Floats]] = field(default_factory=list)
 
-    def add(self, rows: Indices, columns: Indices, blocks: Floats) -> None:
+    def add(self, rows: Integers, columns: Integers, blocks: Floats) -> None:
         """Add blocks, (entry, axis, axis)."""
         if len(rows):
             self.parts.append((rows, columns, blocks))
 
-    def add_scaled_identity(self, rows: Indices, factor: float) -> None:
+    def add_scaled_identity(self, rows: Integers, factor: float) -> None:
         """Add factor · 1 on the diagonal of some rows."""
         block = factor * np.eye(self.axes)
         self.add(rows, rows, np.broadcast_to(block, (len(rows), *block.shape)))
@@ -171,7 +170,7 @@ class BlockMatrix:
         row, column = len(to) * rows[entry] + i, len(of) * columns[entry] + j
         return CoordinateMatrix(row, column, values, shape)
 
-    def _joined(self) -> tuple[Indices, Indices, Floats]:
+    def _joined(self) -> tuple[Integers, Integers, Floats]:
         """Return all parts as one."""
         if not self.parts:
             nothing = np.empty(0, np.intp)

@@ -12,17 +12,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices, Integers
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, FRAME, LEADER, slot_step
 from pbdkit.linear.block_matrix import BlockMatrix, CoordinateMatrix, frame_matrices
 from pbdkit.linear.response import by_sublattice, has_neighbours, respond
 from pbdkit.model.solver import Stepping
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
@@ -31,9 +30,6 @@ from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
     import scipy.sparse
-
-
-Floats = NDArray[np.floating[Any]]
 
 
 class Guiding:
@@ -100,9 +96,6 @@ class Guiding:
             blocks[guided] = np.einsum("eab,ebc->eac", all_blocks, free_axes)
             leader.add(rows[guided], numbers[1][guided], all_blocks - blocks[guided])
         free.add(rows, numbers[0], blocks)
-
-
-Integers = NDArray[np.signedinteger[Any]]
 
 
 @dataclass(frozen=True)

@@ -16,17 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.lattice.raster import EMPTY, Places, slot_step
 from pbdkit.linear.stencil import SMALL, array_of, derivative
 from pbdkit.plugin import Here, Slot, Softens, SoftensCells, Vector
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.rule_evaluation import Contributions, Evaluator, Surroundings, summed
 from pbdkit.stepping.state import State
 
-Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
 Answer = Callable[[Contributions, Here], Any]
 CHUNK_SIZE = 8192

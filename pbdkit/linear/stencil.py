@@ -22,6 +22,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.linear.spectrum import Complex, modes
 from pbdkit.plugin import Here, Slot
 from pbdkit.plugin.discovery import blaming
@@ -73,7 +74,6 @@ def array_of(components: tuple[Any, ...], shape: tuple[int, ...]) -> NDArray[Any
     return np.array([np.broadcast_to(component, shape) for component in components])
 
 
-Floats = NDArray[np.float64]
 NOWHERE = Here(cast(Any, None))
 
 

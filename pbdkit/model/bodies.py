@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, model_validator
 
+from pbdkit.array_types import Floats
 from pbdkit.model.validation import closed_part
 from pbdkit.plugin import Component
 from pbdkit.plugin.units import LENGTH, Place
 
-Floats = NDArray[np.float64]
-"""Type of arrays of double precision."""
 Count = Annotated[int, Field(ge=1, le=2**31)]
 """Type of a number of sites along an axis."""
 Positive = Annotated[float, Field(gt=0.0, le=1e100), LENGTH]
@@ -112,7 +111,7 @@ class Rectangle(Body):
     def distance(self, sites: Sites) -> Floats:
         """Return the larger of the distances from both centre lines minus half the sides."""
         (x, y), (left, low), w, h = sites.at, self.origin, self.width / 2, self.height / 2
-        return np.maximum(np.abs(x - (left + w)) - w, np.abs(y - (low + h)) - h)
+        return np.asarray(np.maximum(np.abs(x - (left + w)) - w, np.abs(y - (low + h)) - h))
 
 
 class Disc(Body):
@@ -152,7 +151,7 @@ class Ring(Body):
     def distance(self, sites: Sites) -> Floats:
         """Return the signed distance from the nearer circle."""
         r = _from(self.centre, sites)
-        return np.maximum(r - self.outer, self.inner - r)
+        return np.asarray(np.maximum(r - self.outer, self.inner - r))
 
 
 class Polygon(Body):

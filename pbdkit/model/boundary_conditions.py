@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+from pbdkit.array_types import Floats
 from pbdkit.model.bodies import Body, Disc, Polygon, Rectangle, Ring
 from pbdkit.model.motions import AnyMotion, Hold, Measured, Newton
 from pbdkit.model.validation import closed_part, fault
@@ -57,8 +58,6 @@ class Cut(Strict):
         return self.from_, self.to
 
 
-Floats = NDArray[np.floating[Any]]
-"""Type of arrays of floating-point numbers."""
 Flags = NDArray[np.bool_]
 """Type of arrays of truth values."""
 Share = Annotated[float, Field(ge=-1e100, le=1e100)]

@@ -15,7 +15,6 @@ from itertools import product
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     Field,
@@ -27,6 +26,7 @@ from pydantic import (
     model_validator,
 )
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError, PluginError, RetirementWarning, warn_caller
 from pbdkit.model.bodies import BODIES, AnyBody, Body, Box
 from pbdkit.model.boundary_conditions import AnyInitial, Cut, LeaderGroup, Load, Obstacle
@@ -209,8 +209,6 @@ RegionName = Annotated[str, AfterValidator(_region)]
 """Type of the name of a region."""
 
 
-Floats = NDArray[np.float64]
-"""Type of arrays of double precision."""
 SLACK = 1e-9
 """Rounding error of the extent of a body, relative to the spacing."""
 

@@ -16,9 +16,9 @@ from pathlib import Path as FilePath
 from typing import Annotated, Any, ClassVar, Literal, Self, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, SerializeAsAny, ValidationInfo, model_validator
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import did_you_mean
 from pbdkit.model.reading import file_resolver
 from pbdkit.model.validation import brief, closed_part, fault
@@ -158,8 +158,6 @@ def _number(cell: list[str], name: str, place: str) -> float:
     return number
 
 
-Floats = NDArray[np.floating[Any]]
-"""Type of arrays of floating-point numbers."""
 Steps = Annotated[int, Field(ge=1, le=2**62)]
 """Type of a number of steps."""
 

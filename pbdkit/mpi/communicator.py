@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Bytes
 from pbdkit.communicator import Communicator
 from pbdkit.errors import PbdkitError
-from pbdkit.io.paged_file import Bytes
 
 NUMBERS_AT_ONCE = 2**20
 """So many of all processes together are compared at a time."""

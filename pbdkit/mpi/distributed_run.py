@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.execution import Execution
@@ -21,7 +22,7 @@ from pbdkit.io.paged_file import PiecedArray
 from pbdkit.io.recorder import RecordedVariables, Recorder, columns_of
 from pbdkit.io.sinks import KeepingSink, Sink
 from pbdkit.io.snapshot import StateMoment, Tables
-from pbdkit.lattice.raster import Floats, RowRange, Stretch
+from pbdkit.lattice.raster import RowRange, Stretch
 from pbdkit.linear.stencil import Bound, wave_bound
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.solver import Equilibrium, Solver, Stepping

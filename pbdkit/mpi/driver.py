@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.equilibrium.certificate import Certificate, SteadyStateMonitor
 from pbdkit.equilibrium.solve import Way
 from pbdkit.equilibrium.system import Rows, Strip, StuckError
@@ -248,7 +249,6 @@ def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> 
             raise scene.experiment.located(NotSharedError(refusal, field))
 
 
-Floats = NDArray[np.floating[Any]]
 SHARE = 4
 """The first grid that all processes have is by so much smaller than the part of one."""
 A_CYCLE = 6

@@ -19,24 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Array, Bytes, Indices, Mask
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
-from pbdkit.io.paged_file import Bytes, PiecedArray, as_bytes
+from pbdkit.io.paged_file import PiecedArray, as_bytes
 from pbdkit.lattice.cells import WeighedCells
 from pbdkit.lattice.fill import Lines, framed, window
-from pbdkit.lattice.raster import (
-    EMPTY,
-    FOLLOWER,
-    FRAME,
-    LeftOut,
-    Mask,
-    Raster,
-    RowLayout,
-    Stretch,
-    hull,
-)
+from pbdkit.lattice.raster import EMPTY, FOLLOWER, FRAME, LeftOut, Raster, RowLayout, Stretch, hull
 from pbdkit.mpi.communicator import MPICommunicator
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Index
 from pbdkit.scene.constants import SceneConstants
 from pbdkit.scene.frame import Frame
@@ -47,7 +37,6 @@ from pbdkit.scene.scene import Ground, Scene
 from pbdkit.stepping.numba_engine.time_skewing import Skew
 from pbdkit.stepping.state import State
 
-Array = NDArray[Any]
 BLOCK = 2**23
 """Bytes that are sent at once."""
 

@@ -60,7 +60,6 @@ def palette_of(quantity: PlottedQuantity) -> Palette:
     return Palette({k: (word, OTHERS[n % len(OTHERS)]) for n, (k, word) in words}, False)
 
 
-Array = NDArray[Any]
 DOTS, FIELD, BOTH_SIGNS = "viridis", "YlOrRd", "RdBu_r"
 NOTHING = "#E0E0E0"
 """The colour of what has no value."""

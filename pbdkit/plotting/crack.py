@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError, refuse_no_matplotlib
 from pbdkit.io.layout import OF_BODY, rows_of
 from pbdkit.plotting.curves import BROAD, TALL, Line, draw_lines, member_dims, new_axes
@@ -34,7 +34,6 @@ APART, CRACKS = 1.5, 50
 """Bonds so many lengths apart are of one crack; so many cracks, the largest, are measured."""
 DIRECTIONS = 180
 """In so many directions a crack is measured; the length is right within 4e-5 of it."""
-Array = NDArray[Any]
 
 
 def crack(dataset: xarray.Dataset, kind: Kind = "map", *, ax: Axes | None = None) -> Axes:

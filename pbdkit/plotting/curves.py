@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Array, Floats
 from pbdkit.errors import ExperimentError, refuse_no_matplotlib
 from pbdkit.io.layout import INDICES, rows_at, scene_of
 from pbdkit.io.members import TEXT, type_alone
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-Floats = NDArray[np.float64]
 FORCE_OF = {"load": "load_resultant", "obstacle": "contact_force", "leader_group": "reaction"}
 """The forces on a curve, by the dimension of what exerts them."""
 NEEDED_FORCES = (
@@ -133,7 +133,6 @@ def _of_rows(dataset: xarray.Dataset, rows: NDArray[Any]) -> Floats:
     return np.concatenate(found)
 
 
-Array = NDArray[Any]
 SIZE_IN, DPI = (4.8, 3.3), 200
 HUES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 """Colours of Okabe and Ito, without the yellow that no white page shows."""

@@ -13,9 +13,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.io.layout import INDICES, OF_BODY, as_step, broken_by, carried, makers_of, rows_of
 from pbdkit.lattice.raster import FRAME
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     import xarray
 
 
-Array = NDArray[Any]
 BRIDGE = 1.35
 """A reference triangle longer than so many usual ones bridges a hole or a notch."""
 

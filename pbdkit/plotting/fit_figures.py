@@ -8,8 +8,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import refuse_no_matplotlib
 from pbdkit.plugin.units import LENGTH
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pbdkit.fitting.fit_result import Fitted
 
 
-Floats = NDArray[np.floating[Any]]
 PANEL_IN, MARGIN_IN, CURVE_IN, CURVES = 3.8, 0.75, 2.5, 3
 WITHIN = 3.0
 """Residuals beyond so many times the noise have the last colour."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Array
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale
 from pbdkit.plotting.data import CutCells, ReferenceBody, Snapshot
 from pbdkit.plotting.style import figure_of
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 
-Array = NDArray[Any]
 SAMPLES = 2_000_000
 """So many are taken at a time."""
 MOST = 60_000_000

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.lattice.raster import FOLLOWER, Raster
 from pbdkit.model.boundary_conditions import Load
 from pbdkit.model.motions import Hold, Motion, Newton, Oscillation, Rotation
@@ -28,7 +29,6 @@ from pbdkit.scene.selection import spacing
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.floating[Any]]
 HEAD = 7.0
 """The length of an arrow's head, pixels."""
 

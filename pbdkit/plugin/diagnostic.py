@@ -10,11 +10,10 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.plugin.component import Bonds, Component, Pair
 from pbdkit.plugin.rule import Stiffness
 
-Floats = NDArray[np.floating[Any]]
-"""Type of arrays of floating-point numbers."""
 Need = Literal["bonds", "cells", "material", "forces", "loads"]
 """Type of a requirement of a diagnostic."""
 
@@ -96,7 +95,7 @@ class TouchingRows(NamedTuple):
     """Followers that touch an obstacle: their rows, and the outward normals there, (row, axis)."""
 
     rows: NDArray[np.intp]
-    normals: NDArray[np.float64]
+    normals: Floats
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ class BondHistory(Bonds):
     """
 
     broken_step: NDArray[np.int32]
-    broken_strain: NDArray[np.float64]
+    broken_strain: Floats
 
 
 class CellValues(ABC):

@@ -25,13 +25,12 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError, core_schema
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import did_you_mean
 from pbdkit.plugin.component import Component, Strict
 from pbdkit.plugin.schedule import Course, as_course
 from pbdkit.plugin.units import LENGTH, PATTERN, Quantity, or_text
 
-Floats = NDArray[np.float64]
-"""Type of arrays of double precision."""
 Held = Mapping[str, NDArray[np.bool_]]
 """Type of the masks of places inside each region, in the order of the experiment."""
 MAX_TEXT_VALUES = 1000

@@ -9,12 +9,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Indices
 from pbdkit.plugin.component import Component
 from pbdkit.plugin.lattice import Cell, Index
 from pbdkit.plugin.rule import FollowerRule
-
-Indices = NDArray[np.intp]
-"""Type of arrays of indices."""
 
 
 @dataclass(frozen=True)

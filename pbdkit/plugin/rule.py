@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.plugin.component import Remembers
 from pbdkit.plugin.fields import TakesFields
 from pbdkit.plugin.lattice import Cell, Slot, Tiling
@@ -217,7 +217,7 @@ class MixesCells(Calibrated):
         are not linear in the stiffness of a cell: cells of another have `spring_share` of them."""
         return {}
 
-    def spring_share(self, c: NDArray[np.float64], setting: Setting) -> NDArray[np.float64]:
+    def spring_share(self, c: Floats, setting: Setting) -> Floats:
         """(cell,): how many times the `spring_weights` cells have, for their stiffness c over
         Young's modulus, (cell, 3, 3) in the components xx, yy, xy."""
         return np.zeros(len(c))

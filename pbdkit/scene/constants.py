@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from pbdkit.array_types import Floats, Mask
 from pbdkit.errors import AccuracyWarning, ExperimentError, PluginError, of_category
 from pbdkit.lattice.cells import patches
 from pbdkit.lattice.fill import rounding_of
 from pbdkit.lattice.neighbourhood import Neighbourhood, bonds_in, plane_block
-from pbdkit.lattice.raster import FRAME, Floats, Mask, Raster, Where
+from pbdkit.lattice.raster import FRAME, Raster, Where
 from pbdkit.model.bodies import Body, Sites
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (

@@ -6,18 +6,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import add
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER, FRAME, Raster, bounds, distinct
 from pbdkit.plugin import FollowerRule, FrameMap, FramePolicy, FrameSites
-from pbdkit.plugin.frame_policy import Indices
-
-Floats = NDArray[np.floating[Any]]
-"""Type of arrays of floating-point numbers."""
 
 
 @dataclass(frozen=True)

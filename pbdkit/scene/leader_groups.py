@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.lattice.raster import FOLLOWER, LEADER, Floats, Mask, Raster, distinct
+from pbdkit.lattice.raster import FOLLOWER, LEADER, Raster, distinct
 from pbdkit.model.boundary_conditions import LeaderGroup
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Measured, Newton, Rotation
 from pbdkit.plugin import TurnsParticles
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.scene.constants import particle_numbers
 from pbdkit.scene.selection import Selecting, shares_of, spacing

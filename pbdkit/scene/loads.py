@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.cells import WeighedCells, patches
-from pbdkit.lattice.raster import Floats, Raster
+from pbdkit.lattice.raster import Raster
 from pbdkit.model.boundary_conditions import Load
 from pbdkit.model.experiment import Experiment
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.lattice import Tiling, signed_area
 from pbdkit.plugin.schedule import Course
 from pbdkit.scene.selection import Selecting, shares_of

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Mask
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.cells import WeighedCells
 from pbdkit.lattice.fill import CELLS_AT_ONCE, NEAREST, cut_by_border
-from pbdkit.lattice.raster import FOLLOWER, Block, Mask, Raster
+from pbdkit.lattice.raster import FOLLOWER, Block, Raster
 from pbdkit.model.bodies import Body
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import MixesCells, Setting, Slot, Stiffness, TearsCells
@@ -25,8 +26,6 @@ from pbdkit.plugin.lattice import CellPolygon
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import Values, kinds_of, named_weights, signed_distance, values_at
 
-Floats = NDArray[np.float64]
-"""Type of arrays of double precision."""
 ACROSS = [0, 2]
 """Indices of the components (normal, tangential, shear) whose stress is the same in all layers."""
 ALONG = [1]

@@ -14,20 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.errors import ExperimentError
-from pbdkit.lattice.raster import Mask, Raster
+from pbdkit.lattice.raster import Raster
 from pbdkit.model.bodies import Disc, Polygon, Rectangle, Ring
 from pbdkit.model.boundary_conditions import AnyShape, Facing, Obstacle
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Newton
 from pbdkit.plugin import where
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.scene.leader_groups import Leading
 
-Floats = NDArray[np.float64]
-"""Type of arrays of double precision."""
-AnyFloats = NDArray[np.floating[Any]]
-"""Type of arrays of floating-point numbers."""
 HALF_PLANE = 0
 """Kind of the outline of a half-plane."""
 CIRCLES = 1
@@ -107,7 +103,7 @@ class Walls(NamedTuple):
         """Evaluate `clearance` at places."""
         return clearance(x, y, self.kinds, self.points, self.first, self.radii)
 
-    def way_between(self, at: AnyFloats, C: AnyFloats, code: int) -> tuple[Any, Any]:
+    def way_between(self, at: Floats, C: Floats, code: int) -> tuple[Any, Any]:
         """Evaluate `way_between` for a particle."""
         (x, y), (xx, xy, yy) = at, C
         arrays = self.kinds, self.points, self.first, self.radii
@@ -164,7 +160,7 @@ class Outline:
         gap, nx, ny = (np.broadcast_to(value, x.shape) for value in result)
         return gap, nx, ny
 
-    def way_out(self, at: AnyFloats, C: AnyFloats) -> AnyFloats:
+    def way_out(self, at: Floats, C: Floats) -> Floats:
         """Evaluate `way_out` at places, (axis, place), with the compliance C, (xx xy yy, place)."""
         whole = self.points, 0, len(self.points), self.inner, self.outer
         result = way_out(at[0], at[1], C[0], C[1], C[2], self.kind, *whole)

@@ -6,11 +6,11 @@ from collections import namedtuple
 from dataclasses import dataclass
 from typing import Any
 
+from pbdkit.array_types import Indices
 from pbdkit.lattice.raster import Raster
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import ParticleOperation
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.scene.selection import Selecting
 
 

@@ -9,11 +9,11 @@ from functools import cached_property
 
 import numpy as np
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.errors import ExperimentError, did_you_mean
-from pbdkit.lattice.raster import FOLLOWER, NOWHERE, Floats, Raster, distinct
+from pbdkit.lattice.raster import FOLLOWER, NOWHERE, Raster, distinct
 from pbdkit.model.bodies import Body
 from pbdkit.plugin import Pair
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.particles import Selection
 from pbdkit.scene.constants import signed_distance
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.errors import (
     ExperimentError,
     PbdkitError,
@@ -23,13 +24,12 @@ from pbdkit.errors import (
     of_category,
 )
 from pbdkit.lattice.neighbourhood import count_bonds
-from pbdkit.lattice.raster import FOLLOWER, Floats, Mask
+from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.linear.spectrum import NEUTRAL
 from pbdkit.linear.stencil import NO_REMEDY, Bound, bounds_the_body, wave_bound
 from pbdkit.memory import machine_memory
 from pbdkit.model.motions import Newton
 from pbdkit.plugin import Anchors, Calibrated
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.leader_groups import kinds_at, kinds_of_places
 from pbdkit.scene.memory_estimate import LARGEST_ANEW, MIB, Sizes, sizes_of

@@ -21,11 +21,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain, pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.equilibrium.system import ACCURACY, StuckError, System, solved
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, slot_step
@@ -33,13 +33,10 @@ from pbdkit.linear.block_matrix import BlockMatrix
 from pbdkit.linear.operator import Guiding, moves_and_couplings, step_operator
 from pbdkit.linear.spectrum import excess
 from pbdkit.model.motions import Oscillation
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.units import Units, in_lengths
 from pbdkit.scene.leader_groups import Leading, kinds_of_places
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
-
-Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.linear.block_matrix import DENSE, CoordinateMatrix, connected
@@ -147,7 +148,6 @@ def _minimise(function: Any, low: float, high: float) -> float:
     return float(result.x)
 
 
-Floats = NDArray[np.floating[Any]]
 MARGIN = 0.02
 """Relative margin of the ends of a spectrum from iteration, which may be too close together."""
 ROUGH = 1e-3

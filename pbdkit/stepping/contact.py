@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.lattice.raster import FOLLOWER, Block, Mask, Places, distinct
-from pbdkit.plugin.frame_policy import Indices
+from pbdkit.array_types import Floats, Indices, Mask
+from pbdkit.lattice.raster import FOLLOWER, Block, Places, distinct
 from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import length, vector
 from pbdkit.scene.leader_groups import guided_at, has_guides, kinds_at
@@ -29,7 +29,7 @@ from pbdkit.scene.obstacles import SLACK, Outline, Walls, leave, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
-from pbdkit.stepping.state import Floats, State, unmoved_state
+from pbdkit.stepping.state import State, unmoved_state
 from pbdkit.stepping.step import PUSHED_BY_COURSES, Hindrance, Mode, Operation, Step
 
 NUDGE = 0.01
@@ -99,7 +99,7 @@ def compliance(scene: Scene) -> Floats | None:
     return found
 
 
-Touching = list[tuple[Indices, NDArray[np.float64]]]
+Touching = list[tuple[Indices, Floats]]
 """Of each obstacle some rows, and the normals there, (row, axis)."""
 FREE, ALL_LED = 0, 3
 """Codes of particles that follow along both axes, and along none; 1 and 2 are led along x, y."""

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.lattice.neighbourhood import Neighbourhood
 from pbdkit.lattice.raster import positions
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import Here, StoresEnergy, Vector
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
@@ -26,12 +26,11 @@ from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.rule_evaluation import (
     Contributions,
     Evaluator,
-    Mask,
     Neighbour,
     Surroundings,
     blocks,
 )
-from pbdkit.stepping.state import Floats, State, shown
+from pbdkit.stepping.state import State, shown
 from pbdkit.stepping.step import Hindrance, Mode, Operation, Step
 
 REAL = "fiub"

@@ -22,10 +22,10 @@ from itertools import permutations
 
 import numpy as np
 
+from pbdkit.array_types import Array, Floats, Indices
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import Places
 from pbdkit.model.motions import Newton
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.leader_groups import Guided, Leading, guided_at, has_guides, rotations_of
 from pbdkit.scene.obstacles import Barrier
@@ -34,7 +34,7 @@ from pbdkit.stepping.contact import Contact, stiffnesses
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
-from pbdkit.stepping.state import Array, Floats, State
+from pbdkit.stepping.state import State
 from pbdkit.stepping.step import (
     PUSHED_BY_COURSES,
     Hindrance,

@@ -8,13 +8,13 @@ from typing import Any, Self
 
 import numpy as np
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.plugin.component import as_vector
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.state import Floats, shown
+from pbdkit.stepping.state import shown
 from pbdkit.stepping.step import Operation, Step
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Mask
 from pbdkit.lattice.cells import CellBond
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, Raster, Where
 from pbdkit.plugin import (
@@ -42,7 +43,6 @@ from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, renew, shown
 
-Mask = NDArray[np.bool_]
 Contributions = tuple[Any, ...]
 Cells = tuple[CellStress, ...]
 

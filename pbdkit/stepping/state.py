@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Array, Floats
 from pbdkit.errors import PluginError, did_you_mean
 from pbdkit.lattice.neighbourhood import crossed_bonds
 from pbdkit.lattice.raster import LEADER
@@ -53,8 +54,6 @@ def cut_bonds(scene: Scene, broken: BrokenSteps | None, step: int) -> bool:
     return bool(segments)
 
 
-Array = NDArray[Any]
-Floats = NDArray[np.floating[Any]]
 Values = tuple[Array, ...]
 """One array a number that is remembered, in the order in which the part declares them."""
 

@@ -15,10 +15,10 @@ from typing import Any, Literal, NamedTuple, Self
 
 from numpy.typing import NDArray
 
-from pbdkit.plugin.frame_policy import Indices
+from pbdkit.array_types import Floats, Indices
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import State
 
 
 class Placed(NamedTuple):

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xxhash
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import carried, in_this_layout, reserved_names
 from pbdkit.io.members import STATUS
@@ -109,7 +109,6 @@ def _attributes(runs: list[xarray.Dataset]) -> list[str]:
     return [name for name in names if len({str(run.attrs.get(name)) for run in runs}) > 1]
 
 
-Array = NDArray[Any]
 Reports = Callable[[str], MemberReport]
 FILL = "fill_value"
 """Attribute with the value of integers that a member does not have."""

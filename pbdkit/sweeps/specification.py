@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import xxhash
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
+from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError, PluginError, did_you_mean
 from pbdkit.io.layout import SCHEMA_VERSION, reserved_names
 from pbdkit.io.members import PARAMETER, STATUS, TEXT
@@ -207,7 +207,6 @@ MESSAGE = "message"
 """Variable with the message of each member."""
 UNNAMED_ENDS = (".otherwise", ".type")
 """Ends of paths that give no name: a number outside all regions, and the type of a part."""
-Array = NDArray[Any]
 
 
 class MemberSetting(NamedTuple):

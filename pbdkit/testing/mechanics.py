@@ -17,8 +17,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.communicator import SERIAL
 from pbdkit.errors import ExperimentError
 from pbdkit.io.checkpoint import Checkpoint
@@ -37,7 +37,6 @@ from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.testing.states import displacements, state_with
 
-Floats = NDArray[np.float64]
 SHARE_BROKEN = 0.2
 """The share of bonds that are broken in a pattern at random."""
 NUDGE = 1e-5

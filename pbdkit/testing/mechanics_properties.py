@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
@@ -35,7 +36,7 @@ from pbdkit.testing.mechanics import (
     resistance_to_rigid_motions,
     stiffening,
 )
-from pbdkit.testing.states import Floats, advanced, displacements
+from pbdkit.testing.states import advanced, displacements
 from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, place_of
 
 STEPS = 3

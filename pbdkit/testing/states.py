@@ -11,8 +11,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import PluginError
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.plugin import (
@@ -33,8 +33,6 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.rule_evaluation import Evaluator, summed
 from pbdkit.stepping.state import State, describe_bonds, describe_particles, initial_state
-
-Floats = NDArray[np.float64]
 
 
 def spacing(scene: Scene) -> float:

@@ -9,6 +9,7 @@ from contextlib import suppress
 
 import numpy as np
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import PluginError
 from pbdkit.io.sinks import MemorySink
 from pbdkit.io.snapshot import StateMoment, Tables
@@ -35,7 +36,6 @@ from pbdkit.stepping.state import State, initial_state
 from pbdkit.testing.component_properties import differing
 from pbdkit.testing.mechanics import resumed
 from pbdkit.testing.states import (
-    Floats,
     advanced,
     differences,
     displacements,

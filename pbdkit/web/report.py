@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Array
 from pbdkit.bench.work_precision import COLUMNS
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io.atomic_file import write
@@ -81,7 +82,6 @@ def factor_of(variable: xarray.DataArray) -> float:
     return in_its_units(variable.attrs)[0]
 
 
-Array = NDArray[Any]
 MOST_POINTS, MOST_SERIES = 1200, 12
 AGAINST = {"nominal_stress": "nominal_strain", "load_resultant": "load_displacement"}
 """What is drawn over something else than time as well."""

@@ -20,10 +20,11 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import PrivateAttr
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.io.atomic_file import write_together
 from pbdkit.model.experiment import Experiment
-from pbdkit.model.motions import Floats, Motion, Path
+from pbdkit.model.motions import Motion, Path
 from pbdkit.model.reading import MAX_BYTES, MAX_NODES, yaml_text
 from pbdkit.plugin.fracture_model import Segment
 from pbdkit.web.view_frames import AdjustableNumber, numbers_of, placed

@@ -27,8 +27,8 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.lattice.raster import FRAME
 from pbdkit.model.experiment import Experiment
@@ -273,7 +273,6 @@ def _size(state: State) -> int:
     return 2 * state.u.nbytes + sum(array.nbytes for array in more if array is not None)
 
 
-Floats = NDArray[np.float64]
 SAMPLES = 64
 NEAR = 0.25
 """By so many spacings a line may be straightened."""

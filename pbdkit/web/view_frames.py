@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Bytes
 from pbdkit.errors import PbdkitError
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin.schedule import NumberCourse
@@ -34,7 +35,6 @@ COLOURS = {"kind": "kind", "displacement": "displacement", "last-step": "way of 
 HEAD = struct.Struct("<IIIIIIIIdd")
 VALUES, KINDS, BROKEN = 1, 2, 4
 """What a frame holds besides positions."""
-Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats, Indices
 from pbdkit.lattice.neighbourhood import BondPlane, plane_block
 from pbdkit.lattice.raster import FOLLOWER, Block, slot_step
 from pbdkit.plugin import Slot
-from pbdkit.plugin.frame_policy import Indices
 from pbdkit.scene.frame import Frame
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses
@@ -30,7 +30,7 @@ from pbdkit.stepping.numba_engine.sweeps import (
 )
 from pbdkit.stepping.program import program_of
 from pbdkit.stepping.rule_evaluation import presence
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import State
 
 Arrays = dict[str, Any]
 Bits = NDArray[np.unsignedinteger[Any]]

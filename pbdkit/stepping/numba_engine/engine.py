@@ -22,6 +22,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.array_types import Floats
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.plugin import RenewsBonds, RenewsParticles, StartsCracked
 from pbdkit.plugin.discovery import blaming
@@ -66,7 +67,7 @@ from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.particle_operation import OperateOnParticles
 from pbdkit.stepping.program import program_of
 from pbdkit.stepping.rule_evaluation import Evaluator, presence
-from pbdkit.stepping.state import Floats, State, cut_bonds, unmoved_state
+from pbdkit.stepping.state import State, cut_bonds, unmoved_state
 from pbdkit.stepping.step import Led
 
 
