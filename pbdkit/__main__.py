@@ -7,7 +7,7 @@ import os
 import signal
 from contextlib import suppress
 
-COLLECT_AFTER = 100_000
+COLLECT_AFTER = 300_000
 """Number of new objects after which the garbage collector looks for cycles. Python's own 700 make
 it look hundreds of times while a command is loaded, when nothing can be freed."""
 

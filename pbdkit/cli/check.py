@@ -183,7 +183,7 @@ def _in_regions(scene: Scene) -> Iterator[str]:
     raster = scene.raster
     x = raster.reference(raster.body_rows)
     for name, region in scene.experiment.regions.items():
-        inside = signed_distance(region, raster.lattice.cell(), *x.T) <= 0.0
+        inside = signed_distance(region, raster.cell, *x.T) <= 0.0
         yield f"{name}, {_particles(int(inside.sum()))}"
 
 

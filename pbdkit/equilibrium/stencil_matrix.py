@@ -94,7 +94,7 @@ class PrimitiveRaster:
     @classmethod
     def of(cls, scene: Scene) -> PrimitiveRaster | None:
         """None where bonds lead farther than to a primitive cell beside."""
-        cell = scene.raster.lattice.cell()
+        cell = scene.raster.cell
         steps = [primitive_step(scene, slot) for slot in scene.neighbourhood.every]
         if (
             scene.axes != 2
@@ -117,7 +117,7 @@ class PrimitiveRaster:
     @property
     def is_the_scenes(self) -> bool:
         """Whether places here are places there."""
-        return len(self.scene.raster.lattice.cell().sites) == 1
+        return len(self.scene.raster.cell.sites) == 1
 
     def places(self, place: Indices) -> Indices:
         """The flat places here of some on the scene's raster."""
@@ -131,7 +131,7 @@ class PrimitiveRaster:
         if self.is_the_scenes:
             return np.stack(np.unravel_index(place, self.shape), axis=-1)
         raster = self.scene.raster
-        cell = raster.lattice.cell()
+        cell = raster.cell
         s, *cells = np.unravel_index(place, raster.shape)
         whole = np.stack(cells, axis=-1) + raster.first
         sites = np.array([site.primitive for site in cell.sites])

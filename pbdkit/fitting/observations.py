@@ -203,7 +203,7 @@ class Interpolation:
         nearest three of a polygon of the lattice. Points without all of them, as in a hole, are
         left out, and so are points between particles with a bond that is broken from the start.
         """
-        has_one_site = len(scene.raster.lattice.cell().sites) == 1
+        has_one_site = len(scene.raster.cell.sites) == 1
         interpolation = _in_cells(scene, points) if has_one_site else _in_triangles(scene, points)
         return (
             interpolation._restricted(~_is_torn(scene, interpolation))
@@ -239,7 +239,7 @@ class Interpolation:
 
 def _in_cells(scene: Scene, points: Floats) -> Interpolation:
     raster = scene.raster
-    cell = raster.lattice.cell()
+    cell = raster.cell
     vectors = np.array(cell.vectors, float)
     coordinates = np.linalg.solve(vectors.T, (points - raster.lattice.origin).T).T
     low = np.floor(coordinates + ON_EDGE)

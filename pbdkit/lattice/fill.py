@@ -33,7 +33,6 @@ from pbdkit.lattice.raster import (
     distinct,
     hull,
     positions,
-    sublattices,
 )
 from pbdkit.model.bodies import Body, Box, Sites
 from pbdkit.plugin import Cell, Lattice, Vector
@@ -150,12 +149,12 @@ def build_raster(lattice: Lattice, low: Index, sites: NDArray[np.int8], reach: I
 
 def sublattices_from(cell: Cell, low: Index, shape: Index) -> Indices:
     """Return the sublattice of each site of a window from `low`; -1 at a hole."""
-    return _repeated(sublattices(cell), low, shape)
+    return _repeated(cell.sublattices, low, shape)
 
 
 def has_sites(cell: Cell, low: Index, shape: Index) -> Mask:
     """Return a mask of the indices of a window from `low` that are sites."""
-    return _repeated(sublattices(cell) >= 0, low, shape)
+    return _repeated(cell.sublattices >= 0, low, shape)
 
 
 def _repeated(values: NDArray[Any], low: Index, shape: Index) -> NDArray[Any]:

@@ -412,14 +412,14 @@ def missing_segments(
 def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
     """Return the lattice context from which a rule may derive constants."""
     lower, upper = (end.each(add, raster.lattice.origin) for end in body_box(raster))
-    cell, slots = raster.lattice.cell(), neighbourhood.slots
+    cell, slots = raster.cell, neighbourhood.slots
     return Setting(cell, slots, lower, upper, neighbourhood.tiling)
 
 
 def body_box(raster: Raster) -> tuple[Vector[float], Vector[float]]:
     """Return the corners (lower, upper) of the body, from site (0, 0) of the lattice."""
     ends = (raster.ends_of_rows(s) for s in range(raster.shape[0]))
-    at = [positions(raster.lattice.cell(), s, *cells) for s, cells in enumerate(ends)]
+    at = [positions(raster.cell, s, *cells) for s, cells in enumerate(ends)]
     lower, upper = raster.hull_of_all(
         (tuple(x.min() for x in ends), tuple(x.max() for x in ends)) for ends in at if ends[0].size
     )

@@ -288,6 +288,11 @@ class Raster:
     row_range: RowRange | None = None
 
     @cached_property
+    def cell(self) -> Cell:
+        """Repeat cell of the lattice."""
+        return self.lattice.cell()
+
+    @cached_property
     def count(self) -> int:
         """Number of particles, frame included."""
         return int(np.count_nonzero(self.sites != EMPTY))
@@ -377,7 +382,7 @@ class Raster:
 
     def cells_of(self, rows: Indices) -> tuple[Indices, ...]:
         """Return sublattice and repeat cell of rows."""
-        return cells_of_sites(self.lattice.cell(), *self.site_of(rows).T)
+        return cells_of_sites(self.cell, *self.site_of(rows).T)
 
     def place_of(self, rows: Indices) -> Indices:
         """Return the flat places of rows on the raster."""
@@ -388,7 +393,7 @@ class Raster:
         """Return the rows of the particles at (sublattice, raster cell, raster cell); -1 if there
         is none.
         """
-        cell = self.lattice.cell()
+        cell = self.cell
         index = np.array([site.index for site in cell.sites])
         whole = np.stack(cells, axis=-1) + self.first
         return self.rows_of_sites(whole * cell.period + index[s])
@@ -410,7 +415,7 @@ class Raster:
         """Return X of all particles or of the given rows, (particle, axis)."""
         if rows is None:
             return self._of_all(self.reference, self.sites.ndim, np.float64)
-        offsets = positions(self.lattice.cell(), *self.cells_of(rows))
+        offsets = positions(self.cell, *self.cells_of(rows))
         return np.stack(offsets, axis=1) + self.lattice.origin
 
     def reference_planes(self, where: Where) -> Any:
@@ -421,7 +426,7 @@ class Raster:
         else:
             s, *cells = where.sublattice, *np.ogrid[where.slices()[1:]]
         cells = [c + first for c, first in zip(cells, self.first, strict=True)]
-        return positions(self.lattice.cell(), s, *cells)
+        return positions(self.cell, s, *cells)
 
     def table(self, u: NDArray[Any]) -> NDArray[Any]:
         """Return the values of planes u, (axis, sublattice, cell, cell), by particle, (particle,
@@ -431,7 +436,7 @@ class Raster:
             flat = u.reshape(len(u), -1)
             return self._of_all(lambda rows: flat.take(self.place_of(rows), 1).T, len(u), u.dtype)
         out = np.empty((*self.sites.shape, len(u)), u.dtype)
-        cell = self.lattice.cell()
+        cell = self.cell
         for s, site in enumerate(cell.sites):
             skip = np.subtract(site.index, self.low) % cell.period
             target = out[tuple(slice(n, None, p) for n, p in zip(skip, cell.period, strict=True))]
@@ -481,19 +486,10 @@ def positions(cell: Cell, s: int | Indices, *cells: Indices) -> Any:
     """Return the positions of sublattice s in repeat cells (m, n), at + m·a + n·b, from site (0,
     0).
     """
-    at = np.array([site.at for site in cell.sites])
-    return vector(at[s, axis] + part for axis, part in enumerate(cell.shift(cells)))
+    return vector(cell.basis[s, axis] + part for axis, part in enumerate(cell.shift(cells)))
 
 
 def cells_of_sites(cell: Cell, *site: Indices) -> tuple[Indices, ...]:
     """Return sublattice and repeat cell of the sites (i, j); sublattice -1 at a hole."""
     remainder = tuple(i % p for i, p in zip(site, cell.period, strict=True))
-    return sublattices(cell)[remainder], *(i // p for i, p in zip(site, cell.period, strict=True))
-
-
-def sublattices(cell: Cell) -> Indices:
-    """Return the sublattice of each index of the cell, (period, period), -1 at a hole."""
-    result = np.full(cell.period, -1, np.intp)
-    for s, site in enumerate(cell.sites):
-        result[site.index] = s
-    return result
+    return cell.sublattices[remainder], *(i // p for i, p in zip(site, cell.period, strict=True))

@@ -238,7 +238,7 @@ class _Window:
         before = raster.extent.row_offset if raster.extent else 0
         self._whole, self._sub = raster, (subdomain := subdomain.after(before))
         self._axes = len(raster.shape) - 1
-        period = raster.lattice.cell().period[0]
+        period = raster.cell.period[0]
         lines = raster.sites.shape[0]
 
         def line(row: int) -> int:

@@ -251,7 +251,7 @@ class _Drawing:
             self.legend.append((colour, said))
 
     def _regions(self) -> None:
-        cell = self.scene.raster.lattice.cell()
+        cell = self.scene.raster.cell
         at = self.X[self.body]
         for n, (name, shape) in enumerate(self.scene.experiment.regions.items()):
             inside = at[signed_distance(shape, cell, *at.T) <= 0.0]

@@ -12,6 +12,7 @@ from functools import cache, cached_property, reduce
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pbdkit.plugin.component import Component
@@ -95,6 +96,19 @@ class Cell:
         """How many axes space has."""
         return len(self.vectors)
 
+    @cached_property
+    def basis(self) -> NDArray[np.float64]:
+        """Positions of the sites in the cell, (sublattice, axis)."""
+        return np.array([site.at for site in self.sites])
+
+    @cached_property
+    def sublattices(self) -> NDArray[np.intp]:
+        """Sublattice of each site index within the period, -1 at a hole."""
+        result = np.full(self.period, -1, np.intp)
+        for sublattice, site in enumerate(self.sites):
+            result[site.index] = sublattice
+        return result
+
     def shift(self, cell: Iterable[Any]) -> Any:
         """m·a + n·b, the vector from a repeat cell to that `cell` further on; numbers or arrays."""
         steps = [n * v for n, v in zip(cell, self.vectors, strict=True)]
@@ -124,7 +138,7 @@ class Cell:
 
     def offsets(self, source: int, radius: float) -> list[Offset]:
         """All offsets from a site of `source` with 0 < |rest| ≤ radius, the nearest first."""
-        sites = np.array([site.at for site in self.sites])
+        sites = self.basis
         cells = np.array(list(self._cells_within(radius + 2 * np.linalg.norm(sites, axis=1).max())))
         rests = (cells @ np.array(self.vectors))[:, None] + (sites - sites[source])
         near = np.argwhere(np.linalg.norm(rests, axis=2) <= radius * (1 + NEARLY))

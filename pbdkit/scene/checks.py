@@ -111,7 +111,7 @@ def locking(experiment: Experiment, raster: Raster) -> Iterator[str]:
     values, vectors = np.linalg.eigh([[c.xx, c.xy], [c.xy, c.yy]])
     if vectors[0, 0] * vectors[1, 0] > -0.25:  # the compliant mode is not of that kind
         return
-    sides = [math.hypot(*vector) for vector in raster.lattice.cell().vectors]
+    sides = [math.hypot(*vector) for vector in raster.cell.vectors]
     ends = zip(*body_box(raster), sides, strict=True)
     across = max(1.0, min((high - low) / side for low, high, side in ends))
     error = LOCKING_FACTOR * float(c.shear / values[0]) / across
@@ -206,7 +206,7 @@ def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
     selections |= {f"loads.{n}": load.select for n, load in enumerate(experiment.loads)}
     points = [(name, at) for name, select in selections.items() for at in select.nearest or ()]
     body = Selecting(raster)
-    limit = MAX_DISTANCE * max(math.hypot(*vector) for vector in raster.lattice.cell().vectors)
+    limit = MAX_DISTANCE * max(math.hypot(*vector) for vector in raster.cell.vectors)
     far = body.least_distances(at for _, at in points) > limit
     for name, (x, y) in islice(compress(points, far), MAX_LISTED):
         rows = body.nearest([(x, y)])

@@ -82,7 +82,7 @@ def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     if not len(rows):
         return None
     site = raster.site_of(rows).astype(np.int32)
-    return RasterFrame(raster.lattice.cell(), site, low, high, raster, rows, rule)
+    return RasterFrame(raster.cell, site, low, high, raster, rows, rule)
 
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:

@@ -275,7 +275,7 @@ def has_guides(leading: Iterable[Leading]) -> bool:
 def guided_at(raster: Raster, leading: Iterable[Leading], step: int) -> Guided:
     """Return the guided particles of a step; groups on different axes of one particle combine."""
     active = [group for group in leading if group.group.leads(step)]
-    axes = len(raster.lattice.cell().vectors)
+    axes = len(raster.cell.vectors)
     parts = [group.rows for group in active if len(group.axes) < axes]
     rows = distinct(np.concatenate(parts)) if parts else np.empty(0, np.intp)
     lead_axes = np.zeros((axes, len(rows)), bool)

@@ -139,7 +139,7 @@ def _areas(raster: Raster, tiling: Tiling, cells: WeighedCells | None) -> Floats
     It is an equal part of the weighted area of every cell at the particle, or the area of a site of
     the lattice if cells are not weighted.
     """
-    cell = raster.lattice.cell()
+    cell = raster.cell
     if cells is None or cells.share is None:
         return np.full(raster.shape, abs(np.linalg.det(cell.vectors)) / len(cell.sites))
     area = np.zeros(raster.shape)

@@ -593,7 +593,7 @@ def build_obstacles(raster: Raster, experiment: Experiment) -> tuple[Barrier, ..
     """
     if not experiment.obstacles:
         return ()
-    if len(raster.lattice.cell().vectors) != 2:
+    if len(raster.cell.vectors) != 2:
         raise ExperimentError(
             "obstacles require a plane lattice; remove them, or use a plane lattice",
             ("obstacles",),
@@ -624,7 +624,7 @@ def _refuse_infinite(barrier: Barrier, steps: int, n: int) -> None:
 def _refuse_body_inside(raster: Raster, outline: Outline, n: int) -> None:
     rows = raster.body_rows
     gap = outline.facing(*raster.reference(rows).T)[0]
-    if gap.min() < -SLACK * math.hypot(*raster.lattice.cell().vectors[0]):
+    if gap.min() < -SLACK * math.hypot(*raster.cell.vectors[0]):
         worst = int(np.argmin(gap))
         x, y = raster.reference(rows[worst : worst + 1])[0]
         raise ExperimentError(
@@ -644,7 +644,7 @@ def collisions(
     that move by Newton's law are stopped by obstacles and are not considered, nor are guided
     particles that can evade along the axis along which they follow.
     """
-    slack = SLACK * math.hypot(*raster.lattice.cell().vectors[0])
+    slack = SLACK * math.hypot(*raster.cell.vectors[0])
     warnings = []
     for k, leaders in enumerate(leading):
         if isinstance(leaders.group.motion, Newton):

@@ -312,7 +312,7 @@ class Scene:
     @property
     def axes(self) -> int:
         """Number of axes of space, that of the lattice."""
-        return len(self.raster.lattice.cell().vectors)
+        return len(self.raster.cell.vectors)
 
     @property
     def frame_changes(self) -> bool:

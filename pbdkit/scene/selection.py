@@ -126,7 +126,7 @@ class Selecting:
             names = ", ".join(self.regions) or "there is none: add `regions`"
             hint = did_you_mean(name, self.regions)
             raise ExperimentError(f"there is no region '{name}'{hint} (known: {names})", where)
-        distance = signed_distance(self.regions[name], self.raster.lattice.cell(), *self._x.T)
+        distance = signed_distance(self.regions[name], self.raster.cell, *self._x.T)
         return self._body[distance <= 0.0]
 
     def nearest(self, points: Iterable[Pair]) -> Indices:
@@ -151,7 +151,7 @@ class Selecting:
 
 def spacing(raster: Raster) -> float:
     """Return the length of the first vector of the lattice."""
-    return math.hypot(*raster.lattice.cell().vectors[0])
+    return math.hypot(*raster.cell.vectors[0])
 
 
 def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, ...]) -> Indices:

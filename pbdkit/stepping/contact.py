@@ -61,7 +61,7 @@ def _stiffnesses(scene: Scene, place: Indices, sublattice: int) -> Floats:
     if scene.constants.by_particle:
         evaluator = evaluator.given(around.parameters)
     neighbours, here = around.neighbours(rest), around.here(rest.u, rest)
-    size = NUDGE * length(scene.raster.lattice.cell().vectors[0])
+    size = NUDGE * length(scene.raster.cell.vectors[0])
     sizes = (size,) if scene.experiment.rule.linear else (size, -size)
     found = np.zeros((len(place), scene.axes, scene.axes))
     for nudge in sizes:
@@ -114,7 +114,7 @@ class Contact:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._vectors: Floats = np.array(scene.raster.lattice.cell().vectors)
+        self._vectors: Floats = np.array(scene.raster.cell.vectors)
         self._inverse = np.linalg.inv(self._vectors)
         ends = [end for block in self._blocks() for end in self._ends(block)]
         self.reach = float(np.abs(ends).max())
@@ -250,7 +250,7 @@ class Contact:
         corner = np.array([box[:2] - high, box[2:] - low])
         if np.isnan(corner).any():
             return None
-        at = np.array(raster.lattice.cell().sites[block.sublattice].at)
+        at = raster.cell.basis[block.sublattice]
         low, high = self._ends(block)
         # Boxes that do not end are those of the body here, and a little more.
         corner = np.clip(corner, low - 1.0, high + 1.0)
@@ -276,7 +276,7 @@ class Contact:
         """(low, high) of the places of a block's sites, from site (0, 0)."""
         corners = product(*((a, b - 1) for a, b in zip(block.start, block.stop, strict=True)))
         sites = np.array(list(corners)) + self._scene.raster.first
-        at = np.array(self._scene.raster.lattice.cell().sites[block.sublattice].at)
+        at = self._scene.raster.cell.basis[block.sublattice]
         places = sites @ self._vectors + at
         return places.min(axis=0), places.max(axis=0)
 

@@ -172,7 +172,7 @@ class GatheringFollowers(Followers):
         everybody = np.arange(raster.count)
         self.place, self.body = raster.place_of(everybody), raster.body_rows
         self._site = raster.cells_of(everybody)
-        local = positions(raster.lattice.cell(), *self._site)
+        local = positions(raster.cell, *self._site)
         self.X = np.stack(local)
         self._at = local.each(np.add, raster.lattice.origin)
         self._centred = local.each(np.subtract, scene.middle)

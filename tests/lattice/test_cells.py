@@ -40,7 +40,7 @@ def area_of(polygon):
 
 
 def cell_of(lattice):
-    return scene_of(lattice=lattice).raster.lattice.cell()
+    return scene_of(lattice=lattice).raster.cell
 
 
 @pytest.mark.parametrize(

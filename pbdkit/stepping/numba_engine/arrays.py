@@ -45,7 +45,7 @@ def constant_arrays(plan: Plan) -> Arrays:
     arrays = {
         "kind": scene.raster.kind,
         "first": np.array(scene.raster.first, np.int64),
-        "at": np.array([site.at for site in scene.raster.lattice.cell().sites]),
+        "at": scene.raster.cell.basis,
         "counts": np.array([len(own) for own in slots]),
         **changing_arrays(plan),
         **{name: v.reshape(len(slots), most, *v.shape[1:]) for name, v in by_slot.items()},

@@ -261,7 +261,7 @@ class Plan:
         """X from site (0, 0), in the order of operations of the rasters."""
         index = [f"{name} + first[{n}]" for n, name in enumerate((*self.lead, "j + j0"))]
         found = []
-        for n, along in enumerate(zip(*self.scene.raster.lattice.cell().vectors, strict=True)):
+        for n, along in enumerate(zip(*self.scene.raster.cell.vectors, strict=True)):
             terms = [f"({at}) * {float(v)!r}" for at, v in zip(index, along, strict=True)]
             found.append(f"at[{s}, {n}] + ({' + '.join(terms)})")
         return found
