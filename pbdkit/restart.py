@@ -390,7 +390,7 @@ def _unfinished(
         if not (is_same or anyway):
             _refuse_other_weights(f"{output}: ", scene, chosen, execution)
         run = execution.run(scene, watch)
-        run.driver.chosen = chosen
+        run.driver.automatic = chosen
         recorder = run.recorder(run.sink(sink))
         with _report_damage(output):
             restore(run.driver, recorder, checkpoint, communicator)
@@ -424,7 +424,7 @@ def _continued(
         if not anyway:
             _refuse_other_weights("", scene, chosen, execution)
         run = execution.run(scene, watch)
-        run.driver.chosen = chosen
+        run.driver.automatic = chosen
         sink = NetcdfSink(output, True, experiment.record.compression)
         recorder, recorded = run.recorder(run.sink(sink)), None
         try:

@@ -49,115 +49,144 @@ States = Generator[State, None, RunOutcome]
 
 
 class Driver(ABC):
-    """Takes one scene from a state to its end, once.
+    """Advances one scene from a state to the end of its run.
 
-    `state` is where it stands, `choice` what steps it. `ending` says of a state just given out that
-    it is the last of a run that ends before its last step, to be kept whatever the plan, `is_over`
-    that nothing remains to be computed; `stopped` is how such a run ends that was asked to stop.
+    Attributes
+    ----------
+    scene, state, watch
+        Scene, current state, and display of progress.
+    choice : Choice
+        Engine of the run, its threads, and the reason.
+    ends_early : bool
+        True at the last state of a run that ends before its last step. That state is recorded even
+        if no record is due.
+    is_complete : bool
+        True if nothing remains to be computed after the current state.
+    interruption : RunOutcome or None
+        Outcome of a run that was interrupted on request.
+    automatic : tuple of str
+        Solver parameters that the experiment gives as `auto`; they have values now.
+    load_time : float or None
+        Time within a step at which the current state is an equilibrium to be recorded; None
+        otherwise.
+    requested_step : int
+        Step at which the state is yielded even if no record is due; -1 for none.
+    certificate : Certificate or None
+        Error bound of the equilibrium, once it is reached.
+    rejection : FloatingPointError or None
+        Error raised by the recorder for the current state. The driver decides how to continue.
     """
 
     choice: Choice
 
     def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
         self.scene, self.state, self.watch = scene, state, watch
-        self.ending = self.is_over = False
-        self.stopped: RunOutcome | None = None
-        self.chosen: tuple[str, ...] = ()
-        """The parameters of the solver that were `auto`, and are numbers now."""
-        self.within: float | None = None
-        """The moment within a step of which the state just given out is an equilibrium to be
-        recorded; None elsewhere."""
-        self.pause = -1
-        """A step at which to give out the state whatever is recorded."""
+        self.ends_early = self.is_complete = False
+        self.interruption: RunOutcome | None = None
+        self.automatic: tuple[str, ...] = ()
+        self.load_time: float | None = None
+        self.requested_step = -1
         self.certificate: Certificate | None = None
-        """The bound on the distance of the last state from equilibrium, of an equilibrium that was
-        found."""
         self.rejection: FloatingPointError | None = None
-        """Why whoever looked at the last state could not use it; its next move is up to the
-        driver."""
 
     @abstractmethod
     def states(self) -> States:
-        """The states on the way, the first included, each valid until the next is asked for; then
-        how it ended. Raises ExperimentError where there is no way."""
+        """Generate the states of the run, the first included, and return its outcome.
+
+        Each state is valid until the next is generated.
+
+        Raises
+        ------
+        ExperimentError
+            If the run is impossible.
+        """
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """All that decides how it goes on from a state just given out."""
+        """Return everything that determines how the run continues from the current state."""
 
     def restart(self, state: State) -> None:
-        """Go on from another state of the same step in place of that just given out."""
+        """Continue from another state of the same step."""
         self.state = state
 
     @abstractmethod
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """Goes on from there, before the first state was asked for."""
+        """Restore the result of `state_dict`, before the first state is generated."""
 
 
-LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
-"""An engine is called for so long at most, so that progress shows and interruptions are heard."""
+LONGEST_CALL_S = 0.2
+"""Maximum duration of one call of an engine in seconds. Progress is shown and interruptions are
+handled between calls."""
+SECONDS_A_VALUE = 2e-9
+"""First estimate of the time for one step of one particle in seconds."""
 MOST_STEPS = 100_000
-"""A call."""
+"""Maximum number of steps in one call of an engine."""
 
 
 class SteppingDriver(Driver):
-    """The driver of the solver `stepping`: gives out a state at every step of which something is
-    wanted, and some between."""
+    """Driver of the solver `stepping`.
+
+    States are yielded at every step that is recorded, and at some steps between.
+    """
 
     def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
         super().__init__(scene, state, watch)
         self._engine, self.choice = make_engine(scene, choose(scene))
-        self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.count)
+        self._steps_per_call = self._steps_in(SECONDS_A_VALUE * scene.raster.count)
         self.guard = Guard.of(scene, state)
-        self.settling: SteadyStateMonitor | None = None
-        if asked := scene.experiment.stepping.settle:
-            from pbdkit.equilibrium.certificate import (
-                SteadyStateMonitor,  # only where it is asked for
-            )
+        self.monitor: SteadyStateMonitor | None = None
+        if tolerance := scene.experiment.stepping.settle:
+            from pbdkit.equilibrium.certificate import SteadyStateMonitor
 
-            self.settling = SteadyStateMonitor(scene, asked, state, watch)
-        self.kept = -1
-        """The last step that was given out to be recorded, and was not rejected."""
+            self.monitor = SteadyStateMonitor(scene, tolerance, state, watch)
+        self.recorded_step = -1
+        """Last step that was yielded for recording and not rejected."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The state, and what the guard and whoever looks whether it has settled remember."""
-        settling = self.settling
-        pace = {"pace": settling.pace, "obstacle": settling.obstacle} if settling else {}
+        """Return the state, and those of the guard and of the steady-state monitor."""
+        monitor = self.monitor
+        pace = {"pace": monitor.pace, "obstacle": monitor.obstacle} if monitor else {}
         guard = {"good_step": self.guard.good_step, "next_look": self.guard.next_look}
-        return {"state": self.state, "guard": guard, "kept": self.kept, **pace}
+        return {"state": self.state, "guard": guard, "kept": self.recorded_step, **pace}
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """What follows from the scene is its own: the size of the body, and when to look whether
-        it has settled, where a run of so many steps has not looked by then."""
-        self.state, self.kept = parts["state"], parts["kept"]
-        is_good = parts["guard"]["good_step"] == self.state.step
-        kept = self.state.copy() if is_good else self.guard.kept
-        self.guard = replace(self.guard, kept=kept, **parts["guard"])
-        if self.settling and "pace" in parts:
-            self._take_up_settling(self.settling, parts["pace"], parts["obstacle"])
+        """Restore the result of `state_dict`.
 
-    def _take_up_settling(self, settling: SteadyStateMonitor, pace: Pace, obstacle: str) -> None:
-        step, own = self.state.step, settling.pace
-        if own.next_look > step:  # what is to happen by then, the other run may not have known
+        What follows from the scene is not restored: the size of the body, and the first step at
+        which convergence is tested if a run of this length has not tested by then.
+        """
+        self.state, self.recorded_step = parts["state"], parts["kept"]
+        is_good = parts["guard"]["good_step"] == self.state.step
+        good_state = self.state.copy() if is_good else self.guard.kept
+        self.guard = replace(self.guard, kept=good_state, **parts["guard"])
+        if self.monitor and "pace" in parts:
+            self._restore_monitor(self.monitor, parts["pace"], parts["obstacle"])
+
+    def _restore_monitor(self, monitor: SteadyStateMonitor, pace: Pace, obstacle: str) -> None:
+        step, new_pace = self.state.step, monitor.pace
+        if new_pace.next_look > step:  # the earlier run may not have planned those tests
             return
-        if pace.begin != own.begin:
+        if pace.begin != new_pace.begin:
             experiment = self.scene.experiment
             text = (
-                f"a run of {experiment.steps} steps looks from step {own.next_look} on whether it "
-                f"has settled, and step {step} was reached without; run it anew, or go on to more "
-                "steps"
+                f"a run of {experiment.steps} steps tests convergence from step "
+                f"{new_pace.next_look} on, and step {step} was reached without a test; start the "
+                "run again, or resume it with more steps"
             )
             raise experiment.located(ExperimentError(text, ("solver", "settle")))
-        settling.pace, settling.obstacle = pace, obstacle
+        monitor.pace, monitor.obstacle = pace, obstacle
 
     def restart(self, state: State) -> None:
-        """Go on from another state; the guard looks back to it."""
+        """Continue from another state, which the guard takes as good."""
         super().restart(state)
         self.guard = replace(self.guard, good_step=state.step, kept=state.copy())
 
     def states(self) -> States:
-        """A run that diverges gives out the last good state at its end, where that is later than
-        what was recorded."""
+        """Generate the states of the run.
+
+        If the run diverges, its last state is the last good one, provided that it is later than
+        the last recorded one.
+        """
         try:
             return (yield from self._stepped())
         except FloatingPointError as error:
@@ -167,207 +196,218 @@ class SteppingDriver(Driver):
         steps = self.scene.experiment.steps
         outcome: RunOutcome | None = None
         try:
-            yield from self._given_out()
-            while not (outcome := self._settled()) and (step := self.state.step) < steps:
+            yield from self._current_state()
+            while not (outcome := self._convergence()) and (step := self.state.step) < steps:
                 self.watch.look(step / steps, f"step {step} of {steps}")
                 self._advance()
-                yield from self._given_out()
-        except StoppedError:  # after the last step, too, while it is looked at
+                yield from self._current_state()
+        except StoppedError:  # also raised while the last state is recorded
             step = self.state.step
-            self.stopped = outcome = RunOutcome("interrupted", f"stopped after step {step}", step)
-        if self.stopped or self.kept < self.state.step:
-            self.ending = True
-            yield from self._given_out()
+            outcome = RunOutcome("interrupted", f"stopped after step {step}", step)
+            self.interruption = outcome
+        if self.interruption or self.recorded_step < self.state.step:
+            self.ends_early = True
+            yield from self._current_state()
         if outcome:
             return outcome
-        unsettled = f", not settled: {self.settling.obstacle}" if self.settling else ""
-        return RunOutcome("complete", f"all steps done{unsettled}", steps)
+        obstacle = f", not settled: {self.monitor.obstacle}" if self.monitor else ""
+        return RunOutcome("complete", f"all steps done{obstacle}", steps)
 
     def _advance(self) -> None:
-        """To the next step at which to look. Raises FloatingPointError."""
+        """Step to the next state that is recorded or tested. Raises FloatingPointError."""
         experiment, state = self.scene.experiment, self.state
         stops = [experiment.next_recorded(state.step), self.guard.next_look]
-        stops += [self.settling.pace.next_look] if self.settling else []
-        stops += [self.pause] if self.pause > state.step else []
-        reached = min(*stops, state.step + self._patience)
-        planned = experiment.record.keeps(reached, reached + 1)  # by longer runs, too
-        notes = reached == self.guard.next_look or planned
-        begun, steps = perf_counter(), reached - state.step
+        stops += [self.monitor.pace.next_look] if self.monitor else []
+        stops += [self.requested_step] if self.requested_step > state.step else []
+        target = min(*stops, state.step + self._steps_per_call)
+        is_recorded = experiment.record.keeps(target, target + 1)  # in longer runs too
+        notes = target == self.guard.next_look or is_recorded
+        start_time, steps = perf_counter(), target - state.step
         self.state = self._engine.advance(state, steps)
-        self._patience = self._steps_in((perf_counter() - begun) / steps)
-        if notes or reached == experiment.steps:
+        self._steps_per_call = self._steps_in((perf_counter() - start_time) / steps)
+        if notes or target == experiment.steps:
             self.guard.look(self.scene, self.state, note=notes)
 
     def _steps_in(self, seconds_a_step: float) -> int:
-        """How many steps a call takes, where a step takes so long."""
+        """Return the number of steps in one call of the engine."""
         return max(1, min(MOST_STEPS, int(LONGEST_CALL_S / max(seconds_a_step, 1e-9))))
 
-    def _given_out(self) -> Iterator[State]:
-        """The state. Raises what whoever looked at it has against it."""
+    def _current_state(self) -> Iterator[State]:
+        """Yield the state; raise the error of the recorder, if any."""
         yield self.state
         if self.rejection:
             raise self.rejection
         if self.scene.experiment.records(self.state.step):
-            self.kept = self.state.step
+            self.recorded_step = self.state.step
 
-    def _settled(self) -> RunOutcome | None:
+    def _convergence(self) -> RunOutcome | None:
+        """Return the outcome of a converged run if a test is due and passes."""
         state = self.state
-        if self.settling is None or state.step != self.settling.pace.next_look:
+        if self.monitor is None or state.step != self.monitor.pace.next_look:
             return None
-        found = self.settling.look(state)
-        return RunOutcome("settled", str(found), state.step, found.as_dict()) if found else None
+        bound = self.monitor.look(state)
+        return RunOutcome("settled", str(bound), state.step, bound.as_dict()) if bound else None
 
     def _diverged(self, error: FloatingPointError) -> States:
         step, rule = self.state.step, self.scene.experiment.rule.type
         cause = self._cause_of_nan()
         if self.rejection and not cause and np.isfinite(self.state.u).all():
-            cause = ": displacements are finite, but not what is measured of them"
+            cause = ": displacements are finite, but a recorded variable is not"
         reason = f"{error} left all bounds under rule '{rule}'{cause}"
         self.rejection = None
-        if self.kept < step - 1:
+        if self.recorded_step < step - 1:
             good = self.guard.last_good(
-                self.scene, self._engine, step, self._patience, self.watch.stopping
+                self.scene, self._engine, step, self._steps_per_call, self.watch.stopping
             )
-            if good is not None and good.step > self.kept:
-                self.ending = True
+            if good is not None and good.step > self.recorded_step:
+                self.ends_early = True
                 yield good
-                if not self.rejection:  # else a diagnostic of it is not finite
+                if not self.rejection:  # otherwise a diagnostic is not finite
                     reason += (
-                        f"; kept is step {good.step}, the last no larger than the body and its "
-                        "leaders' ways"
+                        f"; the last recorded state is step {good.step}, the last in which no "
+                        "displacement exceeds the size of the body and the paths of its leaders"
                     )
         return RunOutcome("diverged", reason, step)
 
     def _cause_of_nan(self) -> str:
-        """Where the rule made NaN of numbers, found by stepping once more with numpy; empty where
-        there is no NaN."""
+        """Return the place in the rule at which NaN appears, or an empty string without NaN.
+
+        It is located by repeating the last steps with numpy.
+        """
         if not np.isnan(self.state.u).any():
             return ""
         rule, start = type(self.scene.experiment.rule), self.guard.kept
         start = start.copy() if start else initial_state(self.scene)
-        steps, found = self.state.step - start.step, ""
+        steps, place = self.state.step - start.step, ""
         try:
             if steps <= EVERY:
                 Stepper(self.scene, strict=True).advance(start, steps)
         except FloatingPointError as error:
-            found = f", from {worded(error, rule.__module__.split('.')[0])}"
+            place = f", from {worded(error, rule.__module__.split('.')[0])}"
         return (
-            f": a displacement is NaN{found}; guard divisions and roots with `pbdkit.plugin.where`"
+            f": a displacement is NaN{place}; guard divisions and roots with `pbdkit.plugin.where`"
         )
 
 
 class EquilibriumDriver(Driver):
-    """The driver of the solver `equilibrium`: gives out the start, what it reaches on the way, and
-    the equilibrium."""
+    """Driver of the solver `equilibrium`.
+
+    Yields the initial state, the states after increments of the load, and the equilibrium.
+    """
 
     choice = Choice("equilibrium", 1, "asked for")
     moment = 0.0
-    """What of the load's way has been reached, in steps."""
+    """Time that the load has reached, in steps."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The state and the moment: each increment begins anew from them."""
+        """Return state and time, from which the next increment starts."""
         return {"state": self.state, "moment": self.moment}
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """From the last that was reached."""
+        """Restore the result of `state_dict`."""
         self.state, self.moment = parts["state"], float(parts["moment"])
 
     def states(self) -> States:
-        """Interrupted, or without an equilibrium, it gives out how far it had come."""
-        # Loaded by those who look for an equilibrium, and by nobody else.
+        """Generate the states of the run.
+
+        If it is interrupted or finds no equilibrium, its last state is the last one reached.
+        """
         from pbdkit.equilibrium.certificate import UnconvergedError
         from pbdkit.equilibrium.solve import SeparatedError
 
         state = self.state
         yield state
         try:
-            self.certificate = certificate = yield from self._on_the_way(state)
+            self.certificate = certificate = yield from self._increments(state)
             outcome = RunOutcome("complete", str(certificate), state.step, certificate.as_dict())
         except UnconvergedError as error:
-            found = error.certificate
-            outcome = RunOutcome("unconverged", f"{error}: {found}", state.step, found.as_dict())
+            bound = error.certificate
+            outcome = RunOutcome("unconverged", f"{error}: {bound}", state.step, bound.as_dict())
         except SeparatedError as error:
             outcome = RunOutcome("separated", str(error), state.step)
         except FloatingPointError as error:
             return RunOutcome("unconverged", f"{error} left all bounds", state.step)
         except StoppedError:
             reason = f"stopped on the way to equilibrium, after step {state.step}"
-            outcome = self.stopped = RunOutcome("interrupted", reason, state.step)
-        self.ending = outcome.status != "complete"
+            outcome = self.interruption = RunOutcome("interrupted", reason, state.step)
+        self.ends_early = outcome.status != "complete"
         yield state
         if self.rejection:
             return RunOutcome("unconverged", f"{self.rejection} left all bounds", state.step)
         return outcome
 
     def _way(self, state: State) -> Way:
-        """What is reached on the way of a state to equilibrium."""
+        """Follow the load from a state to equilibrium."""
         from pbdkit.equilibrium.solve import increments
 
         return increments(self.scene, state, self.watch, self.moment, stops=self._stops)
 
     @property
     def _stops(self) -> list[int]:
-        """The recorded steps between the first and the last one."""
+        """Recorded steps between the first and the last one."""
         experiment = self.scene.experiment
         return list(experiment.record.steps_before(experiment.steps))
 
-    def _on_the_way(self, state: State) -> Generator[State, None, Certificate]:
-        """Raises FloatingPointError where a state cannot be recorded."""
-        way, increments = self._way(state), self.scene.experiment.record.increments
+    def _increments(self, state: State) -> Generator[State, None, Certificate]:
+        """Yield the states after increments of the load and return the error bound.
+
+        Raises FloatingPointError if a state cannot be recorded.
+        """
+        way, records_all = self._way(state), self.scene.experiment.record.increments
         while True:
             try:
                 reached = next(way)
             except StopIteration as end:
                 certificate: Certificate = end.value
                 return certificate
-            self.moment, self.is_over = reached.moment, reached.is_last
-            within = increments and reached.at_rest and reached.moment != reached.state.step
-            self.within = reached.moment if within else None
+            self.moment, self.is_complete = reached.moment, reached.is_last
+            is_within = records_all and reached.at_rest and reached.moment != reached.state.step
+            self.load_time = reached.moment if is_within else None
             yield reached.state
-            self.within = None
+            self.load_time = None
             if self.rejection:
                 raise self.rejection
 
 
 def checkpoint_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Checkpoint:
-    """Return the checkpoint of a run, its arrays not copied; `rate` is in steps a second."""
+    """Return the checkpoint of a run without copying arrays; `rate` is in steps per second."""
     experiment, step = driver.scene.experiment, driver.state.step
     run = driver.state_dict()
-    return Checkpoint.of(experiment, run, recorder.seen, step, driver.chosen, rate)
+    return Checkpoint.of(experiment, run, recorder.seen, step, driver.automatic, rate)
 
 
 DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
     Stepping: SteppingDriver,
     Equilibrium: EquilibriumDriver,
 }
-"""What carries out what an experiment asks for under `solver`."""
+"""Driver of each solver."""
 FAILED = ("diverged", "unconverged", "separated")
-"""How runs end that do not come to their last step or to rest."""
+"""Statuses of runs that reach neither their last step nor equilibrium."""
 LARGEST = 50_000
-"""Of larger bodies nothing is measured ahead of the run."""
+"""Maximum number of particles of a body whose diagnostics are evaluated before the run."""
 
 
 class Simulation:
-    """One simulation of an experiment, stepped by hand or to its end.
+    """Simulation of an experiment, step by step or to its end.
 
-    The numbers are those of `pbdkit.run`, bit for bit, however many steps are made in a call. A
-    warning is issued for what is doubtful in the scene, as `pbdkit.run` does.
+    The results are those of `pbdkit.run`, bit for bit, for any number of steps in a call. The same
+    warnings are issued as by `pbdkit.run`.
 
     Parameters
     ----------
     experiment : Experiment, mapping, str or path
-        As `pbdkit.run` takes it.
+        Experiment, as for `pbdkit.run`.
     components, settings
-        As in `pbdkit.load`.
+        As for `pbdkit.load`.
     start : Simulation, optional
-        The simulation from whose state this one starts, at the step that it has reached: the body
-        must have the same particles and bonds. By default the initial state of the experiment.
+        Simulation whose current state and step this one starts from. The body must have the same
+        particles and bonds. By default the initial state of the experiment.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where the experiment is wrong, a plugin is missing or broken, or the start is the state of
-        another body.
+        If the experiment is invalid, a plugin is missing or broken, or the state of `start`
+        belongs to another body.
 
     Examples
     --------
@@ -379,7 +419,7 @@ class Simulation:
     """
 
     processes: int = 1
-    """The number of processes that share it."""
+    """Number of processes that share the lattice."""
 
     def __init__(
         self,
@@ -395,8 +435,8 @@ class Simulation:
             state = start.driver.state.copy()
             if not state.fits(unmoved_state(scene, scene.raster.shape[1:])):
                 raise ExperimentError(
-                    "start: its state is that of another body: the particles, bonds, leader "
-                    "groups and precision must be the same"
+                    "start: its state belongs to another body; particles, bonds, leader groups and "
+                    "precision must be the same"
                 )
             if state.step > scene.experiment.steps:
                 raise ExperimentError(
@@ -416,54 +456,57 @@ class Simulation:
         Parameters
         ----------
         scene : Scene
-            The experiment on its lattice.
+            Experiment on its lattice.
         start : State, optional
-            The state to go on from, which the simulation takes over.
+            Initial state; the simulation modifies it.
         watch : Watch, optional
-            Shows progress and says whether to stop.
+            Display of progress, and requests to stop.
         """
         simulation = cls.__new__(cls)
         simulation._begin(scene, start, watch or Watch())
         return simulation
 
     def _begin(self, scene: Scene, start: State | None, watch: Watch) -> None:
-        chosen = scene.experiment.stepping.open_parameters
+        automatic = scene.experiment.stepping.open_parameters
         self.scene = scene = tuned(scene)
         with _located(scene):
             make = DRIVERS[type(scene.experiment.solver)]
             self.driver = make(scene, start or initial_state(scene), watch)
-        self.driver.chosen = chosen
+        self.driver.automatic = automatic
 
     outcome: RunOutcome | None = None
-    """How the simulation ended; None until it has."""
+    """Outcome of the simulation; None before its end."""
 
     def __iter__(self) -> Iterator[State]:
-        """Yield the states to the end, once: of every step of which something is recorded, the
-        first and the last included, and of some between. Each is valid, and may be changed, until
-        the next: ``state.copy()`` keeps it."""
+        """Yield the states to the end of the run; possible once.
+
+        The states are those of every recorded step, the first and the last included, and of some
+        steps between. Each is valid, and may be modified, until the next; ``state.copy()`` keeps
+        it.
+        """
         with _located(self.scene):
             self.outcome = yield from self.driver.states()
 
     def step(self, n: int = 1) -> None:
-        """Make steps.
+        """Advance by n steps.
 
         Parameters
         ----------
         n : int
-            The number of steps. A run that has settled ends earlier, as `outcome` then says.
+            Number of steps. A run that converges ends earlier; `outcome` is set then.
 
         Raises
         ------
         ExperimentError
-            Where the experiment has fewer steps left, or its solver makes none.
+            If the experiment has fewer steps left, or its solver makes no steps.
         DivergedError
-            Where a displacement leaves the finite numbers.
+            If a displacement is not finite.
         """
         steps, time = self.experiment.steps, self.time
         if not self.experiment.solver.makes_steps:
             raise ExperimentError(
-                "solver: an equilibrium is found without steps: call run() or equilibrate(), or "
-                "take solver: {type: stepping}"
+                "solver: the solver `equilibrium` makes no steps; call run() or equilibrate(), or "
+                "set solver: {type: stepping}"
             )
         if type(n) is not int or n < 0:
             raise ExperimentError(f"step: expected a number of steps from 0, got {n!r}")
@@ -471,40 +514,41 @@ class Simulation:
             raise ExperimentError(f"step: the simulation has ended: {self.outcome.stop_reason}")
         if time + n > steps:
             raise ExperimentError(
-                f"step: step {time} of {steps} is reached, and {n} more are asked for; "
-                f"settings={{'steps': {time + n}}} makes the experiment longer"
+                f"step: {n} more steps exceed the {steps} of the experiment, of which {time} are "
+                f"made; extend it with settings={{'steps': {time + n}}}"
             )
-        self.driver.pause = time + n
+        self.driver.requested_step = time + n
         self._go(lambda: self.time >= time + n)
 
     def run(self) -> None:
-        """Go on to the end of the experiment, as `pbdkit.run` does.
+        """Continue to the end of the experiment, as `pbdkit.run`.
 
         Raises
         ------
         DivergedError
-            Where a displacement leaves the finite numbers, there is no equilibrium, or the body
-            comes apart on the way to one.
+            If a displacement is not finite, no equilibrium is found, or the body separates into
+            parts under the load.
         """
         self._go(lambda: False)
 
     def equilibrate(self) -> Certificate:
-        """Move the body to equilibrium, with leaders, loads and numbers as they are now.
+        """Compute the equilibrium for the current leaders, loads and parameters.
 
-        Bonds that are too long in equilibrium break. The time stays as it is, and steps go on from
-        there. With ``solver: equilibrium`` the load is followed to the last step, as in `run`.
+        Bonds that exceed their limit in equilibrium break. The time does not change, and steps
+        continue from the equilibrium. With ``solver: equilibrium`` the load is followed to the last
+        step, as by `run`.
 
         Returns
         -------
         Certificate
-            The bound on the distance from equilibrium; ``print`` shows it.
+            A posteriori bound on the distance from equilibrium; ``print`` displays it.
 
         Raises
         ------
         DivergedError
-            Where no equilibrium is found.
+            If the iteration does not converge.
         ExperimentError
-            Where there is none.
+            If no equilibrium exists.
         """
         from pbdkit.equilibrium.certificate import UnconvergedError
         from pbdkit.equilibrium.solve import settle_at_step
@@ -523,29 +567,29 @@ class Simulation:
         return certificate
 
     def record(self, path: str | Path | None = None, *, force: bool = False) -> Recording:
-        """Record from the present state on what the experiment asks for under `record`.
+        """Record from the current state on, as the field `record` of the experiment specifies.
 
-        The present state is recorded in any case, and so is the last one. Recording ends with the
-        block, or by `Recording.close`, and where the simulation ends.
+        The current and the last state are always recorded. Recording ends with the ``with`` block,
+        by `Recording.close`, or with the simulation.
 
         Parameters
         ----------
         path : str or path, optional
-            The file to write, as `pbdkit.run` does; by default the dataset is kept in memory.
+            File to write; by default the dataset is kept in memory.
         force : bool
             Replace an existing file.
 
         Returns
         -------
         Recording
-            A context manager, whose `dataset` is there when it has ended.
+            Context manager; its attribute `dataset` is available after recording has ended.
 
         Raises
         ------
         ExperimentError
-            Where the file exists, or the simulation has ended.
+            If the file exists, or the simulation has ended.
         StorageError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         if self.outcome:
             raise ExperimentError(f"record: the simulation has ended: {self.outcome.stop_reason}")
@@ -568,13 +612,13 @@ class Simulation:
     _states: Iterator[State] | None = None
 
     def _start(self) -> None:
-        """Let the driver give out the present state, which recordings then take."""
+        """Start the driver, which yields the current state to be recorded."""
         if self._states is None:
             self._states, self._recordings = iter(self), []
             next(self._states)
 
     def _go(self, is_reached: Callable[[], bool]) -> None:
-        """Go on until a time is reached, or the end; recordings take each state as it is left."""
+        """Advance until a condition holds or the run ends; record each state before it is left."""
         self._start()
         assert self._states is not None
         while not self.outcome and not is_reached():
@@ -583,35 +627,36 @@ class Simulation:
                     recording.take(self.driver.state)
                 next(self._states, None)
             except BaseException:
-                time, ending, self._recordings = self.time, self._recordings, []
+                time, recordings, self._recordings = self.time, self._recordings, []
                 self.outcome = RunOutcome("interrupted", f"by an error after step {time}", time)
-                for recording in ending:
+                for recording in recordings:
                     recording.abandon()
                 raise
         if self.outcome:
-            ending, self._recordings = self._recordings, []
-            for recording in ending:
+            recordings, self._recordings = self._recordings, []
+            for recording in recordings:
                 recording.finish(self.outcome)
             if self.outcome.status in FAILED:
                 raise DivergedError(self.outcome.stop_reason)
 
     @property
     def experiment(self) -> Experiment:
-        """The experiment, with numbers in place of `auto`."""
+        """Experiment, with values in place of `auto`."""
         return self.scene.experiment
 
     @property
     def time(self) -> int:
-        """The number of steps that are made."""
+        """Current step."""
         return self.driver.state.step
 
     @property
     def state(self) -> xarray.Dataset:
-        """The present state: `position`, `u` and `kind` of every particle, what rule and fracture
-        model remember, and `broken_step` of every bond where bonds can break.
+        """Current state as a dataset.
 
-        The names, coordinates and units are those of a run's dataset at one time. The values are
-        read-only, and later steps do not change them.
+        It contains `position`, `u` and `kind` of every particle, the remembered numbers of rule and
+        fracture model, and `broken_step` of every bond if bonds can break. Names, coordinates and
+        units are those of the dataset of a run at one time. The values are read-only, and later
+        steps do not change them.
         """
         return self._snapshots.dataset(self.driver.state)
 
@@ -621,49 +666,65 @@ class Simulation:
 
     @property
     def choice(self) -> Choice:
-        """The engine, its threads, and why."""
+        """Engine, number of threads, and the reason of the choice."""
         return self.driver.choice
 
     @property
     def particles(self) -> int:
-        """How many there are, frame included."""
+        """Number of particles, frame included."""
         return self.scene.raster.count
 
     def recorder(self, sink: Sink) -> Recorder:
-        """Return what takes from its states what the dataset holds."""
+        """Return a recorder of the variables of the dataset into a sink."""
         return Recorder(self.scene, sink)
 
     def sink(self, file: KeepingSink) -> KeepingSink:
-        """Return a sink that writes into a file beside the simulation."""
+        """Return a sink that writes to a file concurrently with the simulation."""
         return OverlappingSink(file)
 
     @cached_property
     def prediction(self) -> dict[str, Any]:
-        """What was known of it before the first step."""
+        """Prediction of stability before the first step, as attributes of the dataset."""
         return prediction(self.scene, self.waves)
 
     @cached_property
     def waves(self) -> Bound | None:
-        """The bound on its stability from plane waves."""
+        """Bound on stability from plane waves, or None without one."""
         return wave_bound(self.scene)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """The warnings before the first step: of the scene, and of stability."""
+        """Warnings before the first step, about the scene and its stability."""
         return quick_warnings(self.scene, self.waves)
 
     def outlook(self) -> list[str]:
-        """Return what else `check` warns of, where the body is so small that it is known at
-        once."""
-        wave_warns = bool(self.waves) and "solver.relaxation" in " ".join(self.warnings)
-        found = outlook(self.scene)
-        return [w for w in found if not (wave_warns and w.startswith("solver.relaxation"))]
+        """Return the further warnings of `check` if they are computed in less than a second."""
+        repeats = bool(self.waves) and "solver.relaxation" in " ".join(self.warnings)
+        warnings = outlook(self.scene)
+        return [w for w in warnings if not (repeats and w.startswith("solver.relaxation"))]
 
 
 @dataclass(frozen=True)
 class RunReport:
-    """How a recorded run went, for those who look at its cost, and what is to be said of its
-    end."""
+    """Outcome and cost of a recorded run.
+
+    Parameters
+    ----------
+    outcome
+        Outcome of the run.
+    particles
+        Number of particles, frame included.
+    wall_s
+        Wall time of stepping and recording in seconds.
+    choice
+        Engine of the run.
+    warnings
+        Warnings at the end of the run.
+    first
+        Step at which this part of the run started.
+    processes
+        Number of processes that shared the lattice.
+    """
 
     outcome: RunOutcome
     particles: int
@@ -671,26 +732,24 @@ class RunReport:
     choice: Choice
     warnings: tuple[str, ...] = ()
     first: int = 0
-    """The step from which on it was run."""
     processes: int = 1
-    """That shared it."""
 
     @property
     def ns_per_particle_step(self) -> float:
-        """Wall time of stepping and recording together."""
-        made = max(1, self.outcome.steps - self.first)
-        return self.wall_s * 1e9 / (self.particles * made)
+        """Wall time of stepping and recording in nanoseconds per particle and step."""
+        steps = max(1, self.outcome.steps - self.first)
+        return self.wall_s * 1e9 / (self.particles * steps)
 
 
 def peak_memory() -> int:
-    """Bytes at most resident in this process; 0 where the system does not tell.
+    """Return the largest resident memory of this process in bytes; 0 if it is not available.
 
-    Linux counts what the process that started this one had resident into ru_maxrss, so the
-    figure of this program's own memory is taken where there is one.
+    The value of `ru_maxrss` includes memory of the parent process on Linux, so that VmHWM of
+    /proc/self/status is used where it exists.
     """
     status = Path("/proc/self/status")
-    if status.exists() and (found := re.search(r"VmHWM:\s*(\d+)", status.read_text())):
-        return int(found[1]) * 1024
+    if status.exists() and (match := re.search(r"VmHWM:\s*(\d+)", status.read_text())):
+        return int(match[1]) * 1024
     try:
         from resource import RUSAGE_SELF, getrusage
     except ImportError:
@@ -699,9 +758,9 @@ def peak_memory() -> int:
 
 
 class Recording:
-    """What a simulation records of its states, as its experiment asks for under `record`.
+    """Recording of a simulation, as the field `record` of its experiment specifies.
 
-    Made by `Simulation.record`, and a context manager: recording ends with the block.
+    Returned by `Simulation.record`. As a context manager it ends with its block.
     """
 
     def __init__(
@@ -712,8 +771,8 @@ class Recording:
         dataset_of: Callable[[], xarray.Dataset] | None = None,
     ) -> None:
         self._simulation, self._sink, self._dataset_of = simulation, sink, dataset_of
-        self._keeping = sink if isinstance(sink, KeepingSink) else None
-        self._begun, self._first = time.perf_counter(), simulation.time
+        self._checkpoints = sink if isinstance(sink, KeepingSink) else None
+        self._start_time, self._first = time.perf_counter(), simulation.time
         self._has_ended = False
         try:
             if recorder is None:
@@ -732,19 +791,20 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """End recording with the present state. A run that has not come to its end is then recorded
-        with the status "interrupted".
+        """End recording with the current state.
+
+        The status of a run before its last step is then "interrupted".
 
         Raises
         ------
         StorageError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         simulation, time = self._simulation, self._simulation.time
         if self._has_ended:
             return
         if time >= simulation.experiment.steps:
-            with suppress(DivergedError):  # the dataset says it
+            with suppress(DivergedError):  # recorded as the status of the dataset
                 simulation.run()
             return
         simulation._recordings.remove(self)
@@ -757,71 +817,76 @@ class Recording:
 
     @property
     def dataset(self) -> xarray.Dataset:
-        """The dataset that was recorded.
+        """Recorded dataset.
 
         Raises
         ------
         ExperimentError
-            Where recording has not ended.
+            If recording has not ended.
         """
         if not self._has_ended or self._dataset_of is None:
-            raise ExperimentError("record: has not ended: leave the block, or call close()")
+            raise ExperimentError(
+                "record: recording has not ended; leave the `with` block, or call close()"
+            )
         return self._dataset_of()
 
     def take(self, state: State) -> None:
-        """Record what is wanted of a state, and keep where the simulation stands, if it is due. A
-        state that cannot be recorded is for the driver to deal with."""
+        """Record a state, and write a checkpoint if one is due.
+
+        If the state cannot be recorded, the driver receives the error as `rejection`.
+        """
         simulation, driver = self._simulation, self._simulation.driver
         try:
             with _located(simulation.scene):
-                self._recorder.observe(state, last=driver.ending, within=driver.within)
+                self._recorder.observe(state, last=driver.ends_early, within=driver.load_time)
         except FloatingPointError as error:
             driver.rejection = error
             return
-        # At its end there is nothing to go on to: what follows from the last state is its end.
-        ends = driver.ending or driver.is_over or state.step >= simulation.experiment.steps
-        if self._keeping and not ends and self._keeping.due():
-            rate = (state.step - self._first) / (time.perf_counter() - self._begun)
-            self._keeping.keep(checkpoint_of(driver, self._recorder, rate))
+        # A run is not resumed from its last state, so no checkpoint is needed there.
+        steps = simulation.experiment.steps
+        ends = driver.ends_early or driver.is_complete or state.step >= steps
+        if self._checkpoints and not ends and self._checkpoints.due():
+            rate = (state.step - self._first) / (time.perf_counter() - self._start_time)
+            self._checkpoints.keep(checkpoint_of(driver, self._recorder, rate))
 
     def suspend(self, outcome: RunOutcome) -> RunReport:
-        """Leave the run where it stands, to be gone on with."""
-        assert self._keeping
-        self._keeping.suspend(checkpoint_of(self._simulation.driver, self._recorder))
+        """Write a checkpoint from which the run can be resumed."""
+        assert self._checkpoints
+        self._checkpoints.suspend(checkpoint_of(self._simulation.driver, self._recorder))
         return self._report(outcome)
 
     def finish(self, outcome: RunOutcome) -> RunReport:
-        """Record what is known at the end."""
+        """Record the variables and attributes that are known at the end of the run."""
         simulation, driver = self._simulation, self._simulation.driver
-        if self._keeping:
-            self._keeping.note_end(checkpoint_of(driver, self._recorder))
+        if self._checkpoints:
+            self._checkpoints.note_end(checkpoint_of(driver, self._recorder))
         with _located(simulation.scene):
             self._recorder.finish(driver.state, outcome, simulation.prediction)
         self._has_ended = True
         return self._report(outcome, self._recorder.warnings)
 
     def abandon(self) -> None:
-        """Give up what was recorded; what was kept stays."""
+        """Discard the recording; checkpoints remain."""
         self._has_ended, self._dataset_of = True, None
         self._sink.abandon()
 
     def _report(self, outcome: RunOutcome, warnings: tuple[str, ...] = ()) -> RunReport:
-        simulation, wall_s = self._simulation, time.perf_counter() - self._begun
+        simulation, wall_s = self._simulation, time.perf_counter() - self._start_time
         cost = simulation.particles, wall_s, simulation.choice
         return RunReport(outcome, *cost, warnings, self._first, simulation.processes)
 
 
 def record(simulation: Simulation, sink: Sink, *, recorder: Recorder | None = None) -> RunReport:
-    """Take a simulation to its end, and what the experiment records of it into the sink.
+    """Run a simulation to its end and record it into a sink.
 
-    A `recorder` of the sink that has begun goes on with what it took before. A simulation that is
-    asked to stop is left where it stands, where the sink can keep that.
+    A `recorder` that has begun continues an earlier recording. If the simulation is interrupted on
+    request, a checkpoint is written, provided that the sink supports checkpoints.
     """
     recording = Recording(simulation, sink, recorder)
     try:
         for state in simulation:
-            if isinstance(sink, KeepingSink) and simulation.driver.stopped:
-                return recording.suspend(simulation.driver.stopped)
+            if isinstance(sink, KeepingSink) and simulation.driver.interruption:
+                return recording.suspend(simulation.driver.interruption)
             recording.take(state)
         assert simulation.outcome is not None
         return recording.finish(simulation.outcome)
@@ -831,18 +896,18 @@ def record(simulation: Simulation, sink: Sink, *, recorder: Recorder | None = No
 
 
 def rehearse(scene: Scene) -> None:
-    """Measures at the start what the run will record; raises what the run would."""
+    """Evaluate the diagnostics of the initial state, to raise their errors before the run."""
     if not scene.experiment.diagnostics or scene.raster.count > LARGEST:
         return
     recorder = Recorder(scene, MemorySink())
-    with _located(scene), suppress(FloatingPointError):  # such a run diverges at once, and says so
+    with _located(scene), suppress(FloatingPointError):  # such a run diverges in its first step
         recorder.begin()
         recorder.observe(initial_state(scene))
 
 
 @contextmanager
 def _located(scene: Scene) -> Iterator[None]:
-    """An ExperimentError gets the place of its field in the file."""
+    """Add the place in the experiment file to an ExperimentError."""
     try:
         yield
     except ExperimentError as error:

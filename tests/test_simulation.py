@@ -114,12 +114,12 @@ def test_all_that_decides_when_a_run_settles_is_data(
             break
     driver, state = left.driver, left.driver.state.copy()
     assert isinstance(driver, SteppingDriver)
-    assert driver.settling is not None
+    assert driver.monitor is not None
     rest = Simulation.of_scene(scene_of(given), start=state)
     assert isinstance(rest.driver, SteppingDriver)
-    assert rest.driver.settling is not None
+    assert rest.driver.monitor is not None
     rest.driver.guard = Guard(**vars(copy.deepcopy(driver.guard)))
-    rest.driver.settling.pace = Pace(**dataclasses.asdict(driver.settling.pace))
+    rest.driver.monitor.pace = Pace(**dataclasses.asdict(driver.monitor.pace))
     assert [state.step for state in rest] == steps[steps.index(middle) :]
     assert rest.outcome is not None
     assert whole.outcome is not None
@@ -277,7 +277,7 @@ def test_recording_in_the_middle_begins_and_ends_with_the_state_at_hand(
     simulation.step(12)
     with simulation.record(tmp_path / "part.nc") as recording:
         simulation.step(11)
-        with pytest.raises(pbdkit.ExperimentError, match="record: has not ended"):
+        with pytest.raises(pbdkit.ExperimentError, match="record: recording has not ended"):
             _ = recording.dataset
     simulation.step(1)
     with pbdkit.open(tmp_path / "part.nc") as part:
@@ -349,7 +349,7 @@ def test_a_simulation_starts_from_the_state_of_another(tensile: dict[str, Any]) 
     np.testing.assert_array_equal(second.state.position, whole.position[-1])
     assert not np.array_equal(third.state.position, whole.position[-1])
     wider = given | {"body": {"type": "grid", "columns": 11, "rows": 10}}
-    with pytest.raises(pbdkit.ExperimentError, match="start: its state is that of another body"):
+    with pytest.raises(pbdkit.ExperimentError, match="start: its state belongs to another body"):
         pbdkit.Simulation(wider, start=first)
     with pytest.raises(pbdkit.ExperimentError, match="start: step 40 is reached"):
         pbdkit.Simulation(given | {"steps": 20}, start=first)
@@ -358,7 +358,8 @@ def test_a_simulation_starts_from_the_state_of_another(tensile: dict[str, Any]) 
 def test_steps_that_the_experiment_does_not_have_are_refused(tensile: dict[str, Any]) -> None:
     simulation = pbdkit.Simulation(tensile | {"steps": 30})
     simulation.step(10)
-    with pytest.raises(pbdkit.ExperimentError, match=r"step 10 of 30 .* settings={'steps': 35}"):
+    message = r"step: 25 more steps exceed the 30 .* 10 are made; .*{'steps': 35}"
+    with pytest.raises(pbdkit.ExperimentError, match=message):
         simulation.step(25)
     for n in (-1, 1.0, True):
         with pytest.raises(pbdkit.ExperimentError, match="step: expected a number of steps"):

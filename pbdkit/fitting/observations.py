@@ -657,10 +657,10 @@ class RunObservation(Observation):
         """
         last = -1.0
         for state in run:
-            within = run.driver.within
+            within = run.driver.load_time
             moment = state.step if within is None else within
             wanted = within is not None or run.scene.experiment.records(state.step)
-            if (wanted or run.driver.ending) and moment > last:
+            if (wanted or run.driver.ends_early) and moment > last:
                 last = moment
                 yield moment, state
         if run.outcome is None or run.outcome.status in FAILED:

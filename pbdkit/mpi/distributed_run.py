@@ -356,14 +356,14 @@ class DistributedSimulation(Simulation):
     states of the part. Raises what any run does, in all processes."""
 
     def __init__(self, ranks: MPICommunicator, scene: Scene, watch: Watch) -> None:
-        chosen = scene.experiment.stepping.open_parameters
+        automatic = scene.experiment.stepping.open_parameters
         scene, kind = _tuned(ranks, scene), type(scene.experiment.solver)
         with ranks.raise_together():
             parts = CUTS[kind].subdomains(scene, ranks.size)
         self.division = Division(ranks, scene, parts)
         self.scene, self.outcome, self.processes = self.division.scene, None, ranks.size
         self.driver = DRIVERS[kind](self.division, scene, watch)
-        self.driver.chosen = chosen
+        self.driver.automatic = automatic
         bound = wave_bound(scene)
         self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
 

@@ -215,12 +215,12 @@ class DistributedSteppingDriver(SteppingDriver):
         start, anew = division.begun(scene)
         Driver.__init__(self, division.scene, start, DistributedWatch(ranks, watch))
         self._engine, self.choice = division.stepper(ranks.bcast(choose(scene)))
-        self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.total / ranks.size)
+        self._steps_per_call = self._steps_in(SECONDS_A_VALUE * scene.raster.total / ranks.size)
         size = size_of(scene) + ranks.largest(most_of(start))
         self.guard = DividedGuard(size, 0, EVERY, None if anew else start.copy(), ranks)
-        self.settling, self.kept = None, -1
+        self.monitor, self.recorded_step = None, -1
         if asked := scene.experiment.stepping.settle:
-            self.settling = DividedSettling(division, asked)
+            self.monitor = DividedSettling(division, asked)
 
     def _steps_in(self, seconds_a_step: float) -> int:
         """As the first process finds it."""

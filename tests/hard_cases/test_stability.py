@@ -194,7 +194,7 @@ def test_case_16_divergence_is_warned_of_and_stopped_and_the_last_good_state_kep
         assert all(np.isfinite(ds[name]).all() for name in ("position", "u"))
         # The body is 7 wide, a spacing, its leaders go .5, and the noise.
         assert 1.0 < np.abs(ds.u[-1]).max() <= 8.501
-        assert f"kept is step {int(ds.time[-1])}, the last no larger than the body" in end
+        assert f"the last recorded state is step {int(ds.time[-1])}, the last in which" in end
 
 
 def test_case_16_memory_1_swings_for_ever_and_does_not_grow():

@@ -128,7 +128,8 @@ def test_the_last_good_state_of_a_run_that_diverges_is_kept(
     assert last > (200 if kept_every == 100 else 20)  # a second copy goes over the first
     assert len(begun) == (kept_every > last)
     assert sparse.stop_reason.endswith(
-        f"kept is step {last}, the last no larger than the body and its leaders' ways"
+        f"the last recorded state is step {last}, the last in which no displacement exceeds "
+        "the size of the body and the paths of its leaders"
     )
     every = diverged(record={"at": [0, last, last + 1]}, **parts).sel(time=slice(0, last + 1))
     for name in ("position", "u", "pe2", "broken_bonds"):
