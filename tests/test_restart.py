@@ -392,7 +392,7 @@ def test_an_interrupted_run_is_not_taken_for_a_shorter_one(tmp_path: Path) -> No
         Simulation.of_scene(scene_of(given | {"steps": 900}), watch=stopping_after(40)),
         NetcdfSink(part),
     )
-    with pytest.raises(pbdkit.ExperimentError, match="of 100 steps tests convergence from step 1 on"):
+    with pytest.raises(pbdkit.ExperimentError, match="100 steps tests convergence from step 1 on"):
         resumption(part, Watch(), steps=100)
     found = resumption(part, Watch())
     assert found is not None
