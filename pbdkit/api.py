@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import DivergedError, ExperimentError, ReproducibilityWarning, warn_caller
-from pbdkit.io.layout import carried, experiment_of as experiment_of
+from pbdkit.io.layout import experiment_of as experiment_of, json_attribute
 from pbdkit.io.sinks import MemorySink, Sink
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.loading import as_experiment, but_got, load_experiment
@@ -145,9 +145,9 @@ def _run(
 def _run_into(output: Path, experiment: Experiment, progress: bool, force: bool) -> xarray.Dataset:
     from pbdkit.io.netcdf import NetcdfSink
     from pbdkit.io.open import open
-    from pbdkit.io.save import refuse_taken
+    from pbdkit.io.save import refuse_existing
 
-    refuse_taken(output, force=force)
+    refuse_existing(output, force=force)
     scene = build_scene(experiment)
     file = NetcdfSink(output, force, experiment.record.compression)
     report = _recorded(scene, lambda simulation: simulation.sink(file), progress)
@@ -318,7 +318,7 @@ def resume(
 
 def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
     here = {"pbdkit": version("pbdkit")} | experiment.distributions()
-    made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | carried(dataset, "plugins")
+    made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | json_attribute(dataset, "plugins")
     for name, now in here.items():
         before = made_by.get(name)
         if name != GIVEN and before != now:

@@ -23,7 +23,7 @@ from pbdkit.io.other_files import refuse_other_file, refuse_store
 from pbdkit.io.paged_file import PiecedArray
 from pbdkit.io.recorder import Recorder, columns_of
 from pbdkit.io.run_store import UnfinishedRun, is_unfinished, make_room
-from pbdkit.io.seal import opened
+from pbdkit.io.seal import open_sealed
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source, with_settings
 from pbdkit.model.shipped import read_experiment
@@ -187,7 +187,7 @@ def _entry(variable: Any, pieced: bool) -> Any:
 
 
 def _final_state(output: Path, stack: ExitStack | None) -> Checkpoint:
-    content = opened(output)
+    content = open_sealed(output)
     with ExitStack() as closing:
         closing.callback(content.close)
         try:

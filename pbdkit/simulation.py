@@ -599,9 +599,9 @@ class Simulation:
         else:
             from pbdkit.io.netcdf import NetcdfSink
             from pbdkit.io.open import open
-            from pbdkit.io.save import refuse_taken
+            from pbdkit.io.save import refuse_existing
 
-            refuse_taken(Path(path), force=force)
+            refuse_existing(Path(path), force=force)
             file = NetcdfSink(Path(path), force, self.experiment.record.compression)
             recording = Recording(self, self.sink(file), dataset_of=lambda: open(file.written))
         self._start()
@@ -838,7 +838,7 @@ class Recording:
         simulation, driver = self._simulation, self._simulation.driver
         try:
             with _located(simulation.scene):
-                self._recorder.observe(state, last=driver.ends_early, within=driver.load_time)
+                self._recorder.observe(state, last=driver.ends_early, time=driver.load_time)
         except FloatingPointError as error:
             driver.rejection = error
             return
@@ -859,7 +859,7 @@ class Recording:
         """Record the variables and attributes that are known at the end of the run."""
         simulation, driver = self._simulation, self._simulation.driver
         if self._checkpoints:
-            self._checkpoints.note_end(checkpoint_of(driver, self._recorder))
+            self._checkpoints.keep_final(checkpoint_of(driver, self._recorder))
         with _located(simulation.scene):
             self._recorder.finish(driver.state, outcome, simulation.prediction)
         self._has_ended = True

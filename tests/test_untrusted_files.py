@@ -49,7 +49,7 @@ def test_an_experiment_a_folder_and_nothing_are_no_results(call):
     result = call("verify", "e.json", "kept", "gone.nc", "/dev/null")
     assert result.code == 6
     assert result.out.splitlines() == [
-        "e.json: is an experiment; `pbdkit run e.json` makes a result of it, and says where",
+        "e.json: is an experiment; `pbdkit run e.json` computes its result and prints the path",
         "kept: is a folder, no result of pbdkit",
         "gone.nc: there is no such file",
         "/dev/null: is no plain file, and no result of pbdkit",
@@ -82,7 +82,7 @@ def test_a_library_that_fails_brings_nothing_down(name, bare, tmp_path, monkeypa
 
 def test_sound_files_pass(bare):
     assert try_reading(bare) is None
-    with pytest.warns(pbdkit.PbdkitWarning, match="carries no seal"):
+    with pytest.warns(pbdkit.PbdkitWarning, match="has no seal"):
         dataset = pbdkit.open(bare)
     with dataset, opened_unsealed(bare) as plain:
         xarray.testing.assert_identical(dataset.load(), plain.load())
@@ -99,7 +99,7 @@ def test_the_child_finds_this_pbdkit_from_anywhere(bare):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert "carries no seal" in done.stderr
+    assert "has no seal" in done.stderr
 
 
 def test_more_than_a_file_can_hold_is_refused(bare, tmp_path):

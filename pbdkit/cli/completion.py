@@ -150,11 +150,11 @@ def times(context: click.Context, begun: str) -> Iterator[str]:
 @contextmanager
 def _content(context: click.Context) -> Iterator[Any]:
     """Open the first result on the line, without xarray."""
-    from pbdkit.io.seal import opened
+    from pbdkit.io.seal import open_sealed
 
     given = [v for v in context.params.values() if isinstance(v, Path)]
     given += [Path(word) for word in context.args]
-    file = opened(next(path for path in given if path.is_file()))
+    file = open_sealed(next(path for path in given if path.is_file()))
     try:
         yield file
     finally:

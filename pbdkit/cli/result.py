@@ -17,7 +17,7 @@ from pbdkit.cli.options import PATH, at_option, json_option, result_argument
 if TYPE_CHECKING:
     import xarray
 
-    from pbdkit.io.explain import BondStatus, Explained
+    from pbdkit.io.explain import BondStatus, BondTable
     from pbdkit.scene.scene import Scene
 
 
@@ -69,10 +69,10 @@ def _fault_of(file: Path) -> str:
 def _refuse_elsewhere(file: Path) -> None:
     """Raise StorageError if the bytes are those that were sealed, but refer to other files."""
     from pbdkit.errors import StorageError, one_line
-    from pbdkit.io.seal import opened
+    from pbdkit.io.seal import open_sealed
 
     try:
-        opened(file).close()
+        open_sealed(file).close()
     except StorageError:
         raise
     except Exception as error:  # h5py raises errors of many types
@@ -124,19 +124,19 @@ def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_jso
     For one bond, report its distance from breaking, or its break, and what happened around it.
     """
     from pbdkit.cli.options import waiting
-    from pbdkit.io.explain import Explained
+    from pbdkit.io.explain import BondTable
     from pbdkit.io.layout import scene_of
     from pbdkit.io.open import reading
 
     with waiting(f"reading {file}", silent=as_json), reading(file, at=at) as dataset:
-        explained = Explained(dataset, scene_of(dataset, "explain"))
+        explained = BondTable(dataset, scene_of(dataset, "explain"))
         facts = _bond_facts(explained, *bond) if bond else _run_facts(explained)
         lines = _bond_in_words(facts) if bond else _run_in_words(facts)
         text = json.dumps(facts, default=asdict) if as_json else "\n".join(lines)
     click.echo(text)
 
 
-def _run_facts(explained: Explained) -> dict[str, Any]:
+def _run_facts(explained: BondTable) -> dict[str, Any]:
     steps = explained.steps
     return {
         "fracture": explained.model.type,
@@ -144,24 +144,24 @@ def _run_facts(explained: Explained) -> dict[str, Any]:
         "broken": int((steps > 0).sum() - explained.cut.sum()),
         "cut": int(explained.cut.sum()),
         "broken_from_the_start": int((steps == 0).sum()),
-        "in_order": explained.standings(explained.order),
+        "in_order": explained.statuses(explained.order),
         "nearest": explained.nearest(),
     }
 
 
-def _bond_facts(explained: Explained, a: int, b: int) -> dict[str, Any]:
+def _bond_facts(explained: BondTable, a: int, b: int) -> dict[str, Any]:
     import numpy as np
 
     row = explained.row(a, b)
     step, strain = explained.most_strained(row)
-    (standing,) = explained.standings(np.array([row]))
+    (standing,) = explained.statuses(np.array([row]))
     return {
         "fracture": explained.model.type,
         "bond": standing,
         "most_strained": {"step": step, "strain": strain},
         "remembered": explained.remembered(row),
         "broken_in_all": len(explained.order),
-        "around": explained.standings(explained.around(row), standing.step),
+        "around": explained.statuses(explained.around(row), standing.step),
     }
 
 

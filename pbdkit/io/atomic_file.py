@@ -32,20 +32,23 @@ TRIES, PAUSE_S = 10, 0.02
 
 
 def is_local(path: Path, mounts: str = "/proc/self/mountinfo") -> bool:
-    """Whether a file lies on a file system that is known to be local; False where nobody tells."""
-    kinds: dict[str, str] = {}
+    """Return whether a file lies on a local file system; False where that cannot be determined."""
+    types: dict[str, str] = {}
     with suppress(OSError):
         for line in Path(mounts).read_text(errors="surrogateescape").splitlines():
-            before, _, after = line.partition(" - ")
-            place = os.fsencode(before.split()[4]).decode("unicode_escape").encode("latin-1")
-            kinds[os.fsdecode(place)] = after.split()[0]
+            head, _, tail = line.partition(" - ")
+            mount = os.fsencode(head.split()[4]).decode("unicode_escape").encode("latin-1")
+            types[os.fsdecode(mount)] = tail.split()[0]
     folders = (str(folder) for folder in (path.resolve(), *path.resolve().parents))
-    return next((kinds[folder] in LOCAL for folder in folders if folder in kinds), False)
+    return next((types[folder] in LOCAL for folder in folders if folder in types), False)
 
 
 def lock(file: io.FileIO) -> bool:
-    """Locks an open file for as long as it is open. False where somebody else holds it; systems
-    and file systems without locks give it to everybody."""
+    """Lock an open file until it is closed and return whether that succeeded.
+
+    The result is False where another process holds the lock, and True on systems and file systems
+    without locks.
+    """
     try:
         import fcntl
     except ImportError:
@@ -59,9 +62,12 @@ def lock(file: io.FileIO) -> bool:
     return True
 
 
-def opened_alone(path: Path) -> io.FileIO | None:
-    """An existing file, open and locked; None where somebody else writes it. Who only asks holds
-    the lock for a moment, and is waited for. Raises OSError."""
+def open_locked(path: Path) -> io.FileIO | None:
+    """Open an existing file and lock it; return None where another process writes it.
+
+    A process that only tests the lock holds it for a moment, so that several attempts are made.
+    Raises OSError.
+    """
     for _ in range(TRIES):
         file = io.FileIO(path, "r+b")
         with suppress(FileNotFoundError):  # it may be another one by now, or none
@@ -73,7 +79,7 @@ def opened_alone(path: Path) -> io.FileIO | None:
 
 
 def is_full(folder: Path) -> bool:
-    """Whether next to nothing is free where a folder lies."""
+    """Return whether the file system of a folder is (almost) full."""
     try:
         return shutil.disk_usage(folder).free < FULL_BYTES
     except OSError:
@@ -81,15 +87,15 @@ def is_full(folder: Path) -> bool:
 
 
 def write_all(file: io.FileIO, data: bytes | bytearray | memoryview) -> None:
-    """Writes all of it: one write may take less than it is given, above all where the disk gets
-    full. Raises OSError."""
+    """Write all of the data: a single write may be short, above all on a disk that is nearly full.
+    Raises OSError."""
     view = memoryview(data)
     while view:
         view = view[file.write(view) :]
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes names in a folder last, where the file system can."""
+    """Sync the entries of a folder to the disk, where the file system supports it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -99,7 +105,7 @@ def sync_folder(folder: Path) -> None:
 
 
 class NewFile(io.RawIOBase):
-    """A file on the disk that is written whole, or whose first fault is noted.
+    """A file on the disk that is written completely, or whose first fault is recorded.
 
     HDF5 would try a failed write again when the process ends, and crash it; other libraries drop
     what a short write left. Here every write is complete and none raises: after the first fault
@@ -112,23 +118,23 @@ class NewFile(io.RawIOBase):
         self._fault: OSError | None = None
 
     def readable(self) -> bool:
-        """It is."""
+        """Return True: the file supports it."""
         return True
 
     def writable(self) -> bool:
-        """It is."""
+        """Return True: the file supports it."""
         return True
 
     def seekable(self) -> bool:
-        """It is."""
+        """Return True: the file supports it."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """As in any file."""
+        """Set the position, as in any file."""
         return self.disk.seek(offset, whence)
 
     def truncate(self, size: int | None = None) -> int:
-        """As in any file."""
+        """Set the size, as in any file."""
         length = self.tell() if size is None else size
         if self._fault is None:
             try:
@@ -138,7 +144,7 @@ class NewFile(io.RawIOBase):
         return length
 
     def readinto(self, buffer: Any) -> int:
-        """As in any file; zeros where the disk gives nothing."""
+        """Read into a buffer, with zeros for bytes that the disk does not return."""
         view = memoryview(buffer).cast("B")
         count = 0
         try:
@@ -151,32 +157,32 @@ class NewFile(io.RawIOBase):
         return count
 
     def write(self, data: Any) -> int:
-        """All of it, unless there was a fault."""
+        """Write all of the data, unless a fault was recorded."""
         view = memoryview(data).cast("B")
         self._write_all(view)
         return len(view)
 
     def close(self) -> None:
-        """Closes the file on the disk, too."""
+        """Close the file, on the disk too."""
         self.disk.close()
         super().close()
 
     def fail(self, fault: OSError) -> None:
-        """Notes a fault, unless there was one before."""
+        """Record a fault, unless an earlier one is recorded."""
         self._fault = self._fault or fault
 
     def check(self) -> None:
-        """Raises the OSError that was met in writing, if one was."""
+        """Raise the OSError that was recorded in writing, if any."""
         if self._fault:
             raise self._fault
 
     def sync(self) -> None:
-        """Waits until what was written is on the disk. Raises OSError."""
+        """Wait until the file is on the disk. Raises OSError."""
         self.check()
         os.fsync(self.disk.fileno())
 
     def settle(self) -> None:
-        """Ends the writing. Raises OSError where anything of it failed."""
+        """Finish the file. Raises OSError where any write failed."""
         self.sync()
 
     def _write_all(self, view: memoryview) -> None:
@@ -188,25 +194,25 @@ class NewFile(io.RawIOBase):
 
 
 WHOLE = ("complete", "settled")
-"""The status of results that may replace others."""
+"""Status of results that may replace other results."""
 PARTIAL = "-partial"
-"""Added to the name of a result that may not, where its name is taken."""
+"""Suffix of the name of a result that may not, where its name exists already."""
 TEMPORARY = ".partial"
-"""How the names of files end that are no results yet."""
+"""Suffix of files under construction."""
 RANDOM_BYTES = 8
-"""In such a name, as hexadecimal digits, between that of the result and the end."""
+"""Number of random bytes in the name of a file under construction, as hexadecimal digits."""
 NAME_BYTES = 100
-"""Of a name so much stays at most where something is added to it: names have 255 bytes at most."""
+"""Maximum number of bytes of a name to which a suffix is added; file systems allow 255."""
 KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
-"""What may be at a path and no plain file, by the type that the system gives it."""
+"""Descriptions of file types that are not replaced."""
 
 File = TypeVar("File", bound=NewFile)
 
 
 @contextmanager
-def written(path: Path, kind: type[File], *, replace: bool) -> Iterator[File]:
-    """Write a file that appears under its name at the end of the block, whole and on the disk, or
-    not at all; until then, and after a fault, the earlier file stands.
+def open_atomic(path: Path, kind: type[File], *, replace: bool) -> Iterator[File]:
+    """Write a file that appears under its name at the end of the block, complete and synced, or not
+    at all; until then, and after a fault, an earlier file stays.
 
     Parameters
     ----------
@@ -222,8 +228,8 @@ def written(path: Path, kind: type[File], *, replace: bool) -> Iterator[File]:
         Where the system refuses anything, or the name belongs to a link, a pipe or a device.
     """
     with _refusing(path):
-        if kind_there := kind_of(path):
-            raise OSError(0, f"is {kind_there}, which is not replaced")
+        if kind_in_place := kind_of(path):
+            raise OSError(0, f"is {kind_in_place}, which is not replaced")
         destination = Destination(path, replace=replace)
         disk = destination.temporary()
     temporary = Path(disk.name)
@@ -244,14 +250,14 @@ def written(path: Path, kind: type[File], *, replace: bool) -> Iterator[File]:
 
 
 def write(path: Path, content: str | bytes, *, replace: bool) -> None:
-    """Write a text, as UTF-8, or bytes, as `written` does."""
+    """Write a text, as UTF-8, or bytes, as `open_atomic` does."""
     data = content.encode(errors="replace") if isinstance(content, str) else content
-    with written(path, NewFile, replace=replace) as file:
+    with open_atomic(path, NewFile, replace=replace) as file:
         file.write(data)
 
 
 def write_together(contents: Mapping[Path, str | bytes]) -> None:
-    """Write new files in that order, each as `write` does; where one fails none stays."""
+    """Write new files in the given order, each as `write` does; where one fails, none remains."""
     with ExitStack() as undo:
         for path, content in contents.items():
             write(path, content, replace=False)
@@ -260,7 +266,8 @@ def write_together(contents: Mapping[Path, str | bytes]) -> None:
 
 
 def write_folder(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write a new folder of files, by their places in it, which appears whole or not at all.
+    """Write a new folder of files, given by their relative paths, which appears complete or not at
+    all.
 
     Raises WriteError where the system refuses anything, and where something has its name.
     """
@@ -284,7 +291,8 @@ def write_folder(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def kind_of(path: Path) -> str | None:
-    """What else than a plain file is at a path, if anything. Raises OSError."""
+    """Return a description of what is at a path if it is anything but a plain file, else None.
+    Raises OSError."""
     try:
         mode = path.lstat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -296,7 +304,7 @@ def kind_of(path: Path) -> str | None:
 
 @contextmanager
 def _refusing(path: Path) -> Iterator[None]:
-    """What the system refuses in the block is a WriteError of that path."""
+    """Convert an OSError of the block into a WriteError of that path."""
     try:
         yield
     except OSError as error:
@@ -304,36 +312,36 @@ def _refusing(path: Path) -> Iterator[None]:
 
 
 def _hidden(name: str, random: str = "") -> str:
-    """The name of a file that is none yet, beside that of the result."""
+    """Return the name of a file under construction, beside the result."""
     return f".{_short(name)}.{random or secrets.token_hex(RANDOM_BYTES)}{TEMPORARY}"
 
 
 def _short(name: str) -> str:
-    """As much of a name as leaves room for what is added to it."""
+    """Shorten a name so that there is room for a suffix."""
     while len(os.fsencode(name)) > NAME_BYTES:
         name = name[:-1]
     return name
 
 
 class Destination:
-    """A name for a result. With `replace` a whole result takes the place of what is there. What is
-    left of a run that diverged or did not converge takes nobody's place: beside it."""
+    """The name of a result. With `replace`, a complete result replaces an existing file; a run that
+    diverged or did not converge is written beside it."""
 
     def __init__(self, path: Path, *, replace: bool) -> None:
         self.path, self.replace = path, replace
         self._folder = path.parent.absolute()  # whoever changes the folder meanwhile
         self.written = path
-        """Where the result is, once it has its name: beside `path` where that was taken."""
+        """Path of the result once it has its name: beside `path` where that was in use."""
 
     def temporary(self) -> io.FileIO:
-        """A new file beside it, under a name that no other machine takes, locked. What killed runs
-        left behind under such names is removed. Raises OSError."""
+        """Create and lock a file beside the result, under a unique name; remove the files that
+        killed runs left behind under such names. Raises OSError."""
         random = "[0-9a-f]" * 2 * RANDOM_BYTES
-        begin, _, end = _hidden(self.path.name, "*").rpartition("*")
-        for left in self._folder.glob(f"{escape(begin)}{random}{end}"):
-            with suppress(OSError), io.FileIO(left, "r+b") as file:
+        prefix, _, end = _hidden(self.path.name, "*").rpartition("*")
+        for leftover in self._folder.glob(f"{escape(prefix)}{random}{end}"):
+            with suppress(OSError), io.FileIO(leftover, "r+b") as file:
                 if lock(file):
-                    left.unlink()
+                    leftover.unlink()
         while True:
             file = io.FileIO(self._folder / _hidden(self.path.name), "x+b")
             if lock(file) and os.fstat(file.fileno()).st_nlink:
@@ -341,8 +349,8 @@ class Destination:
             file.close()  # another run took it for one that was left behind
 
     def take(self, temporary: Path, status: str) -> None:
-        """Gives a file its name. Raises OSError, and WriteError where the name was taken meanwhile:
-        then the result is beside it."""
+        """Give a file its name. Raises OSError, and WriteError where the name came into use
+        meanwhile: the result is then beside it."""
         whole = status in WHOLE
         if whole and self.replace:
             name = self._folder / self.path.name
@@ -362,15 +370,18 @@ class Destination:
             )
 
     def _free(self, whole: bool) -> Iterator[Path]:
-        """Names to try, one after the other."""
+        """Generate the candidate names, in order."""
         stem, suffix = _short(self.path.stem), _short(self.path.suffix)
         partial = "" if whole else PARTIAL
-        more = chain([] if whole else [PARTIAL], (f"{partial}-{n}" for n in count(2)))
-        return chain([self.path], (self.path.with_name(f"{stem}{m}{suffix}") for m in more))
+        endings = chain([] if whole else [PARTIAL], (f"{partial}-{n}" for n in count(2)))
+        return chain(
+            [self.path], (self.path.with_name(f"{stem}{ending}{suffix}") for ending in endings)
+        )
 
 
 def _rename(file: Path, name: Path) -> bool:
-    """Whether the name was free, or the file's from before it was killed; then it has no other."""
+    """Rename a file unless the name is in use, and return whether it has that name now; a file that
+    was linked before the process was killed counts as renamed."""
     try:
         os.link(file, name)
     except FileExistsError:

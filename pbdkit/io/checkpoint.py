@@ -38,8 +38,8 @@ Arrays = dict[str, Any]
 
 @dataclass
 class RecordedSteps:
-    """The last steps, or moments between two, of which anything was taken, and of which a record
-    was made."""
+    """The last step, or moment between two steps, that was observed, and the last that was
+    recorded."""
 
     step: float = -1
     recorded: float = -1
@@ -52,7 +52,7 @@ NAMES = {type_: name for name, type_ in CLASSES.items()}
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """All that a run needs to continue, to the same result bit for bit."""
+    """Everything that a run needs to continue with the same result bit for bit."""
 
     about: dict[str, Any]
     facts: dict[str, Any]
@@ -63,7 +63,7 @@ class Checkpoint:
         cls,
         experiment: Experiment,
         run: Mapping[str, Any],
-        seen: RecordedSteps,
+        recorded: RecordedSteps,
         step: int,
         chosen: Sequence[str] = (),
         rate: float = 0.0,
@@ -73,7 +73,7 @@ class Checkpoint:
         arrays = Arrays()
         facts = {
             "run": pack(dict(run), "run", arrays),
-            "seen": pack(seen, "seen", arrays),
+            "seen": pack(recorded, "seen", arrays),
             "chosen": list(chosen),
             "step": step,
             "rate": rate,
@@ -120,50 +120,54 @@ class Checkpoint:
         parts: dict[str, Any] = unpack(
             facts, self.arrays, {**CLASSES, **classes, state_class.__name__: state_class}
         )
-        state, seen = parts.get("state"), parts.get("seen")
+        state, recorded = parts.get("state"), parts.get("seen")
         if not (
-            isinstance(state, state_class) and isinstance(seen, RecordedSteps)
+            isinstance(state, state_class) and isinstance(recorded, RecordedSteps)
         ) or not state.fits(like["state"]):
             raise StorageError("the state that was kept is not one of this experiment")
-        if not _is_consistent(state, seen, parts, steps):
+        if not _is_consistent(state, recorded, parts, steps):
             raise StorageError("the state that was kept is damaged: inconsistent step counters")
         return parts
 
 
-def _is_consistent(state: State, seen: RecordedSteps, parts: dict[str, Any], steps: int) -> bool:
+def _is_consistent(
+    state: State, recorded: RecordedSteps, parts: dict[str, Any], steps: int
+) -> bool:
     """Return whether the numbers of steps follow each other, so that the run can end."""
-    now = state.step
-    guard, pace = parts.get("guard", {"good_step": 0, "next_look": now + 1}), parts.get("pace")
+    step = state.step
+    guard, pace = parts.get("guard", {"good_step": 0, "next_look": step + 1}), parts.get("pace")
     try:
-        past = [seen.step, seen.recorded, parts.get("kept", -1), guard["good_step"]]
-        coming = [guard["next_look"], pace.next_look if pace else now, steps]
-        whole = all(isinstance(step, int) for step in (now, *past[2:], *coming))
+        earlier = [recorded.step, recorded.recorded, parts.get("kept", -1), guard["good_step"]]
+        later = [guard["next_look"], pace.next_look if pace else step, steps]
+        integral = all(isinstance(n, int) for n in (step, *earlier[2:], *later))
         # An equilibrium may be recorded within a step, and that of steps that are yet to be made.
-        latest = max(now, parts.get("moment", 0.0))
-        in_order = min(past) >= -1 and max(past) <= latest and now <= min(coming)
+        latest = max(step, parts.get("moment", 0.0))
+        in_order = min(earlier) >= -1 and max(earlier) <= latest and step <= min(later)
         in_order = in_order and 0.0 <= parts.get("moment", 0.0) <= steps
-        return whole and in_order and (now < guard["next_look"] or now == steps)
+        return integral and in_order and (step < guard["next_look"] or step == steps)
     except (KeyError, TypeError, AttributeError):
         return False
 
 
-def _is_like(found: Any, own: Any) -> bool:
-    """Return whether facts are of the types of a run's own; what it does not have yet may be a
-    number, an array, or numbers."""
-    if isinstance(own, dict) and "array" not in own:
-        same = isinstance(found, dict) and found.keys() == own.keys()
-        return same and all(_is_like(found[key], part) for key, part in own.items())
-    if isinstance(found, list):
-        return (own is None or isinstance(own, list)) and all(
-            _is_like(part, None) for part in found
+def _is_like(facts: Any, template: Any) -> bool:
+    """Return whether facts have the types of a template, the facts of a run before its first step.
+
+    A None of the template may be a number, an array, or numbers.
+    """
+    if isinstance(template, dict) and "array" not in template:
+        same_keys = isinstance(facts, dict) and facts.keys() == template.keys()
+        return same_keys and all(_is_like(facts[key], part) for key, part in template.items())
+    if isinstance(facts, list):
+        return (template is None or isinstance(template, list)) and all(
+            _is_like(part, None) for part in facts
         )
-    if isinstance(found, dict):
-        return found.keys() == {"array"} and (own is None or isinstance(own, dict))
-    if isinstance(own, str) or isinstance(found, str):
-        return isinstance(own, str) and isinstance(found, str)
-    if isinstance(found, float):
-        return not isinstance(own, int)  # infinite is what a run may find, and no step
-    return found is None or (isinstance(found, int) and abs(found) < 2**63)
+    if isinstance(facts, dict):
+        return facts.keys() == {"array"} and (template is None or isinstance(template, dict))
+    if isinstance(template, str) or isinstance(facts, str):
+        return isinstance(template, str) and isinstance(facts, str)
+    if isinstance(facts, float):
+        return not isinstance(template, int)  # infinite is what a run may find, and no step
+    return facts is None or (isinstance(facts, int) and abs(facts) < 2**63)
 
 
 def pack(value: Any, name: str, arrays: Arrays) -> Any:

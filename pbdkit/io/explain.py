@@ -1,4 +1,5 @@
-"""How far bonds are, or were, from breaking: from a dataset and the scene of its experiment."""
+"""Status of bonds: intact, broken or cut, and their distance from breaking; from a dataset and the
+scene of its experiment."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ Rows = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class BondStatus:
-    """One bond: the numbers of its particles, its shell and rest length, and how it stands.
+    """Status of one bond: the numbers of its particles, its shell and rest length, and whether it
+    broke.
 
     `state` is "intact", "broken", "cut", "broken from the start" or "cannot break". `step`, `order`
     (among the broken ones, from 1) and `strain_at_break` are None unless known; `breaks_above` is
@@ -50,12 +52,13 @@ class BondStatus:
 
     @property
     def share(self) -> float | None:
-        """How far it is on its way to breaking at that step, 1 where it breaks."""
+        """Fraction of the breaking strain reached at that step; 1 where the bond breaks."""
         return self.strain / self.breaks_above if self.breaks_above else None
 
 
-class Explained:
-    """What a dataset tells of its bonds. Raises ExperimentError where it has no table of them."""
+class BondTable:
+    """The bonds of a dataset and their histories. Raises ExperimentError where the dataset has no
+    table of bonds."""
 
     def __init__(self, dataset: xarray.Dataset, scene: Scene) -> None:
         if "bond_ends" not in dataset.variables:
@@ -68,14 +71,14 @@ class Explained:
         self._remembered = [number.name for number in bond_numbers(scene.experiment)]
         self.bonds: Bonds = describe_bonds(scene)
         self.steps = self._of_bonds("broken_step", np.int32(-1))
-        """(bond,): when each broke, -1 where it has not."""
+        """(bond,): the step in which each bond broke, -1 where it is intact."""
         self.strains_at_break: Floats = self._of_bonds("broken_strain", np.nan)
-        """(bond,): NaN where it is not known."""
-        known = "broken_strain" in dataset.variables
-        self.cut = known & (self.steps > 0) & np.isnan(self.strains_at_break)
-        """(bond,): those that were cut after the first step had begun."""
+        """(bond,): strain at breaking, NaN where it is unknown."""
+        has_strains = "broken_strain" in dataset.variables
+        self.cut = has_strains & (self.steps > 0) & np.isnan(self.strains_at_break)
+        """(bond,): whether the bond was cut after the first step had begun."""
         self.order: Rows = breaking_order(self.steps, self.strains_at_break)
-        """The rows of the broken bonds, in the order in which they broke."""
+        """Rows of the broken bonds, in the order of breaking."""
         if not np.array_equal(self.bonds.ends, dataset["bond_ends"].values):
             raise ExperimentError(
                 "its bonds are not those of the experiment that it carries: the file was changed, "
@@ -83,13 +86,15 @@ class Explained:
             )
 
     def _of_bonds(self, name: str, unknown: Any) -> NDArray[Any]:
-        known = self._dataset.variables.get(name)
-        return np.full(len(self.bonds), unknown) if known is None else np.asarray(known.values)
+        variable = self._dataset.variables.get(name)
+        return (
+            np.full(len(self.bonds), unknown) if variable is None else np.asarray(variable.values)
+        )
 
     @cached_property
     def limits(self) -> Floats:
-        """(bond,): the strain above which each broke, or breaks at the last recorded step; NaN
-        where the model does not say."""
+        """(bond,): strain at which each bond broke, or breaks at the last recorded step; NaN where
+        the model does not define it."""
         limits, last = np.full(len(self.bonds), np.nan), math.ceil(self._dataset["time"].values[-1])
         moments = np.where(self.steps > 0, self.steps, last)
         if not self._scene.experiment.courses:
@@ -101,22 +106,22 @@ class Explained:
 
     def _limits_at(self, moment: int) -> Floats:
         limits, constants = np.full(len(self.bonds), np.nan), self._scene.at(moment).constants
-        known = all(name in self._dataset for name in self._remembered)
+        has_all = all(name in self._dataset for name in self._remembered)
         model = self.model
-        if not (known and model.can_break and isinstance(model, BreaksAtStrain)):
+        if not (has_all and model.can_break and isinstance(model, BreaksAtStrain)):
             return limits
-        own = [_last(self._dataset[name]).astype(float) for name in self._remembered]
+        memories = [_last(self._dataset[name]).astype(float) for name in self._remembered]
         for n, plane in enumerate(self._scene.neighbourhood.planes):
             rows = np.flatnonzero(self._scene.bonds.plane == n)
             home = Places(self._scene.raster.shape, self._scene.bonds.place[rows])
             fixed = constants.limits_at(plane.slot, n, home)
-            c = constants.of_bond(*fixed, *(values[rows] for values in own))
+            c = constants.of_bond(*fixed, *(values[rows] for values in memories))
             limits[rows] = model.breaking_strain(plane.slot.rest, c, constants.fracture)
         return limits
 
     @cached_property
     def spared(self) -> NDArray[np.bool_]:
-        """(bond,): those that cannot break."""
+        """(bond,): whether the bond cannot break."""
         if not self.model.can_break:
             return np.ones(len(self.bonds), np.bool_)
         frame = self._dataset["role"].values == OF_FRAME
@@ -124,7 +129,8 @@ class Explained:
         return np.asarray(touches & (not self.model.breaks_frame_bonds()))
 
     def strains(self, rows: Rows, time: int | slice = -1) -> Floats:
-        """(..., bond): of some bonds at recorded times, by their places along `time`."""
+        """Return the strains of some bonds, (..., bond), at recorded times, given by index along
+        `time`."""
         particles = np.unique(self.bonds.ends[rows] - 1)
         at = {"time": time, "particle": particles}
         if "u" in self._dataset:
@@ -136,12 +142,12 @@ class Explained:
             raise StorageError("is damaged, or was changed: it has positions that are not finite")
         a, b = (np.searchsorted(particles, self.bonds.ends[rows, end] - 1) for end in (0, 1))
         rest = self.bonds.rest[rows]
-        now = rest + (u[..., b, :] - u[..., a, :])
-        return np.asarray(np.hypot(now[..., 0], now[..., 1]) / np.hypot(*rest.T) - 1.0)
+        current = rest + (u[..., b, :] - u[..., a, :])
+        return np.asarray(np.hypot(current[..., 0], current[..., 1]) / np.hypot(*rest.T) - 1.0)
 
-    def standings(self, rows: Rows, until: int | None = None) -> list[BondStatus]:
-        """How some bonds stand, strained as at the last recorded step, or the last one until a
-        step."""
+    def statuses(self, rows: Rows, until: int | None = None) -> list[BondStatus]:
+        """Return the status of some bonds, with the strain at the last recorded step, or at the
+        last one until a given step."""
         place = {row: n + 1 for n, row in enumerate(self.order.tolist())}
         times = self._dataset["time"].values
         time = int(np.searchsorted(times, times[-1] if until is None else until, "right")) - 1
@@ -170,30 +176,33 @@ class Explained:
         return "cut" if self.cut[row] else "broken"
 
     def nearest(self) -> BondStatus | None:
-        """The bond that is nearest to breaking at the last recorded step, if that is known."""
+        """Return the bond closest to breaking at the last recorded step, or None where no limits
+        are known."""
         rows = np.flatnonzero((self.steps < 0) & ~self.spared & np.isfinite(self.limits))
         if not len(rows):
             return None
         share = self.strains(rows) / self.limits[rows]
-        return self.standings(rows[[np.argmax(share)]])[0]
+        return self.statuses(rows[[np.argmax(share)]])[0]
 
     def row(self, a: int, b: int) -> int:
-        """The row of the bond between two numbers. Raises ExperimentError where there is none."""
+        """Return the row of the bond between two particle numbers. Raises ExperimentError where
+        there is none."""
         count = int(self._dataset.sizes["particle"])
         for number in (a, b):
             if not 1 <= number <= count:
                 raise ExperimentError(
                     f"there is no particle {number}; they are numbered 1 to {count}"
                 )
-        found = np.flatnonzero((self.bonds.ends == sorted((a, b))).all(axis=1))
-        if len(found):
-            return int(found[0])
-        mine = self.bonds.ends[(self.bonds.ends == a).any(axis=1)]
-        others = ", ".join(map(str, sorted(mine[mine != a].tolist()))) or "nobody"
-        raise ExperimentError(f"no bond joins {a} and {b}; the bonds of {a} are to {others}")
+        rows = np.flatnonzero((self.bonds.ends == sorted((a, b))).all(axis=1))
+        if len(rows):
+            return int(rows[0])
+        ends = self.bonds.ends[(self.bonds.ends == a).any(axis=1)]
+        partners = ", ".join(map(str, sorted(ends[ends != a].tolist()))) or "none"
+        raise ExperimentError(f"no bond joins {a} and {b}; the bonds of {a} are to {partners}")
 
     def around(self, row: int) -> Rows:
-        """The other bonds at the ends of a bond, the broken ones first and in their order."""
+        """Return the other bonds at the ends of a bond, the broken ones first and in their
+        order."""
         touches = np.asarray(np.isin(self.bonds.ends, self.bonds.ends[row]).any(axis=1))
         touches[row] = False
         broken = self.order[touches[self.order]]
@@ -201,15 +210,15 @@ class Explained:
         return np.append(broken, np.flatnonzero(touches))
 
     def most_strained(self, row: int) -> tuple[float, float]:
-        """The recorded step at which a bond was the longest, and its strain then."""
+        """Return the recorded step at which a bond was longest, and its strain at that step."""
         history = self.strains(np.array([row]), slice(None))[:, 0]
-        most = int(np.argmax(history))
-        return as_step(self._dataset["time"].values[most]), float(history[most])
+        largest = int(np.argmax(history))
+        return as_step(self._dataset["time"].values[largest]), float(history[largest])
 
     def remembered(self, row: int) -> dict[str, float]:
-        """What the model remembers of a bond, at the last recorded step."""
-        known = [name for name in self._remembered if name in self._dataset]
-        return {name: float(_last(self._dataset[name])[row]) for name in known}
+        """Return the state variables of a bond at the last recorded step."""
+        names = [name for name in self._remembered if name in self._dataset]
+        return {name: float(_last(self._dataset[name])[row]) for name in names}
 
 
 def _last(variable: xarray.DataArray) -> NDArray[Any]:

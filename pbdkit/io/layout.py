@@ -40,18 +40,18 @@ ATTRIBUTES = (
     "prediction", "status", "stop_reason", "created",
 )  # fmt: skip
 INDICES = "ijk"
-"""The names of a site's indices, one for each axis of the lattice."""
+"""Names of a site's indices, one for each axis of the lattice."""
 OF_BODY, OF_FRAME = np.int8(0), np.int8(1)
-"""The roles of particles: leaders and followers are body, at every step."""
+"""Roles of particles: leaders and followers are body, at every step."""
 TIMES = ("time", "step")
-"""Coordinates that count steps: fractions of them too where increments of load are recorded."""
+"""Coordinates that count steps; fractional where increments of load are recorded."""
 STEP, ENDS = "step", "their numbers, the lower one first"
 Values = dict[str, Any]
-"""What goes into a dataset, by the name of the variable."""
+"""Values of a dataset, by the name of the variable."""
 
 
 class When(Enum):
-    """At what time a variable gets its values."""
+    """Time at which a variable is recorded."""
 
     START = "once, before the first step"
     RECORD = "at every recorded step"
@@ -61,9 +61,9 @@ class When(Enum):
 
 @dataclass(frozen=True)
 class Column:
-    """One variable of the dataset with its full dimensions; `coordinate` marks coordinates.
+    """One variable of the dataset with all its dimensions; `coordinate` marks coordinates.
 
-    `long_name` is short, as it stands at the axes of plots; `comment` says the rest. `more` are
+    `long_name` is short, as it stands at the axes of plots; `comment` is the rest. `extra` are
     other attributes.
     """
 
@@ -74,28 +74,28 @@ class Column:
     long_name: str
     units: str = ""
     coordinate: bool = False
-    more: dict[str, Any] = field(default_factory=dict)
+    extra: dict[str, Any] = field(default_factory=dict)
     comment: str = ""
 
     @property
     def grows(self) -> bool:
-        """Whether it gains an entry along its first dimension as the run goes on."""
+        """Return whether the variable has an entry for each record or step of the run."""
         return self.when in (When.RECORD, When.STEP)
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """All that stands with it in the dataset."""
-        said = {"long_name": self.long_name, "units": self.units, "comment": self.comment}
-        return {name: text for name, text in said.items() if text} | self.more
+        """Attributes of the variable in the dataset."""
+        texts = {"long_name": self.long_name, "units": self.units, "comment": self.comment}
+        return {name: text for name, text in texts.items() if text} | self.extra
 
 
 def as_step(time: Any) -> float:
-    """A recorded time as it is written: a whole number of steps, or a fraction with six digits."""
+    """Convert a recorded time to a whole number of steps, or to a fraction with six digits."""
     return int(time) if float(time).is_integer() else float(f"{time:.6g}")
 
 
 def broken_by(broken_step: Any, step: Any) -> Any:
-    """Whether bonds that broke in these steps, -1 where they did not, are broken after a step."""
+    """Return whether bonds are broken after a step, from their steps of breaking (-1: intact)."""
     return (broken_step >= 0) & (broken_step <= step)
 
 
@@ -108,17 +108,20 @@ def coordinate(
     when: When = When.START,
     units: str = "",
     comment: str = "",
-    more: dict[str, Any] | None = None,
+    extra: dict[str, Any] | None = None,
 ) -> Column:
-    """A coordinate; that of the dimension with its name unless other dimensions are given."""
-    return Column(name, dims or (name,), dtype, when, long_name, units, True, more or {}, comment)
+    """Return a coordinate, by default that of the dimension with its name."""
+    return Column(name, dims or (name,), dtype, when, long_name, units, True, extra or {}, comment)
 
 
 def base_columns(axes: int = 2) -> list[Column]:
-    """What every dataset has, on a lattice with so many axes."""
+    """Return the columns of every dataset, on a lattice with `axes` axes."""
     each, on, number = ("particle",), When.RECORD, "number of the particle"
-    by_site, now = "counted from 1, by site: i, then j", "during the step; at time 0 during step 1"
-    beyond = "corners of cells that the outline cuts may not; stress and strain are NaN there"
+    by_site, timing = (
+        "counted from 1, by site: i, then j",
+        "during the step; at time 0 during step 1",
+    )
+    outside = "corners of cells that the outline cuts may not; stress and strain are NaN there"
     kinds = _flags({"leader": LEADER, "follower": FOLLOWER, "frame": FRAME})
     roles = _flags({"body": OF_BODY, "frame": OF_FRAME})
     return [
@@ -126,26 +129,28 @@ def base_columns(axes: int = 2) -> list[Column]:
         coordinate("particle", number, comment=by_site),
         coordinate("number", number, dims=each, comment=by_site),
         *(coordinate(name, f"site index {name}", "i4", each) for name in INDICES[:axes]),
-        coordinate("role", "role of the particle", "i1", each, more=roles),
-        coordinate("inside", "whether it lies inside the outline", "bool", each, comment=beyond),
+        coordinate("role", "role of the particle", "i1", each, extra=roles),
+        coordinate("inside", "whether it lies inside the outline", "bool", each, comment=outside),
         coordinate("axis", "axis", "str"),
         coordinate("site", "site indices", "i4", (*each, "index")),
         coordinate("reference", "reference position", "f8", (*each, "axis"), units=LENGTH.lattice),
         Column("position", ("time", *each, "axis"), "f8", on, "position", LENGTH.lattice),
-        Column("kind", ("time", *each), "i1", on, "kind of the particle", more=kinds, comment=now),
+        Column(
+            "kind", ("time", *each), "i1", on, "kind of the particle", extra=kinds, comment=timing
+        ),
     ]
 
 
 def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
-    """The attributes of a variable whose values stand for words."""
+    """Return the CF attributes of a variable whose values are codes."""
     values = np.array([*meanings.values()], np.int8)
     return {"flag_values": values, "flag_meanings": " ".join(meanings)}
 
 
 def optional_columns() -> list[list[Column]]:
-    """What only some datasets have, whatever their diagnostics: the table of bonds, when each
-    broke, the coordinate of what is measured at every step, and those of leader groups, of loads,
-    of obstacles and of principal values."""
+    """Return the columns that depend on the experiment, whatever its diagnostics: the table of
+    bonds, their steps of breaking, the coordinate of what is measured at every step, and those of
+    leader groups, loads, obstacles and principal values."""
     bond, by_ends = ("bond",), "counted from 1, by its ends"
     whole = "-1 where it has not broken"
     no_strain = "NaN where it has not broken, was cut, or was broken from the start"
@@ -171,42 +176,42 @@ def optional_columns() -> list[list[Column]]:
 
 
 def reserved_names() -> set[str]:
-    """The names that nobody else can give to a variable or a dimension."""
+    """Return the names of variables and dimensions that diagnostics cannot use."""
     ours = chain(base_columns(len(INDICES)), *optional_columns())
     return {name for column in ours for name in (column.name, *column.dims)}
 
 
 def remembered_column(number: Remembered, owner: str, part_renews: bool) -> Column:
-    """A number that a part remembers of each `owner`, bond or particle."""
+    """Return the column of a state variable that a component declares for each `owner`, bond or
+    particle."""
     grows = number.changes and part_renews
     dims, when = (("time", owner), When.RECORD) if grows else ((owner,), When.START)
     return Column(number.name, dims, number.dtype, when, number.long_name, number.units)
 
 
 def when_measured(diagnostic: Diagnostic | type[Diagnostic]) -> When:
-    """At what time a diagnostic is asked."""
+    """Return when a diagnostic is evaluated."""
     if diagnostic.at_end:
         return When.END
     return When.STEP if diagnostic.every_step else When.RECORD
 
 
 def diagnostic_column(variable: Variable, diagnostic: Diagnostic | type[Diagnostic]) -> Column:
-    """A diagnostic's variable with its leading dimension."""
+    """Return the column of a diagnostic's variable, with its leading dimension."""
     when = when_measured(diagnostic)
     dims = (*{When.STEP: ["step"], When.RECORD: ["time"]}.get(when, []), *variable.dims)
-    described = variable.long_name, variable.units, False, variable.attributes
-    return Column(variable.name, dims, variable.dtype, when, *described)
+    description = variable.long_name, variable.units, False, variable.attributes
+    return Column(variable.name, dims, variable.dtype, when, *description)
 
 
 def own_coordinate(diagnostic: Diagnostic | type[Diagnostic]) -> Column:
-    """That of the dimension whose length a diagnostic knows at the end only."""
+    """Return the coordinate of a dimension whose length is only known at the end."""
     name = diagnostic.own_dimension
     return coordinate(name, name.replace("_", " "), when=When.END, comment="counted from 1")
 
 
 def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:
-    """The JSON Schema of datasets, in the form of ``xarray.Dataset.to_dict(data=False)``; without
-    `installed`, of those of the built-in diagnostics alone."""
+    """Return the JSON Schema of datasets, in the form of ``xarray.Dataset.to_dict(data=False)``."""
     base = base_columns()
     diagnostics = registry.spellings(Diagnostic, installed=installed)
     columns = list(chain(base, *optional_columns(), *map(_columns_of, diagnostics)))
@@ -231,20 +236,22 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
 def makers_of(names: set[str]) -> list[str]:
     """Return the built-in diagnostics that make a variable of one of these names, or whose name
     begins with one and `_`, as an experiment names them."""
-    begins = tuple(f"{name}_" for name in names if name)
-    found = []
+    prefixes = tuple(f"{name}_" for name in names if name)
+    spellings = []
     for each, types in Registry().spellings(Diagnostic, installed=False).items():
-        made = [column.name for column in _columns_of(each)]
-        if any(name in names or name.startswith(begins) for name in made):
+        variables = [column.name for column in _columns_of(each)]
+        if any(name in names or name.startswith(prefixes) for name in variables):
             fields = each.model_fields.items()  # the modulus may come from `units`
-            needed = [n for n, part in fields if part.is_required() or n == "youngs_modulus"]
-            found.append(f"{{{', '.join([f'type: {types[0]}', *(f'{n}: ...' for n in needed)])}}}")
-    return found
+            required = [n for n, part in fields if part.is_required() or n == "youngs_modulus"]
+            spellings.append(
+                f"{{{', '.join([f'type: {types[0]}', *(f'{n}: ...' for n in required)])}}}"
+            )
+    return spellings
 
 
 def _columns_of(diagnostic: type[Component]) -> list[Column]:
-    """The columns of a diagnostic, asked of one whose parameters are not set; where variables
-    depend on parameters, or cannot be had, the schema leaves them open."""
+    """Return the columns of a diagnostic with unset parameters; none where its variables depend on
+    parameters or cannot be evaluated, which leaves the schema open."""
     assert issubclass(diagnostic, Diagnostic)
     with suppress(Exception):  # it is somebody's code, which nobody asked to run
         variables = diagnostic.model_construct(type="").variables()
@@ -255,8 +262,8 @@ def _columns_of(diagnostic: type[Component]) -> list[Column]:
 
 
 def _schema_of(column: Column) -> dict[str, Any]:
-    said = {k: v for k, v in column.attributes.items() if not isinstance(v, np.ndarray)}
-    attributes = {name: {"const": value} for name, value in said.items()}
+    scalars = {k: v for k, v in column.attributes.items() if not isinstance(v, np.ndarray)}
+    attributes = {name: {"const": value} for name, value in scalars.items()}
     if (quantity := QUANTITIES.get(column.units)) and quantity.youngs_modulus:
         attributes["units"] = {"enum": [column.units, quantity.unit]}
     parts = {"dims": {"const": list(column.dims)}, "attrs": _object(attributes, sorted(attributes))}
@@ -264,76 +271,78 @@ def _schema_of(column: Column) -> dict[str, Any]:
         name = np.dtype(column.dtype).name
         fractions = {"enum": [name, "float64"]}
         parts["dtype"] = fractions if column.name in TIMES else {"const": name}
-    described = {"description": f"{column.long_name}; written {column.when.value}"}
-    return described | _object(parts, ["dims", "attrs", "dtype"])
+    description = {"description": f"{column.long_name}; written {column.when.value}"}
+    return description | _object(parts, ["dims", "attrs", "dtype"])
 
 
 def _object(properties: dict[str, Any], required: list[str]) -> dict[str, Any]:
     return {"type": "object", "required": required, "properties": properties}
 
 
-def refuse_no_dataset(given: Any) -> None:
+def refuse_no_dataset(candidate: Any) -> None:
     """Raise ExperimentError where a file, or anything else, is given in place of a dataset."""
-    if not hasattr(given, "data_vars"):
-        opening = f"pbdkit.open({str(given)!r})" if isinstance(given, str | Path) else ""
+    if not hasattr(candidate, "data_vars"):
+        opening = f"pbdkit.open({str(candidate)!r})" if isinstance(candidate, str | Path) else ""
         raise ExperimentError(
-            f"expected a dataset of pbdkit, got an object of type {type(given).__name__}; "
+            f"expected a dataset of pbdkit, got an object of type {type(candidate).__name__}; "
             f"{opening or 'pbdkit.open(file)'} returns that of a file, pbdkit.run(...) a new one"
         )
 
 
 def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
-    """The dataset itself, or an older one with the names of now: indices and roles of particles,
-    and bonds by number, which were places from 0; all of the body counts as inside its outline.
+    """Return the dataset in the current layout: indices and roles of particles, and bonds by
+    number, which were indices from 0; all of the body counts as inside its outline.
 
     What was measured stays as it was: frame points hold 0 in what is NaN there now. Raises
     ExperimentError for what is no dataset.
     """
     refuse_no_dataset(dataset)
-    found, dims = dataset.variables, {name: v.dims for name, v in dataset.variables.items()}
+    variables, dims = dataset.variables, {name: v.dims for name, v in dataset.variables.items()}
     new: dict[str, Any] = {}
-    if dims.get("site") == ("particle", "index") and "i" not in found:
+    if dims.get("site") == ("particle", "index") and "i" not in variables:
         axes = zip(INDICES, range(dataset.sizes["index"]), strict=False)
-        new |= {name: found["site"].isel(index=n) for name, n in axes}
-    if "particle" in dims.get("kind", ()) and "role" not in found:
-        frame = found["kind"].isel(time=0, missing_dims="ignore") == FRAME
+        new |= {name: variables["site"].isel(index=n) for name, n in axes}
+    if "particle" in dims.get("kind", ()) and "role" not in variables:
+        frame = variables["kind"].isel(time=0, missing_dims="ignore") == FRAME
         new["role"] = frame.copy(data=np.where(frame, OF_FRAME, OF_BODY))
-    role = new.get("role", found.get("role"))
-    if role is not None and "inside" not in found:
+    role = new.get("role", variables.get("role"))
+    if role is not None and "inside" not in variables:
         new["inside"] = (role.dims, role.values == OF_BODY)
     if dims.get("bond") == ("bond", "end"):
-        new["bond_ends"] = found["bond"] + 1
-        places = {"crack_bond": found["crack_bond"] + 1} if "crack_bond" in found else {}
+        new["bond_ends"] = variables["bond"] + 1
+        places = {"crack_bond": variables["crack_bond"] + 1} if "crack_bond" in variables else {}
         counted = ("bond", "crack") if places else ("bond",)
         new |= places | {dim: (dim, np.arange(1, dataset.sizes[dim] + 1)) for dim in counted}
     return _described(dataset, new) if new else dataset
 
 
 def _described(dataset: xarray.Dataset, new: dict[str, Any]) -> xarray.Dataset:
-    """The dataset with what is new, all of it labelled as now."""
+    """Add new variables to a dataset, and the current attributes to all of them."""
     dataset = dataset.assign(new)
     crack = (diagnostic_column(v, CrackPath) for v in CrackPath().variables())
-    ours = chain(base_columns(len(INDICES)), *optional_columns(), crack)
-    known = [c for c in (*ours, own_coordinate(CrackPath)) if c.name in dataset.variables]
-    for column in known:
+    layout_columns = chain(base_columns(len(INDICES)), *optional_columns(), crack)
+    columns = [
+        c for c in (*layout_columns, own_coordinate(CrackPath)) if c.name in dataset.variables
+    ]
+    for column in columns:
         if column.name in new:
             dataset[column.name] = dataset[column.name].astype(column.dtype).drop_encoding()
         dataset[column.name].attrs |= column.attributes
-    return dataset.set_coords([column.name for column in known if column.coordinate])
+    return dataset.set_coords([column.name for column in columns if column.coordinate])
 
 
-def carried(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
-    """The map in an attribute, or in the coordinate that it is for one run of several; empty where
-    there is neither. Raises StorageError where it is damaged."""
-    beside = dataset.coords.get(attribute)
-    text = "{}" if beside is None or beside.ndim else beside.item()
+def json_attribute(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
+    """Return the map in an attribute, or in the scalar coordinate that replaces it in one member of
+    a sweep; empty where there is neither. Raises StorageError where it is damaged."""
+    coordinate = dataset.coords.get(attribute)
+    text = "{}" if coordinate is None or coordinate.ndim else coordinate.item()
     try:
-        found = json.loads(dataset.attrs.get(attribute, text))
+        content = json.loads(dataset.attrs.get(attribute, text))
     except (ValueError, TypeError, RecursionError) as error:
         raise StorageError(f"its attribute '{attribute}' is damaged: {error}") from None
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise StorageError(f"its attribute '{attribute}' is damaged: it holds no map of keys")
-    return found
+    return content
 
 
 def scene_of(dataset: xarray.Dataset, what: str) -> Scene:
@@ -341,58 +350,58 @@ def scene_of(dataset: xarray.Dataset, what: str) -> Scene:
 
     Raises ExperimentError where it cannot be built, as where a component of it is retired.
     """
-    refuse_retired(carried(dataset, "experiment"), what)
+    refuse_retired(json_attribute(dataset, "experiment"), what)
     return build_scene(experiment_of(dataset))
 
 
 def experiment_of(
     dataset: xarray.Dataset, components: Iterable[type[Component]] = ()
 ) -> Experiment:
-    """The experiment that a dataset carries. Raises ExperimentError where there is none, or where
-    it wants components that are not there."""
+    """Build the experiment of a dataset. Raises ExperimentError where there is none, or where it
+    needs components that are not available."""
     refuse_no_dataset(dataset)
-    parts = carried(dataset, "experiment")
+    parts = json_attribute(dataset, "experiment")
     if not parts:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
     source = Source("dataset", parts)
     try:
         return Experiment.build(source, components)
     except ExperimentError as error:
-        given = carried(dataset, "plugins").get(GIVEN)
-        if given is None or components:
+        sources = json_attribute(dataset, "plugins").get(GIVEN)
+        if sources is None or components:
             raise
-        raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
+        raise ExperimentError(f"{error}; it was run with components=[...]: {sources}") from None
 
 
 def indices_of(dataset: xarray.Dataset) -> list[str]:
-    """Those that particles are found by."""
-    found = dataset.variables
-    return [name for name in INDICES if name in found and found[name].dims == ("particle",)]
+    """Return the names of the lattice indices by which particles can be selected."""
+    variables = dataset.variables
+    return [name for name in INDICES if name in variables and variables[name].dims == ("particle",)]
 
 
 def rows_at(dataset: xarray.Dataset, index: Mapping[str, int]) -> Array:
-    """The rows of the particles whose sites have these indices. Raises ExperimentError where there
-    is none, and for what is no index."""
-    known = indices_of(dataset)
-    here = np.ones(dataset.sizes.get("particle", 0), np.bool_)
+    """Return the rows of the particles at the given lattice indices. Raises ExperimentError where
+    there is none, and for unknown names."""
+    names = indices_of(dataset)
+    matches = np.ones(dataset.sizes.get("particle", 0), np.bool_)
     for name, value in index.items():
-        if name not in known:
-            raise ExperimentError(f"particles here are found by {known}, not by '{name}'")
-        here &= dataset.variables[name].values == value
-    if not here.any():
+        if name not in names:
+            raise ExperimentError(f"particles here are found by {names}, not by '{name}'")
+        matches &= dataset.variables[name].values == value
+    if not matches.any():
         place = ", ".join(f"{name}={value}" for name, value in index.items())
         raise ExperimentError(f"there is no particle at {place}")
-    return np.flatnonzero(here)
+    return np.flatnonzero(matches)
 
 
-def rows_of(numbers: Array, given: Array) -> Array:
-    """Where particles of those numbers are; -1 where they are not."""
-    wanted = np.nan_to_num(given, nan=-1.0).astype(np.int64)
+def rows_of(numbers: Array, wanted: Array) -> Array:
+    """Return the rows of particles by number; -1 for numbers that are missing."""
+    integers = np.nan_to_num(wanted, nan=-1.0).astype(np.int64)
     last = len(numbers)
     if last and numbers[0] == 1 and numbers[-1] == last:  # all of them, as in most datasets
-        return np.where(wanted <= last, wanted - 1, -1)
+        return np.where(integers <= last, integers - 1, -1)
     if not last:
-        return np.full(wanted.shape, -1)
+        return np.full(integers.shape, -1)
     order = np.argsort(numbers)
-    at = order[np.searchsorted(numbers[order], wanted).clip(max=last - 1)]
-    return np.where(numbers[at] == wanted, at, -1)
+    at = order[np.searchsorted(numbers[order], integers).clip(max=last - 1)]
+    return np.where(numbers[at] == integers, at, -1)

@@ -1,4 +1,4 @@
-"""One member of the dataset of a sweep, chosen by its parameters."""
+"""Selection of one member of the dataset of a sweep by its parameters."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError, did_you_mean
-from pbdkit.io.layout import carried
+from pbdkit.io.layout import json_attribute
 from pbdkit.model.reading import Source, with_value
 
 if TYPE_CHECKING:
     import xarray
 
 SWEEP, STATUS = "sweep", "status"
-"""The attribute that only datasets of sweeps have, and the variable along all their dimensions."""
+"""The attribute that identifies datasets of sweeps, and the variable along all their dimensions."""
 TEXT = "_text"
-"""Added to the name of a dimension for the values that it counts, as text."""
+"""Suffix of the coordinate with the text of values that are numbered along a dimension."""
 PARAMETER = "parameter"
-"""The attribute of a coordinate that names a parameter by its path in the experiment."""
+"""The attribute of a coordinate with the path of its parameter in the experiment."""
 SHOWN = 6
-"""So many values are listed in messages."""
+"""Maximum number of values in messages."""
 
 
 def type_alone(text: str) -> str:
-    """Return of a part that has nothing but its type, that; else the text as it is."""
+    """Return the type of a component given as JSON without parameters; any other text unchanged."""
     with suppress(ValueError, RecursionError):
         part = json.loads(text)
         if isinstance(part, dict) and part.keys() == {"type"}:
@@ -58,30 +58,30 @@ def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset
         raise ExperimentError(
             f"{', '.join(choice)}: there is nothing to choose, as this is the result of one run"
         )
-    chosen: dict[str, int] = {}
+    indices: dict[str, int] = {}
     for name, value in choice.items():
         dim, row = _place(dataset, name, value)
-        if chosen.setdefault(dim, row) != row:
+        if indices.setdefault(dim, row) != row:
             raise ExperimentError(f"{name}={value}: no member has this with the other choices")
-    found = dataset.isel(chosen)
+    selection = dataset.isel(indices)
     words = ", ".join(f"{name}={value}" for name, value in choice.items())
     title = f"{dataset.attrs.get('title', 'sweep')}, {words}"
-    found = found.assign_attrs(title=title) if choice else found
-    return found if found[STATUS].ndim else _with_experiment(found)
+    selection = selection.assign_attrs(title=title) if choice else selection
+    return selection if selection[STATUS].ndim else _with_experiment(selection)
 
 
 def choices(dataset: xarray.Dataset) -> str:
-    """Return what can be chosen, as messages list it: ``steel: 1, 2, 3; rule: barycentre``."""
+    """Return the parameters and their values as text: ``steel: 1, 2, 3; rule: barycentre``."""
     parts = []
     for dim in map(str, dataset[STATUS].dims):
-        shown = [_word(value) for value in _labels(dataset, dim)[:SHOWN]]
-        more = ", ..." if dataset.sizes[dim] > SHOWN else ""
-        parts.append(f"{dim}: {', '.join(shown)}{more}")
+        words = [_word(value) for value in _labels(dataset, dim)[:SHOWN]]
+        ellipsis = ", ..." if dataset.sizes[dim] > SHOWN else ""
+        parts.append(f"{dim}: {', '.join(words)}{ellipsis}")
     return "; ".join(parts)
 
 
 def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
-    """The values along a dimension, or of a parameter beside it."""
+    """Return the values along a dimension, or of a parameter along it."""
     for label in (f"{name}{TEXT}", name):
         if label in dataset.coords:
             return np.asarray(dataset[label].values)
@@ -93,19 +93,19 @@ def _word(value: Any) -> str:
 
 
 def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
-    """The dimension of a parameter, and the place along it of the value."""
+    """Return the dimension of a parameter, and the index of the value along it."""
     grid = [str(dim) for dim in dataset[STATUS].dims]
-    beside = {str(n): str(c.dims[0]) for n, c in dataset.coords.items() if c.ndim == 1}
-    known = {dim: dim for dim in grid} | {n: dim for n, dim in beside.items() if dim in grid}
-    if name not in known:
-        hint = did_you_mean(name, known)
+    coordinates = {str(n): str(c.dims[0]) for n, c in dataset.coords.items() if c.ndim == 1}
+    dims = {dim: dim for dim in grid} | {n: dim for n, dim in coordinates.items() if dim in grid}
+    if name not in dims:
+        hint = did_you_mean(name, dims)
         raise ExperimentError(f"{name}: is no parameter of this sweep{hint} ({choices(dataset)})")
     labels = _labels(dataset, name)
     rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, value)]
     if not rows:
         near = ", ".join(map(_word, labels.tolist()[:SHOWN]))
         raise ExperimentError(f"{name}={value}: no member has this value; there are {near}")
-    return known[name], rows[0]
+    return dims[name], rows[0]
 
 
 def _is_alike(label: Any, value: Any) -> bool:
@@ -116,14 +116,14 @@ def _is_alike(label: Any, value: Any) -> bool:
     return False
 
 
-def _with_experiment(one: xarray.Dataset) -> xarray.Dataset:
-    """The member with its experiment, and without the times that only others reached."""
+def _with_experiment(selection: xarray.Dataset) -> xarray.Dataset:
+    """Return a member with its experiment, without the times that only other members reached."""
     from pbdkit.model.experiment import Experiment  # imports pydantic
 
-    source = Source(data=carried(one, SWEEP).get("experiment"))
-    for name, coordinate in one.coords.items():
+    source = Source(data=json_attribute(selection, SWEEP).get("experiment"))
+    for name, coordinate in selection.coords.items():
         path = coordinate.attrs.get(PARAMETER)
-        if path is None or coordinate.ndim or f"{name}{TEXT}" in one.coords:
+        if path is None or coordinate.ndim or f"{name}{TEXT}" in selection.coords:
             continue
         value, units = coordinate.item(), str(coordinate.attrs.get("units", "1"))
         if isinstance(value, str):
@@ -131,8 +131,10 @@ def _with_experiment(one: xarray.Dataset) -> xarray.Dataset:
                 value = json.loads(value)
         written = f"{value!r} {units}" if units != "1" and "unit" not in units else value
         source = with_value(source, str(path), written, str(name), Experiment.defaults())
-    growing = [n for n, v in one.data_vars.items() if "time" in v.dims and v.dtype.kind == "f"]
-    found = one.dropna("time", how="all", subset=growing) if growing else one.copy()
-    attributes = {name: value for name, value in one.attrs.items() if name != SWEEP}
-    found.attrs = attributes | {"experiment": json.dumps(source.data)}
-    return found
+    growing = [
+        n for n, v in selection.data_vars.items() if "time" in v.dims and v.dtype.kind == "f"
+    ]
+    run = selection.dropna("time", how="all", subset=growing) if growing else selection.copy()
+    attributes = {name: value for name, value in selection.attrs.items() if name != SWEEP}
+    run.attrs = attributes | {"experiment": json.dumps(source.data)}
+    return run

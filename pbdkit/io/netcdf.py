@@ -23,25 +23,26 @@ from pbdkit.io.atomic_file import FULL, Destination, is_full
 from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import Column, Values, When
 from pbdkit.io.paged_file import PagedFile, PiecedArray
-from pbdkit.io.run_store import UnfinishedRun, damaged
+from pbdkit.io.run_store import UnfinishedRun, damage_error
 from pbdkit.io.seal import is_whole
 from pbdkit.io.sinks import KeepingSink
 from pbdkit.scene.memory_estimate import CHUNK_BYTES, OPEN_CHUNK
 
 LEVEL = 1
-"""Of zlib: the next levels cost much and gain little on positions."""
+"""Compression level of zlib: higher levels cost much and gain little on positions."""
 LABELS = "coordinates"
-"""The attribute of CF that names such as are no dimension's; xarray reads that of the file too."""
+"""CF's attribute for coordinates that are not those of a dimension; xarray reads it from the file
+too."""
 FIRST_LENGTH = 1024
-"""Of a dimension that grows, until there is more."""
+"""Initial length of a growing dimension."""
 
 Waiting = dict[str, list[Array]]
-"""Entries by column that fill no chunk yet."""
+"""Entries by column that do not fill a chunk yet."""
 
 
 class NetcdfFile:
-    """The columns of a dataset, put into a file as they come; `waiting` and `written`, how many
-    entries of a column are in the file, are what it remembers besides."""
+    """The columns of a dataset, written to a file as they come. Its state is `waiting` and
+    `written`, the number of entries of each column in the file."""
 
     def __init__(self, file: PagedFile, columns: list[Column], *, compress: bool = False) -> None:
         self.file, self._compress = file, compress
@@ -52,7 +53,7 @@ class NetcdfFile:
         self.written = dict.fromkeys(self.waiting, 0)
 
     def make(self, sizes: Mapping[str, int], planned: Mapping[str, int]) -> None:
-        """Defines the variables in an empty file."""
+        """Define the variables in an empty file."""
         self._open("w")
         self._batch: dict[str, int] = {}
         grow = dict.fromkeys(d for column in self._columns.values() for d in column.dims)
@@ -61,8 +62,8 @@ class NetcdfFile:
             self._define(column, sizes, planned)
 
     def reopen(self, waiting: Waiting, written: Mapping[str, Any]) -> None:
-        """Goes on with a file as it was committed. Raises StorageError where it does not hold what
-        is said to be written."""
+        """Continue with a file as it was committed. Raises StorageError where it holds fewer
+        entries than `written`."""
         self.waiting |= waiting
         self.written |= written
         self._open("r+")
@@ -72,22 +73,22 @@ class NetcdfFile:
         self._batch = {name: self._content[name].chunks[0] for name in self.written}
 
     def put(self, values: Values) -> None:
-        """Keeps growing columns until a chunk is full."""
+        """Write values; growing columns are buffered until a chunk is full."""
         for name, value in values.items():
             if self._columns[name].grows:
-                one = isinstance(value, PiecedArray) and self._batch[name] == 1
-                self.waiting[name].append(value if one else np.asarray(value))
+                is_streamed = isinstance(value, PiecedArray) and self._batch[name] == 1
+                self.waiting[name].append(value if is_streamed else np.asarray(value))
                 if len(self.waiting[name]) >= self._batch[name]:
                     self._append(name)
             else:
                 self._store(self._columns[name], value)
 
     def flush(self) -> None:
-        """The file, with its pages, holds all but what waits."""
+        """Write everything but the buffered entries to the file and its pages."""
         self._h5.flush()
 
     def finish(self, attributes: Mapping[str, str]) -> None:
-        """Puts what waits, and closes. Nothing more comes."""
+        """Write the buffered entries and close the file."""
         for name in self.waiting:
             if self.waiting[name]:
                 self._append(name)
@@ -103,7 +104,7 @@ class NetcdfFile:
         self._h5.close()
 
     def add_group(self, name: str, facts: str, arrays: Mapping[str, Any]) -> None:
-        """Arrays, and what else there is to say of them, apart from the dataset."""
+        """Add a group with arrays and JSON facts, apart from the dataset."""
         group = self._content.create_group(name)
         group.attrs["facts"] = facts
         for key, array in arrays.items():
@@ -115,7 +116,7 @@ class NetcdfFile:
             _fill(variable, array)
 
     def give_up(self) -> None:
-        """What was put is not wanted; nothing is raised."""
+        """Discard the file; nothing is raised."""
         self.file.give_up()
         for file in (self._content, self._h5):
             with suppress(Exception):
@@ -127,14 +128,14 @@ class NetcdfFile:
         self._content = h5netcdf.File(self._h5, mode)
 
     def _define(self, column: Column, sizes: Mapping[str, int], planned: Mapping[str, int]) -> None:
-        more: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         if column.grows:
-            more["chunks"] = _chunks(column, sizes, planned)
-            self._batch[column.name] = more["chunks"][0]
+            options["chunks"] = _chunks(column, sizes, planned)
+            self._batch[column.name] = options["chunks"][0]
         elif not all(sizes.get(dim) for dim in column.dims):
-            more["chunks"] = tuple(sizes.get(dim) or OPEN_CHUNK for dim in column.dims)
+            options["chunks"] = tuple(sizes.get(dim) or OPEN_CHUNK for dim in column.dims)
         if self._compress and column.dtype != "str" and column.dims:
-            more |= {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
+            options |= {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
         if column.grows:
             dim = column.dims[0]
             self._lengthen(dim, min(FIRST_LENGTH, planned[dim]))
@@ -142,13 +143,13 @@ class NetcdfFile:
         attributes = column.attributes
         if column.dtype == "bool":  # as xarray writes it: netCDF has no such type
             dtype, attributes = "i1", attributes | {"dtype": "bool"}
-        variable = self._content.create_variable(column.name, column.dims, dtype, **more)
+        variable = self._content.create_variable(column.name, column.dims, dtype, **options)
         variable.attrs.update(attributes)
         if not column.coordinate and (labels := self._labels({*column.dims})):
             variable.attrs[LABELS] = " ".join(labels)
 
     def _labels(self, dims: set[str]) -> list[str]:
-        """The coordinates along these dimensions that are no dimension's own."""
+        """Return the coordinates along these dimensions that are not those of a dimension."""
         of_others = (c for c in self._columns.values() if c.coordinate and c.dims != (c.name,))
         return [column.name for column in of_others if dims.issuperset(column.dims)]
 
@@ -157,7 +158,7 @@ class NetcdfFile:
             self._content.resize_dimension(dim, length)
 
     def _append(self, name: str) -> None:
-        """What waits of a column, as one chunk along its first dimension."""
+        """Write the buffered entries of a column as one chunk along its first dimension."""
         entries, begin = self.waiting[name], self.written[name]
         variable, dim = self._content[name], self._columns[name].dims[0]
         if (end := begin + len(entries)) > self._content.dimensions[dim].size:
@@ -179,7 +180,7 @@ class NetcdfFile:
         self.file.values_bytes = -1
 
     def _store(self, column: Column, value: Any) -> None:
-        """The whole of a column that does not grow."""
+        """Write a column that does not grow."""
         variable = self._content[column.name]
         if column.dtype == "str":
             variable[...] = np.asarray(value, dtype=object)
@@ -192,7 +193,7 @@ class NetcdfFile:
 
 
 def _fill(variable: Any, values: Array | PiecedArray) -> None:
-    """Writes all of a variable, as it comes."""
+    """Write all values of a variable."""
     if isinstance(values, PiecedArray):
         for place, tile in values.tiles(CHUNK_BYTES):
             variable[place] = tile
@@ -201,7 +202,8 @@ def _fill(variable: Any, values: Array | PiecedArray) -> None:
 
 
 def _parts(entries: list[Any], chunks: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
-    """Entries, (entry, ...), chunk by chunk along their first dimension, and where each begins."""
+    """Generate the chunks of entries, (entry, ...), along their first dimension, with the start of
+    each."""
     if isinstance(entries[0], PiecedArray):
         for n, rows in enumerate(entries[0].rows(chunks[1])):
             yield n * chunks[1], rows[None]
@@ -226,7 +228,7 @@ def _chunks(
 
 
 def _padded(part: Array, shape: tuple[int, ...]) -> Array:
-    """The part of an array at the beginning of a whole chunk."""
+    """Pad an array with zeros to the shape of a chunk."""
     if part.shape == shape:
         return part
     whole = np.zeros(shape, part.dtype)
@@ -235,16 +237,16 @@ def _padded(part: Array, shape: tuple[int, ...]) -> Array:
 
 
 FIRST_S, EVERY_S, SHARE = 1.0, 1.0, 50
-"""What is over by then leaves no store; so far apart are commits at least, in seconds and in times
-what the last one cost."""
+"""Time in seconds before the first commit, minimum interval of commits, and minimum interval as a
+multiple of the duration of the last commit. A run that ends before the first has no store."""
 FINAL_STATE = "final_state"
-"""The group of the file with what a run needs to be gone on with to more steps."""
+"""The group of the file with the state from which a run can be continued to more steps."""
 WAITING = "waiting."
 
 
 class NetcdfSink(KeepingSink):
-    """Writes beside `path`, first under a temporary name, after a second as the records of an
-    unfinished run; `finish` makes it the result. `origin` says of the run where it comes from.
+    """Sink that writes a temporary file beside `path`, commits it after a second as the records of
+    an unfinished run, and renames it at `finish`. `origin` are the arguments of the command.
 
     Raises StorageError where anything cannot be written; what was kept until then stays kept.
     """
@@ -266,16 +268,16 @@ class NetcdfSink(KeepingSink):
 
     @property
     def written(self) -> Path:
-        """Where the result is, once it is finished: beside `path` where that was taken."""
+        """Path of the finished result: beside `path` where that was in use."""
         return self._destination.written
 
     @property
     def kept(self) -> bool:
-        """Whether there is something to go on with."""
+        """Return whether there is a checkpoint to resume from."""
         return self.unfinished is not None and self.unfinished.kept
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Opens the file, so that what cannot be written is known before the first step."""
+        """Open the file, so that errors are found before the first step."""
         path = self._destination.path
         if not path.absolute().parent.is_dir():
             raise StorageError(f"{path}: there is no folder {path.parent}")
@@ -293,37 +295,37 @@ class NetcdfSink(KeepingSink):
         columns: list[Column],
         compression: str,
     ) -> None:
-        """Takes up an unfinished run instead of beginning."""
+        """Continue an unfinished run instead of beginning one."""
         self.unfinished, self._temporary = unfinished, unfinished.records
         file = unfinished.file(read_only=False)
         file.verify()
         with self._storing():
             file.forget()
-            self._file = reopened(file, columns, checkpoint, compress=compression == "zlib")
+            self._file = reopen_dataset(file, columns, checkpoint, compress=compression == "zlib")
         self._next = time.perf_counter() + EVERY_S
 
     def conclude(self, unfinished: UnfinishedRun) -> None:
-        """Takes up a run that is finished but for its name."""
+        """Complete a run that has finished but whose result has no name yet."""
         self.unfinished, self._temporary = unfinished, unfinished.records
         file, status = unfinished.file(read_only=False), unfinished.facts["finished"]
         with self._storing():
             settled = is_whole(file.disk)
             if settled and not file.is_settled():
-                raise damaged(unfinished.records, "it is another result")
+                raise damage_error(unfinished.records, "it is another result")
             self._complete(file, status, settled=settled)
 
     def put(self, values: Values) -> None:
-        """Into the file, by whole chunks."""
+        """Write values to the file, chunk by chunk."""
         with self._storing() as file:
             file.put(values)
 
     def due(self) -> bool:
-        """After a second, and then about once a second."""
+        """Return whether a commit is due: after a second, and then about once a second."""
         return time.perf_counter() >= self._next
 
     def keep(self, checkpoint: Checkpoint) -> None:
-        """One commit: what it returns from outlives the process and the machine."""
-        begun = time.perf_counter()
+        """Commit a checkpoint, which survives the process and the machine."""
+        start = time.perf_counter()
         with self._storing() as file:
             if self.unfinished is None:
                 output, disk = self._destination.path.absolute(), file.file.disk
@@ -332,22 +334,21 @@ class NetcdfSink(KeepingSink):
             file.flush()
             checkpoint = checkpoint.with_origin(self._origin)
             self.unfinished.keep(checkpoint, file.file, file.waiting, file.written)
-        now = time.perf_counter()
-        self._next = now + max(EVERY_S, SHARE * (now - begun))
+        end = time.perf_counter()
+        self._next = end + max(EVERY_S, SHARE * (end - start))
 
     def suspend(self, checkpoint: Checkpoint) -> None:
-        """Keeps it and leaves it."""
+        """Commit a checkpoint and close."""
         self.keep(checkpoint)
         self.abandon()
 
-    def note_end(self, checkpoint: Checkpoint) -> None:
-        """As a group of the file."""
+    def keep_final(self, checkpoint: Checkpoint) -> None:
+        """Write the final state as a group of the file."""
         with self._storing() as file:
             file.add_group(FINAL_STATE, json.dumps(checkpoint.facts), checkpoint.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
-        """Completes the file, seals and syncs it, reads it back, and gives it its name; then the
-        store goes."""
+        """Complete the file, seal and sync it, read it back, rename it, and remove the store."""
         with self._storing() as file:
             file.finish(attributes)
             file.file.check()
@@ -356,7 +357,7 @@ class NetcdfSink(KeepingSink):
             self._complete(file.file, attributes["status"])
 
     def _complete(self, file: PagedFile, status: str, *, settled: bool = False) -> None:
-        """The last steps, from a file that is whole with its pages. Raises OSError."""
+        """Verify, settle and rename a file that is complete with its pages. Raises OSError."""
         if not settled:
             file.verify()
             file.settle()
@@ -368,7 +369,7 @@ class NetcdfSink(KeepingSink):
             file.disk.close()
 
     def abandon(self) -> None:
-        """Removes the file; if it was kept, only what came after."""
+        """Remove the file; of an unfinished run, only the part after the last commit."""
         if self._file is None:
             return
         self._file.give_up()
@@ -395,7 +396,8 @@ class NetcdfSink(KeepingSink):
             raise WriteError(f"{path}: cannot be written: {reason}") from None
 
     def _reason(self, error: Exception) -> str:
-        """The disk's own, where it has one: the library says little."""
+        """Return the reason of the disk where there is one, since the library's errors say
+        little."""
         try:
             if self._file:
                 self._file.file.check()
@@ -407,23 +409,23 @@ class NetcdfSink(KeepingSink):
         return str(getattr(error, "strerror", None) or error)
 
 
-def reopened(
+def reopen_dataset(
     file: PagedFile, columns: list[Column], checkpoint: Checkpoint, *, compress: bool
 ) -> NetcdfFile:
-    """The dataset in the file of an unfinished run, with what waited."""
-    found = NetcdfFile(file, columns, compress=compress)
+    """Return the dataset in the file of an unfinished run, with its buffered entries."""
+    dataset = NetcdfFile(file, columns, compress=compress)
     waiting = {
         name.removeprefix(WAITING): list(array)
         for name, array in checkpoint.arrays.items()
         if name.startswith(WAITING)
     }
     written = checkpoint.facts.get("written")
-    if not isinstance(written, dict) or not {*waiting} <= {*written} == {*found.waiting}:
+    if not isinstance(written, dict) or not {*waiting} <= {*written} == {*dataset.waiting}:
         raise StorageError("the store holds another dataset than the experiment makes")
     try:
-        found.reopen({n: [np.asarray(v) for v in batch] for n, batch in waiting.items()}, written)
+        dataset.reopen({n: [np.asarray(v) for v in batch] for n, batch in waiting.items()}, written)
     except StorageError:
         raise
     except Exception as error:  # whatever the libraries below make of it
         raise StorageError(f"the store holds a damaged file: {error}") from None
-    return found
+    return dataset

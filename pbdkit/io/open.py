@@ -22,41 +22,42 @@ from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout
 from pbdkit.io.members import SWEEP, choices, member
 from pbdkit.io.other_files import refuse_other_file
 from pbdkit.io.run_store import STORE, has_committed
-from pbdkit.io.seal import BrokenSealError, SealedFile, opened, seal_of
+from pbdkit.io.seal import BrokenSealError, SealedFile, open_sealed, seal_of
 from pbdkit.untrusted_files import opened_unsealed, try_reading
 
 if TYPE_CHECKING:
     import xarray
 
 
-UNSEALED = "carries no seal: nobody can tell whether it is as it was written"
+UNSEALED = "has no seal: changes since it was written cannot be detected"
 
 
 def open(path: str | Path) -> xarray.Dataset:
-    """The dataset in a result file; its values are read, and checked, when they are used. Of a run
-    that is not finished, what was kept of it last, with the status "interrupted".
+    """Open the dataset of a result file; values are read, and verified, when they are used.
 
-    Raises ExperimentError for an experiment and a sweep, and StorageError where there is no such
-    file, where it is not as it was written, where it cannot be read as netCDF, where pbdkit did not
-    make it, where variables are missing, or where a newer pbdkit made it than this one can read. A
-    change that is met later, as values are read, raises StorageError too. Warns, with
-    StorageWarning, of a file without a seal, which is first read once in another process.
+    The dataset of an unfinished run is that of its last checkpoint, with the status "interrupted".
+
+    Raises ExperimentError for an experiment and a sweep specification, and StorageError for a
+    missing file, a file that was changed, that is not netCDF, that pbdkit did not write, that lacks
+    variables, or that a newer pbdkit wrote. A change found later, as values are read, raises
+    StorageError too. Warns, with StorageWarning, of a file without a seal, which is first read once
+    in a separate process.
     """
     if not isinstance(path, str | Path):
         raise ExperimentError(
             f"open: expected the path of a result, got an object of type {type(path).__name__}"
         )
     file = Path(path)
-    left = _output_of(file)
-    if not left:
+    unfinished = _output_of(file)
+    if not unfinished:
         refuse_other_file(file)
         refuse_no_file(file)
     try:
-        dataset = in_this_layout(_unfinished(left) if left else _opened(file))
+        dataset = in_this_layout(_unfinished(unfinished) if unfinished else _opened(file))
     except PbdkitError:
         raise
     except Exception as error:  # whatever the libraries below make of a damaged file
-        if not left:
+        if not unfinished:
             with SealedFile(file) as content:
                 content.check()
         reason = getattr(error, "strerror", None) or error
@@ -68,7 +69,7 @@ def open(path: str | Path) -> xarray.Dataset:
 
 
 def refuse_no_file(file: Path) -> None:
-    """Raises StorageError where there is no plain file of that name."""
+    """Raise StorageError where the path is not a plain file."""
     if file.is_dir():
         raise StorageError(f"{file}: is a folder, no result of pbdkit")
     if not file.is_file():
@@ -90,7 +91,7 @@ def _opened(file: Path) -> xarray.Dataset:
         return dataset
     import xarray
 
-    return _dataset(xarray.backends.CachingFileManager(opened, file.absolute(), mode="r"))
+    return _dataset(xarray.backends.CachingFileManager(open_sealed, file.absolute(), mode="r"))
 
 
 def _dataset(content: Any) -> xarray.Dataset:
@@ -110,7 +111,8 @@ def _unfinished(output: Path) -> xarray.Dataset:
 
 
 def _output_of(file: Path) -> Path | None:
-    """The output of the unfinished run that is meant, by its own name or that of its store."""
+    """Return the output of the unfinished run that a path names, by its own name or that of its
+    store."""
     if file.name.endswith(STORE) and file.is_file():
         return file.with_name(file.name.removesuffix(STORE))
     return file if not file.exists() and has_committed(file) else None
@@ -120,12 +122,11 @@ def _output_of(file: Path) -> Path | None:
 def reading(
     path: str | Path, *, sweeps: bool = False, at: Mapping[str, str] | None = None
 ) -> Iterator[xarray.Dataset]:
-    """The dataset of a run in a result file, or with `sweeps` of either, to be read from in the
-    block; `at` chooses among the members of a sweep.
+    """Open the dataset of a run, or with `sweeps` of a sweep too, for reading in the block.
 
-    Raises ExperimentError for that of a sweep otherwise, what `open` does, and StorageError for
-    whatever reading and using its values raises: files are sound when written. Another file that
-    cannot be written in the block, a WriteError, is no fault of this one.
+    `at` selects a member of a sweep. Raises ExperimentError for a sweep otherwise, the errors of
+    `open`, and StorageError for any error in reading and using the values: files are sound when
+    written. A WriteError of another file in the block passes unchanged.
     """
     with open(path) as whole:
         dataset = _chosen(whole, path, at) if at else whole
@@ -143,8 +144,8 @@ def reading(
         except (PbdkitError, MemoryError):
             raise
         except Exception as error:
-            told = f"{type(error).__name__}: {error}"
-            raise StorageError(f"{path}: is damaged, or was changed: {one_line(told)}") from error
+            reason = f"{type(error).__name__}: {error}"
+            raise StorageError(f"{path}: is damaged, or was changed: {one_line(reason)}") from error
 
 
 def _chosen(dataset: xarray.Dataset, path: str | Path, at: Mapping[str, str]) -> xarray.Dataset:
@@ -155,7 +156,7 @@ def _chosen(dataset: xarray.Dataset, path: str | Path, at: Mapping[str, str]) ->
 
 
 def fault_of(dataset: xarray.Dataset) -> str | None:
-    """Why this pbdkit cannot read it, if it cannot."""
+    """Return the reason why this pbdkit cannot read a dataset, or None."""
     version = dataset.attrs.get("schema_version")
     if version is None:
         return "is no dataset of pbdkit: it has no attribute schema_version"

@@ -1,4 +1,5 @@
-"""Files that are no results: what they are, by their content, and which command reads them."""
+"""Identification of files that are not results by their content, and of the command that reads
+them."""
 
 from __future__ import annotations
 
@@ -12,38 +13,39 @@ from pbdkit.untrusted_files import BEGINNINGS
 
 TEXTS = (".yaml", ".yml", ".json")
 FAULTY = "faulty"
-"""The kind of what is no text, or of a text at fault."""
+"""Kind of a file that is not text, or not valid YAML."""
 
 
 def refuse_other_file(path: Path) -> None:
-    """Raises ExperimentError where it is known what a path leads to, and that is no result."""
-    if told := other_file(path):
-        raise ExperimentError(f"{path}: {told}")
+    """Raise ExperimentError where a path is known to lead to something other than a result."""
+    if description := other_file(path):
+        raise ExperimentError(f"{path}: {description}")
 
 
 def other_file(path: Path) -> str:
-    """What it is and what takes it; empty for results, for nothing and for what nobody knows."""
+    """Return a description of a file that is not a result and the command for it; empty for
+    results, missing files and unknown content."""
     if path.is_dir():
         inner = path / "sweep.nc"
         sweep = f"is the folder of a sweep; its dataset is {inner}"
         return sweep if inner.is_file() else "is a folder, no result of pbdkit"
     if not path.is_file():
-        known = path.as_posix() in shipped_names()
-        return f"is a shipped experiment; `pbdkit run {path}` makes a result of it" * known
+        is_shipped = path.as_posix() in shipped_names()
+        return f"is a shipped experiment; `pbdkit run {path}` makes a result of it" * is_shipped
     kind = _kind_of_text(path)
     if kind is None:
         return ""
     if kind == FAULTY:
         return "is no result, by its name an experiment" if path.suffix in TEXTS else ""
     if kind == EXPERIMENT:
-        return f"is an experiment; `pbdkit run {path}` makes a result of it, and says where"
-    takes = f"is {kind}, no result; {what_takes(kind, str(path))}"
-    return takes if kind else "is no result: those end in .nc"
+        return f"is an experiment; `pbdkit run {path}` computes its result and prints the path"
+    description = f"is {kind}, no result; {what_takes(kind, str(path))}"
+    return description if kind else "is no result: those end in .nc"
 
 
 def is_experiment(path: Path) -> bool:
-    """Return whether a path leads to an experiment, in a file or shipped: one that cannot be read
-    is told by its name."""
+    """Return whether a path leads to an experiment, in a file or shipped; a file that cannot be
+    read is judged by its suffix."""
     if not path.is_file():
         return path.as_posix() in shipped_names()
     kind = _kind_of_text(path)
@@ -51,8 +53,8 @@ def is_experiment(path: Path) -> bool:
 
 
 def _kind_of_text(path: Path) -> str | None:
-    """What a text describes, FAULTY where it is no text of YAML; None for results, and what cannot
-    be read."""
+    """Return the kind of a YAML file, FAULTY for invalid text; None for results and unreadable
+    files."""
     try:
         with path.open("rb") as file:
             if file.read(8).startswith(BEGINNINGS):
@@ -65,7 +67,7 @@ def _kind_of_text(path: Path) -> str | None:
 
 
 def refuse_store(path: Path) -> None:
-    """Raises ExperimentError for the store of an unfinished run in place of its output."""
+    """Raise ExperimentError for the store of an unfinished run given in place of its output."""
     if path.name.endswith(STORE) and path.is_file():
         output = path.with_name(path.name.removesuffix(STORE))
         raise ExperimentError(f"{path}: is what was kept of an unfinished run; name {output}")

@@ -25,10 +25,10 @@ MAGIC = b"pbdkit-r"
 HDF5 = b"\x89HDF\r\n\x1a\n"
 LAYOUT = struct.Struct("<8s16sQ")
 HEADER_BYTES = LAYOUT.size + 8
-"""They end with a digest. HDF5's superblock, which lies here in the finished file, is longer; until
-then it is in a page of the store."""
+"""Length of the header with its digest. The superblock of HDF5, which is longer, takes its place in
+the finished file; until then it is in a page of the store."""
 TRIES, PAUSE_S = 3, 0.02
-"""A reader may meet a header that is just being written."""
+"""Attempts and pause in seconds for a header that is being written at the moment of reading."""
 
 
 class Header(NamedTuple):
@@ -39,7 +39,7 @@ class Header(NamedTuple):
 
 
 SETTLED = Header(b"", 1)
-"""Stands for the beginning of a file that is settled for its end, which follows a commit."""
+"""Header that marks the end of a settled file, which follows a commit."""
 
 
 def write_header(file: io.FileIO, header: Header) -> None:
@@ -70,18 +70,20 @@ def read_header(file: io.FileIO) -> Header | None:
 
 PAGE = 4096
 LARGE_BYTES = 2**16
-"""What is written in one go and is larger goes to the disk at once."""
+"""Single writes larger than this go to the disk immediately."""
 
 
 class PagedFile(NewFile):
-    """A file on the disk, and pages in memory that lie over it.
+    """A file on the disk overlaid by pages in memory.
 
-    What is large goes to the disk as it comes, behind all that was there at the last `commit`, and
-    each extent of it once. All else, what the library notes of its variables, stays in memory until
-    `settle`. So the bytes on the disk, with the pages, extents and size of a commit, are the file
-    as it was then, whatever is written afterwards. With `read_only` everything stays in memory.
+    Large writes are appended to the disk, behind everything that existed at the last `commit`, each
+    extent once. Everything else, such as the metadata that HDF5 rewrites, stays in memory until
+    `settle`. The bytes on the disk, with the pages, extents and size of a commit, therefore form
+    the file as of that commit, whatever is written afterwards. With `read_only` everything stays in
+    memory.
 
-    Extents that are handed over are checked before a byte of them is given out: BrokenSealError.
+    Extents passed to the constructor are verified before any of their bytes are returned; damage
+    raises BrokenSealError.
     """
 
     def __init__(
@@ -96,36 +98,36 @@ class PagedFile(NewFile):
         super().__init__(disk)
         self.size = size
         self.pages = {number: bytearray(page) for number, page in (pages or {}).items()}
-        """By number."""
+        """Pages in memory, by number."""
         self.extents = list(extents)
-        """What lies on the disk, by place."""
+        """Extents on the disk, sorted by position."""
         self.changed: set[int] = set()
-        """The pages written since the last commit."""
+        """Numbers of the pages written since the last commit."""
         self.values_bytes = -1
-        """So many bytes in one go are values, too, however few."""
+        """A single write of this size counts as values, however small."""
         self.noted = len(self.extents)
-        """So many of them were there at the last commit."""
+        """Number of extents at the last commit."""
         self._unchecked = {extent.start for extent in extents}
         self._append_from, self._place = (2**63 if read_only else size), 0
 
     @property
     def added(self) -> list[ByteRange]:
-        """The extents written since the last commit."""
+        """Extents written since the last commit."""
         return self.extents[self.noted :]
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """As in any file."""
+        """Set the position, as in any file."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self.size}[whence]
         self._place = max(0, start + offset)
         return self._place
 
     def truncate(self, size: int | None = None) -> int:
-        """As in any file; the disk hears of it when all is settled."""
+        """Set the size, as in any file; on the disk it is set by `settle`."""
         self.size = self._place if size is None else size
         return self.size
 
     def readinto(self, buffer: Any) -> int:
-        """From the pages, and from the disk where there is none."""
+        """Read from the pages, and from the disk elsewhere."""
         view = memoryview(buffer).cast("B")
         view = view[: max(0, self.size - self._place)]
         self.verify(self._place, self._place + len(view))
@@ -136,14 +138,14 @@ class PagedFile(NewFile):
         return len(view)
 
     def write(self, data: Any) -> int:
-        """To the disk what is large and new, into pages what is not."""
+        """Append large new writes to the disk and put all others into pages."""
         view = memoryview(data).cast("B")
         values = len(view) >= LARGE_BYTES or len(view) == self.values_bytes
         to_disk = values and self._place >= self._append_from
         if to_disk:
             self._append(view)
-        there = self.pages if to_disk else None
-        for page, inside, outside in _overlaps(self._place, len(view), there):
+        pages = self.pages if to_disk else None
+        for page, inside, outside in _overlaps(self._place, len(view), pages):
             if page not in self.pages:
                 self.pages[page] = bytearray(self._on_disk(page * PAGE, PAGE))
             self.pages[page][inside] = view[outside]
@@ -153,8 +155,8 @@ class PagedFile(NewFile):
         return len(view)
 
     def verify(self, start: int = 0, stop: int = 2**63) -> None:
-        """Checks the extents that were handed over and of which bytes lie between two places, once
-        each. Raises BrokenSealError."""
+        """Verify the extents passed to the constructor that overlap a range, once each. Raises
+        BrokenSealError."""
         if not self._unchecked:
             return
         first = bisect_right(self.extents, start, key=lambda extent: extent.stop)
@@ -168,21 +170,21 @@ class PagedFile(NewFile):
                 self._unchecked.discard(extent.start)
 
     def give_up(self) -> None:
-        """Nothing more goes to the disk."""
+        """Stop writing to the disk."""
         self.fail(OSError("given up"))
 
     def forget(self) -> None:
-        """What was written after the last commit, by a process that was killed. Raises OSError."""
+        """Remove what a killed process wrote after the last commit. Raises OSError."""
         self.disk.truncate(max((extent.stop for extent in self.extents), default=HEADER_BYTES))
 
     def commit(self) -> None:
-        """What is there now stays: pages, extents and size were noted elsewhere."""
+        """Mark the present content as committed: pages, extents and size have been stored."""
         self._append_from = max(self._append_from, self.size)
         self.noted, self.changed = len(self.extents), set()
 
     def settle(self) -> None:
-        """Puts the pages in their places, seals the file, syncs it and reads all of it back. Raises
-        OSError where it cannot be written, or is not what was written."""
+        """Write the pages to their positions, seal and sync the file, and read all of it back.
+        Raises OSError where it cannot be written, or differs from what was written."""
         self.check()
         for number, page in sorted(self.pages.items()):
             self.disk.seek(number * PAGE)
@@ -191,10 +193,11 @@ class PagedFile(NewFile):
         put_seal(self.disk, [self._settled(e) for e in self.extents if e.stop <= self.size])
         self.sync()
         if not is_whole(self.disk):
-            raise OSError(f"{self.disk.name}: the disk gives back what was not written")
+            raise OSError(f"{self.disk.name}: the disk returns other bytes than were written")
 
     def is_settled(self) -> bool:
-        """Whether the pages are in their places on the disk, of which the seal follows the last."""
+        """Return whether the pages are at their positions on the disk; the seal follows the
+        last."""
         for number, page in self.pages.items():
             length = min(PAGE, max(0, self.size - number * PAGE))
             if self._on_disk(number * PAGE, length) != page[:length]:
@@ -202,7 +205,7 @@ class PagedFile(NewFile):
         return True
 
     def _settled(self, extent: ByteRange) -> ByteRange:
-        """With the digest that it has now, should a page lie over it."""
+        """Return an extent with its present digest, which differs where a page overlaps it."""
         pages = range(extent.start // PAGE, -(-extent.stop // PAGE))
         if not any(page in self.pages for page in pages):
             return extent
@@ -219,7 +222,7 @@ class PagedFile(NewFile):
         self._append_from = self.extents[-1].stop
 
     def _on_disk(self, start: int, length: int) -> bytes:
-        """So many bytes; zero behind the end."""
+        """Read from the disk, with zeros behind its end."""
         self.disk.seek(start)
         return self.disk.read(length).ljust(length, b"\0")
 
@@ -227,8 +230,8 @@ class PagedFile(NewFile):
 def _overlaps(
     begin: int, length: int, among: Container[int] | None = None
 ) -> Iterator[tuple[int, slice, slice]]:
-    """The pages that some bytes touch, all or those `among` some: number, part of the page, part of
-    the bytes."""
+    """Generate the pages that a byte range touches, optionally only those in `among`: number, slice
+    of the page, slice of the range."""
     end = begin + length
     touched = range(begin // PAGE, -(-end // PAGE))
     for page in touched if among is None else [page for page in touched if page in among]:
@@ -238,8 +241,8 @@ def _overlaps(
 
 
 class PiecedArray:
-    """An array of a shape and dtype, of which the `pieces` come in the order of memory. Who asks
-    for it takes them: that can be done once."""
+    """An array of given shape and dtype whose `pieces` are generated in memory order. It can be
+    read only once."""
 
     def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any], pieces: Iterable[Array]):
         self.shape, self.dtype, self.ndim = shape, dtype, len(shape)
@@ -249,28 +252,28 @@ class PiecedArray:
 
     @classmethod
     def of(cls, array: Array) -> PiecedArray:
-        """One that is there, as a single piece."""
+        """Return an existing array as a single piece."""
         return cls(array.shape, array.dtype, [array])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
-        """The whole."""
+        """Return the whole array."""
         whole = self._read(self.nbytes).view(self.dtype).reshape(self.shape)
         return whole if dtype is None else whole.astype(dtype, copy=False)
 
     def blocks(self, nbytes: int) -> Iterator[Bytes]:
-        """Of so many bytes each; the last has what is left."""
+        """Generate blocks of `nbytes` bytes; the last may be shorter."""
         for at in range(0, self.nbytes, nbytes):
             yield self._read(min(nbytes, self.nbytes - at))
 
     def rows(self, count: int) -> Iterator[Array]:
-        """So many entries of the first axis each; the last has what is left."""
+        """Generate `count` entries of the first axis at a time; the last part may be shorter."""
         each = math.prod(self.shape[1:]) * self.dtype.itemsize
         for block in self.blocks(max(1, count * each)):
             yield block.view(self.dtype).reshape(-1, *self.shape[1:])
 
     def tiles(self, nbytes: int) -> Iterator[tuple[tuple[Any, ...], Array]]:
-        """Places of it and what stands there, of about so many bytes each: some entries along an
-        axis, the first of two axes or of fewer, else the last but one."""
+        """Generate index and values of tiles of about `nbytes` bytes: entries along one axis, the
+        first of one or two axes, else the last but one."""
         *lead, count = self.shape[: max(1, self.ndim - 1)]
         inner = self.shape[len(lead) + 1 :]
         each = math.prod(inner) * self.dtype.itemsize
@@ -278,25 +281,25 @@ class PiecedArray:
         for at in np.ndindex(*lead):
             for first in range(0, count, step):
                 last = min(first + step, count)
-                found = self._read((last - first) * each).view(self.dtype)
-                yield (*at, slice(first, last)), found.reshape(last - first, *inner)
+                values = self._read((last - first) * each).view(self.dtype)
+                yield (*at, slice(first, last)), values.reshape(last - first, *inner)
 
     def drain(self) -> None:
-        """Takes what nobody has asked for."""
+        """Consume the remaining pieces."""
         for _ in self._pieces:
             pass
 
     def _read(self, nbytes: int) -> Bytes:
-        """So many bytes more."""
-        found, size = [self._left], self._left.size
+        """Return the next `nbytes` bytes."""
+        blocks, size = [self._left], self._left.size
         while size < nbytes:
-            found.append(next(self._pieces))
-            size += found[-1].size
-        whole = np.concatenate(found) if len(found) > 2 or found[0].size else found[-1]
+            blocks.append(next(self._pieces))
+            size += blocks[-1].size
+        whole = np.concatenate(blocks) if len(blocks) > 2 or blocks[0].size else blocks[-1]
         self._left = whole[nbytes:]
         return whole[:nbytes]
 
 
 def as_bytes(array: Array) -> Bytes:
-    """The bytes of an array, in the order of memory."""
+    """Return the bytes of an array, in memory order."""
     return np.ascontiguousarray(array).reshape(-1).view(np.uint8)

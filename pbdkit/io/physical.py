@@ -1,4 +1,4 @@
-"""Results in mm, MPa and N beside the lattice's own, where the experiment has `units`."""
+"""Conversion of results to physical units, mm, MPa and N, for experiments with `units`."""
 
 from __future__ import annotations
 
@@ -20,61 +20,62 @@ if TYPE_CHECKING:
 
 IN_MM = f"_{LENGTH.unit}"
 OF_GIVEN = {"youngs_modulus": "stress unit", "thickness": "thickness unit"}
-"""What the units are called in which these are given as plain numbers."""
+"""Names of the units in which these quantities are given as plain numbers."""
 UNITS, FACTOR, TWIN_OF = "physical_units", "physical_factor", "physical_of"
-"""The attributes of a variable in lattice units: times the factor it is in those units; and of what
-stands beside a variable, its name."""
+"""Attributes of a variable in lattice units: its physical unit and the factor to it; and the
+attribute of a converted copy with the name of the original."""
 
 
 class Physical:
-    """What `units` makes of a dataset; nothing where there are none.
+    """Physical units of the variables of a dataset; without `units` nothing changes.
 
-    Stresses, forces and energies, which no lattice has without a modulus, are in MPa, N and mJ, and
-    say what they are counted in on the lattice. All else keeps its values, and says its scale;
-    lengths but the positions, the bulk of a file, stand there in mm too.
+    Stresses, forces and energies, which need a modulus, are stored in MPa, N and mJ with their
+    lattice units as attributes. All other variables keep their values and have the factor as an
+    attribute; lengths, except the large positions, are also stored in mm.
     """
 
     def __init__(self, units: Units | None) -> None:
         self._units = units
 
     def scaled(self, diagnostic: Diagnostic) -> Iterator[tuple[Variable, float]]:
-        """The variables of a diagnostic, and by what their values are to be multiplied."""
+        """Generate the variables of a diagnostic, each with the factor for its values."""
         for variable in diagnostic.variables():
             quantity = QUANTITIES.get(variable.units)
-            if quantity and quantity.youngs_modulus and self._gave(diagnostic, quantity):
+            if quantity and quantity.youngs_modulus and self._defines_units(diagnostic, quantity):
                 assert self._units is not None
-                own: dict[str, Any] = {"lattice_units": quantity.lattice}
+                lattice: dict[str, Any] = {"lattice_units": quantity.lattice}
                 for name, unit in OF_GIVEN.items():
-                    own["lattice_units"] = own["lattice_units"].replace(unit, name)
-                own["lattice_factor"] = 1.0 / self._units.scale(quantity)
-                attributes = variable.attributes | own
+                    lattice["lattice_units"] = lattice["lattice_units"].replace(unit, name)
+                lattice["lattice_factor"] = 1.0 / self._units.scale(quantity)
+                attributes = variable.attributes | lattice
                 factor = (self._units.value("length") or 1.0) ** quantity.length
                 yield replace(variable, units=quantity.unit, attributes=attributes), factor
             else:
                 yield variable, 1.0
 
-    def _gave(self, diagnostic: Diagnostic, quantity: Quantity) -> bool:
-        """Whether the diagnostic's modulus, and thickness where it counts, are those of `units`."""
+    def _defines_units(self, diagnostic: Diagnostic, quantity: Quantity) -> bool:
+        """Return whether the diagnostic's modulus, and thickness where needed, are those of
+        `units`."""
         if self._units is None or self._units.lacks(quantity):
             return False
-        taken = [n for n in ("youngs_modulus", "thickness") if getattr(quantity, n)]
-        return {*taken} <= {*given_by_units(diagnostic)} and all(
-            math.isclose(getattr(diagnostic, n), self._units.value(n) or 0.0) for n in taken
+        fields = [n for n in ("youngs_modulus", "thickness") if getattr(quantity, n)]
+        return {*fields} <= {*given_by_units(diagnostic)} and all(
+            math.isclose(getattr(diagnostic, n), self._units.value(n) or 0.0) for n in fields
         )
 
     def columns(self, columns: Iterable[Column]) -> list[Column]:
-        """The same with a word on their units, their scales, and what stands beside them. Raises
-        PluginError where a name is taken."""
-        found = list(map(_explained, columns))
+        """Return the columns with their scales, comments on units, and the copies in mm. Raises
+        PluginError where a name is in use."""
+        entries = list(map(_with_comment, columns))
         if self._units is None:
-            return found
-        scale, names = self._units.value("length") or 1.0, {column.name for column in found}
-        for n, column in enumerate(found):
+            return entries
+        scale, names = self._units.value("length") or 1.0, {column.name for column in entries}
+        for n, column in enumerate(entries):
             quantity = QUANTITIES.get(column.units)
             if quantity is None or quantity.youngs_modulus:
                 continue
-            said = {UNITS: quantity.unit, FACTOR: scale**quantity.length}
-            found[n] = replace(column, more=column.more | said)
+            scales = {UNITS: quantity.unit, FACTOR: scale**quantity.length}
+            entries[n] = replace(column, extra=column.extra | scales)
             if quantity is LENGTH and column.name != "position":
                 twin = f"{column.name}{IN_MM}"
                 if twin in names:
@@ -82,43 +83,43 @@ class Physical:
                         f"the variable '{twin}' stands where '{column.name}' in {LENGTH.unit} does;"
                         " give it another name"
                     )
-                more = column.more | {TWIN_OF: column.name}
-                found.append(replace(column, name=twin, units=LENGTH.unit, more=more))
-        return found
+                attributes = column.extra | {TWIN_OF: column.name}
+                entries.append(replace(column, name=twin, units=LENGTH.unit, extra=attributes))
+        return entries
 
 
-def _explained(column: Column) -> Column:
-    """A column that says of which given number its units are."""
-    given = [
+def _with_comment(column: Column) -> Column:
+    """Return a column whose comment names the given quantity that defines its units."""
+    notes = [
         f"{unit}: that of {n} as it is given"
         for n, unit in OF_GIVEN.items()
         if unit in column.units
     ]
-    return replace(column, comment="; ".join(given)) if given else column
+    return replace(column, comment="; ".join(notes)) if notes else column
 
 
-class Twins:
-    """What stands beside the variables of a dataset with these columns."""
+class ConvertedCopies:
+    """The converted copies of the variables of a dataset."""
 
     def __init__(self, columns: list[Column]) -> None:
-        factors = {c.name: c.more[FACTOR] for c in columns if FACTOR in c.more}
-        of = {c.more[TWIN_OF]: c.name for c in columns if TWIN_OF in c.more}
+        factors = {c.name: c.extra[FACTOR] for c in columns if FACTOR in c.extra}
+        of = {c.extra[TWIN_OF]: c.name for c in columns if TWIN_OF in c.extra}
         self._of = {name: (twin, factors[name]) for name, twin in of.items()}
 
-    def beside(self, values: Values) -> Values:
-        """The values, and theirs."""
-        wanted = {self._of[name]: value for name, value in values.items() if name in self._of}
-        return values | {name: np.asarray(v) * factor for (name, factor), v in wanted.items()}
+    def add_to(self, values: Values) -> Values:
+        """Return the values together with the converted copies."""
+        lengths = {self._of[name]: value for name, value in values.items() if name in self._of}
+        return values | {name: np.asarray(v) * factor for (name, factor), v in lengths.items()}
 
 
 def in_physical_units(dataset: xarray.Dataset) -> xarray.Dataset:
-    """The dataset with every variable that says its scale in those units, by its own name."""
-    found = dataset.drop_vars([n for n, v in dataset.variables.items() if TWIN_OF in v.attrs])
-    for name, variable in found.variables.items():
-        said: dict[Any, Any] = dict(variable.attrs)
-        if UNITS in said and FACTOR in said:
-            factor = float(said.pop(FACTOR))
-            said |= {"units": said.pop(UNITS), "lattice_units": said["units"]}
-            said["lattice_factor"] = 1.0 / factor
-            found[name] = (variable.dims, variable.values * factor, said)
-    return found.set_coords([name for name in dataset.coords if name in found.variables])
+    """Return the dataset with every variable that has a scale converted, under its own name."""
+    converted = dataset.drop_vars([n for n, v in dataset.variables.items() if TWIN_OF in v.attrs])
+    for name, variable in converted.variables.items():
+        attributes: dict[Any, Any] = dict(variable.attrs)
+        if UNITS in attributes and FACTOR in attributes:
+            factor = float(attributes.pop(FACTOR))
+            attributes |= {"units": attributes.pop(UNITS), "lattice_units": attributes["units"]}
+            attributes["lattice_factor"] = 1.0 / factor
+            converted[name] = (variable.dims, variable.values * factor, attributes)
+    return converted.set_coords([name for name in dataset.coords if name in converted.variables])

@@ -20,7 +20,7 @@ from pbdkit.errors import AccuracyWarning, PluginError, WarningText
 from pbdkit.io import layout
 from pbdkit.io.checkpoint import RecordedSteps
 from pbdkit.io.layout import Column, Values, When, diagnostic_column
-from pbdkit.io.physical import Physical, Twins
+from pbdkit.io.physical import ConvertedCopies, Physical
 from pbdkit.io.sinks import MemorySink, Sink
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import FRAME
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class RecordedVariables:
-    """The numbers and diagnostics of a scene that go into its dataset."""
+    """The state variables and diagnostics of a scene that are recorded in its dataset."""
 
     def __init__(self, scene: Scene) -> None:
         experiment = scene.experiment
@@ -54,27 +54,27 @@ class RecordedVariables:
 
     @cached_property
     def every_step(self) -> bool:
-        """Whether anything is measured at every step."""
+        """Return whether any diagnostic is measured at every step."""
         return any(layout.when_measured(d) is When.STEP for d in self._diagnostics)
 
     @cached_property
     def shows_leaders(self) -> bool:
-        """Whether anything is measured of each leader group."""
+        """Return whether any variable has a value for each leader group."""
         return self._shows("leader_group")
 
     @cached_property
     def shows_loads(self) -> bool:
-        """Whether anything is measured of each load."""
+        """Return whether any variable has a value for each load."""
         return self._shows("load")
 
     @cached_property
     def shows_obstacles(self) -> bool:
-        """Whether anything is measured of each obstacle."""
+        """Return whether any variable has a value for each obstacle."""
         return self._shows("obstacle")
 
     @cached_property
     def shows_principal(self) -> bool:
-        """Whether principal values are measured."""
+        """Return whether any variable holds principal values."""
         return self._shows("principal")
 
     def _shows(self, dim: str) -> bool:
@@ -82,7 +82,7 @@ class RecordedVariables:
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """The lengths of the dimensions that are known before the first step."""
+        """Lengths of the dimensions that are known before the first step."""
         scene = self._scene
         sizes = {"particle": scene.raster.count, "axis": scene.axes, "index": scene.axes}
         if scene.experiment.shows_bonds:
@@ -98,24 +98,27 @@ class RecordedVariables:
         return sizes | {name: len(values) for name, values in self.coordinates.items()}
 
     def columns(self) -> list[Column]:
-        """Theirs. Raises PluginError for names that are taken, and for dimensions that nobody gives
-        a length."""
-        taken, columns = layout.reserved_names(), list(self._remembered)
+        """Return the columns of state variables and diagnostics. Raises PluginError for names in
+        use, and for dimensions of unknown length."""
+        names, columns = layout.reserved_names(), list(self._remembered)
         for column in columns:
-            _refuse_taken(
-                column.name, taken, f"a part remembers '{column.name}' of each {column.dims[-1]}"
+            _reserve_name(
+                column.name, names, f"a part remembers '{column.name}' of each {column.dims[-1]}"
             )
         for diagnostic in self._diagnostics:
-            own, whose = diagnostic.coordinates(), f"Diagnostic '{diagnostic.type}' declares"
-            for name in (*own, *filter(None, [diagnostic.own_dimension])):
-                _refuse_taken(name, taken, f"{whose} the dimension '{name}'")
-            columns += [layout.coordinate(n, n, v.dtype.str[1:]) for n, v in own.items()]
+            coordinates, whose = (
+                diagnostic.coordinates(),
+                f"Diagnostic '{diagnostic.type}' declares",
+            )
+            for name in (*coordinates, *filter(None, [diagnostic.own_dimension])):
+                _reserve_name(name, names, f"{whose} the dimension '{name}'")
+            columns += [layout.coordinate(n, n, v.dtype.str[1:]) for n, v in coordinates.items()]
             if diagnostic.own_dimension:
                 columns.append(layout.own_coordinate(diagnostic))
-            known = {*self.sizes, "time", "step", diagnostic.own_dimension}
+            dims = {*self.sizes, "time", "step", diagnostic.own_dimension}
             for variable, _ in self.physical.scaled(diagnostic):
-                _refuse_taken(variable.name, taken, f"{whose} the variable '{variable.name}'")
-                if unknown := [dim for dim in variable.dims if dim not in known]:
+                _reserve_name(variable.name, names, f"{whose} the variable '{variable.name}'")
+                if unknown := [dim for dim in variable.dims if dim not in dims]:
                     raise PluginError(
                         f"{whose} the variable '{variable.name}' with the dimension "
                         f"'{unknown[0]}', which it gives no values"
@@ -125,79 +128,80 @@ class RecordedVariables:
 
     @cached_property
     def coordinates(self) -> dict[str, Any]:
-        """Those of the diagnostics, by name."""
+        """Coordinates of the diagnostics, by name."""
         return {n: values for d in self._diagnostics for n, values in d.coordinates().items()}
 
-    def remembered(self, now: Moment, *, first: bool) -> Values:
-        """What is remembered and changes and, the `first` time, what stays; of particles it is of
-        the body, NaN at frame points unless whole. Raises FloatingPointError for what changes and
-        is not finite."""
+    def remembered(self, moment: Moment, *, first: bool) -> Values:
+        """Return the changing state variables and, the `first` time, the constant ones; NaN at
+        frame points for floats. Raises FloatingPointError for changing ones that are not finite."""
         values: Values = {}
         for column in (c for c in self._remembered if c.grows or first):
-            value = now.remembered(column.name)
+            value = moment.remembered(column.name)
             if column.grows and not np.isfinite(value).all():
-                raise FloatingPointError(f"{column.name} at step {now.step}")
+                raise FloatingPointError(f"{column.name} at step {moment.step}")
             of_body = column.dims[-1] == "particle" and value.dtype.kind == "f"
-            values[column.name] = np.where(now.body, value, np.nan) if of_body else value
+            values[column.name] = np.where(moment.body, value, np.nan) if of_body else value
         return values
 
     def diagnosed(
-        self, when: When, now: Moment, which: Callable[[Diagnostic], bool] = lambda _: True
+        self, when: When, moment: Moment, which: Callable[[Diagnostic], bool] = lambda _: True
     ) -> Values:
-        """What the diagnostics of that time measure, by variable; of all, or of those `which`.
+        """Measure the diagnostics of that time, by variable; all, or those selected by `which`.
 
         Raises PluginError for another shape than declared, and FloatingPointError for what is not
         finite; at the end such values stay: the run may have ended because of them.
         """
         values: Values = {}
-        told = "at the end" if when is When.END else f"at step {now.step}"
+        occasion = "at the end" if when is When.END else f"at step {moment.step}"
         for n, diagnostic in enumerate(self._diagnostics):
             if layout.when_measured(diagnostic) is not when or not which(diagnostic):
                 continue
-            sizes, own = dict(self.sizes), diagnostic.own_dimension
-            with blaming(diagnostic, told, "diagnostics", n):
-                found = as_values(diagnostic.measure(now), "measure")
+            sizes, dimension = dict(self.sizes), diagnostic.own_dimension
+            with blaming(diagnostic, occasion, "diagnostics", n):
+                results = as_values(diagnostic.measure(moment), "measure")
                 for (variable, factor), value in zip(
-                    self.physical.scaled(diagnostic), found, strict=True
+                    self.physical.scaled(diagnostic), results, strict=True
                 ):
-                    if own in variable.dims and np.ndim(value) == len(variable.dims):
+                    if dimension in variable.dims and np.ndim(value) == len(variable.dims):
                         # The first variable that has it gives its length, the others keep to it.
-                        sizes.setdefault(own, np.shape(value)[variable.dims.index(own)])
+                        sizes.setdefault(dimension, np.shape(value)[variable.dims.index(dimension)])
                     shape = tuple(sizes.get(dim, -1) for dim in variable.dims)
                     if np.shape(value) != shape:
                         raise ValueError(
                             f"'{variable.name}' has the shape {np.shape(value)}, not {shape}"
                         )
                     if when is not When.END:
-                        _refuse_infinite(variable, value, now, self._scene.raster.particle_offset)
+                        _refuse_infinite(
+                            variable, value, moment, self._scene.raster.particle_offset
+                        )
                     values[variable.name] = (
                         np.array(value) if factor == 1.0 else np.multiply(value, factor)
                     )
-            if own in sizes:
-                values[own] = np.arange(1, sizes[own] + 1)
+            if dimension in sizes:
+                values[dimension] = np.arange(1, sizes[dimension] + 1)
         return values
 
 
-def _refuse_taken(name: str, taken: set[str], what: str) -> None:
-    """Raises PluginError for a name that stands in the dataset already; afterwards it does."""
-    if name in taken:
+def _reserve_name(name: str, names: set[str], what: str) -> None:
+    """Add a name to those in use. Raises PluginError where it is among them already."""
+    if name in names:
         raise PluginError(f"{what}, and that name is taken in the dataset; give it another")
-    taken.add(name)
+    names.add(name)
 
 
-def _refuse_infinite(variable: Variable, value: Any, now: Moment, before: int) -> None:
-    fine = variable.is_recordable(value, now.inside)
-    if not fine.all():
-        place = np.argwhere(~fine)[0]
+def _refuse_infinite(variable: Variable, value: Any, moment: Moment, offset: int) -> None:
+    valid = variable.is_recordable(value, moment.inside)
+    if not valid.all():
+        place = np.argwhere(~valid)[0]
         whose = (
-            f"particle {before + place[0] + 1}" if variable.dims[:1] == ("particle",) else "the run"
+            f"particle {offset + place[0] + 1}" if variable.dims[:1] == ("particle",) else "the run"
         )
-        raise FloatingPointError(f"{variable.name} of {whose} at step {now.step}")
+        raise FloatingPointError(f"{variable.name} of {whose} at step {moment.step}")
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended; `certificate` says of an equilibrium how far it can be off."""
+    """Outcome of a run; `certificate` holds the error bound of an equilibrium."""
 
     status: str
     stop_reason: str
@@ -206,27 +210,29 @@ class RunOutcome:
 
 
 class Recorder:
-    """Records the run of one scene into a sink; `seen` decides how it goes on."""
+    """Records the run of one scene into a sink; `seen` are the last steps observed and recorded."""
 
     def __init__(self, scene: Scene, sink: Sink) -> None:
         self._scene, self.sink = scene, sink
         self._tables, self._measured = Tables(scene), RecordedVariables(scene)
         self._columns = columns_of(scene)
-        self._twins = Twins(self._columns)
+        self._copies = ConvertedCopies(self._columns)
         self.seen = RecordedSteps()
         self.warnings: tuple[str, ...] = ()
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
-        """Hands over the columns and everything that is known before the first step, or instead of
-        it the `history` of a run that is gone on with."""
+        """Pass the columns and initial values to the sink, or instead of these the `history` of a
+        run that is continued."""
         count = self._scene.experiment.record_count
         planned = {"time": count, "step": max(count, self._scene.experiment.steps + 1)}
         self.sink.begin(self._columns, self._measured.sizes, planned)
-        for values in map(self._twins.beside, self.known()) if history is None else history:
+        for values in (
+            map(self._copies.add_to, self.initial_values()) if history is None else history
+        ):
             self.sink.put(values)
 
-    def known(self) -> Iterator[Values]:
-        """What is known before the first step; made one after the other, and not all at once."""
+    def initial_values(self) -> Iterator[Values]:
+        """Generate the values known before the first step, one after the other to save memory."""
         raster, scene = self._scene.raster, self._scene
         numbers = raster.particle_offset + np.arange(1, raster.count + 1)
         yield {"particle": numbers, "number": numbers}
@@ -255,64 +261,67 @@ class Recorder:
         yield self._measured.coordinates
 
     @np.errstate(all="ignore")
-    def observe(self, state: State, *, last: bool = False, within: float | None = None) -> None:
-        """Takes what is wanted of this step; positions too of the `last` of a run that stops before
-        its end, which may have come before without that; else a step that was seen is left out.
-        An equilibrium `within` a step is recorded with that moment as its time. Raises
-        FloatingPointError where a recorded value has left the finite numbers; nothing of that step
-        is kept."""
-        if (state.step if within is None else within) > self.seen.step or last:
-            self._put(state, self._taken(state, last, within))
+    def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
+        """Record what is due at this step.
+
+        The `last` state of a run that stops early is recorded in any case, even if it was observed
+        before; otherwise an observed step is skipped. `time` is that of an equilibrium within a
+        step. Raises FloatingPointError where a recorded value is not finite; then nothing of the
+        step is recorded.
+        """
+        if (state.step if time is None else time) > self.seen.step or last:
+            self._put(state, self._record_of(state, last, time))
 
     def _put(self, state: State, values: Values) -> None:
         if values:
-            self.sink.put(self._twins.beside(values))
-        now = values.get("time", state.step)
-        self.seen = RecordedSteps(now, now if "time" in values else self.seen.recorded)
+            self.sink.put(self._copies.add_to(values))
+        time = values.get("time", state.step)
+        self.seen = RecordedSteps(time, time if "time" in values else self.seen.recorded)
 
-    def _taken(self, state: State, last: bool, within: float | None = None) -> Values:
-        """What is wanted of a step."""
-        moment = StateMoment(state, self._tables, within=within)
+    def _record_of(self, state: State, last: bool, time: float | None = None) -> Values:
+        """Return the values to be recorded at a step."""
+        moment = StateMoment(state, self._tables, time=time)
         values: Values = {}
-        experiment, now = self._scene.experiment, state.step if within is None else within
-        late = last and now > self.seen.recorded
-        # The first state is always recorded, of a run that does not begin with step 0 too.
-        planned = within is not None or experiment.records(state.step) or self.seen.recorded < 0
+        experiment, within_step = self._scene.experiment, time is not None
+        time = state.step if time is None else time
+        late = last and time > self.seen.recorded
+        # The first state is always recorded, also of a run that does not begin with step 0.
+        planned = within_step or experiment.records(state.step) or self.seen.recorded < 0
         recorded = late or (not last and planned)
         if recorded:
             position = moment.position()
             if not np.isfinite(position).all():
-                before = self._scene.raster.particle_offset
+                offset = self._scene.raster.particle_offset
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
-                raise FloatingPointError(f"particle {before + row + 1} at step {state.step}")
-            values = {"time": now, "position": position, "kind": moment.kind()}
+                raise FloatingPointError(f"particle {offset + row + 1} at step {state.step}")
+            values = {"time": time, "position": position, "kind": moment.kind()}
             values |= self._measured.remembered(moment, first=self.seen.recorded < 0)
             values |= self._diagnosed(When.RECORD, moment)
         stepped = recorded or experiment.solver.makes_steps
         if self._measured.every_step and stepped and not last:
-            values |= {"step": now} | self._diagnosed(When.STEP, moment)
+            values |= {"step": time} | self._diagnosed(When.STEP, moment)
         return values
 
     def _diagnosed(self, when: When, moment: StateMoment) -> Values:
         return self._measured.diagnosed(when, moment)
 
     def finish(self, state: State, outcome: RunOutcome, prediction: dict[str, Any]) -> None:
-        """Hands over what is known at the end, and the attributes, with what was predicted before
-        the first step; `warnings` says what the user should know of the last state."""
+        """Record the final values, and the attributes with the prediction made before the first
+        step; `warnings` then holds warnings about the last state."""
         # Where a run diverged, what broke since the last record is no result.
         diverged, recorded = outcome.status == "diverged", self.seen.recorded
         if state.step < recorded < state.step + 1:
-            moment = StateMoment(state, self._tables, within=recorded)
+            moment = StateMoment(state, self._tables, time=recorded)
         else:
-            known = int(recorded) if diverged else state.step
-            moment = StateMoment(state, self._tables, known)
+            latest = int(recorded) if diverged else state.step
+            moment = StateMoment(state, self._tables, latest)
         if not diverged and (warning := self._inside_out(state)):
             self.warnings = (WarningText(warning, AccuracyWarning),)
         if self._scene.has_fracture:
             steps, strains = moment.broken_step(), moment.broken_strain()
             self.sink.put({"broken_step": steps, "broken_strain": strains})
         with np.errstate(all="ignore"):
-            self.sink.put(self._twins.beside(self._diagnosed(When.END, moment)))
+            self.sink.put(self._copies.add_to(self._diagnosed(When.END, moment)))
         self.sink.finish(self._attributes(outcome, prediction))
 
     def _inside_out(self, state: State) -> str | None:
@@ -329,7 +338,7 @@ class Recorder:
 
 
 def provenance_of(experiment: Experiment) -> dict[str, str]:
-    """Return the attributes that say what a dataset was made of, and by which versions."""
+    """Return the attributes with the experiment and the versions that made a dataset."""
     return {
         "Conventions": layout.CONVENTIONS,
         "schema_version": layout.SCHEMA_VERSION,
@@ -341,16 +350,16 @@ def provenance_of(experiment: Experiment) -> dict[str, str]:
 
 
 class Snapshots:
-    """Labelled states of a scene, as a dataset of its run has them at one time."""
+    """Builds labelled datasets of single states of a scene, as its run has them at one time."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._tables = scene, Tables(scene)
         self._measured = RecordedVariables(scene)
         self._columns = {column.name: column for column in columns_of(scene)}
-        shown = diagnostic_column(Displacement().variables()[0], Displacement)
-        self._columns.setdefault(shown.name, shown)
-        known = Recorder(scene, MemorySink()).known()
-        labels = {name: value for values in known for name, value in values.items()}
+        displacement = diagnostic_column(Displacement().variables()[0], Displacement)
+        self._columns.setdefault(displacement.name, displacement)
+        initial = Recorder(scene, MemorySink()).initial_values()
+        labels = {name: value for values in initial for name, value in values.items()}
         dims = {"particle", "axis", "index", "bond", "end"}
         self._labels = {
             name: self._variable(name, value)
@@ -380,7 +389,7 @@ class Snapshots:
 
 
 def columns_of(scene: Scene) -> list[Column]:
-    """Those of the scene's dataset."""
+    """Return the columns of a scene's dataset."""
     measured = RecordedVariables(scene)
     wanted = (
         scene.experiment.shows_bonds,
@@ -391,9 +400,9 @@ def columns_of(scene: Scene) -> list[Column]:
         measured.shows_obstacles,
         measured.shows_principal,
     )
-    some = chain(*compress(layout.optional_columns(), wanted))
-    all_of_them = [*layout.base_columns(scene.axes), *some, *measured.columns()]
-    columns = measured.physical.columns(all_of_them)
+    optional = chain(*compress(layout.optional_columns(), wanted))
+    lattice_columns = [*layout.base_columns(scene.axes), *optional, *measured.columns()]
+    columns = measured.physical.columns(lattice_columns)
     record = scene.experiment.record
     if record.dtype == "float32":
         columns = [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pbdkit.errors import ExperimentError
-from pbdkit.io.atomic_file import kind_of, written
+from pbdkit.io.atomic_file import kind_of, open_atomic
 from pbdkit.io.open import fault_of
 from pbdkit.io.paged_file import PagedFile
 from pbdkit.io.run_store import make_room
@@ -39,7 +39,7 @@ def save(dataset: xarray.Dataset, path: str | Path, *, force: bool = False) -> P
         Where the file cannot be written.
     """
     file = Path(path)
-    refuse_taken(file, force=force)
+    refuse_existing(file, force=force)
     if fault := fault_of(dataset):
         raise ExperimentError(
             f"save: the dataset {fault.partition(':')[0]}, which a result needs; parts and tables "
@@ -50,7 +50,7 @@ def save(dataset: xarray.Dataset, path: str | Path, *, force: bool = False) -> P
 
 
 def write_dataset(dataset: xarray.Dataset, path: Path, *, replace: bool) -> None:
-    """Write a dataset whole and sealed, or not at all. Raises WriteError."""
+    """Write a dataset as a complete, sealed file, or not at all. Raises WriteError."""
     import h5netcdf
     import h5py
     from xarray.backends import H5NetCDFStore
@@ -60,16 +60,16 @@ def write_dataset(dataset: xarray.Dataset, path: Path, *, replace: bool) -> None
         if variable.encoding.get("zlib"):
             plain[name].encoding["zlib"] = True
     with (
-        written(path, PagedFile, replace=replace) as file,
+        open_atomic(path, PagedFile, replace=replace) as file,
         h5py.File(file, "w", track_order=True) as content,
-        h5netcdf.File(content, "w") as made,
+        h5netcdf.File(content, "w") as target,
     ):
-        plain.dump_to_store(H5NetCDFStore(made, autoclose=False))
+        plain.dump_to_store(H5NetCDFStore(target, autoclose=False))
 
 
-def refuse_taken(path: Path, *, force: bool) -> None:
-    """Raise ExperimentError where no file is to be written: beside an unfinished run and over a
-    file without `force`, and over what is no plain file."""
+def refuse_existing(path: Path, *, force: bool) -> None:
+    """Raise ExperimentError where a path cannot be written: beside an unfinished run and over a
+    file without `force`, and over anything that is not a plain file."""
     try:
         kind = kind_of(path)
     except OSError as error:

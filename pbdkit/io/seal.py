@@ -25,18 +25,18 @@ from pbdkit.io.atomic_file import write_all
 from pbdkit.untrusted_files import check_declared
 
 BLOCK = 2**20
-"""Bytes a digest, at most: to read anything, so many are read at most besides."""
+"""Maximum number of bytes of a digest, and so of the bytes read in addition to those requested."""
 MARK = b"pbdkit seal 2\n\0\0"
 FOOT = struct.Struct("<QQ16s16s")
-"""The end of the file: bytes of content, number of digests, digest of both and of the table before
-them, mark."""
+"""End of the file: bytes of content, number of digests, digest of both and of the table, and the
+mark."""
 ROW = np.dtype([("stop", "<u8"), ("digest", "<u8"), ("values", "<u8")])
-"""A row of the table: where an extent ends, which begins where the one before ends, its digest, and
-whether it holds values alone, and nothing that HDF5 says of them."""
+"""Row of the table: end of an extent, which begins at the end of the previous one, its digest, and
+whether it holds only values, without structure of HDF5."""
 
 
 class BrokenSealError(StorageError):
-    """A result is not what was written; the text says which and where."""
+    """A result differs from what was written; the message names file and position."""
 
 
 class ByteRange(NamedTuple):
@@ -48,25 +48,25 @@ class ByteRange(NamedTuple):
 
 
 class Seal(NamedTuple):
-    """The digests of all the extents of some content."""
+    """The digests of all extents of a file's content."""
 
     size: int
     table: NDArray[Any]
 
     def foot(self) -> bytes:
-        """What stands behind the table."""
+        """Return the bytes that follow the table."""
         counts = struct.pack("<QQ", self.size, len(self.table))
-        own = xxhash.xxh3_128_digest(counts + self.table.tobytes())
-        return FOOT.pack(self.size, len(self.table), own, MARK)
+        checksum = xxhash.xxh3_128_digest(counts + self.table.tobytes())
+        return FOOT.pack(self.size, len(self.table), checksum, MARK)
 
 
 def digest(data: Any) -> int:
-    """Of bytes: xxh3, 64 bits."""
+    """Return the xxh3 digest of bytes, 64 bits."""
     return int(xxhash.xxh3_64_intdigest(data))
 
 
 class SealedFile(io.RawIOBase):
-    """The content of a sealed file, each extent checked before the first byte of it is given out.
+    """The content of a sealed file; each extent is verified before its first byte is returned.
 
     Raises OSError, and BrokenSealError as soon as bytes are asked for that have changed.
     """
@@ -74,27 +74,27 @@ class SealedFile(io.RawIOBase):
     def __init__(self, path: Path, file: io.FileIO | None = None) -> None:
         self.path, self._file = path, file or path.open("rb", buffering=0)
         self.seal = seal_of(self._file)
-        """None where the file has none: then all of it is content, and nothing is checked."""
+        """None for a file without a seal: all of it is content, and nothing is verified."""
         self._size = self.seal.size if self.seal else os.fstat(self._file.fileno()).st_size
         self._place = 0
         self._unchecked = np.ones(len(self.seal.table) if self.seal else 0, bool)
 
     def readable(self) -> bool:
-        """It is."""
+        """Return True: the file supports it."""
         return True
 
     def seekable(self) -> bool:
-        """It is."""
+        """Return True: the file supports it."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """As in any file; the end is that of the content."""
+        """Set the position, as in any file; the end is that of the content."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size}[whence]
         self._place = max(0, start + offset)
         return self._place
 
     def readinto(self, buffer: Any) -> int:
-        """Checks the extents that were not, and reads."""
+        """Verify the extents that have not been verified yet, and read."""
         view = memoryview(buffer).cast("B")
         view = view[: max(0, self._size - self._place)]
         self.check(self._place, self._place + len(view))
@@ -104,14 +104,13 @@ class SealedFile(io.RawIOBase):
         return count
 
     def check_structure(self) -> None:
-        """Checks all extents that are not of values alone: what the HDF5 library believes."""
+        """Verify all extents with structure, which the HDF5 library trusts."""
         table = self.seal.table if self.seal else np.empty(0, ROW)
         for n in np.flatnonzero(table["values"] == 0).tolist():
             self.check(int(table["stop"][n]) - 1, int(table["stop"][n]))
 
     def check(self, start: int = 0, stop: int | None = None) -> None:
-        """Checks the extents of which bytes lie between two places, once each. Raises
-        BrokenSealError."""
+        """Verify the extents that overlap a range, once each. Raises BrokenSealError."""
         if self.seal is None:
             return
         stops = self.seal.table["stop"]
@@ -126,26 +125,26 @@ class SealedFile(io.RawIOBase):
             self._unchecked[n] = False
 
     def close(self) -> None:
-        """Closes the file on the disk, too."""
+        """Close the file, on the disk too."""
         self._file.close()
         super().close()
 
 
-def put_seal(file: io.FileIO, known: Iterable[ByteRange] = ()) -> None:
-    """Seals a finished file, open for reading and writing. Extents of values whose digests are
-    `known`, in their order, are not read. Raises OSError."""
-    size, known = file.seek(0, os.SEEK_END), tuple(known)
-    values = {extent.start for extent in known}
-    rows = [(e.stop, e.digest, e.start in values) for e in _gapless(file, size, known)]
+def put_seal(file: io.FileIO, extents: Iterable[ByteRange] = ()) -> None:
+    """Seal a finished file, open for reading and writing. The sorted `extents` of values with known
+    digests are not read. Raises OSError."""
+    size, extents = file.seek(0, os.SEEK_END), tuple(extents)
+    values = {extent.start for extent in extents}
+    rows = [(e.stop, e.digest, e.start in values) for e in _gapless(file, size, extents)]
     seal = Seal(size, np.array(rows, ROW))
     file.seek(size)
     write_all(file, seal.table.tobytes() + seal.foot())
 
 
-def _gapless(file: io.FileIO, size: int, known: tuple[ByteRange, ...]) -> Iterator[ByteRange]:
-    """The known extents, and between them those that fill the file."""
+def _gapless(file: io.FileIO, size: int, extents: tuple[ByteRange, ...]) -> Iterator[ByteRange]:
+    """Generate the known extents and, between them, new ones that fill the file."""
     place = 0
-    for extent in (*known, ByteRange(size, size, 0)):
+    for extent in (*extents, ByteRange(size, size, 0)):
         while place < extent.start:
             stop = min(place + BLOCK, extent.start)
             file.seek(place)
@@ -157,27 +156,27 @@ def _gapless(file: io.FileIO, size: int, known: tuple[ByteRange, ...]) -> Iterat
 
 
 def seal_of(file: io.FileIO) -> Seal | None:
-    """The seal of an open file; None where it has none. Raises BrokenSealError."""
-    whole = file.seek(0, os.SEEK_END)
-    if whole < FOOT.size:
+    """Read the seal of an open file; None where it has none. Raises BrokenSealError."""
+    length = file.seek(0, os.SEEK_END)
+    if length < FOOT.size:
         return None
-    file.seek(whole - FOOT.size)
+    file.seek(length - FOOT.size)
     foot = file.read(FOOT.size)
     size, count, _, mark = FOOT.unpack(foot)
     if mark != MARK:
         return None
-    if size + count * ROW.itemsize + FOOT.size == whole:
+    if size + count * ROW.itemsize + FOOT.size == length:
         file.seek(size)
-        found = Seal(size, np.frombuffer(file.read(count * ROW.itemsize), ROW))
-        stops = found.table["stop"]
+        seal = Seal(size, np.frombuffer(file.read(count * ROW.itemsize), ROW))
+        stops = seal.table["stop"]
         whole_table = (stops[-1] if count else 0) == size and bool((stops[1:] > stops[:-1]).all())
-        if found.foot() == foot and whole_table:
-            return found
+        if seal.foot() == foot and whole_table:
+            return seal
     raise BrokenSealError(f"{file.name}: its seal is not what was written")
 
 
 def is_whole(file: io.FileIO) -> bool:
-    """Whether an open file is sealed, and all in it is as it was written. Raises OSError."""
+    """Return whether an open file is sealed and unchanged. Raises OSError."""
     try:
         with SealedFile(Path(file.name), io.FileIO(os.dup(file.fileno()))) as content:
             content.check()
@@ -186,21 +185,24 @@ def is_whole(file: io.FileIO) -> bool:
         return False
 
 
-def opened(path: Path, mode: str = "r") -> Any:
-    """The content of a sealed file as an h5netcdf.File. Raises StorageError where it declares or
-    refers to what it should not: anybody can make a seal."""
+def open_sealed(path: Path, mode: str = "r") -> Any:
+    """Open the content of a sealed file as an h5netcdf.File.
+
+    Anyone can write a seal: declarations and references are checked, and raise StorageError where
+    they are not acceptable.
+    """
     file = SealedFile(path)
     file.check_structure()
     try:
-        return opened_in(file)
+        return open_content(file)
     except StorageError as error:
         file.close()
         raise type(error)(f"{path}: {error}") from None
 
 
-def opened_in(file: io.RawIOBase) -> Any:
-    """The netCDF-4 content of a file that is read through Python, as an h5netcdf.File. Raises
-    StorageError where it declares or refers to what it should not."""
+def open_content(file: io.RawIOBase) -> Any:
+    """Open the netCDF-4 content of a Python file object as an h5netcdf.File. Raises StorageError
+    for declarations or references that are not acceptable."""
     import h5netcdf
     import h5py
 
@@ -210,7 +212,7 @@ def opened_in(file: io.RawIOBase) -> Any:
     except BaseException:
         content.close()
         raise
-    found = h5netcdf.File(content, "r", decode_vlen_strings=True)
+    dataset = h5netcdf.File(content, "r", decode_vlen_strings=True)
     # HDF5 reads from Python here, and no more once Python has ended: by then it must be closed.
-    weakref.finalize(found, content.close)
-    return found
+    weakref.finalize(dataset, content.close)
+    return dataset

@@ -20,70 +20,70 @@ if TYPE_CHECKING:
 
 
 class Sink(ABC):
-    """Where a dataset goes while it is made. It may keep what it is given: nobody changes that
-    afterwards."""
+    """Destination of a dataset under construction. A sink may keep the values without copying: they
+    are not changed afterwards."""
 
     @abstractmethod
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """The columns to come, the sizes of the dimensions that do not grow, and how many entries
-        are planned along those that do."""
+        """Receive the columns, the sizes of the fixed dimensions, and the planned lengths of the
+        growing ones."""
 
     @abstractmethod
     def put(self, values: Values) -> None:
-        """One entry for each column that grows, or the whole of a column that does not."""
+        """Receive one entry of each growing column, or the whole of others."""
 
     @abstractmethod
     def finish(self, attributes: dict[str, str]) -> None:
-        """Nothing more comes."""
+        """Receive the attributes and complete the dataset."""
 
     @abstractmethod
     def abandon(self) -> None:
-        """The run failed: what was put is not wanted."""
+        """Discard the dataset: the run failed."""
 
 
 class KeepingSink(Sink):
-    """A sink that keeps where the run stands, so that it can be gone on with."""
+    """A sink that stores checkpoints, from which the run can be resumed."""
 
     @abstractmethod
     def due(self) -> bool:
-        """Whether it is time to."""
+        """Return whether a checkpoint is due."""
 
     @abstractmethod
     def keep(self, checkpoint: Checkpoint) -> None:
-        """After what was put; what is kept outlives `abandon`."""
+        """Store a checkpoint with the values received so far; it survives `abandon`."""
 
     @abstractmethod
     def suspend(self, checkpoint: Checkpoint) -> None:
-        """Keeps it; nothing more comes for now."""
+        """Store a checkpoint and end for now."""
 
     @abstractmethod
-    def note_end(self, checkpoint: Checkpoint) -> None:
-        """Before `finish`: from there the run can be continued to more steps."""
+    def keep_final(self, checkpoint: Checkpoint) -> None:
+        """Store the final state before `finish`, so that the run can be continued to more steps."""
 
 
 class MemorySink(Sink):
-    """A dataset in memory; `columns` and `sizes` are those that it has begun with."""
+    """A dataset in memory, with the `columns` and `sizes` received by `begin`."""
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Begin; nothing is allocated before it comes."""
+        """Begin; nothing is allocated in advance."""
         self.columns, self.sizes = columns, sizes
         self._entries: dict[str, list[Any]] = {c.name: [] for c in columns}
 
     def put(self, values: Values) -> None:
-        """Keeps what it is given."""
+        """Keep the values received."""
         for name, value in values.items():
             self._entries[name].append(value)
 
     def finish(self, attributes: dict[str, str]) -> None:
-        """Keeps the attributes."""
+        """Keep the attributes received."""
         self._attributes = attributes
 
     def abandon(self) -> None:
-        """Forgets everything."""
+        """Discard all values received."""
         self._entries = {}
 
     def dataset(self) -> xarray.Dataset:
-        """The dataset as in the file."""
+        """Return the dataset, as in a file."""
         import xarray
 
         variables = {c.name: (c.dims, self.values(c), c.attributes) for c in self.columns}
@@ -91,7 +91,7 @@ class MemorySink(Sink):
         return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)
 
     def values(self, column: Column, rows: Iterable[int] | None = None) -> Any:
-        """Return the values of a column; of one that grows those `rows`, by default all."""
+        """Return the values of a column; of a growing one the entries `rows`, by default all."""
         entries = self._entries[column.name]
         if column.grows:
             entries = entries if rows is None else [entries[row] for row in rows]
@@ -102,14 +102,14 @@ class MemorySink(Sink):
 
 
 LARGE_BYTES = 2**20
-"""Below this, handing over costs as much as writing."""
+"""Smaller values are written directly, which costs no more than a second thread."""
 MOST_WAITING, MOST_CALLS = 2, 100
-"""So many large values may wait to be written, and so many calls; then the run waits."""
+"""Maximum number of large values, and of calls, that may be pending; then the run waits."""
 
 
 class OverlappingSink(KeepingSink):
-    """Hands everything to another sink, in order, what is large and what comes while that is being
-    written in a second thread.
+    """Passes everything on to another sink, in order; large values, and what follows while they are
+    written, in a second thread.
 
     What goes wrong there is raised at the next call.
     """
@@ -121,11 +121,11 @@ class OverlappingSink(KeepingSink):
         self._keeping: Future[None] | None = None
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """At once, so that what cannot be written is known before the first step."""
+        """Begin immediately, so that errors are found before the first step."""
         self._inner.begin(columns, sizes, planned)
 
     def put(self, values: Values) -> None:
-        """Takes the values over: they must not be changed afterwards."""
+        """Take over the values, which must not be changed afterwards."""
         large = sum(np.asarray(v).nbytes for v in values.values()) >= LARGE_BYTES
         while self._waiting and self._waiting[0][1].done():
             self._waiting.popleft()[1].result()
@@ -135,30 +135,30 @@ class OverlappingSink(KeepingSink):
             self._inner.put(values)
 
     def due(self) -> bool:
-        """Not while the last one is being kept."""
+        """Return whether a checkpoint is due and none is being stored."""
         return (self._keeping is None or self._keeping.done()) and self._inner.due()
 
     def keep(self, checkpoint: Checkpoint) -> None:
-        """Beside the run, from a copy."""
+        """Store a copy of the checkpoint while the run continues."""
         self._keeping = self._hand_over(True, self._inner.keep, checkpoint.copied())
 
     def suspend(self, checkpoint: Checkpoint) -> None:
-        """When all is written."""
+        """Store a checkpoint after all values are written."""
         self._end()
         self._inner.suspend(checkpoint)
 
-    def note_end(self, checkpoint: Checkpoint) -> None:
-        """When all is written; what is known at the end only comes after it."""
+    def keep_final(self, checkpoint: Checkpoint) -> None:
+        """Store the final state after all values are written; only final values follow."""
         self._wait()
-        self._inner.note_end(checkpoint)
+        self._inner.keep_final(checkpoint)
 
     def finish(self, attributes: dict[str, str]) -> None:
-        """When all is written."""
+        """Complete the dataset after all values are written."""
         self._end()
         self._inner.finish(attributes)
 
     def abandon(self) -> None:
-        """What waits is not written."""
+        """Discard the dataset with all pending values."""
         self._thread.shutdown(cancel_futures=True)
         self._waiting.clear()
         self._inner.abandon()

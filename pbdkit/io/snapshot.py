@@ -65,11 +65,11 @@ from pbdkit.stepping.state import State, describe_bonds
 
 
 def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
-    """The first Piola-Kirchhoff stress that damage takes away, over Young's modulus: planes
-    (component × axis, sublattice, cell, cell), at each particle the mean over the given cells
-    around it by their share.
+    """Return the first Piola-Kirchhoff stress lost to damage, over Young's modulus, as planes
+    (component × axis, sublattice, cell, cell); at each particle the mean over the given cells
+    around it, weighted by their shares.
 
-    Of a cell it is -Σ ΔF ⊗ X over its corners and its area, with the forces ΔF that the damage
+    In a cell it is -Σ ΔF ⊗ X over its corners, divided by its area, with the forces ΔF that damage
     changes: the mean stress of a body under forces on its surface.
     """
     total, area = np.zeros((4, *scene.raster.shape)), np.zeros(scene.raster.shape)
@@ -91,7 +91,7 @@ def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, 
 
 
 def _places(scene: Scene, patch: Patch, corner: int, cells: NDArray[np.intp]) -> Places:
-    """Where the corners of some cells of a patch lie, counted in it."""
+    """Return the places of a corner of some cells of a patch, which are counted within it."""
     block, shape = patch.corners[corner], scene.raster.shape
     at = np.unravel_index(cells, patch.whole.shape)
     index = [n + start for n, start in zip(at, block.start, strict=True)]
@@ -102,48 +102,49 @@ def _places(scene: Scene, patch: Patch, corner: int, cells: NDArray[np.intp]) ->
 def _lost_forces(
     scene: Scene, state: State, u: Floats, patch: Patch, corner: int, place: Places
 ) -> Iterator[Any]:
-    """The forces of each other corner on one in these cells, without damage less with it."""
+    """Generate the forces of each other corner on one corner of these cells, undamaged minus
+    damaged."""
     around = Surroundings(scene, place, patch.corners[corner].sublattice)
     evaluator = Evaluator(scene)
-    here = around.here(u, state)
-    beside = scene.neighbourhood.tiling.beside
+    particle = around.here(u, state)
+    neighbours = scene.neighbourhood.tiling.beside
     parts = zip(around.slots, around.differences(u), around.neighbours(state), strict=True)
     for slot, d, to in parts:
-        sides = [_is_of(side, patch, corner) for side in beside[slot]]
+        sides = [_belongs_to(side, patch, corner) for side in neighbours[slot]]
         if to.torn is None or not any(sides):
             continue
-        own = replace(
+        damaged = replace(
             to,
             w=_of_sides(to.w, sides),
             more=tuple(_of_sides(w, sides) for w in to.more),
         )
         whole, torn = (
-            evaluator.force(_total(evaluator, d, here, one), here)
-            for one in (replace(own, torn=None), own)
+            evaluator.force(_total(evaluator, d, particle, neighbour), particle)
+            for neighbour in (replace(damaged, torn=None), damaged)
         )
         yield torn - whole
 
 
-def _total(evaluator: Evaluator, d: Any, here: Here, to: Neighbour) -> Any:
-    return summed([(evaluator.contribution(d, here.u, to), None)])
+def _total(evaluator: Evaluator, d: Any, particle: Here, neighbour: Neighbour) -> Any:
+    return summed([(evaluator.contribution(d, particle.u, neighbour), None)])
 
 
-def _is_of(side: Side, patch: Patch, corner: int) -> bool:
-    """Whether a cell beside a bond that starts at a corner is the patch's."""
+def _belongs_to(side: Side, patch: Patch, corner: int) -> bool:
+    """Return whether a cell beside a bond that starts at a corner belongs to the patch."""
     source = patch.polygon.source if side.first is None else side.first.target
     return (side.kind, source, side.start) == (patch.polygon.kind, patch.polygon.source, corner)
 
 
 def _of_sides(w: Any, sides: list[bool]) -> Any:
-    left, right = (
-        share if own else 0.0 for own, share in zip(sides, (w.left, w.right), strict=True)
+    left_share, right_share = (
+        share if on_side else 0.0 for on_side, share in zip(sides, (w.left, w.right), strict=True)
     )
-    return w._replace(left=left, right=right)
+    return w._replace(left=left_share, right=right_share)
 
 
 def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness | None:
-    """The stiffness over Young's modulus at each particle, (particle,) a component; that of the
-    rule where it is one."""
+    """Return the stiffness over Young's modulus at each particle, each component (particle,); that
+    of the rule where it is uniform."""
     rule = experiment.rule
     if not (rule.varying and rule.uses_cells):
         return material_of(rule)
@@ -154,7 +155,8 @@ def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness 
 
 
 def through_thickness_of_particles(experiment: Experiment, raster: Raster) -> Floats | float:
-    """σ_zz over σ_xx + σ_yy at each particle, (particle,); that of the rule where it is one."""
+    """Return σ_zz over σ_xx + σ_yy at each particle, (particle,); that of the rule where it is
+    uniform."""
     rule = experiment.rule
     if not isinstance(rule, Calibrated):
         return 0.0
@@ -167,40 +169,41 @@ def through_thickness_of_particles(experiment: Experiment, raster: Raster) -> Fl
 
 
 def phases_of_particles(experiment: Experiment, raster: Raster) -> NDArray[np.int64]:
-    """(particle,): which regions of the rule's hold each, a bit a region."""
+    """Return the regions of the rule that contain each particle, (particle,), a bit for each
+    region."""
     x, y = raster.reference().T
-    found, cell = np.zeros(len(x), np.int64), experiment.lattice.cell()
+    phases, cell = np.zeros(len(x), np.int64), experiment.lattice.cell()
     for bit, region in enumerate(regions_of(experiment).values()):
-        found |= (signed_distance(region, cell, x, y) <= 0.0).astype(np.int64) << bit
-    return found
+        phases |= (signed_distance(region, cell, x, y) <= 0.0).astype(np.int64) << bit
+    return phases
 
 
 Array = TypeVar("Array", bound=NDArray[Any])
 
 
 def read_only(values: Array) -> Array:
-    """The same values, as diagnostics see them: nobody writes to what others read."""
+    """Return a read-only view, for values that several diagnostics share."""
     view: Array = values.view()
     view.flags.writeable = False
     return view
 
 
 class Tables:
-    """What every moment of a scene shares: the reference, and who is around whom."""
+    """Data shared by all moments of a scene: the reference configuration and the neighbourhoods."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
 
     def at(self, moment: float) -> Tables:
-        """The same with the numbers of a moment."""
-        if (now := self.scene.at(moment)) is self.scene:
+        """Return the tables with the time-dependent constants of a moment."""
+        if (scene := self.scene.at(moment)) is self.scene:
             return self
-        found = Tables(now)
-        vars(found).update(reference=self.reference, body=self.body, inside=self.inside)
-        return found
+        tables = Tables(scene)
+        vars(tables).update(reference=self.reference, body=self.body, inside=self.inside)
+        return tables
 
     def add_reference(self, u: Floats) -> Floats:
-        """X + u, (particle, axis), in place; X is kept where it is wanted more than twice."""
+        """Add X to u, (particle, axis), in place; X is kept where it is needed more than twice."""
         experiment = self.scene.experiment
         if experiment.record_count > 2:
             u += self.reference
@@ -210,24 +213,24 @@ class Tables:
         return u
 
     def of_body(self, planes: Floats) -> Floats:
-        """The values of planes by particle, (particle, ...); NaN at frame points."""
+        """Return the values of planes by particle, (particle, ...); NaN at frame points."""
         table = self.scene.raster.table(planes)
         table[~self.body] = np.nan
         return read_only(table)
 
     @cached_property
     def reference(self) -> Floats:
-        """X, (particle, axis)."""
+        """Reference positions X, (particle, axis)."""
         return read_only(self.scene.raster.reference())
 
     @cached_property
     def body(self) -> NDArray[np.bool_]:
-        """(particle,): which are leaders or followers."""
+        """(particle,): whether the particle is a leader or follower."""
         return read_only(self.scene.raster.table_kind == FOLLOWER)
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
-        """(particle,): which particles of the body lie inside or on its outline: all but some
+        """(particle,): whether a particle of the body lies inside or on its outline: all but some
         corners of cells that it cuts."""
         scene, raster = self.scene, self.scene.raster
         if scene.cells is None or scene.cells.share is None:
@@ -240,50 +243,50 @@ class Tables:
         body, lattice = scene.experiment.body, scene.experiment.lattice
         rows = np.flatnonzero(self.body & raster.table(cut)[:, 0])
         sites = Sites(tuple(raster.site_of(rows).T), tuple(raster.reference(rows).T))
-        found = self.body.copy()
-        found[rows] = body.distance(sites) <= tolerance_of(body, lattice)
-        return read_only(found)
+        inside = self.body.copy()
+        inside[rows] = body.distance(sites) <= tolerance_of(body, lattice)
+        return read_only(inside)
 
     @cached_property
     def followers(self) -> SlotFollowers:
-        """The rule on the scene, which knows forces and energy."""
+        """The rule on the scene, for forces and energy."""
         return SlotFollowers(self.scene)
 
     @cached_property
     def stiffness(self) -> Stiffness | None:
-        """The rule's, of each particle where fields make it differ."""
+        """Stiffness of the rule, at each particle where it varies."""
         return stiffness_of_particles(self.scene.experiment, self.scene.raster)
 
     @cached_property
     def through_thickness(self) -> Floats | float:
-        """σ_zz over σ_xx + σ_yy, of each particle where fields make it differ."""
+        """σ_zz over σ_xx + σ_yy, at each particle where it varies."""
         return through_thickness_of_particles(self.scene.experiment, self.scene.raster)
 
     @cached_property
     def phase(self) -> NDArray[np.int64]:
-        """(particle,): of which material each is, by a number."""
+        """(particle,): number of the material of each particle."""
         return phases_of_particles(self.scene.experiment, self.scene.raster)
 
     @cached_property
     def surroundings(self) -> list[Surroundings]:
-        """Who is around the body's particles."""
+        """The neighbourhoods of the body's particles."""
         return blocks(self.scene)
 
 
 FLAT = 0.1
-"""Where the centres around the corners of a cell span less than this of its area they lie in line,
-as in a body of one row of cells, and tell of no slope."""
+"""Smallest area spanned by the centres around a cell's corners, relative to its own area, for which
+they define a slope; below it they are collinear, as in a body of one row of cells."""
 
 
 def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]) -> Floats:
-    """∂u_a/∂X_b as planes (2a + b, sublattice, cell, cell), from planes u and the cells with their
-    shares; 0 where no cell is."""
+    """Return ∂u_a/∂X_b as planes (2a + b, sublattice, cell, cell), from planes u and the cells with
+    their shares; 0 where there are no cells."""
     cells = list(cells)
     shape = u.shape[1:]
     area, offset, gradient = np.zeros(shape), np.zeros((2, *shape)), np.zeros((2, 2, *shape))
     for patch, share in cells:
         rest = patch.polygon.rest
-        whole, slopes = _around([np.array(d) for d in patch.differences(u)], rest)
+        whole, slopes = _mean_gradient([np.array(d) for d in patch.differences(u)], rest)
         centre = [sum(r[axis] for r in rest) / len(rest) for axis in (0, 1)]
         for corner, r in zip(patch.corners, rest, strict=True):
             corner.of(area)[...] += whole * share
@@ -291,34 +294,34 @@ def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]
                 corner.of(plane)[...] += (middle - place) * whole * share
             for plane, slope in zip(gradient, slopes, strict=True):
                 corner.of(plane)[...] += slope * share
-    some = np.where(area > 0.0, area, 1.0)
-    gradient /= some
-    offset /= some
+    divisor = np.where(area > 0.0, area, 1.0)
+    gradient /= divisor
+    offset /= divisor
     planes = gradient.reshape(4, *shape)
-    return planes - _beyond(planes, offset, cells)
+    return planes - _extrapolation(planes, offset, cells)
 
 
-def _beyond(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
-    """What a gradient changes from the particles to the centres, (4, ...)."""
+def _extrapolation(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
+    """Return the change of a gradient from the particles to the centres of cells, (4, ...)."""
     area, slope = np.zeros(gradient.shape[1:]), np.zeros((4, 2, *gradient.shape[1:]))
     for patch, share in cells:
         rest, away = patch.polygon.rest, [corner.of(offset) for corner in patch.corners]
-        at = [r + Vector(*(own - away[0])) for r, own in zip(rest, away, strict=True)]
+        at = [r + Vector(*(position - away[0])) for r, position in zip(rest, away, strict=True)]
         values = [corner.of(gradient) for corner in patch.corners]
-        whole, slopes = _around([value - values[0] for value in values], at)
+        whole, slopes = _mean_gradient([value - values[0] for value in values], at)
         usable = np.where(whole > FLAT * signed_area(rest), share, 0.0)
         for corner in patch.corners:
             corner.of(area)[...] += whole * usable
             for plane, part in zip(slope, slopes, strict=True):
                 corner.of(plane)[...] += part * usable
     slope /= np.where(area > 0.0, area, 1.0)
-    beyond: Floats = slope[:, 0] * offset[0] + slope[:, 1] * offset[1]
-    return beyond
+    change: Floats = slope[:, 0] * offset[0] + slope[:, 1] * offset[1]
+    return change
 
 
-def _around(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
-    """The area of a polygon with corners r, and area times the mean gradient of d, (component of d,
-    axis, ...)."""
+def _mean_gradient(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
+    """Return the area of a polygon with corners r, and area times the mean gradient of d,
+    (component of d, axis, ...)."""
     slopes = np.zeros((len(d[0]), 2, *d[0].shape[1:]))
     for k, value in enumerate(d):
         ahead, behind = r[(k + 1) % len(r)], r[k - 1]
@@ -327,29 +330,30 @@ def _around(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
     return signed_area(r), slopes
 
 
-def _known_beside(
-    gradient: Floats, alike: list[tuple[Patch, Floats]], cells: list[tuple[Patch, Floats]]
+def _extend_gradient(
+    gradient: Floats, phase_cells: list[tuple[Patch, Floats]], cells: list[tuple[Patch, Floats]]
 ) -> Floats:
-    """A gradient found from some cells alone, (4, ...): where none of these is, the mean of the
-    particles that share any cell with the place; NaN where they have none either."""
+    """Extend a gradient computed from some cells only, (4, ...), to particles without such cells:
+    the mean over the particles that share any cell; NaN where there is none either."""
     shape = gradient.shape[1:]
-    met, total, count = np.zeros(shape), np.zeros_like(gradient), np.zeros(shape)
-    for patch, share in alike:
+    weight, total, count = np.zeros(shape), np.zeros_like(gradient), np.zeros(shape)
+    for patch, share in phase_cells:
         for corner in patch.corners:
-            corner.of(met)[...] += share
-    known = met > 0.0
+            corner.of(weight)[...] += share
+    covered = weight > 0.0
     for patch, share in cells:
-        there_is = share > 0.0
-        for here, there in product(patch.corners, repeat=2):
-            here.of(count)[...] += there.of(known) & there_is
-            for plane, value in zip(total, gradient * known, strict=True):
-                here.of(plane)[...] += there.of(value) * there_is
+        exists = share > 0.0
+        for corner, source in product(patch.corners, repeat=2):
+            corner.of(count)[...] += source.of(covered) & exists
+            for plane, value in zip(total, gradient * covered, strict=True):
+                corner.of(plane)[...] += source.of(value) * exists
     mean = np.where(count > 0.0, total, np.nan) / np.where(count > 0.0, count, 1.0)
-    return np.where(known, gradient, mean)
+    return np.where(covered, gradient, mean)
 
 
 TURNED = -1e-6
-"""A share of the area at rest; nearer to zero it is rounding, of single precision too."""
+"""Threshold of the ratio of a cell's area to that at rest below which the cell is inverted; values
+closer to zero are rounding errors, also in single precision."""
 
 
 class StateCells(CellValues):
@@ -364,16 +368,16 @@ class StateCells(CellValues):
         *,
         intact_only: bool = False,
     ) -> Floats:
-        """Patch by patch, each with the cells of one shape."""
-        found = [np.empty(0)]
+        """Evaluate the function patch by patch, each with the cells of one shape."""
+        parts = [np.empty(0)]
         for patch in self._scene.patches:
             counted = self._intact(patch) if intact_only else patch.whole
             values = function(patch.differences(self._state.u), patch.polygon.rest)
-            found.append(np.broadcast_to(values, counted.shape)[counted])
-        return np.concatenate(found)
+            parts.append(np.broadcast_to(values, counted.shape)[counted])
+        return np.concatenate(parts)
 
     def gradient(self) -> Floats:
-        """Once a moment, whoever asks."""
+        """Return the gradient, computed once a moment."""
         return self._gradient
 
     @cached_property
@@ -386,7 +390,7 @@ class StateCells(CellValues):
         return read_only(whole.reshape(-1, 2, 2))
 
     def lost_stress(self) -> Floats | None:
-        """Found anew whenever it is called: one diagnostic does."""
+        """Return the stress lost to damage, computed at each call: only one diagnostic uses it."""
         scene, state = self._scene, self._state
         if not (scene.tears and isinstance(scene.experiment.fracture, (Softens, SoftensCells))):
             return None
@@ -406,33 +410,34 @@ class StateCells(CellValues):
     def _by_phase(
         self, phase: NDArray[Any], u: Floats, cells: list[tuple[Patch, Floats]], whole: Floats
     ) -> Floats:
-        """The gradient from the cells of a particle's own material alone: at a border it jumps.
-        Who has no such cell takes the mean of those beside it that have, if there is any."""
-        found, own = whole.copy(), self._tables.phase
-        for number in np.unique(own).tolist():
-            alike = [
+        """Return the gradient from the cells of each particle's own material alone, since it jumps
+        at interfaces. A particle without such cells has the mean of its neighbours that have some.
+        """
+        gradient, phases = whole.copy(), self._tables.phase
+        for number in np.unique(phases).tolist():
+            phase_cells = [
                 (patch, share * (patch.corners[0].of(phase[patch.polygon.kind]) == number))
                 for patch, share in cells
             ]
-            planes = _known_beside(displacement_gradient(u, alike), alike, cells)
-            within = self._tables.of_body(planes)
-            some = (own == number) & np.isfinite(within).all(axis=1)
-            found[some] = within[some]
-        return found
+            planes = _extend_gradient(displacement_gradient(u, phase_cells), phase_cells, cells)
+            values = self._tables.of_body(planes)
+            rows = (phases == number) & np.isfinite(values).all(axis=1)
+            gradient[rows] = values[rows]
+        return gradient
 
     def inside_out(self) -> str | None:
-        """A warning where cells have turned over or, if none has, corners of cells; None where none
-        has: a rule of positions does not mind, a body does. Torn cells do not count: the parts of a
-        broken body go their own ways."""
+        """Return a warning where cells, or else corners of cells, are inverted, or None. Torn cells
+        do not count: the parts of a broken body move apart."""
         remedy = "let the leaders go less far, or weaken the rule where it couples x and y"
-        if found := self._turned(area_share, "cells have turned over"):
-            return f"the last state is inside out: {found}; {remedy}"
-        if found := self._turned(corner_share, "cells have a corner that has turned over"):
-            return f"the last state is folded: {found}; {remedy}"
+        if description := self._turned(area_share, "cells have turned over"):
+            return f"the last state is inside out: {description}; {remedy}"
+        if description := self._turned(corner_share, "cells have a corner that has turned over"):
+            return f"the last state is folded: {description}; {remedy}"
         return None
 
     def _turned(self, share: Callable[..., Any], what: str) -> str | None:
-        """Of how many cells the share of the area at rest is negative, and where it is worst."""
+        """Return the number of inverted cells and the place of the worst, by their share of the
+        area at rest; None where there is none."""
         turned = total = number = 0
         worst = 0.0
         for patch in self._scene.patches:
@@ -454,7 +459,7 @@ class StateCells(CellValues):
         )
 
     def _intact(self, patch: Patch) -> NDArray[np.bool_]:
-        """Which cells of a patch have no broken bond between their corners."""
+        """Return the cells of a patch without a broken bond between their corners."""
         intact = patch.whole
         if self._state.broken_step is None:
             return intact
@@ -466,10 +471,10 @@ class StateCells(CellValues):
 
 
 class StateMoment(Moment):
-    """A state as a table; bonds that broke later than asked for count as they were before.
+    """A state as a table; bonds that broke after `no_later_than` count as intact.
 
-    An equilibrium `within` a step, at an increment of load, has the roles of that step, and the
-    numbers and loads of that moment.
+    An equilibrium within a step, at an increment of load, has a `time` of its own: the roles are
+    those of that step, constants and loads those of that time.
     """
 
     def __init__(
@@ -477,44 +482,44 @@ class StateMoment(Moment):
         state: State,
         tables: Tables,
         no_later_than: int | None = None,
-        within: float | None = None,
+        time: float | None = None,
     ) -> None:
-        self._now: float = state.step if within is None else within
-        self.step, self._within = math.ceil(self._now), within
+        self._now: float = state.step if time is None else time
+        self.step, self._time = math.ceil(self._now), time
         self._no_later_than = self.step if no_later_than is None else no_later_than
         self._state, self._tables = state, tables.at(self._now)
         self._scene, self._raster = tables.scene, tables.scene.raster
 
     def of(self, state: State, tables: Tables) -> StateMoment:
-        """The same moment of another state."""
-        return StateMoment(state, tables, self._no_later_than, self._within)
+        """Return the same moment of another state."""
+        return StateMoment(state, tables, self._no_later_than, self._time)
 
     @property
     def body(self) -> NDArray[np.bool_]:
-        """The same at every moment."""
+        """(particle,): whether the particle is a leader or follower, at every moment the same."""
         return self._tables.body
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """The same at every moment."""
+        """(particle,): whether the particle lies inside the outline, at every moment the same."""
         return self._tables.inside
 
     @cached_property
     def cells(self) -> StateCells:
-        """Made where somebody asks."""
+        """Values on the cells, computed on request."""
         return StateCells(self._state, self._tables)
 
     @cached_property
     def forces(self) -> ForceValues:
-        """Made where somebody asks."""
+        """Forces and energy, computed on request."""
         return StateForces(self._state, self._tables)
 
     def rows(self, numbers: tuple[int, ...]) -> Indices:
-        """Numbers count from 1 in the order of the rows."""
+        """Return the rows of particles by number, which count from 1 in the order of rows."""
         return np.array(numbers, np.intp) - 1
 
     def nearest(self, points: tuple[Pair, ...]) -> Indices:
-        """As leaders are selected."""
+        """Return the rows of the particles nearest to points, as leaders are selected."""
         return Selecting(self._raster).nearest(points)
 
     @cached_property
@@ -522,36 +527,37 @@ class StateMoment(Moment):
         return read_only(self._raster.table(self._state.u))
 
     def displacement(self, rows: Indices | None = None) -> Floats:
-        """The whole table is made once a moment; a few rows are made without it."""
+        """Return the displacements; the whole table is computed once a moment, a few rows without
+        it."""
         if rows is None:
             return self._u
         place = self._raster.place_of(rows)
         return read_only(np.stack([plane.ravel()[place] for plane in self._state.u], axis=1))
 
     def previous_displacement(self) -> Floats:
-        """From the buffer of the step before."""
+        """Return the displacements of the previous step."""
         return read_only(self._raster.table(self._state.previous))
 
     def reference(self, rows: Indices | None = None) -> Floats:
-        """X."""
+        """Return the reference positions X."""
         if rows is None:
             return self._tables.reference
         return read_only(self._raster.reference(rows))
 
     def position(self) -> Floats:
-        """x = X + u, (particle, axis), in float64 whatever the run's precision."""
+        """Return x = X + u, (particle, axis), in float64 whatever the run's precision."""
         return self._tables.add_reference(
             self._raster.table(self._state.u).astype(float, copy=False)
         )
 
     def kind(self) -> NDArray[np.int8]:
-        """(particle,): the role during this step."""
+        """Return the role of each particle during this step, (particle,)."""
         return kinds_at(self._raster, self._scene.leading, self.step)
 
     def sum_over_neighbours(
         self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
-        """The loop of the stepper, on the body's particles."""
+        """Sum a function over the neighbours of the body's particles, as stepping does."""
 
         def contribution(d: Any, u: Any, to: Neighbour) -> tuple[Any, ...]:
             value = function(d, to.r)
@@ -567,7 +573,7 @@ class StateMoment(Moment):
         return read_only(self._raster.table(sums[None])[:, 0])
 
     def leader_groups(self) -> tuple[LeaderRows, ...]:
-        """At time 0 those of step 1 lead."""
+        """Return the leader groups; at time 0 those active in step 1."""
         step = max(self.step, 1)
         return tuple(
             LeaderRows(read_only(each.rows), each.group.leads(step), each.axes)
@@ -575,7 +581,7 @@ class StateMoment(Moment):
         )
 
     def loads(self) -> tuple[LoadRows, ...]:
-        """As they act in this step."""
+        """Return the loads as they act in this step."""
         loads = self._scene.loads
         return tuple(
             LoadRows(read_only(each.rows), read_only(each.share), each.load.force_at(self._now))
@@ -583,29 +589,29 @@ class StateMoment(Moment):
         )
 
     def touching(self) -> tuple[TouchingRows, ...]:
-        """Found once a moment."""
+        """Return the contacts with obstacles, computed once a moment."""
         return self._touching
 
     @cached_property
     def _touching(self) -> tuple[TouchingRows, ...]:
         if not self._scene.barriers:
             return ()
-        found = Contact(self._scene).touching(self._state, self._now)
-        return tuple(TouchingRows(read_only(rows), read_only(n)) for rows, n in found)
+        contacts = Contact(self._scene).touching(self._state, self._now)
+        return tuple(TouchingRows(read_only(rows), read_only(n)) for rows, n in contacts)
 
     def broken_bonds(self) -> int:
-        """Every bond that breaks is marked on one plane, once."""
+        """Return the number of broken bonds, each of which is marked on one plane."""
         broken = self._state.broken_step
         return 0 if broken is None else int((broken >= 0).sum())
 
     def bonds(self) -> BondHistory:
-        """Made anew: seldom wanted."""
+        """Return the table of bonds with their histories, computed at each call."""
         parts = vars(describe_bonds(self._scene)).values()
         values = (*parts, self.broken_step(), self.broken_strain())
         return BondHistory(*(read_only(value) for value in values))
 
     def broken_step(self) -> NDArray[np.int32]:
-        """From the planes; none has where none can."""
+        """Return the step in which each bond broke, -1 for intact ones."""
         bonds, broken = self._scene.bonds, self._state.broken_step
         if broken is None:
             return np.full(len(bonds.ends), -1, np.int32)
@@ -613,7 +619,8 @@ class StateMoment(Moment):
         return np.where(steps > self._no_later_than, np.int32(-1), steps)
 
     def broken_strain(self) -> Floats:
-        """From the lengths, in float64 whatever the run's precision; what was cut has none."""
+        """Return the strain at breaking, in float64 whatever the run's precision; NaN for bonds
+        that were cut."""
         scene, lengths, steps = self._scene, self._state.broken_length, self.broken_step()
         if lengths is None:
             return np.full(len(steps), np.nan)
@@ -622,27 +629,27 @@ class StateMoment(Moment):
         return np.where((steps > 0) & (strains > -1.0), strains, np.nan)
 
     def remembered(self, name: str) -> NDArray[Any]:
-        """In the order of the bonds' table, or of the particles' numbers."""
+        """Return a state variable, in the order of the table of bonds, or of the particles."""
         experiment, state = self._scene.experiment, self._state
-        names = [number.name for number in bond_numbers(experiment)]
-        of_bonds = dict(zip(names, state.bond_values, strict=True))
-        names = [number.name for number in particle_numbers(experiment)]
-        of_particles = dict(zip(names, state.particle_values, strict=True))
+        labels = [number.name for number in bond_numbers(experiment)]
+        of_bonds = dict(zip(labels, state.bond_values, strict=True))
+        labels = [number.name for number in particle_numbers(experiment)]
+        of_particles = dict(zip(labels, state.particle_values, strict=True))
         if name in of_bonds:
             return read_only(self._of_bonds(of_bonds[name]))
         if name in of_particles:
             return read_only(self._raster.table(of_particles[name][None])[:, 0])
-        known = [*of_bonds, *of_particles]
-        raise ValueError(f"no part remembers '{name}'{did_you_mean(name, known)}")
+        names = [*of_bonds, *of_particles]
+        raise ValueError(f"no part remembers '{name}'{did_you_mean(name, names)}")
 
     def _of_bonds(self, planes: NDArray[Any]) -> NDArray[Any]:
-        """Values on the planes of bonds, (bond,)."""
+        """Return values on the planes of bonds by bond, (bond,)."""
         bonds = self._scene.bonds
         return np.asarray(planes.reshape(len(planes), -1)[bonds.plane, bonds.place])
 
 
 class StateForces(ForceValues):
-    """What the scene's rule makes of a state."""
+    """Forces, energy and stiffness of the scene's rule in a state."""
 
     def __init__(self, state: State, tables: Tables) -> None:
         self._state, self._tables = state, tables
@@ -650,7 +657,7 @@ class StateForces(ForceValues):
 
     @property
     def stiffness(self) -> Stiffness:
-        """The rule's, of each particle where fields make it differ."""
+        """Stiffness of the rule, at each particle where it varies."""
         stiffness = self._tables.stiffness
         if stiffness is None:
             raise ValueError(
@@ -661,11 +668,11 @@ class StateForces(ForceValues):
 
     @property
     def through_thickness(self) -> Any:
-        """The rule's, of each particle where fields make it differ."""
+        """σ_zz over σ_xx + σ_yy, at each particle where it varies."""
         return self._tables.through_thickness
 
     def on_particles(self) -> Floats:
-        """Once a moment, whoever asks."""
+        """Return the forces on particles, computed once a moment."""
         return self._on_particles
 
     @cached_property
@@ -675,7 +682,7 @@ class StateForces(ForceValues):
         return self._tables.of_body(forces)
 
     def energy(self) -> float:
-        """The rule's."""
+        """Return the energy of the rule."""
         with self._blaming_rule():
             return self._tables.followers.energy(self._u, self._state)
 

@@ -1,4 +1,4 @@
-"""SQLite files: opened for writing, or looked at without a change to anything on the disk."""
+"""Access to SQLite files, for writing or for reading without a change to anything on the disk."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ SMALLEST_PAGE = 512
 PATIENCE_S = 60.0
 """Seconds to wait for another program that has locked the file."""
 LOGS = ("-journal", "-wal")
-"""What SQLite adds to the name of the file, for commits that are not in it, or not yet."""
+"""Suffixes of the files with commits that are not yet, or no longer, in the database."""
 SHARED_MEMORY = "-shm"
 ONE_PAGE = 4096
 """Maximum size in bytes of a database in which nothing was committed."""
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the files that SQLite keeps of a database, there or not."""
-    return [path.with_name(path.name + more) for more in ("", *LOGS, SHARED_MEMORY)]
+    """Return the paths of all files that SQLite keeps of a database, whether they exist or not."""
+    return [path.with_name(path.name + suffix) for suffix in ("", *LOGS, SHARED_MEMORY)]
 
 
 def journal_mode(path: Path) -> str:
@@ -37,9 +37,9 @@ def size_of(path: Path) -> int:
 
 
 def is_database(path: Path) -> bool:
-    """Whether a file begins as an SQLite database does. Raises OSError.
+    """Return whether a file begins as an SQLite database does. Raises OSError.
 
-    Of what does not, SQLite would remove the log, should there be one.
+    SQLite would remove the log of any other file.
     """
     try:
         with path.open("rb") as file:
@@ -67,11 +67,11 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
 
 
 def look(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connection:
-    """Open a database to read one commit of it; `closing` closes it. Raises sqlite3.Error, OSError.
+    """Open a database to read one commit of it; `closing` closes it.
 
-    A connection that may write would drop a damaged write-ahead log when it is closed. What a
-    killed process was writing with a journal has to be undone before it can be read: that is done
-    in a copy.
+    A connection with write access would drop a damaged write-ahead log when it is closed. A
+    transaction that a killed process left in a journal has to be rolled back before reading: that
+    is done in a copy. Raises sqlite3.Error and OSError.
     """
     connection = closing.enter_context(contextlib.closing(connect(path, "ro")))
     try:
@@ -90,9 +90,9 @@ def look(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connection:
 
 
 def fault_of(connection: sqlite3.Connection) -> str:
-    """What SQLite finds wrong in a database, first of all; empty where nothing is."""
+    """Return the first fault that SQLite finds in a database; empty where there is none."""
     try:
-        (found,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+        (report,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     except sqlite3.DatabaseError as error:
         return str(error)
-    return "" if found == "ok" else str(found).splitlines()[-1]
+    return "" if report == "ok" else str(report).splitlines()[-1]

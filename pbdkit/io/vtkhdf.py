@@ -18,7 +18,7 @@ import numpy as np
 
 from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError
-from pbdkit.io.atomic_file import NewFile, written
+from pbdkit.io.atomic_file import NewFile, open_atomic
 from pbdkit.io.layout import broken_by
 
 if TYPE_CHECKING:
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
 
 
 PARTICLE, BOND, CELL = 0, 1, 2
-"""What a cell of the grid stands for."""
+"""Values of `part`: what a cell of the grid represents."""
 VERTEX, LINE, TRIANGLE, POLYGON, QUAD = 1, 3, 5, 7, 9
-"""The numbers that VTK gives to shapes."""
+"""VTK's numbers of cell types."""
 
 
 @dataclass(frozen=True)
 class UnstructuredGrid:
-    """First a vertex for each particle, then a line for each bond, then the polygons between
-    particles: `connectivity` are rows of the particle table, those of cell n from offsets[n] to
-    offsets[n + 1]; `types` are VTK's. `part` says what each is; `broken_step` the step in which a
-    bond, or the first of a polygon's, broke, -1 where none did, None where none can."""
+    """A vertex for each particle, a line for each bond, then the polygons between particles.
+    `connectivity` holds rows of the particle table, those of cell n from offsets[n] to offsets[n +
+    1]; `types` are VTK's; `part` is what each cell represents; `broken_step` the step in which a
+    bond, or the first bond of a polygon, broke, -1 where none did, None without fracture."""
 
     connectivity: Array
     offsets: Array
@@ -48,14 +48,15 @@ class UnstructuredGrid:
     broken_step: Array | None
 
     def of_bonds(self, values: Array, elsewhere: Any) -> Array:
-        """(cell,): values of bonds, and in all other cells that."""
-        found = np.full(len(self.part), elsewhere, values.dtype)
-        found[self.part == BOND] = values
-        return found
+        """Return values by cell: those of the bonds, and `elsewhere` in all other cells."""
+        cells = np.full(len(self.part), elsewhere, values.dtype)
+        cells[self.part == BOND] = values
+        return cells
 
 
 def grid_of(dataset: xarray.Dataset, scene: Scene | None) -> UnstructuredGrid:
-    """The grid of a dataset; without its scene, and on a lattice in space, without polygons."""
+    """Return the grid of a dataset; without its scene, and on a lattice in space, without
+    polygons."""
     count = dataset.sizes["particle"]
     has_bonds = "bond_ends" in dataset.variables
     bonds = dataset["bond_ends"].values - 1 if has_bonds else np.empty((0, 2), int)
@@ -68,24 +69,26 @@ def grid_of(dataset: xarray.Dataset, scene: Scene | None) -> UnstructuredGrid:
     broken = None
     if "broken_step" in dataset.variables:
         steps = dataset["broken_step"].values
-        own = [np.full(count, -1, steps.dtype), steps]
-        broken = np.concatenate([*own, *(_torn(rows, bonds, steps, count) for rows in polygons)])
+        steps_by_cell = [np.full(count, -1, steps.dtype), steps]
+        broken = np.concatenate(
+            [*steps_by_cell, *(_first_breaking(rows, bonds, steps, count) for rows in polygons)]
+        )
     connectivity = np.concatenate([rows.ravel() for rows in kinds]).astype(np.int64)
     offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     return UnstructuredGrid(connectivity, offsets, types, part, broken)
 
 
 def polygons_of(scene: Scene) -> list[Array]:
-    """The rows of the corners of the body's cells, (cell, corner), those of one shape together."""
-    found: dict[int, list[Array]] = {}
+    """Return the rows of the corners of the body's cells, (cell, corner), grouped by shape."""
+    corners_by_size: dict[int, list[Array]] = {}
     for patch in scene.patches:
         places = np.argwhere(patch.whole)
         corners = [
             scene.raster.rows_at(block.sublattice, *(places + block.start).T)
             for block in patch.corners
         ]
-        found.setdefault(len(corners), []).append(np.stack(corners, axis=1))
-    return [np.concatenate(rows) for rows in found.values()]
+        corners_by_size.setdefault(len(corners), []).append(np.stack(corners, axis=1))
+    return [np.concatenate(rows) for rows in corners_by_size.values()]
 
 
 def _type(rows: Array) -> int:
@@ -93,8 +96,9 @@ def _type(rows: Array) -> int:
     return shapes.get(rows.shape[1], POLYGON)
 
 
-def _torn(rows: Array, bonds: Array, steps: Array, count: int) -> Array:
-    """(cell,): the step in which the first bond between two corners of a cell broke, else -1."""
+def _first_breaking(rows: Array, bonds: Array, steps: Array, count: int) -> Array:
+    """Return the step in which the first bond between two corners of a cell broke, (cell,), else
+    -1."""
     broken = np.flatnonzero(steps >= 0)
     key = bonds[broken] @ (count, 1)
     order = np.argsort(key)
@@ -104,41 +108,42 @@ def _torn(rows: Array, bonds: Array, steps: Array, count: int) -> Array:
     for a, b in combinations(range(rows.shape[1]), 2):
         pair = np.sort(rows[:, [a, b]], axis=1) @ (count, 1)
         at = np.searchsorted(key[:-1], pair)
-        there = key[at] == pair
-        first[there] = np.minimum(first[there], when[at[there]])
+        matches = key[at] == pair
+        first[matches] = np.minimum(first[matches], when[at[matches]])
     return np.where(first == never, -1, first)
 
 
 VERSION, TYPE = (2, 2), b"UnstructuredGrid"
 BLOCK_BYTES = 2**25
-"""About so much of a variable is in memory at a time."""
+"""Approximate number of bytes of a variable that are in memory at a time."""
 CHUNK = 2**16
-"""Values in a chunk of what grows step by step."""
+"""Values in a chunk of a growing array."""
 ELSEWHERE = ("position", "time", "particle", "site", "axis", "bond_ends", "broken_step")
-"""What the grid itself says."""
+"""Variables that the grid itself contains."""
 NOT_HERE = {"i": -1, "u": 0, "f": np.nan}
-"""What stands, by the kind of number, in the cells that have no value."""
+"""Fill values by kind of number, for cells without a value."""
 
 
 def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace: bool) -> None:
-    """Writes every recorded step: the particles, the bonds, and of a `scene` the cells between
-    them, with all that the dataset knows of them. At most some steps are in memory.
+    """Write every recorded step: particles, bonds and, with a `scene`, the cells between them, with
+    all variables of the dataset.
 
-    Raises ExperimentError where there are no positions, as in a sweep that kept none, and
-    WriteError where it cannot be written; then nothing stands there, or the earlier file.
+    Only some steps are in memory at a time. Raises ExperimentError where there are no positions, as
+    in a sweep that kept none, and WriteError where the file cannot be written; then an earlier file
+    stays.
     """
     import h5py
 
     if "position" not in dataset.variables:
         raise ExperimentError("there are no positions to write: keep the variable `position`")
     grid = grid_of(dataset, scene)
-    with written(path, NewFile, replace=replace) as new, h5py.File(new, "w") as file:
+    with open_atomic(path, NewFile, replace=replace) as new, h5py.File(new, "w") as file:
         _write(file, dataset, grid)
 
 
 def _write(file: h5py.File, dataset: xarray.Dataset, grid: UnstructuredGrid) -> None:
-    for name, said in dataset.attrs.items():
-        file.attrs[name] = said if isinstance(said, str) else json.dumps(said, default=str)
+    for name, value in dataset.attrs.items():
+        file.attrs[name] = value if isinstance(value, str) else json.dumps(value, default=str)
     root = file.create_group("VTKHDF")
     root.attrs["Version"] = VERSION
     root.attrs.create("Type", np.bytes_(TYPE))
@@ -169,36 +174,40 @@ def _write(file: h5py.File, dataset: xarray.Dataset, grid: UnstructuredGrid) -> 
 
 @dataclass(frozen=True)
 class Parts:
-    """Where a variable goes."""
+    """Destination of a variable in the file."""
 
     root: h5py.Group
     name: str
     steps: int
 
     def once(self, where: str, values: Array) -> None:
-        """The same at every step; of field data the entries are tuples."""
+        """Write values that hold for every step; entries of field data are tuples."""
         self.root[f"{where}/{self.name}"] = values
         self._from(where, np.zeros(self.steps, int), values)
 
     def each(self, where: str, rows: Iterator[Array]) -> None:
-        """Values for each step; those that did not change since the last stand there once."""
+        """Write values for each step; unchanged ones are stored once."""
         last: Array | None = None
-        starts, start, length, kept = list[int](), 0, 0, None
+        starts, start, length, array = list[int](), 0, 0, None
         for values in rows:
             if last is None or not np.array_equal(values, last, equal_nan=values.dtype.kind == "f"):
-                kept = kept or self._growing(where, values)
-                kept.resize(length + len(values), axis=0)
-                kept[length:] = values
+                array = array or self._growing(where, values)
+                array.resize(length + len(values), axis=0)
+                array[length:] = values
                 start, length, last = length, length + len(values), values
             starts.append(start)
         if last is not None:
             self._from(where, np.array(starts), last)
 
     def _growing(self, where: str, values: Array) -> h5py.Dataset:
-        more = values.shape[1:]
-        chunk = (max(1, min(CHUNK, len(values))), *more)
+        trailing = values.shape[1:]
+        chunk = (max(1, min(CHUNK, len(values))), *trailing)
         return self.root.create_dataset(
-            f"{where}/{self.name}", (0, *more), values.dtype, chunks=chunk, maxshape=(None, *more)
+            f"{where}/{self.name}",
+            (0, *trailing),
+            values.dtype,
+            chunks=chunk,
+            maxshape=(None, *trailing),
         )
 
     def _from(self, where: str, starts: Array, values: Array) -> None:
@@ -211,7 +220,8 @@ class Parts:
 def _put(
     parts: Parts, values: xarray.DataArray, dims: tuple[Any, ...], grid: UnstructuredGrid
 ) -> None:
-    """A variable where it belongs; what is of neither particles nor bonds is field data."""
+    """Write a variable as point or cell data; variables of neither particles nor bonds are field
+    data."""
     along = {*dims} - {"time", "axis"}
     if parts.name in ELSEWHERE or values.dtype.kind not in "biuf" or "step" in along:
         return
@@ -235,19 +245,19 @@ def _put(
 
 
 def _put_broken(parts: Parts, dataset: xarray.Dataset, grid: UnstructuredGrid) -> None:
-    """Which part every cell of the grid is, and where bonds break, which are broken at each step: a
-    cell between particles is where a bond of its corners is."""
+    """Write what each cell represents and, with fracture, which cells are broken at each step: a
+    polygon counts as broken with the first bond between its corners."""
     Parts(parts.root, "part", parts.steps).once("CellData", grid.part)
     if grid.broken_step is None:
         return
     broken, steps = grid.broken_step, dataset["time"].values
     Parts(parts.root, "broken_step", parts.steps).once("CellData", broken)
-    now = (broken_by(broken, step).astype("u1") for step in steps)
-    parts.each("CellData", now)
+    states = (broken_by(broken, step).astype("u1") for step in steps)
+    parts.each("CellData", states)
 
 
 def _blocks(values: xarray.DataArray) -> Iterator[tuple[int, Array]]:
-    """(first step, values) of some steps at a time."""
+    """Generate (first step, values) of some steps at a time."""
     steps = values.sizes["time"]
     block = max(1, BLOCK_BYTES * steps // max(1, values.nbytes))
     for begin in range(0, steps, block):
@@ -255,6 +265,6 @@ def _blocks(values: xarray.DataArray) -> Iterator[tuple[int, Array]]:
 
 
 def _in_space(values: Array) -> Array:
-    """Vectors with three components."""
+    """Pad vectors to three components."""
     missing = 3 - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])

@@ -204,9 +204,9 @@ class DistributedRecorder(Recorder):
         if history is not None:
             self._joining.take(history)
 
-    def observe(self, state: State, *, last: bool = False, within: float | None = None) -> None:
-        """As one process does, which has no increments `within` steps. What one refuses all of them
-        do."""
+    def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
+        """Record as a single process does, without equilibria within steps. An error of one rank is
+        raised on all."""
         if state.step <= self.seen.step and not last:
             return
         recorded = last or self._scene.experiment.records(state.step)
@@ -216,7 +216,7 @@ class DistributedRecorder(Recorder):
         if measured & self._local:
             self._division.halo.look_back(state)
         with self._ranks.raise_together(), np.errstate(all="ignore"):
-            values = self._taken(state, last)
+            values = self._record_of(state, last)
         self._put(state, values)
 
     def finish(self, state: State, outcome: Any, prediction: dict[str, Any]) -> None:
@@ -312,9 +312,9 @@ class PartSink(KeepingSink):
         """As it is kept."""
         self._first(lambda inner: inner.suspend(checkpoint), checkpoint.arrays)
 
-    def note_end(self, checkpoint: Checkpoint) -> None:
+    def keep_final(self, checkpoint: Checkpoint) -> None:
         """As it is kept."""
-        self._first(lambda inner: inner.note_end(checkpoint), checkpoint.arrays)
+        self._first(lambda inner: inner.keep_final(checkpoint), checkpoint.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
         """Says on how many processes it was run."""

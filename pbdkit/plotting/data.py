@@ -17,7 +17,15 @@ from pydantic import TypeAdapter, ValidationError
 
 from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError, did_you_mean
-from pbdkit.io.layout import INDICES, OF_BODY, as_step, broken_by, carried, makers_of, rows_of
+from pbdkit.io.layout import (
+    INDICES,
+    OF_BODY,
+    as_step,
+    broken_by,
+    json_attribute,
+    makers_of,
+    rows_of,
+)
 from pbdkit.lattice.raster import FRAME
 from pbdkit.model.bodies import AnyBody, Body as Shape, Sites
 from pbdkit.plotting.style import Look, in_its_units, is_number, label, plain
@@ -146,7 +154,9 @@ def shape_of(dataset: xarray.Dataset) -> Shape | None:
     """Return the outline of the body that a dataset carries; None where it carries none, and of a
     body of given sites, which has none."""
     try:
-        shape: Shape = TypeAdapter(AnyBody).validate_python(carried(dataset, "experiment")["body"])
+        shape: Shape = TypeAdapter(AnyBody).validate_python(
+            json_attribute(dataset, "experiment")["body"]
+        )
     except (KeyError, ValidationError):
         return None
     return None if any(box.in_sites for box in shape.boxes()) else shape

@@ -20,7 +20,7 @@ from pbdkit.errors import (
     refuse_no_matplotlib,
     refuse_without,
 )
-from pbdkit.io.atomic_file import NewFile, written
+from pbdkit.io.atomic_file import NewFile, open_atomic
 from pbdkit.io.layout import as_step
 from pbdkit.plotting.data import Extent, Snapshot, Trajectory, extent_of
 from pbdkit.plotting.style import Look
@@ -104,7 +104,7 @@ def animate(
     rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
     moving = Moving(recording, rows, look, show)
     frames = moving.frames(rows, show)
-    with written(path, NewFile, replace=replace) as new:
+    with open_atomic(path, NewFile, replace=replace) as new:
         if path.suffix == ".gif":
             few = moving.frames(rows[:: max(1, len(rows) // 4)])
             _write_gif(new, np.concatenate([*few]), frames, fps)

@@ -12,7 +12,7 @@ import xxhash
 
 from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError
-from pbdkit.io.layout import carried, in_this_layout, reserved_names
+from pbdkit.io.layout import in_this_layout, json_attribute, reserved_names
 from pbdkit.io.members import STATUS
 from pbdkit.memory import machine_memory
 from pbdkit.sweeps.specification import MESSAGE, Dimension, Member, names_of, values_along
@@ -51,7 +51,7 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     if hasattr(runs, "data_vars"):
         raise ExperimentError("concat: expected a list of datasets, got one; write concat([a, b])")
     datasets = [in_this_layout(run) for run in runs]
-    experiments = [carried(run, "experiment") for run in datasets]
+    experiments = [json_attribute(run, "experiment") for run in datasets]
     if not all(experiments) or not datasets:
         fault = "a dataset has no experiment" if datasets else "there are no runs"
         raise ExperimentError(f"{fault}: only results of pbdkit can be combined")

@@ -42,8 +42,8 @@ from pbdkit.array_types import Array
 from pbdkit.bench.work_precision import COLUMNS
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io.atomic_file import write
-from pbdkit.io.explain import BondStatus, Explained
-from pbdkit.io.layout import OF_BODY, carried, in_this_layout, scene_of
+from pbdkit.io.explain import BondStatus, BondTable
+from pbdkit.io.layout import OF_BODY, in_this_layout, json_attribute, scene_of
 from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone
 from pbdkit.io.open import reading
 from pbdkit.io.physical import TWIN_OF
@@ -352,7 +352,7 @@ def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> BondArray
     if dataset.sizes.get("bond") == 0:  # of a body whose particles have no neighbours
         return None
     if scene is not None and "bond_ends" in dataset.variables:
-        return _explained(Explained(dataset, scene), dataset)
+        return _explained(BondTable(dataset, scene), dataset)
     if "bond_ends" in dataset.variables and dataset["bond_ends"].ndim == 2:
         return _told(dataset)
     if scene is None or scene.experiment.neighbours.nearness():
@@ -373,7 +373,7 @@ def _whole(ends: Array, rest: Array, shell: Array) -> BondArrays:
     return BondArrays(ends, rest, shell, never, unknown, unknown, state, order)
 
 
-def _explained(known: Explained, dataset: xarray.Dataset) -> BondArrays:
+def _explained(known: BondTable, dataset: xarray.Dataset) -> BondArrays:
     bonds = known.bonds
     names = known.remembered(0) if len(bonds) else ()
     last = {n: dataset[n].isel(time=-1, missing_dims="ignore").values for n in names}
@@ -595,7 +595,7 @@ PARTS = ("lattice", "body", "neighbours", "rule", "frame", "fracture", "solver")
 
 def facts(dataset: xarray.Dataset) -> list[list[str]]:
     """A name and a value each."""
-    said, parts = dataset.attrs, carried(dataset, "experiment")
+    said, parts = dataset.attrs, json_attribute(dataset, "experiment")
     times = dataset["time"].values
     sizes = {str(name): size for name, size in dataset.sizes.items()}
     ended = ": ".join(filter(None, (str(said.get(n, "")) for n in ("status", "stop_reason"))))
@@ -615,7 +615,7 @@ def facts(dataset: xarray.Dataset) -> list[list[str]]:
 
 def made_by(dataset: xarray.Dataset) -> str:
     """pbdkit and the plugins, with their versions."""
-    given = {"pbdkit": dataset.attrs.get("pbdkit_version", "")} | carried(dataset, "plugins")
+    given = {"pbdkit": dataset.attrs.get("pbdkit_version", "")} | json_attribute(dataset, "plugins")
     return ", ".join(f"{name} {version}".strip() for name, version in given.items())
 
 
@@ -775,7 +775,7 @@ def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
 
 def _found(dataset: xarray.Dataset) -> dict[str, Any]:
     """Of an equilibrium: what its certificate says."""
-    certificate = carried(dataset, "certificate")
+    certificate = json_attribute(dataset, "certificate")
     told = [[name.replace("_", " "), value] for name, value in certificate.items()]
     note = "The solver makes no steps: it finds the equilibrium, and says how far from it the "
     return {"certificate": told, "notes": [f"{note}last state can be at most."]}
@@ -869,7 +869,7 @@ class RunContent:
     def __init__(self, dataset: xarray.Dataset) -> None:
         _refuse_no_motion(dataset)
         origin = origin_of(dataset)
-        parts = carried(dataset, "experiment")
+        parts = json_attribute(dataset, "experiment")
         title = title_of(dataset)
         self._dataset = dataset
         self._reference = reference_of(dataset, origin.scene)
@@ -1019,7 +1019,7 @@ class SweepContent:
 
     def __init__(self, dataset: xarray.Dataset) -> None:
         grid = [str(dim) for dim in dataset[STATUS].dims]
-        asked = carried(dataset, "sweep")
+        asked = json_attribute(dataset, "sweep")
         title = title_of(dataset)
         places = product(*(range(dataset.sizes[dim]) for dim in grid))
         self._members = [dataset.isel(dict(zip(grid, place, strict=True))) for place in places]

@@ -129,7 +129,7 @@ def old_result(tmp_path):
     return tmp_path / "old.nc"
 
 
-@pytest.mark.filterwarnings("ignore:.*carries no seal:pbdkit.PbdkitWarning")
+@pytest.mark.filterwarnings("ignore:.*has no seal:pbdkit.PbdkitWarning")
 def test_old_results_open_and_run_again(old_result):
     with pbdkit.open(old_result) as ds:
         with pytest.warns(pbdkit.PbdkitWarning, match=ADVICE):
@@ -139,7 +139,7 @@ def test_old_results_open_and_run_again(old_result):
         assert '"traction-free"' in ds.experiment
 
 
-@pytest.mark.filterwarnings("ignore:.*carries no seal:pbdkit.PbdkitWarning")
+@pytest.mark.filterwarnings("ignore:.*has no seal:pbdkit.PbdkitWarning")
 def test_what_needs_the_scene_that_was_run_is_refused(old_result, call):
     refusal = "requires the scene of the run, but its frame 'traction-free' is retired"
     with pbdkit.open(old_result) as ds:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.io.atomic_file import NewFile, write, write_folder, write_together, written
+from pbdkit.io.atomic_file import NewFile, open_atomic, write, write_folder, write_together
 from pbdkit.io.paged_file import PagedFile
 from pbdkit.io.seal import SealedFile
 from tests.conftest import Call
@@ -92,7 +92,7 @@ def test_a_result_that_the_disk_gives_back_otherwise_gets_no_name(
     monkeypatch.setattr(os, "fsync", spoil)
     found = call("run", "e.json", "-o", "out.nc")
     assert (found.code, Path("out.nc").exists(), left()) == (6, False, [])
-    assert "gives back what was not written" in found.err
+    assert "returns other bytes than were written" in found.err
 
 
 WRITING = {
@@ -164,9 +164,9 @@ def test_an_error_in_the_block_that_is_no_fault_of_the_disk_stays_what_it_is(
     path = tmp_path / "x"
     path.write_text("earlier")
     for kind in (NewFile, PagedFile):
-        with pytest.raises(KeyError), written(path, kind, replace=True):
+        with pytest.raises(KeyError), open_atomic(path, kind, replace=True):
             raise KeyError("mine")
-        with pytest.raises(KeyboardInterrupt), written(path, kind, replace=True):
+        with pytest.raises(KeyboardInterrupt), open_atomic(path, kind, replace=True):
             raise KeyboardInterrupt
     assert path.read_text() == "earlier"
     assert [p.name for p in tmp_path.iterdir()] == ["x"]

@@ -8,7 +8,7 @@ from property_cases import pull_right
 from remembering_parts import Weakest
 
 import pbdkit
-from pbdkit.io.explain import Explained
+from pbdkit.io.explain import BondTable
 from pbdkit.scene.scene import build_scene
 
 RATE = 0.03125
@@ -153,7 +153,7 @@ def test_a_run_without_bonds(explain):
 
 def explained(given, **more):
     ds = pbdkit.run(given, progress=False, **more)
-    return ds, Explained(ds, build_scene(pbdkit.Experiment(**given)))
+    return ds, BondTable(ds, build_scene(pbdkit.Experiment(**given)))
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def explained(given, **more):
 )  # fmt: skip
 def test_who_broke_was_above_its_limit_and_who_did_not_never_was(parts):
     ds, found = explained(BAR | parts)
-    standings = found.standings(np.arange(ds.sizes["bond"]))
+    standings = found.statuses(np.arange(ds.sizes["bond"]))
     broken = [s for s in standings if s.state == "broken"]
     assert sorted(s.order for s in standings if s.order) == list(range(1, len(found.order) + 1))
     assert len(broken) > 3
@@ -192,7 +192,7 @@ def test_a_model_that_does_not_say_when_it_breaks():
     given = BAR | SHEET | {"fracture": Weakest(spread=0.3)}
     ds, found = explained(given, components=[Weakest])
     row = int(found.order[0])
-    (standing,) = found.standings(np.array([row]))
+    (standing,) = found.statuses(np.array([row]))
     assert standing.breaks_above is None
     assert found.nearest() is None
     assert standing.strain_at_break == float(ds.broken_strain[row]) > 0.5
@@ -206,4 +206,4 @@ def test_a_file_that_was_changed_is_refused():
     ds = pbdkit.run(given, progress=False)
     other = build_scene(pbdkit.Experiment(**given | {"neighbours": {"type": "chebyshev"}}))
     with pytest.raises(pbdkit.ExperimentError, match="its bonds are not those of the experiment"):
-        Explained(ds, other)
+        BondTable(ds, other)

@@ -245,7 +245,7 @@ def old(tmp_path):
     return path
 
 
-@pytest.mark.filterwarnings("ignore:.*(carries no seal|made by):pbdkit.PbdkitWarning")
+@pytest.mark.filterwarnings("ignore:.*(has no seal|made by):pbdkit.PbdkitWarning")
 def test_a_file_of_version_1_has_the_names_of_now(old):
     with pbdkit.open(old) as before:
         again = pbdkit.rerun(before, progress=False)
@@ -265,7 +265,7 @@ def test_a_file_of_version_1_has_the_names_of_now(old):
         np.testing.assert_array_equal(in_order, before.crack_step)
 
 
-@pytest.mark.filterwarnings("ignore:.*carries no seal:pbdkit.PbdkitWarning")
+@pytest.mark.filterwarnings("ignore:.*has no seal:pbdkit.PbdkitWarning")
 def test_a_file_of_version_1_is_drawn_explained_and_tried(old, call, tmp_path):
     with xarray.open_dataset(old, engine="h5netcdf") as raw:
         before = raw.copy(deep=True)

@@ -78,7 +78,7 @@ def test_a_crafted_file_is_drawn_or_refused_in_a_line(name: str, sound: Path, ca
         assert result.code in (0, 2, 6), result.err
         assert len(result.err) < 1000
         warning, *fault = result.err.splitlines()
-        assert warning.startswith("warning: crafted.nc: carries no seal")
+        assert warning.startswith("warning: crafted.nc: has no seal")
         assert len(fault) == bool(result.code)
         for line in fault:
             assert line.startswith("pbdkit: ")
@@ -124,4 +124,4 @@ def test_a_file_without_the_end_of_its_seal_is_read_with_a_warning(sound: Path, 
     Path("cut.nc").write_bytes(sound.read_bytes()[:-10])
     result = call("explain", "cut.nc")
     assert (result.code, result.out) == (0, call("explain", str(sound)).out)
-    assert result.err.startswith("warning: cut.nc: carries no seal")
+    assert result.err.startswith("warning: cut.nc: has no seal")

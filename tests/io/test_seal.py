@@ -115,7 +115,7 @@ def test_verify_says_a_line_a_file(sound, call, tmp_path):
     assert result.out.splitlines() == [
         f"{good}: unchanged since it was written",
         f"{bad}: bytes {begin} to {end} of {table['stop'][-1]} are not what was written",
-        f"{bare}: carries no seal: nobody can tell whether it is as it was written",
+        f"{bare}: has no seal: changes since it was written cannot be detected",
         f"{tmp_path / 'none.nc'}: there is no such file",
     ]
 
@@ -135,7 +135,7 @@ def test_a_damaged_seal_is_named(sound, call, tmp_path):
 def test_what_another_program_wrote_is_read_with_a_warning(sound, tmp_path):
     with xarray.open_dataset(sound, engine="netcdf4", decode_times=False) as plain:
         plain.isel(time=[0]).to_netcdf(tmp_path / "first.nc")
-    with pytest.warns(pbdkit.PbdkitWarning, match=r"first\.nc: carries no seal"):
+    with pytest.warns(pbdkit.PbdkitWarning, match=r"first\.nc: has no seal"):
         assert pbdkit.open(tmp_path / "first.nc").sizes["time"] == 1
 
 

@@ -44,7 +44,7 @@ class Noting(KeepingSink):
     def suspend(self, standing):
         self.calls.append("suspend")
 
-    def note_end(self, standing):
+    def keep_final(self, standing):
         self.calls.append("end")
 
     def finish(self, attributes):
@@ -81,7 +81,7 @@ def test_what_is_known_at_the_end_may_be_large():
     sink = OverlappingSink(inner)
     sink.begin([], {}, {})
     sink.put({"a": LARGE})
-    sink.note_end(None)
+    sink.keep_final(None)
     sink.put({"b": LARGE})
     sink.finish({})
     assert inner.calls == ["begin", "a", "end", "b", "finish"]

@@ -32,7 +32,7 @@ import pbdkit.stability.forecast
 from pbdkit.cli import main
 from pbdkit.io import netcdf as netcdf_sink
 from pbdkit.io.netcdf import FINAL_STATE, NetcdfSink
-from pbdkit.io.seal import SealedFile, opened
+from pbdkit.io.seal import SealedFile, open_sealed
 
 OUTPUT = "out.nc"
 OF_A_RUN = ("created", "ranks")
@@ -179,7 +179,7 @@ def differences(one: Path, other: Path) -> list[str]:
     for path in (one, other):
         with SealedFile(path) as file:
             file.check()
-    with opened(one) as first, opened(other) as second:
+    with open_sealed(one) as first, open_sealed(other) as second:
         return list(_different(first, second))
 
 

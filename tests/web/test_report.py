@@ -14,8 +14,8 @@ from hypothesis import given, strategies as st
 from PIL import Image
 
 import pbdkit
-from pbdkit.io.explain import Explained
-from pbdkit.io.layout import carried
+from pbdkit.io.explain import BondTable
+from pbdkit.io.layout import json_attribute
 from pbdkit.model.reading import read_text
 from pbdkit.scene.scene import build_scene
 from pbdkit.web import report, report as bonds
@@ -172,7 +172,7 @@ def test_a_click_on_a_particle_shows_its_history(page, sheet):
 
 def test_a_click_on_a_bond_tells_its_story(page, torn):
     dataset, path = torn
-    known = Explained(dataset, build_scene(pbdkit.load("paper/d1")))
+    known = BondTable(dataset, build_scene(pbdkit.load("paper/d1")))
     opened(page, path)
     show_step(page, 0)
     first = known.order[0]
@@ -180,13 +180,13 @@ def test_a_click_on_a_bond_tells_its_story(page, torn):
     click_at(page, dataset, known.bonds.midpoint[first])
     assert page.locator("aside h3").inner_text() == f"Bond {a}-{b}"
     story = page.locator("aside ul").inner_text()
-    (standing,) = known.standings(known.order[:1])
+    (standing,) = known.statuses(known.order[:1])
     assert (
         f"It broke in step {standing.step} at strain {standing.strain_at_break:.6g}, "
         f"number 1 of the {len(known.order)} broken." in story
     )
     assert f"breaks it above {standing.breaks_above:.6g}" in story
-    around = known.standings(known.around(first))
+    around = known.statuses(known.around(first))
     together = [s for s in around if s.step == standing.step]
     assert all("-".join(map(str, s.bond)) in story for s in together)
     step, strain = known.most_strained(first)
@@ -346,7 +346,7 @@ def test_an_equilibrium_and_its_certificate(page, tmp_path):
     page.get_by_label("Displacements drawn").fill("20")
     page.get_by_label("Displacements drawn").press("Enter")
     assert page.locator("canvas").screenshot() != before
-    distance = carried(dataset, "certificate")["distance"]
+    distance = json_attribute(dataset, "certificate")["distance"]
     assert f"{distance:.6g}" in page.locator("main").inner_text()
     page.get_by_label("Find").fill("100")
     page.get_by_label("Find").press("Enter")
@@ -356,7 +356,7 @@ def test_an_equilibrium_and_its_certificate(page, tmp_path):
 
 def test_what_was_benched_and_what_cannot_be_built_here(page, sheet, tmp_path):
     dataset = sheet[0].copy()
-    parts = carried(dataset, "experiment") | {"rule": {"type": "of-nobody"}}
+    parts = json_attribute(dataset, "experiment") | {"rule": {"type": "of-nobody"}}
     dataset.attrs["experiment"] = json.dumps(parts)
     bench = tmp_path / "bench.json"
     row = {"size": None, "method": "numpy", "precision": "float64", "error": 2e-9, "reason": ""}
