@@ -20,6 +20,7 @@ import numpy as np
 
 from pbdkit.equilibrium.lattice_system import SlowMode
 from pbdkit.equilibrium.system import StuckError, System, one_thread
+from pbdkit.lattice.raster import distinct
 from pbdkit.linear.block_matrix import CoordinateMatrix, connected
 from pbdkit.linear.operator import StepOperator, step_operator
 from pbdkit.linear.spectrum import (
@@ -415,7 +416,7 @@ class Analysis:
         leader_rows = operator.couplings_leader.entries().rows
         is_led[label[np.append(leader_rows, operator.prescribed_unknowns)]] = True
         numbers = operator.followers[np.arange(len(label)) // self.scene.axes] + 1
-        parts = {tuple(np.unique(numbers[label == n]).tolist()) for n in np.flatnonzero(~is_led)}
+        parts = {tuple(distinct(numbers[label == n]).tolist()) for n in np.flatnonzero(~is_led)}
         return sorted(parts)
 
     def warnings(self) -> list[str]:

@@ -28,7 +28,7 @@ import numpy as np
 from pbdkit.array_types import Floats, Indices
 from pbdkit.equilibrium.system import ACCURACY, StuckError, System, solved
 from pbdkit.errors import ExperimentError
-from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, slot_step
+from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, distinct, slot_step
 from pbdkit.linear.block_matrix import BlockMatrix
 from pbdkit.linear.operator import Guiding, moves_and_couplings, step_operator
 from pbdkit.linear.spectrum import excess
@@ -88,7 +88,7 @@ def boundary_coupling(scene: Scene, state: State, step: int) -> BoundaryCoupling
         neighbours = [
             boundary - slot_step(raster.shape, slot) for slot in scene.neighbourhood.every
         ]
-        candidates = np.unique(np.concatenate([*neighbours, boundary])).clip(0, kind.size - 1)
+        candidates = distinct(np.concatenate([*neighbours, boundary]).clip(0, kind.size - 1))
         place = candidates[kind[candidates] == FOLLOWER]
     _, couplings = moves_and_couplings(scene, state, place)
     couplings.parts = [
