@@ -108,6 +108,8 @@ class ConvertedCopies:
 
     def add_to(self, values: Values) -> Values:
         """Return the values together with the converted copies."""
+        if not self._of:
+            return values
         lengths = {self._of[name]: value for name, value in values.items() if name in self._of}
         return values | {name: np.asarray(v) * factor for (name, factor), v in lengths.items()}
 

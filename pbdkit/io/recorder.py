@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     import xarray
 
 
+Measured = tuple[int, Diagnostic, list[tuple[Variable, float]]]
+"""Number of a diagnostic, the diagnostic, and its variables with the factors of their values."""
+
+
 class RecordedVariables:
     """The state variables and diagnostics of a scene that are recorded in its dataset."""
 
@@ -127,6 +131,15 @@ class RecordedVariables:
         return columns
 
     @cached_property
+    def _scaled(self) -> dict[When, list[Measured]]:
+        """Diagnostics by the time of measurement."""
+        result = {when: list[Measured]() for when in When}
+        for n, diagnostic in enumerate(self._diagnostics):
+            variables = list(self.physical.scaled(diagnostic))
+            result[layout.when_measured(diagnostic)].append((n, diagnostic, variables))
+        return result
+
+    @cached_property
     def coordinates(self) -> dict[str, Any]:
         """Coordinates of the diagnostics, by name."""
         return {n: values for d in self._diagnostics for n, values in d.coordinates().items()}
@@ -153,15 +166,13 @@ class RecordedVariables:
         """
         values: Values = {}
         occasion = "at the end" if when is When.END else f"at step {moment.step}"
-        for n, diagnostic in enumerate(self._diagnostics):
-            if layout.when_measured(diagnostic) is not when or not which(diagnostic):
+        for n, diagnostic, variables in self._scaled[when]:
+            if not which(diagnostic):
                 continue
             sizes, dimension = dict(self.sizes), diagnostic.own_dimension
             with blaming(diagnostic, occasion, "diagnostics", n):
                 results = as_values(diagnostic.measure(moment), "measure")
-                for (variable, factor), value in zip(
-                    self.physical.scaled(diagnostic), results, strict=True
-                ):
+                for (variable, factor), value in zip(variables, results, strict=True):
                     if dimension in variable.dims and np.ndim(value) == len(variable.dims):
                         # The first variable that has it gives its length, the others keep to it.
                         sizes.setdefault(dimension, np.shape(value)[variable.dims.index(dimension)])
