@@ -62,7 +62,7 @@ def linearised(
     def by_matrix() -> System:
         return MatrixSystem(scene, state, method, watch, step)
 
-    if find_spec("numba") and asks_for_grids(scene.experiment, method, scene.raster.count):
+    if asks_for_grids(scene.experiment, method, scene.raster.count) and find_spec("numba"):
         from pbdkit.equilibrium.lattice_system import lattice_system
 
         if system := lattice_system(scene, state, step, watch, moves):

@@ -32,7 +32,6 @@ from pbdkit.identification.waves import (
     spacing_of,
     spectrum,
 )
-from pbdkit.lattice.neighbourhood import body_box
 from pbdkit.linear.stencil import NOWHERE, Stencil, linearised, move
 from pbdkit.plugin import Here, Slot
 from pbdkit.plugin.discovery import blaming
@@ -133,7 +132,7 @@ def _places(scene: Scene) -> list[Here]:
     """Return the middle of the body and, for rules that depend on the place, its corners."""
     if not scene.experiment.rule.uses_reference:
         return [NOWHERE]
-    lower, upper = body_box(scene.raster)
+    lower, upper = scene.raster.body_box
     local = [scene.middle, *map(vector, product(*zip(lower, upper, strict=True)))]
     origin = vector(scene.experiment.lattice.origin)
     return [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise, permutations
@@ -174,9 +174,18 @@ class WeighedCells:
         tuple
             Weights on the left and on the right; the number 1 if all are 1.
         """
+        return self.beside_each([slot], where, precision, shares)[0]
+
+    def beside_each(
+        self, slots: Iterable[Slot], where: Where, precision: str, shares: Floats | None = None
+    ) -> list[tuple[Share, Share]]:
+        """Return the same for several slots; the same cell beside two of them is one array."""
         values = self.weight if shares is None else shares
-        left, right = (_seen(values, side, where, precision) for side in self.tiling.beside[slot])
-        return left, right
+        sides = [side for slot in slots for side in self.tiling.beside[slot]]
+        cells = {(side.kind, side.first): side for side in sides}
+        weights = {key: _seen(values, side, where, precision) for key, side in cells.items()}
+        beside = [weights[side.kind, side.first] for side in sides]
+        return list(zip(beside[::2], beside[1::2], strict=True))
 
 
 def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:

@@ -114,6 +114,8 @@ def framed(lattice: Lattice, filling: Filling, layers: int) -> tuple[Index, NDAr
     tuple
         First site index, and kinds, (i, j).
     """
+    if not layers:
+        return filling.first, np.where(filling.body, np.int8(FOLLOWER), np.int8(EMPTY))
     inside = np.pad(filling.body, layers)
     low = tuple(n - layers for n in filling.first)
     occupied = dilated(inside, layers) & has_sites(lattice.cell(), low, inside.shape)
@@ -188,7 +190,8 @@ def window(body: Body, lattice: Lattice, lines: Lines | None = None) -> tuple[In
 def sites_from(lattice: Lattice, low: Index, shape: Index) -> Sites:
     """Return the indices of a window from the site `low`, and their positions."""
     index = [n + first for n, first in zip(np.indices(shape), low, strict=True)]
-    at = positions(lattice.cell(), *cells_of_sites(lattice.cell(), *index))
+    cell = lattice.cell()
+    at = positions(cell, *cells_of_sites(cell, *index))
     return Sites(index, at.each(add, lattice.origin))
 
 
@@ -229,8 +232,9 @@ def fill(body: Body, lattice: Lattice, lines: Lines | None = None) -> Filling:
 def tolerance_of(body: Body, lattice: Lattice) -> float:
     """Return the distance up to which a site in the window of a body counts as on the outline."""
     corners = np.array([*product(*zip(*window(body, lattice), strict=True))]).T
-    at = positions(lattice.cell(), *cells_of_sites(lattice.cell(), *corners))
-    return float(rounding_of(lattice.cell(), *at.each(add, lattice.origin)).max())
+    cell = lattice.cell()
+    at = positions(cell, *cells_of_sites(cell, *corners))
+    return float(rounding_of(cell, *at.each(add, lattice.origin)).max())
 
 
 def rounding_of(cell: Cell, *at: Floats) -> Floats:

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.cells import CellsAround, cells_around, tiling_of
-from pbdkit.lattice.raster import EMPTY, FOLLOWER, Block, Raster, common, hull, positions
+from pbdkit.lattice.raster import EMPTY, FOLLOWER, Block, Raster, common, hull
 from pbdkit.plugin import Cell, Lattice, NeighbourMetric, Offset, Setting, Slot, Vector
 from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.lattice import Index, Tiling
-from pbdkit.plugin.vector import vector
 
 MIN_FLATNESS = 1e-3
 """Smallest accepted flatness of a cell. Within a cell vector of a site lie π/flatness sites."""
@@ -158,7 +157,7 @@ def checked_cell(lattice: Lattice) -> Cell:
             f"the basis sites have the indices {indices}: these must differ and lie within the "
             f"period {cell.period}"
         )
-    for s, site in enumerate(cell.sites):
+    for s, site in enumerate(cell.sites) if len(cell.sites) > 1 else ():
         for near in cell.offsets(s, COINCIDENCE_RTOL * math.hypot(*cell.vectors[0])):
             raise ExperimentError(
                 f"the sites with the indices {site.index} and {cell.sites[near.target].index} lie "
@@ -411,16 +410,6 @@ def missing_segments(
 
 def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
     """Return the lattice context from which a rule may derive constants."""
-    lower, upper = (end.each(add, raster.lattice.origin) for end in body_box(raster))
+    lower, upper = (end.each(add, raster.lattice.origin) for end in raster.body_box)
     cell, slots = raster.cell, neighbourhood.slots
     return Setting(cell, slots, lower, upper, neighbourhood.tiling)
-
-
-def body_box(raster: Raster) -> tuple[Vector[float], Vector[float]]:
-    """Return the corners (lower, upper) of the body, from site (0, 0) of the lattice."""
-    ends = (raster.ends_of_rows(s) for s in range(raster.shape[0]))
-    at = [positions(raster.cell, s, *cells) for s, cells in enumerate(ends)]
-    lower, upper = raster.hull_of_all(
-        (tuple(x.min() for x in ends), tuple(x.max() for x in ends)) for ends in at if ends[0].size
-    )
-    return vector(map(float, lower)), vector(map(float, upper))

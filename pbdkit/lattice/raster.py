@@ -19,7 +19,7 @@ from pbdkit.array_types import Indices, Mask
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.plugin import Cell, Lattice, Offset, Slot
 from pbdkit.plugin.lattice import Index
-from pbdkit.plugin.vector import vector
+from pbdkit.plugin.vector import Vector, vector
 
 
 def distinct(numbers: NDArray[np.integer[Any]]) -> Indices:
@@ -332,6 +332,18 @@ class Raster:
         return hull(box for part in self.communicator.allgather(list(boxes)) for box in part)
 
     @cached_property
+    def body_box(self) -> tuple[Vector[float], Vector[float]]:
+        """Corners (lower, upper) of the body, from site (0, 0) of the lattice."""
+        ends = (self.ends_of_rows(s) for s in range(self.shape[0]))
+        at = [positions(self.cell, s, *cells) for s, cells in enumerate(ends)]
+        lower, upper = self.hull_of_all(
+            (tuple(x.min() for x in x_ends), tuple(x.max() for x in x_ends))
+            for x_ends in at
+            if x_ends[0].size
+        )
+        return vector(map(float, lower)), vector(map(float, upper))
+
+    @cached_property
     def _full(self) -> bool:
         """Whether every site of the window is a particle, so that rows follow from indices."""
         return self.count == self.sites.size
@@ -366,8 +378,12 @@ class Raster:
 
     def site_of(self, rows: Indices) -> NDArray[np.int64]:
         """Return the sites (i, j) of rows, (row, index)."""
+        return np.stack(self._site_indices(rows), axis=1)
+
+    def _site_indices(self, rows: Indices) -> list[Indices]:
+        """Return i and j of the sites of rows."""
         place = rows if self._full else self._flat_sites[rows]
-        return np.stack(np.unravel_index(place, self.sites.shape), axis=1) + self.low
+        return list(map(add, np.unravel_index(place, self.sites.shape), self.low))
 
     def _of_all(self, values: Callable[[Indices], Any], columns: int, dtype: Any) -> NDArray[Any]:
         """Evaluate a function of rows chunk by chunk, into an array (particle, column)."""
@@ -382,7 +398,7 @@ class Raster:
 
     def cells_of(self, rows: Indices) -> tuple[Indices, ...]:
         """Return sublattice and repeat cell of rows."""
-        return cells_of_sites(self.cell, *self.site_of(rows).T)
+        return cells_of_sites(self.cell, *self._site_indices(rows))
 
     def place_of(self, rows: Indices) -> Indices:
         """Return the flat places of rows on the raster."""
@@ -459,8 +475,10 @@ class Raster:
             occupied, end = far < NOWHERE, -far if last else far
         else:
             occupied = body.any(axis=0)
-        lines = np.argwhere(occupied) + np.delete(self.low, axis)
-        rows = self.rows_of_sites(np.insert(lines, axis, end[occupied], axis=1))
+        first = [*self.low[:axis], *self.low[axis + 1 :]]
+        sites = list(map(add, np.nonzero(occupied), first))
+        sites.insert(axis, end[occupied])
+        rows = self.rows_of_sites(np.stack(sites, axis=1))
         return rows[rows >= 0]
 
     def ends_of_rows(self, sublattice: int) -> list[Indices]:

@@ -293,7 +293,10 @@ class _Followers:
         if isinstance(by_slot[0], Vector):
             return vector(self._total(along, common) for along in zip(*by_slot, strict=True))
         shape = (2 * common - 1, self._shape[1])
-        by_slot = [np.broadcast_to(values, shape) for values in by_slot]
+        by_slot = [
+            values if np.shape(values) == shape else np.broadcast_to(values, shape)
+            for values in by_slot
+        ]
         whole = sum(values[:common] for values in by_slot)
         return np.concatenate(
             [whole, *(whole[:1] + (values[common:] - values[0]) for values in by_slot)]

@@ -267,6 +267,10 @@ class DistributedRows(Rows):
         """Update the halo of a field, in place, from the other parts."""
         self._halo.meet(field)
 
+    def whole(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Gather the numbers of all rows, (..., row)."""
+        return np.concatenate(self.communicator.allgather(numbers[..., self.own]), axis=-1)
+
     def random(self, shape: tuple[int, ...]) -> Floats:
         """What one process draws for these rows: a number is one turn of its generator."""
         assert self.strip

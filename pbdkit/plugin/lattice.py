@@ -9,6 +9,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, reduce
+from operator import add, mul, sub
 from typing import Any
 
 import numpy as np
@@ -120,11 +121,11 @@ class Cell:
         The reverse offset has exactly the negated `rest`: every operation here is odd.
         """
         here, there = self.sites[source], self.sites[target]
-        axes = range(self.axes)
+        periods = map(mul, cell, self.period)
         return Offset(
             target,
             cell,
-            tuple(there.index[n] - here.index[n] + cell[n] * self.period[n] for n in axes),
+            tuple(map(add, map(sub, there.index, here.index), periods)),
             self.primitive_step(source, target, cell),
             (there.at - here.at) + self.shift(cell),
         )
@@ -132,9 +133,8 @@ class Cell:
     def primitive_step(self, source: int, target: int, cell: Index) -> Index:
         """The same offset in the primitive basis."""
         here, there = self.sites[source].primitive, self.sites[target].primitive
-        steps = zip(*self.primitive, strict=True)
-        along = (sum(n * m for n, m in zip(cell, step, strict=True)) for step in steps)
-        return tuple(b - a + n for a, b, n in zip(here, there, along, strict=True))
+        along = (sum(map(mul, cell, step)) for step in zip(*self.primitive, strict=True))
+        return tuple(map(add, map(sub, there, here), along))
 
     def offsets(self, source: int, radius: float) -> list[Offset]:
         """All offsets from a site of `source` with 0 < |rest| ≤ radius, the nearest first."""

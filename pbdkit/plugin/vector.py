@@ -134,7 +134,7 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
         As `yes` and `no` are.
     """
     if isinstance(yes, Vector):
-        return yes.each(lambda a, b: np.where(condition, a, b), no)
+        return yes._of([np.where(condition, *parts) for parts in zip(yes, no, strict=True)])
     return np.where(condition, yes, no)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import AccuracyWarning, WarningText
 from pbdkit.lattice.fill import has_narrow_slot
-from pbdkit.lattice.neighbourhood import Neighbourhood, body_box, flatness
+from pbdkit.lattice.neighbourhood import Neighbourhood, flatness
 from pbdkit.lattice.raster import FOLLOWER, LeftOut, Raster, cells_of_sites, positions
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Newton, Oscillation, Rotation
@@ -112,7 +112,7 @@ def locking(experiment: Experiment, raster: Raster) -> Iterator[str]:
     if vectors[0, 0] * vectors[1, 0] > -0.25:  # the compliant mode is not of that kind
         return
     sides = [math.hypot(*vector) for vector in raster.cell.vectors]
-    ends = zip(*body_box(raster), sides, strict=True)
+    ends = zip(*raster.body_box, sides, strict=True)
     across = max(1.0, min((high - low) / side for low, high, side in ends))
     error = LOCKING_FACTOR * float(c.shear / values[0]) / across
     if error > MAX_LOCKING:
@@ -175,7 +175,7 @@ def never_near(
     driven: list[Leading | Barrier] = [*barriers, *leading]
     if any(isinstance(part.group.motion, Newton | Rotation) for part in driven):
         return
-    box = np.array(body_box(raster)) + raster.lattice.origin if barriers else np.zeros((2, 2))
+    box = np.array(raster.body_box) + raster.lattice.origin if barriers else np.zeros((2, 2))
     offsets = [offset for group in leading for offset in _offsets(group, steps)]
     largest = max((np.abs(offset).max(initial=0.0) for offset in offsets), default=0.0)
     reach = 2.0 * largest + float(np.hypot(*(box[1] - box[0])))
@@ -205,6 +205,8 @@ def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
     selections = {f"leaders.{n}": group.select for n, group in enumerate(experiment.leaders)}
     selections |= {f"loads.{n}": load.select for n, load in enumerate(experiment.loads)}
     points = [(name, at) for name, select in selections.items() for at in select.nearest or ()]
+    if not points:
+        return
     body = Selecting(raster)
     limit = MAX_DISTANCE * max(math.hypot(*vector) for vector in raster.cell.vectors)
     far = body.least_distances(at for _, at in points) > limit

@@ -277,9 +277,12 @@ def guided_at(raster: Raster, leading: Iterable[Leading], step: int) -> Guided:
     active = [group for group in leading if group.group.leads(step)]
     axes = len(raster.cell.vectors)
     parts = [group.rows for group in active if len(group.axes) < axes]
-    rows = distinct(np.concatenate(parts)) if parts else np.empty(0, np.intp)
+    if not parts:
+        empty = np.empty(0, np.intp)
+        return Guided(empty, empty, np.empty((axes, 0), bool))
+    rows = distinct(np.concatenate(parts))
     lead_axes = np.zeros((axes, len(rows)), bool)
-    for group in active if parts else ():
+    for group in active:
         lead_axes[list(group.axes)] |= np.isin(rows, group.rows)
     free = ~lead_axes.all(axis=0)
     return Guided(rows[free], raster.place_of(rows[free]), lead_axes[:, free])

@@ -27,7 +27,6 @@ from pbdkit.lattice.fill import (
 from pbdkit.lattice.neighbourhood import (
     BondTable,
     Neighbourhood,
-    body_box,
     build_bond_table,
     build_neighbourhood,
     checked_cell,
@@ -394,7 +393,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     if not loads:
         warnings += never_near(raster, barriers, leading, experiment.steps)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
-    lower, upper = body_box(raster)
+    lower, upper = raster.body_box
     facts = loads, setting, (lower + upper) / 2
     operations = build_operations(raster, experiment)
     return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers, operations))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Mask
-from pbdkit.lattice.cells import CellBond
+from pbdkit.lattice.cells import CellBond, WeighedCells
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, Raster, Where
 from pbdkit.plugin import (
     Calibrated,
@@ -216,13 +216,14 @@ def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
     total: Contributions | None = None
     for part, there in parts:
         if there is not None:
-            part = tuple(where(there, value, _nothing(value)) for value in part)
+            part = tuple(_masked(value, there) for value in part)
         total = part if total is None else tuple(a + b for a, b in zip(total, part, strict=True))
     return total or ()
 
 
-def _nothing(like: Any) -> Any:
-    return like.each(lambda _: 0.0) if isinstance(like, Vector) else 0.0
+def _masked(value: Any, present: Mask) -> Any:
+    zero = vector([0.0] * len(value)) if isinstance(value, Vector) else 0.0
+    return where(present, value, zero)
 
 
 BLOCK_CELLS = 16384
@@ -240,8 +241,10 @@ class Surroundings:
         self._evaluator = Evaluator(scene)
         self.slots = scene.neighbourhood.slots[sublattice]
         self._present = presence(scene.raster, where, self.slots)
-        self._weights = [self._weights_of(slot) for slot in self.slots]
-        self._more = [self._more_of(slot) for slot in self.slots]
+        self._weights = [scene.constants.weights[slot] for slot in self.slots]
+        self._more: list[tuple[Any, ...]] = [()] * len(self.slots)
+        if scene.cells:
+            self._weigh_cells(scene.cells)
         self._there = [where.seen_through(slot) for slot in self.slots]
         neighbours = sum(1 if there is None else there.astype(int) for there in self._present)
         movable = (where.of(scene.raster.kind) == FOLLOWER) & (neighbours > 0)
@@ -305,25 +308,21 @@ class Surroundings:
         parts = zip(self.differences(u), self.neighbours(state), strict=True)
         return summed((function(d, own, to), to.present) for d, to in parts)
 
-    def _weights_of(self, slot: Slot) -> Any:
-        """w of a slot; the shares of cells are arrays where they differ."""
-        weights, cells = self._scene.constants.weights[slot], self._scene.cells
-        if cells is None:
-            return weights
-        left, right = cells.beside(slot, self.where, self._scene.experiment.stepping.precision)
-        return weights._replace(left=left, right=right)
-
-    def _more_of(self, slot: Slot) -> tuple[Any, ...]:
-        """w of cells of a stiffness of their own, where any is beside the slot."""
-        cells, precision = self._scene.cells, self._scene.experiment.stepping.precision
-        found = list[Any]()
-        if cells is None:
-            return ()
+    def _weigh_cells(self, cells: WeighedCells) -> None:
+        """Put the shares of the cells beside each slot into its weights, and add the weights of
+        cells that have a stiffness of their own."""
+        precision = self._scene.experiment.stepping.precision
+        beside = cells.beside_each(self.slots, self.where, precision)
+        self._weights = [
+            weights._replace(left=left, right=right)
+            for weights, (left, right) in zip(self._weights, beside, strict=True)
+        ]
         for weights, shares in zip(cells.weights, cells.mixed, strict=True):
-            left, right = cells.beside(slot, self.where, precision, shares)
-            if np.any(left) or np.any(right):
-                found.append(weights[slot]._replace(left=left, right=right))
-        return tuple(found)
+            beside = cells.beside_each(self.slots, self.where, precision, shares)
+            for n, (left, right) in enumerate(beside):
+                if np.any(left) or np.any(right):
+                    w = weights[self.slots[n]]._replace(left=left, right=right)
+                    self._more[n] = (*self._more[n], w)
 
     def _remembered(self, where: Where, state: State) -> Any:
         """What is remembered of the particles somewhere, by name."""
