@@ -22,10 +22,14 @@ def samples(count, **more):
     )
 
 
+AT_LENGTH = settings().max_examples > 100
+"""The profile is `long`, as in `.ci/nightly`."""
+
+
 def in_turn(values, every, first=0):
     """One in so many of the values of a parametrised test; all of them in the profile `long`."""
     values = list(values)
-    return values if settings().max_examples > 100 else values[first::every]
+    return values if AT_LENGTH else values[first::every]
 
 
 DIAGNOSTICS = [{"type": t} for t in ("pe1", "pe1-intact", "pe2", "displacement", "broken")]

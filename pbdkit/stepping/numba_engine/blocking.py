@@ -159,7 +159,8 @@ def write_deep_passes(writer: PlanWriter, piece: Function) -> None:
     """The beginning of a loop over steps: many in a pass, as long as there are several to make and
     what has been reached is more than stays in the cache."""
     out, plan = writer.out, writer.plan
-    out.add(0, "boxes, made = np.empty((sizes[0], box.size), np.int64), 0")
+    # numba compiles a function for each literal that it is called with, and again for int64.
+    out.add(0, "boxes, made = np.empty((sizes[0], box.size), np.int64), int64(0)")
     out.add(0, "while made < count:", "    area = 1", "    for e in range(0, box.size, 2):")
     out.add(2, "area *= min(box[e + 1], kind.shape[e // 2 + 1]) - max(box[e], 0)")
     out.add(1, "deep = min(sizes[0], count - made)")
@@ -191,7 +192,7 @@ def _write_pieces(out: Function, plan: Plan, piece: Function) -> None:
     """All at once, or the pieces of the threads, and then the gaps between them."""
     more = ("made", "deep", "extent", "boxes")
     if not plan.parallel:
-        out.add(0, piece.call("(i_low, i_high, 0, 0)", *more))
+        out.add(0, piece.call("(i_low, i_high, int64(0), int64(0))", *more))
         return
     skew = Skew(plan.scene).along[0]
     cut, after = (f"i_low + (i_high - i_low) * {n} // sizes[4]" for n in ("n", "(n + 1)"))
@@ -199,7 +200,7 @@ def _write_pieces(out: Function, plan: Plan, piece: Function) -> None:
     out.add(0, "for c in prange(sizes[4]):", "    n = int64(c)")
     out.add(1, piece.call(f"({cut}, {after}, {skew} if n > 0 else 0, {up})", *more))
     out.add(0, "for c in prange(sizes[4] - 1):", "    n = int64(c)")
-    out.add(1, piece.call(f"({after}, {after}, -{skew}, {skew})", *more))
+    out.add(1, piece.call(f"({after}, {after}, int64(-{skew}), int64({skew}))", *more))
 
 
 def _write_extent(out: Function, plan: Plan) -> None:

@@ -9,7 +9,14 @@ from hypothesis import assume, given, strategies as st
 from interpreted_kernels import interpreting
 from property_cases import FRAMES, LATTICES, NEIGHBOURS, RULES, pull_right
 from remembering_parts import Tiring, Weakest
-from scene_strategies import calibrated_experiments, experiments, pulled_apart, samples
+from scene_strategies import (
+    AT_LENGTH,
+    calibrated_experiments,
+    experiments,
+    in_turn,
+    pulled_apart,
+    samples,
+)
 from turning_frame import Turning
 
 import pbdkit
@@ -17,7 +24,7 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import engine_choice as choice
 from pbdkit.stepping.engine_choice import choose, make_engine
 from pbdkit.stepping.numba_engine import arrays as stretches, engine as compiled_stepper
-from pbdkit.stepping.numba_engine.cache import source_key
+from pbdkit.stepping.numba_engine.cache import load_kernel, source_key
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
@@ -163,37 +170,31 @@ def test_the_kernels_logic_for_every_component(parts, interpreted, monkeypatch):
 
 
 COMPILED = {
-    "two sublattices, lag and memory": {
+    "two sublattices, by place, lag and memory": {
         "lattice": LATTICES["hexagonal"],
-        "rule": RULES["distance-weighted"],
+        "rule": RULES["mixed-coordinate-y"],
         "frame": FRAMES["lag"],
+        "initial": {"type": "noise", "amplitude": 0.1},
         "solver": {"type": "stepping", "relaxation": 0.7, "memory": 0.2},
     },
-    "a slanted lattice, by place": {
-        "lattice": LATTICES["oblique"],
-        "rule": RULES["mixed-coordinate-y"],
-        "initial": {"type": "noise", "amplitude": 0.1},
-    },
-    "matrices of a frame that tears": {
-        "neighbours": {"type": "chebyshev", "shells": 1},
-        "rule": ELASTIC,
-        "frame": Turning(),
-        "fracture": TORN | {"placement": 1.0},
-    },
-    "damage, numbers of particles, frame spared": {
-        "rule": Tiring(spread=0.1),
-        "fracture": DAMAGE | {"scatter": 0.3, "frame_bonds": False},
-    },
+    "matrices of a frame that tears": {"frame": Turning(), "fracture": TORN | {"placement": 1.0}},
     "48 neighbours that soften, drawn and counted": {
         "neighbours": MANY,
         "rule": Tiring(spread=0.1),
         "fracture": Weakest(spread=0.3, weak=0.7),
     },
-    "found anew, numbers of particles": {"neighbours": ANEW, "rule": Tiring(spread=0.1)},
+    "found anew on a slanted lattice, numbers of particles": {
+        "lattice": LATTICES["oblique"],
+        "neighbours": ANEW,
+        "rule": Tiring(spread=0.1),
+    },
 }
-"""Each kind of code that kernels are made of, several together in each; one rule that moves by
-another is compiled for threads, below, single precision in `components/test_fracture`, and the
-built-in functions, those of cells that soften too, in `testing/test_conformance`."""
+"""Each kind of code that kernels are made of, several together in each; threads are below, single
+precision in `components/test_fracture`, and the built-in functions, a rule that moves by another
+and cells that soften too, in `testing/test_conformance`. The profile `long` compiles every
+component above as well."""
+if AT_LENGTH:
+    COMPILED |= COMPONENTS
 
 
 @pytest.mark.parametrize("parts", COMPILED.values(), ids=COMPILED)
@@ -206,20 +207,33 @@ def test_compiled_equals_numpy(parts):
 
 THREADED = {
     "torn": {"fracture": TORN},
-    "damaged": {"fracture": DAMAGE},
+    "damaged, numbers of particles, frame spared": {
+        "rule": Tiring(spread=0.1),
+        "fracture": DAMAGE | {"scatter": 0.3, "frame_bonds": False},
+    },
     "found anew": {"neighbours": ANEW},
     "moves of another": TWICE | {"frame": {"type": "mean"}},
 }
 
 
-@pytest.mark.parametrize("parts", THREADED.values(), ids=THREADED)
-def test_any_number_of_threads_gives_the_same(parts, monkeypatch):
-    monkeypatch.setattr(compiled_stepper, "BAND", 100)  # several bands of rows
+@pytest.fixture
+def banded(monkeypatch):
+    """A scene large enough for several bands of rows."""
+    monkeypatch.setattr(compiled_stepper, "BAND", 100)
     body = {"type": "grid", "columns": 36, "rows": 30}
-    scene = build_scene(pbdkit.Experiment(**sheet(body=body, **parts)))
+    return lambda parts: build_scene(pbdkit.Experiment(**sheet(body=body, **parts)))
+
+
+@pytest.mark.parametrize("parts", THREADED.values(), ids=THREADED)
+def test_the_kernels_logic_on_any_number_of_threads(parts, banded, interpreted):
+    scene = banded(parts)
+    assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2), calls=(1, 2, 7))
+
+
+@pytest.mark.parametrize("name", in_turn(THREADED, 2))
+def test_any_number_of_threads_gives_the_same(name, banded):
+    scene = banded(THREADED[name])
     assert_bitwise_equal(scene, CompiledStepper(scene, 2))
-    with interpreting():
-        assert_bitwise_equal(scene, CompiledStepper(scene), calls=(1, 2, 7))
 
 
 @pytest.mark.parametrize("kind", ["whole", "torn"])
@@ -244,8 +258,8 @@ def test_kinds_of_rows_are_a_matter_of_speed_alone(parts, interpreted, monkeypat
 
 
 def test_thousands_of_neighbours_compile_in_seconds():
-    scene = build_scene(pbdkit.Experiment(**sheet(neighbours=MANY | {"shells": 32})))
-    assert max(map(len, scene.neighbourhood.slots)) == 4224
+    scene = build_scene(pbdkit.Experiment(**sheet(neighbours=MANY | {"shells": 24})))
+    assert max(map(len, scene.neighbourhood.slots)) == 2400
     began = time.process_time()
     engine = CompiledStepper(scene)
     assert time.process_time() - began < 10.0
@@ -285,11 +299,19 @@ class Halfway(pbdkit.FollowerRule):
 SHARE = 0.5
 
 
+APPLIED = """
+@njit(cache=KEPT)
+def run(out):
+    out[0] = apply((2.0, 3.0), 0, 0)
+"""
+
+
 def test_an_edited_rule_never_runs_an_old_kernel(monkeypatch):
-    scene = build_scene(pbdkit.Experiment(**sheet(rule=Halfway())))
-    assert_bitwise_equal(scene, CompiledStepper(scene))
-    monkeypatch.setitem(globals(), "SHARE", 0.25)
-    assert_bitwise_equal(scene, CompiledStepper(scene))
+    out = np.empty(1)
+    for share in (0.5, 0.25):
+        monkeypatch.setitem(globals(), "SHARE", share)
+        load_kernel(APPLIED, {"apply": Halfway.apply}, (out,))(out)
+        assert out == Halfway.apply((2.0, 3.0), 0, 0)
 
 
 class Uncompilable(Halfway):
