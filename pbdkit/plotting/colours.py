@@ -1,4 +1,4 @@
-"""Colours of kinds, roles and other classes, and the scale of colours of a quantity.
+"""Colours of particle kinds, roles and other classes, and the colour scale of a quantity.
 
 The colours of a quantity with both signs are centred at zero.
 """
@@ -28,52 +28,54 @@ KINDS = {
     int(FOLLOWER): ("follower", "#0072B2"),
     int(LEADER): ("leader", "#D55E00"),
 }
-"""Names and colours (of Okabe and Ito), in the order of drawing."""
-OTHERS = ("#0072B2", "#F0E442", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+"""Names and colours (of Okabe and Ito), in drawing order."""
+CLASS_COLOURS = ("#0072B2", "#F0E442", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 
 
 @dataclass(frozen=True)
 class Palette:
-    """Names and colours by the number of a class, those on top last: of the kinds, or, not
+    """Names and colours by class number, in drawing order: of the kinds of particles, or, not
     `of_kind`, of the values of a quantity."""
 
     colours: dict[int, tuple[str, str]]
     of_kind: bool
 
-    def ranks(self, now: Snapshot) -> NDArray[Any]:
-        """Which colour, counted from 0, each particle has; NaN where it is of no class."""
-        classes = now.kind if self.of_kind or now.values is None else now.values
-        found = np.full(len(now.kind), np.nan)
+    def ranks(self, snapshot: Snapshot) -> NDArray[Any]:
+        """Return the index of the colour of each particle; NaN for particles of no class."""
+        classes = snapshot.kind if self.of_kind or snapshot.values is None else snapshot.values
+        ranks = np.full(len(snapshot.kind), np.nan)
         for rank, number in enumerate(self.colours):
-            found[classes == number] = rank
-        return found
+            ranks[classes == number] = rank
+        return ranks
 
 
 OF_KINDS = Palette(KINDS, True)
 
 
 def palette_of(quantity: PlottedQuantity) -> Palette:
-    """That of a quantity that has words."""
+    """Return the palette of a quantity with flag meanings."""
     if quantity.variable == "kind":
         return OF_KINDS
     words = enumerate(quantity.words.items())
-    return Palette({k: (word, OTHERS[n % len(OTHERS)]) for n, (k, word) in words}, False)
+    return Palette(
+        {k: (word, CLASS_COLOURS[n % len(CLASS_COLOURS)]) for n, (k, word) in words}, False
+    )
 
 
 DOTS, FIELD, BOTH_SIGNS = "viridis", "YlOrRd", "RdBu_r"
 NOTHING = "#E0E0E0"
-"""The colour of what has no value."""
+"""Colour of missing values."""
 NEARLY = 1e-9
-"""What is so little of the largest is taken for zero, and for no difference."""
+"""Values and differences below this fraction of the largest value count as zero."""
 FROM_ZERO = 0.3
-"""A scale whose lowest value is no more than that of its highest begins at zero."""
+"""A scale begins at zero where its lowest value is below this fraction of its highest."""
 LEVELS = 12
 
 
 @dataclass(frozen=True)
 class Scale:
-    """From `low` to `high`; `extend` as matplotlib says it: which values lie beyond. Numbers at the
-    scale are to be multiplied by ten to the `exponent`."""
+    """Colour scale from `low` to `high`; `extend` as in matplotlib. Tick labels are to be
+    multiplied by ten to the `exponent`."""
 
     low: float
     high: float
@@ -86,7 +88,7 @@ class Scale:
 def scale_of(
     quantity: PlottedQuantity, values: tuple[float, float], look: Look, filled: bool
 ) -> Scale:
-    """The scale of a quantity whose values lie between these two.
+    """Return the colour scale of a quantity with values in a range.
 
     Where they have both signs, and zero is neutral, it reaches as far on either side, unless `look`
     has limits: neutral is zero even then. Raises ExperimentError for a map that is not there.
@@ -95,10 +97,10 @@ def scale_of(
     from matplotlib.ticker import MaxNLocator
 
     low, high = values
-    far = max(abs(low), abs(high))
-    both = quantity.is_signed and low < -NEARLY * far and high > NEARLY * far
-    limited = look.vmin is not None or look.vmax is not None
-    if limited:
+    largest = max(abs(low), abs(high))
+    diverging = quantity.is_signed and low < -NEARLY * largest and high > NEARLY * largest
+    has_limits = look.vmin is not None or look.vmax is not None
+    if has_limits:
         low = low if look.vmin is None else look.vmin
         high = high if look.vmax is None else look.vmax
         if not low < high:
@@ -106,47 +108,47 @@ def scale_of(
                 f"no value lies between the limits of the colours: values are {values[0]:g} to "
                 f"{values[1]:g}; give both vmin and vmax"
             )
-        both = quantity.is_signed and low < 0.0 < high
-    elif both:
-        low, high = -far, far
+        diverging = quantity.is_signed and low < 0.0 < high
+    elif diverging:
+        low, high = -largest, largest
     elif 0.0 < low < FROM_ZERO * high and not quantity.is_place:
         low = 0.0
     elif FROM_ZERO * low < high < 0.0 and not quantity.is_place:
         high = 0.0
-    elif high - low <= NEARLY * far:
-        high = low + (far or 1.0)
-    name = look.cmap or (BOTH_SIGNS if both else FIELD if filled else DOTS)
+    elif high - low <= NEARLY * largest:
+        high = low + (largest or 1.0)
+    name = look.cmap or (BOTH_SIGNS if diverging else FIELD if filled else DOTS)
     if quantity.is_signed and low < high <= 0.0 and not look.cmap:
         name += "_r"  # what is next to zero has the same colour on either side
     norm: Normalize = Normalize(low, high)
     if look.contours:
-        levels = MaxNLocator(LEVELS, symmetric=both and not limited).tick_values(low, high)
+        levels = MaxNLocator(LEVELS, symmetric=diverging and not has_limits).tick_values(low, high)
         norm, low, high = BoundaryNorm(levels, 256), float(levels[0]), float(levels[-1])
-    beyond = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
+    extensions = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
     slack = NEARLY * (high - low)
-    extend = beyond[int(values[0] < low - slack), int(values[1] > high + slack)]
-    colours = _map(name, (low, high) if both else None)
+    extend = extensions[int(values[0] < low - slack), int(values[1] > high + slack)]
+    colours = _map(name, (low, high) if diverging else None)
     return Scale(low, high, colours, norm, extend, _exponent(max(abs(low), abs(high))))
 
 
 def _map(name: str, about_zero: tuple[float, float] | None) -> Colormap:
-    """The map of that name; of one about zero only as far as the scale goes on either side."""
+    """Return the colour map of a name, cropped so that its middle is at zero in `about_zero`."""
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
     if name not in colormaps:
-        near = did_you_mean(name, colormaps) or "; viridis, YlOrRd and RdBu_r are"
-        raise ExperimentError(f"'{name}' is no map of colours{near}")
-    found = colormaps[name]
+        suggestion = did_you_mean(name, colormaps) or "; viridis, YlOrRd and RdBu_r are"
+        raise ExperimentError(f"'{name}' is not a colour map{suggestion}")
+    cmap = colormaps[name]
     if about_zero is not None:
-        far = max(map(abs, about_zero))
-        low, high = (0.5 + 0.5 * end / far for end in about_zero)
-        found = ListedColormap(found(np.linspace(low, high, 256)))
-    return found.with_extremes(bad=NOTHING)
+        largest = max(map(abs, about_zero))
+        low, high = (0.5 + 0.5 * end / largest for end in about_zero)
+        cmap = ListedColormap(cmap(np.linspace(low, high, 256)))
+    return cmap.with_extremes(bad=NOTHING)
 
 
 def _exponent(largest: float) -> int:
-    """Of the power of ten that is told once, in place of zeros at every number."""
+    """Return the power of ten that is written once in the label, instead of zeros at each tick."""
     if largest == 0.0 or not math.isfinite(largest):
         return 0
     power = math.floor(math.log10(largest) + 1e-9)

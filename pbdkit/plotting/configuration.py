@@ -21,8 +21,8 @@ from pbdkit.plotting.data import (
     ReferenceBody,
     Snapshot,
     Trajectory,
+    combine,
     extent_of,
-    joined,
     of_one_run,
     quantity_of,
 )
@@ -118,28 +118,28 @@ def draw(
     look: Look,
     ax: Axes | Sequence[Axes] | None = None,
 ) -> Axes | list[Axes]:
-    """Draw as `plot` does, with the options in `look`."""
+    """Draw recorded steps as `plot` does, with the options in `look`."""
     refuse_no_matplotlib()
 
     recording = Trajectory(dataset, color or "kind")
-    several = isinstance(time, Iterable)
-    rows = [recording.row(one) for one in _listed(time)]
+    is_list = isinstance(time, Iterable)
+    rows = [recording.row(step) for step in _listed(time)]
     if not rows:
         raise ExperimentError("a figure needs at least one time")
-    shown = list(recording.snapshots(rows))
-    titles = [f"step {now.step}" for now in shown]
-    if not several or len(shown) == 1:
+    snapshots = list(recording.snapshots(rows))
+    titles = [f"step {snapshot.step}" for snapshot in snapshots]
+    if not is_list or len(snapshots) == 1:
         titles = [f"{recording.title}, {titles[0]}".lstrip(", ")]
-    extent = extent_of(recording, shown, look)
-    given = None if ax is None else [*ax] if isinstance(ax, Iterable) else [ax]
-    if given is not None and len(given) != len(shown):
-        raise ExperimentError(f"{len(shown)} steps need as many axes; {len(given)} are given")
-    sheet = Sheet([recording] * len(shown), titles, recording.title, extent, look, given)
-    for panel, now in zip(sheet.panels, shown, strict=True):
-        panel.show(now)
+    extent = extent_of(recording, snapshots, look)
+    targets = None if ax is None else [*ax] if isinstance(ax, Iterable) else [ax]
+    if targets is not None and len(targets) != len(snapshots):
+        raise ExperimentError(f"{len(snapshots)} steps need as many axes; {len(targets)} are given")
+    sheet = Sheet([recording] * len(snapshots), titles, recording.title, extent, look, targets)
+    for panel, snapshot in zip(sheet.panels, snapshots, strict=True):
+        panel.show(snapshot)
         if look.numbers:
-            sheet.number(panel.ax, now)
-    return sheet.axes if several else sheet.axes[0]
+            sheet.number(panel.ax, snapshot)
+    return sheet.axes if is_list else sheet.axes[0]
 
 
 def plot_experiment(
@@ -234,151 +234,168 @@ def _side_by_side(
     refuse_no_matplotlib()
 
     recordings = [Trajectory(dataset, color or "kind") for dataset in datasets]
-    shown = [next(r.snapshots([r.row(time)])) for r in recordings]
-    extent = joined([extent_of(r, [now], look) for r, now in zip(recordings, shown, strict=True)])
+    snapshots = [next(r.snapshots([r.row(time)])) for r in recordings]
+    extent = combine(
+        [extent_of(r, [snapshot], look) for r, snapshot in zip(recordings, snapshots, strict=True)]
+    )
     titles = [
-        f"{r.title}, step {now.step}".lstrip(", ") for r, now in zip(recordings, shown, strict=True)
+        f"{r.title}, step {snapshot.step}".lstrip(", ")
+        for r, snapshot in zip(recordings, snapshots, strict=True)
     ]
     sheet = Sheet(recordings, titles, "", extent, look)
-    for panel, now in zip(sheet.panels, shown, strict=True):
-        panel.show(now)
+    for panel, snapshot in zip(sheet.panels, snapshots, strict=True):
+        panel.show(snapshot)
     return sheet.axes
 
 
 def difference_of(
     first: xarray.Dataset, second: xarray.Dataset, color: str, time: float | None
 ) -> tuple[xarray.Dataset, str]:
-    """Return the second dataset at one step, at rest, with the difference in `color` as a variable
-    more, where a particle of that number is in both; and the name of what to draw."""
-    both = [of_one_run(dataset) for dataset in (first, second)]
-    quantity, _ = (quantity_of(dataset, color) for dataset in reversed(both))
+    """Return the second dataset at one step, at rest, with the difference in `color` as an
+    additional variable, for particles whose number is in both; and the name to draw."""
+    runs = [of_one_run(dataset) for dataset in (first, second)]
+    quantity, _ = (quantity_of(dataset, color) for dataset in reversed(runs))
     if quantity.owner != "particle":
-        raise ExperimentError(f"a difference is one of particles, and '{color}' is of bonds")
-    now = [d.isel(time=Trajectory(d).row(time)) for d in both]
-    numbers = np.intersect1d(now[0]["number"].values, now[1]["number"].values)
+        raise ExperimentError(
+            f"difference: expected a variable of particles, and '{color}' is one of bonds"
+        )
+    states = [d.isel(time=Trajectory(d).row(time)) for d in runs]
+    numbers = np.intersect1d(states[0]["number"].values, states[1]["number"].values)
     if not len(numbers):
         raise ExperimentError("the two have no particle in common: no number is in both")
-    a, b = (d.isel(particle=np.flatnonzero(np.isin(d["number"], numbers))) for d in now)
-    before, after = (d[quantity.variable].transpose("particle", "axis", missing_dims="ignore")
+    a, b = (d.isel(particle=np.flatnonzero(np.isin(d["number"], numbers))) for d in states)
+    minuend, subtrahend = (d[quantity.variable].transpose("particle", "axis", missing_dims="ignore")
                      for d in (a, b))  # fmt: skip
-    less = after.variable.copy(data=after.values.astype(float) - before.values)
-    less.attrs["long_name"] = f"difference in {less.attrs.get('long_name', quantity.variable)}"
+    difference = subtrahend.variable.copy(data=subtrahend.values.astype(float) - minuend.values)
+    difference.attrs["long_name"] = (
+        f"difference in {difference.attrs.get('long_name', quantity.variable)}"
+    )
     rest = b["reference"].transpose(*b["position"].dims).values
     title = f"{b.attrs.get('title', '')} less {a.attrs.get('title', '')}"
-    found = b.assign(difference=less, position=b["position"].copy(data=rest))
+    dataset = b.assign(difference=difference, position=b["position"].copy(data=rest))
     name = f"difference{color.removeprefix(quantity.variable)}"
-    return found.assign_attrs(title=title), name
+    return dataset.assign_attrs(title=title), name
 
 
 ROOMY_PT, LINED_PT, CROWDED_PT = 8.0, 5.0, 2.4
-"""Distances of particles on the page: from the first on a field leaves room for dots, from the
-second on bonds are lines of their own, below the third particles are pixels."""
+"""Thresholds of the distance of particles on the page: above the first there is room for dots on a
+field, above the second bonds are single lines, below the third particles are pixels."""
 DETAILED, MANY_BONDS = 50_000, 200_000
-"""More particles than that are never dots, nor more bonds lines."""
+"""Maximum number of particles drawn as dots, and of bonds drawn as lines."""
 
 
 @dataclass(frozen=True)
-class Manner:
-    """`filled`: there is a field. `crowded`: particles are no dots, unless that is asked for.
-    `lined`: whole bonds are lines. `dots` are the quantity's ("values"), its classes ("classes"),
-    the kinds of particles beside something else in colour ("kinds"), or none (""). `apart` is how
-    far from one another particles lie on the page, in points."""
+class RenderStyle:
+    """Rendering style: `filled` draws a field; `crowded` particles are not dots by default; `lined`
+    draws whole bonds as lines. `dots` show the quantity ("values"), its classes ("classes"), the
+    kinds of particles beside another coloured quantity ("kinds"), or nothing (""). `distance` is
+    that of particles on the page, in points."""
 
     filled: bool
     crowded: bool
     lined: bool
     dots: str
-    apart: float
+    distance: float
 
     @property
     def dot(self) -> float:
-        """The diameter of a dot in points."""
-        share, most = {"values": (0.62, 9.0), "classes": (0.45, 7.0)}.get(self.dots, (0.3, 5.0))
-        return min(share * self.apart, most)
+        """Return the diameter of a dot in points."""
+        share, largest = {"values": (0.62, 9.0), "classes": (0.45, 7.0)}.get(self.dots, (0.3, 5.0))
+        return min(share * self.distance, largest)
 
     @property
     def alone(self) -> float:
-        """That of a particle beside a field; 0 where it would be next to nothing."""
-        size = min(0.62 * self.apart, 9.0)
+        """Return the diameter of a particle outside a field; 0 where it would be invisible."""
+        size = min(0.62 * self.distance, 9.0)
         return size if size > 1.0 else 0.0
 
     @property
     def line(self) -> float:
-        """The width of a bond in points."""
-        return min(max(0.05 * self.apart, 0.25), 0.8)
+        """Return the line width of a bond in points."""
+        return min(max(0.05 * self.distance, 0.25), 0.8)
 
 
-def manner_of(body: ReferenceBody, quantity: PlottedQuantity, look: Look, apart: float) -> Manner:
-    """What is asked for, and else what is legible. Raises ExperimentError where what is asked for
-    is not there or would be too much."""
-    crowded = len(body.reference) > DETAILED or apart < CROWDED_PT
-    of_bonds, filled = quantity.owner == "bond", _is_filled(body, quantity, look, apart)
+def choose_style(
+    body: ReferenceBody, quantity: PlottedQuantity, look: Look, distance: float
+) -> RenderStyle:
+    """Choose the rendering style from the options, and else for legibility. Raises ExperimentError
+    for an option that is impossible or too expensive."""
+    crowded = len(body.reference) > DETAILED or distance < CROWDED_PT
+    of_bonds, filled = quantity.owner == "bond", _is_filled(body, quantity, look, distance)
     if quantity.words:
         dots = "" if crowded else "classes"
     elif filled or of_bonds:
-        dots = "kinds" if apart >= ROOMY_PT and not crowded else ""
+        dots = "kinds" if distance >= ROOMY_PT and not crowded else ""
     else:
         dots = "values"
-    return Manner(filled, crowded, _is_lined(body, of_bonds, filled, look, apart), dots, apart)
+    return RenderStyle(
+        filled, crowded, _is_lined(body, of_bonds, filled, look, distance), dots, distance
+    )
 
 
-def _is_filled(body: ReferenceBody, quantity: PlottedQuantity, look: Look, apart: float) -> bool:
-    many = len(body.reference) > DETAILED
-    can, asked = quantity.owner == "particle" and not quantity.words, look.contours or look.filled
-    if asked and not can:
+def _is_filled(body: ReferenceBody, quantity: PlottedQuantity, look: Look, distance: float) -> bool:
+    is_large = len(body.reference) > DETAILED
+    possible, requested = (
+        quantity.owner == "particle" and not quantity.words,
+        look.contours or look.filled,
+    )
+    if requested and not possible:
         raise ExperimentError(
             f"contours need numbers at particles as color, and '{quantity.variable}' has none; "
             "leave them out, or name another variable"
         )
-    if look.filled is False and many:
+    if look.filled is False and is_large:
         raise ExperimentError(
             f"{len(body.reference)} particles are too many for dots; at most {DETAILED}"
         )
-    wanted = asked or (look.filled is None and can and (many or apart < ROOMY_PT))
+    wanted = requested or (look.filled is None and possible and (is_large or distance < ROOMY_PT))
     if wanted and not len(body.cells):
-        if asked or many:
+        if requested or is_large:
             raise ExperimentError("contours need a body of particles that are not in line")
         return False
     return bool(wanted)
 
 
-def _is_lined(body: ReferenceBody, of_bonds: bool, filled: bool, look: Look, apart: float) -> bool:
-    asked, many = look.bonds or look.broken, len(body.ends) > MANY_BONDS
-    if asked and not len(body.ends):
+def _is_lined(
+    body: ReferenceBody, of_bonds: bool, filled: bool, look: Look, distance: float
+) -> bool:
+    requested, is_large = look.bonds or look.broken, len(body.ends) > MANY_BONDS
+    if requested and not len(body.ends):
         raise ExperimentError(
             "there are no bonds to draw: a dataset has them where there is fracture, a cut, or a "
             "diagnostic that uses them"
         )
-    if asked and many:
+    if requested and is_large:
         raise ExperimentError(f"{len(body.ends)} bonds are too many to draw; at most {MANY_BONDS}")
     if look.bonds is not None:
         return look.bonds
-    return not many and (of_bonds or (not filled and apart >= LINED_PT))
+    return not is_large and (of_bonds or (not filled and distance >= LINED_PT))
 
 
 NUMBERED_PT, LARGEST = 20.0, 2.5
-"""How far apart numbers want particles, and how many times as large a page becomes for them."""
+"""Distance of particles on the page at which numbers are legible, and maximum enlargement of the
+page for them."""
 
 
 class Panel:
-    """Axes with layers, each of which shows a step."""
+    """Axes with layers, each of which shows one step at a time."""
 
     def __init__(self, ax: Axes, drawn: list[Layer]) -> None:
         self.ax, self._layers = ax, drawn
         self.artists = [artist for layer in drawn for artist in layer.artists]
 
-    def show(self, now: Snapshot) -> None:
-        """That step, in place of the one before."""
+    def show(self, snapshot: Snapshot) -> None:
+        """Show a step in place of the previous one."""
         for layer in self._layers:
-            layer.show(now)
+            layer.show(snapshot)
 
 
 class Sheet:
-    """Axes, `axes`, of which each shows steps of a recording, `panels`.
+    """Axes and panels, each of which shows steps of a recording.
 
     All have the limits and the scale of an extent. Fields have `finer` times as many pixels, either
     way, as the picture. `axes` given are used as they are; else a figure is made around them,
-    one `alone` or of pyplot.
+    a `standalone` one or one of pyplot.
     Raises ExperimentError for what there is no room or no data for.
     """
 
@@ -392,7 +409,7 @@ class Sheet:
         axes: list[Axes] | None = None,
         finer: float = 2.0,
         *,
-        alone: bool = False,
+        standalone: bool = False,
     ) -> None:
         self._extent, self._look, self._finer = extent, look, finer
         first = recordings[0]
@@ -400,20 +417,24 @@ class Sheet:
         self._quantity, self._body = first.quantity, first.body
         self._palette = palette_of(self._quantity) if self._quantity.words else None
         panels = Panels(extent.box, titles, heading, first.axis_labels)
-        self._page = Page(panels, look.dpi, look.figsize, alone=alone) if axes is None else None
+        self._page = (
+            Page(panels, look.dpi, look.figsize, standalone=standalone) if axes is None else None
+        )
         self.axes = self._page.axes if self._page else list(axes or [])
         self._larger = 1.0
         if self._page:
             self._page.arrange()
             if look.numbers:
-                self._larger = min(max(1.0, NUMBERED_PT / self._apart()), LARGEST)
+                self._larger = min(max(1.0, NUMBERED_PT / self._spacing()), LARGEST)
                 self._page.arrange(larger=self._larger)
         else:
             self._dress(panels)
-        self._manner = manner_of(self._body, self._quantity, look, self._apart())
+        self._style = choose_style(self._body, self._quantity, look, self._spacing())
         self._scale = self._scale_of_all()
         self._key()
-        self._manner = replace(self._manner, apart=self._apart())  # the key took some of the page
+        self._style = replace(
+            self._style, distance=self._spacing()
+        )  # the key took some of the page
         self.panels = [
             Panel(ax, list(self._layers(ax, recording)))
             for ax, recording in zip(self.axes, recordings, strict=True)
@@ -421,61 +442,64 @@ class Sheet:
 
     @property
     def figure(self) -> Figure:
-        """That of the axes."""
+        """Return the figure of the axes."""
         return figure_of(self.axes[0])
 
-    def number(self, ax: Axes, now: Snapshot) -> None:
-        """Writes numbers at the particles of that step, beside their dots."""
-        manner = self._manner
-        draw_numbers(ax, self._body.number, now, manner.dot if manner.dots else 0.0)
+    def number(self, ax: Axes, snapshot: Snapshot) -> None:
+        """Write the numbers of the particles beside their dots."""
+        style = self._style
+        draw_numbers(ax, self._body.number, snapshot, style.dot if style.dots else 0.0)
 
-    def _apart(self) -> float:
-        """How far apart particles at rest lie on the page, in points."""
-        ax, (left, right, bottom, top) = self.axes[0], self._extent.box
+    def _spacing(self) -> float:
+        """Return the distance of particles at rest on the page, in points."""
+        ax, (xmin, xmax, ymin, ymax) = self.axes[0], self._extent.box
         inches = ax.get_window_extent().transformed(self.figure.dpi_scale_trans.inverted())
-        scale = min(inches.width / (right - left), inches.height / (top - bottom))
+        scale = min(inches.width / (xmax - xmin), inches.height / (ymax - ymin))
         return float(72 * scale * self._body.spacing)
 
     def _scale_of_all(self) -> Scale | None:
         if self._palette is not None:
             return None
-        filled = self._manner.filled
+        filled = self._style.filled
         values = self._extent.of_body if filled else self._extent.of_all
         return scale_of(self._quantity, values, self._look, filled)
 
     def _layers(self, ax: Axes, recording: Trajectory) -> Iterator[Layer]:
-        """What is drawn, from below."""
-        body, scale, manner, grid = recording.body, self._scale, self._manner, self._grid(ax)
-        if manner.filled and scale:
-            yield PixelField(ax, body, grid, scale, manner.alone)
-        elif self._palette and manner.crowded:
+        """Generate the layers, from below."""
+        body, scale, style, grid = recording.body, self._scale, self._style, self._grid(ax)
+        if style.filled and scale:
+            yield PixelField(ax, body, grid, scale, style.alone)
+        elif self._palette and style.crowded:
             yield Classes(ax, body, grid, self._palette)
-        if manner.lined:
-            yield BondLines(ax, body, manner.line)
+        if style.lined:
+            yield BondLines(ax, body, style.line)
         if self._look.broken:
-            yield BondLines(ax, body, manner.line, broken=True)
+            yield BondLines(ax, body, style.line, broken=True)
         if self._quantity.owner == "bond" and scale:
-            many = len(body.ends) > MANY_BONDS
-            width = 2.0 * manner.line
-            yield BondField(ax, body, grid, scale) if many else BondValues(ax, body, width, scale)
+            is_large = len(body.ends) > MANY_BONDS
+            width = 2.0 * style.line
+            yield (
+                BondField(ax, body, grid, scale) if is_large else BondValues(ax, body, width, scale)
+            )
         if self._look.outline:
             draw_outline(ax, body.outline)
-        if manner.dots:
-            colours = {"values": scale, "classes": self._palette}.get(manner.dots)
-            yield Dots(ax, manner.dot, colours or OF_KINDS, body.beyond & manner.filled)
+        if style.dots:
+            colours = {"values": scale, "classes": self._palette}.get(style.dots)
+            yield Dots(ax, style.dot, colours or OF_KINDS, body.outside & style.filled)
 
     def _grid(self, ax: Axes) -> PixelGrid:
-        """The pixels of a field, finer than those of the picture where cells are few."""
+        """Return the pixels of a field, which are finer than those of the picture unless there are
+        many cells."""
         extent = ax.get_window_extent()
         finer = 1 if len(self._body.reference) > DETAILED else self._finer
         across, up = (max(2, round(finer * side)) for side in (extent.width, extent.height))
         return PixelGrid(self._extent.box, across, up)
 
     def _key(self) -> None:
-        """The bar of the scale, and a legend of the kinds where they are seen."""
+        """Add the colour bar, and a legend of the kinds that are visible."""
         quantity, scale, page = self._quantity, self._scale, self._page
         text = label(quantity.meaning, quantity.units, scale.exponent if scale else 0)
-        of_kinds = self._manner.dots == "kinds"
+        of_kinds = self._style.dots == "kinds"
         palette = OF_KINDS if of_kinds else self._palette
         if page:
             present = set(self._extent.kinds if of_kinds else self._extent.classes)
@@ -494,14 +518,14 @@ class Sheet:
             self._add_legend(palette)
 
     def _dress(self, panels: Panels) -> None:
-        """Axes that were given: limits, titles and labels."""
-        left, right, bottom, top = panels.box
+        """Set limits, titles and labels of axes passed by the caller."""
+        xmin, xmax, ymin, ymax = panels.box
         for ax, title in zip(self.axes, panels.titles, strict=True):
-            ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", title=title)
+            ax.set(xlim=(xmin, xmax), ylim=(ymin, ymax), aspect="equal", title=title)
             ax.set(xlabel=panels.labels[0], ylabel=panels.labels[1])
 
     def _add_legend(self, palette: Palette) -> None:
-        """Below axes that were given."""
+        """Add a legend below axes passed by the caller."""
         from matplotlib.transforms import ScaledTranslation
 
         below = self.axes[0].transAxes + ScaledTranslation(0, -0.45, self.figure.dpi_scale_trans)

@@ -1,4 +1,5 @@
-"""The crack of a run: which bonds broke, when, and how long it became."""
+"""Pictures of cracks: the broken bonds with their steps of breaking, their number, and the length
+of the longest crack."""
 
 from __future__ import annotations
 
@@ -23,24 +24,28 @@ Kind = Literal["map", "length", "bonds"]
 KINDS: tuple[Kind, ...] = ("map", "length", "bonds")
 COLOURS, BODY, OLD, NEW = "viridis", "#B0B0B0", "#000000", "#D55E00"
 WIDE_IN, LEAST_IN, TALLEST_IN, BESIDE_IN = 5.0, 1.8, 6.0, 1.3
-"""The greatest width of the panel of a map, its least width and height, its greatest height, and
-what the text around it takes."""
+"""Maximum width of a map, its minimum width and height, its maximum height, and the space of the
+text around it, in inches."""
 LONG, SCALE_IN, THIN = 2.5, 0.7, 0.08
-"""Bodies so many times as wide as tall have their scale below them; what it takes there; there is
-room for one tick at a side that is so short."""
+"""Ratio of width to height above which the colour bar is below the body; its height there; ratio of
+the sides below which the shorter has a single tick."""
 POINTS, DENSE = 30_000, 100.0
-"""Of more particles than that some are left out; the size of a dot, points, for one particle."""
+"""Maximum number of particles that are drawn; dot size in points for a single particle."""
 APART, CRACKS = 1.5, 50
-"""Bonds so many lengths apart are of one crack; so many cracks, the largest, are measured."""
+"""Bonds within this multiple of the bond length belong to one crack; maximum number of cracks that
+are measured, the largest first."""
 DIRECTIONS = 180
-"""In so many directions a crack is measured; the length is right within 4e-5 of it."""
+"""Number of directions in which a crack is measured; the relative error of the length is below
+4e-5."""
 
 
 def crack(dataset: xarray.Dataset, kind: Kind = "map", *, ax: Axes | None = None) -> Axes:
-    """Draws what broke and returns the axes: the broken bonds on the body at rest, coloured by the
-    step in which they broke (`map`); or over the steps the `length` of the longest crack, the
-    largest distance between the middles of its bonds, or the number of broken `bonds`. What was
-    cut, or broken from the start, counts too; bonds to the frame do not.
+    """Draw broken bonds and return the axes.
+
+    `map` shows the broken bonds on the body at rest, coloured by step of breaking; `length` the
+    length of the longest crack over the steps, measured as the largest distance between the middles
+    of its bonds; `bonds` the number of broken bonds. Bonds that were cut, or broken from the start,
+    count; bonds to the frame do not.
 
     Raises ExperimentError where bonds could not break, for several runs, and where matplotlib is
     missing.
@@ -54,17 +59,17 @@ def crack(dataset: xarray.Dataset, kind: Kind = "map", *, ax: Axes | None = None
         return _map(dataset, broken, title, ax)
     steps, counts = np.unique(broken.step, return_counts=True)
     if kind == "bonds":
-        values, said, units = np.cumsum(counts), "number of broken bonds", ""
+        values, meaning, units = np.cumsum(counts), "number of broken bonds", ""
     else:
         reached = np.searchsorted(broken.step, steps, side="right") - 1
         factor, units = in_its_units(dataset["reference"].attrs)
-        values, said = factor * _lengths(broken)[reached], "length of the longest crack"
+        values, meaning = factor * _lengths(broken)[reached], "length of the longest crack"
     last = math.ceil(dataset["time"].values[-1])
     x = np.concatenate([[0], np.repeat(steps, 2), [last]])
     y = np.repeat([0.0, *values], 2)
     ax = ax or new_axes()
-    ax.set_xlabel(label("time", "step", broad=BROAD))
-    ax.set_ylabel(label(said, units, broad=TALL))
+    ax.set_xlabel(label("time", "step", width=BROAD))
+    ax.set_ylabel(label(meaning, units, width=TALL))
     draw_lines(ax, [Line(x, y)], title, "")
     for line in ax.lines:
         line.set_marker("")
@@ -73,8 +78,8 @@ def crack(dataset: xarray.Dataset, kind: Kind = "map", *, ax: Axes | None = None
 
 @dataclass(frozen=True)
 class CrackBonds:
-    """Broken bonds in the order of breaking: `step`, the `ends` (bond, end, axis) and the `middle`
-    at rest, without those to the frame."""
+    """Broken bonds of the body in the order of breaking: `step`, the `ends` (bond, end, axis) and
+    the `middle` at rest."""
 
     step: Array
     ends: Array
@@ -86,18 +91,20 @@ def _broken(dataset: xarray.Dataset) -> CrackBonds:
         raise ExperimentError(
             "no bond could break: give the experiment `fracture` or `cuts`, and run again"
         )
-    if more := member_dims(dataset["broken_step"]):
-        raise ExperimentError(f"these are several runs, along {', '.join(more)}: take one by isel")
+    if extra_dims := member_dims(dataset["broken_step"]):
+        raise ExperimentError(
+            f"these are several runs, along {', '.join(extra_dims)}: take one by isel"
+        )
     steps = dataset["broken_step"].values
     rows = np.flatnonzero(steps >= 0)
     rows = rows[np.argsort(steps[rows], kind="stable")]
     if not len(rows):
         raise ExperimentError("no bond broke, nothing is to be drawn")
     particles = rows_of(dataset["number"].values, dataset["bond_ends"].values[rows])
-    there = (particles >= 0).all(axis=1)
-    if not there.any():
-        raise ExperimentError("of the bonds that broke none is between particles that are here")
-    rows, particles = rows[there], particles[there]
+    present = (particles >= 0).all(axis=1)
+    if not present.any():
+        raise ExperimentError("no broken bond is between particles of this dataset")
+    rows, particles = rows[present], particles[present]
     of_body = (dataset["role"].values[particles] == OF_BODY).all(axis=1)
     of_body = of_body if of_body.any() else np.ones_like(of_body)
     ends = dataset["reference"].values[particles[of_body]]
@@ -105,8 +112,8 @@ def _broken(dataset: xarray.Dataset) -> CrackBonds:
 
 
 def _lengths(broken: CrackBonds) -> Array:
-    """(bond,): how long the longest crack is once each bond is broken. Bonds that lie nearer to
-    each other than APART lengths are of one crack."""
+    """Return the length of the longest crack after each bond has broken, (bond,). Bonds within
+    APART lengths of each other belong to one crack."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
@@ -115,30 +122,30 @@ def _lengths(broken: CrackBonds) -> Array:
     longest = np.linalg.norm(broken.ends[:, 1] - broken.ends[:, 0], axis=1).max()
     pairs = KDTree(broken.middle).query_pairs(APART * longest, output_type="ndarray")
     near = coo_array((np.ones(len(pairs)), tuple(pairs.T)), (count, count))
-    which = connected_components(near, directed=False)[1]
-    found = np.zeros(count)
-    for one in np.argsort(-np.bincount(which))[:CRACKS]:
-        rows = np.flatnonzero(which == one)
+    labels = connected_components(near, directed=False)[1]
+    lengths = np.zeros(count)
+    for number in np.argsort(-np.bincount(labels))[:CRACKS]:
+        rows = np.flatnonzero(labels == number)
         until = np.searchsorted(rows, np.arange(count), side="right") - 1
         grown = _extents(broken.middle[rows])[np.maximum(until, 0)]
-        found = np.maximum(found, np.where(until >= 0, grown, 0.0))
-    return found
+        lengths = np.maximum(lengths, np.where(until >= 0, grown, 0.0))
+    return lengths
 
 
 def _extents(middle: Array) -> Array:
-    """(bond,): the largest distance between the middles of the bonds up to each."""
-    found = np.zeros(len(middle))
+    """Return the largest distance between the middles of the bonds up to each, (bond,)."""
+    extents = np.zeros(len(middle))
     for angle in np.arange(DIRECTIONS) * (np.pi / DIRECTIONS):
         along = middle @ (np.cos(angle), np.sin(angle))
-        found = np.maximum(found, np.maximum.accumulate(along) - np.minimum.accumulate(along))
-    return found
+        extents = np.maximum(extents, np.maximum.accumulate(along) - np.minimum.accumulate(along))
+    return extents
 
 
 def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | None) -> Axes:
     from matplotlib.collections import LineCollection
 
     body = dataset["reference"].values[dataset["role"].values == OF_BODY]
-    own, ax = ax is None, ax or _axes_around(body)
+    is_new, ax = ax is None, ax or _axes_around(body)
     dots = body[:: 1 + len(body) // POINTS]
     size = min(max(DENSE / np.sqrt(len(body)), 1.2), 6.0)
     ax.plot(*dots.T, ".", color=BODY, ms=size, mew=0.0, rasterized=len(dots) > 5000, zorder=0)
@@ -146,16 +153,16 @@ def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | Non
     groups = {"broken from the start": (broken.step == 0, OLD)}
     if len(later) == 1:
         groups[f"broken in step {later[0]}"] = (broken.step > 0, NEW)
-    for said, (which, colour) in groups.items():
-        if which.any():
-            lines = LineCollection([*broken.ends[which]], colors=colour, linewidths=1.6)
-            lines.set_label(said)
+    for name, (rows, colour) in groups.items():
+        if rows.any():
+            lines = LineCollection([*broken.ends[rows]], colors=colour, linewidths=1.6)
+            lines.set_label(name)
             ax.add_collection(lines, autolim=False)
     if len(later) > 1:
         _coloured(ax, broken, below=_is_long(body))
     units = dataset["reference"].attrs.get("units", "")
-    x, y = (label(axis, units, broad=BROAD) for axis in "xy")
-    ax.set(aspect="equal", title=label(title, broad=BROAD), xlabel=x, ylabel=y)
+    x, y = (label(axis, units, width=BROAD) for axis in "xy")
+    ax.set(aspect="equal", title=label(title, width=BROAD), xlabel=x, ylabel=y)
     ax.margins(0.04)
     low, sides = body.min(axis=0), np.ptp(body, axis=0)
     for axis, first, side in zip((ax.xaxis, ax.yaxis), low, sides, strict=True):
@@ -163,7 +170,7 @@ def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | Non
             axis.set_ticks([round(float(first), 6)])
     if ax.get_legend_handles_labels()[1]:
         style: dict[str, Any] = {"frameon": False, "fontsize": "small"}
-        if whole := ax.get_figure(root=True) if own else None:
+        if whole := ax.get_figure(root=True) if is_new else None:
             whole.legend(loc="outside lower center", ncols=2, **style)
         else:
             ax.legend(**style)
@@ -176,7 +183,8 @@ def _is_long(body: Array) -> bool:
 
 
 def _axes_around(body: Array) -> Axes:
-    """Those of a figure of the body's shape, as far as there is room for text around it."""
+    """Return the axes of a new figure with the body's aspect ratio, as far as there is room for
+    text."""
     wide, tall = np.maximum(np.ptp(body, axis=0), 1e-9)
     height = min(max(WIDE_IN * tall / wide, LEAST_IN), TALLEST_IN)
     width = min(max(height * wide / tall, LEAST_IN), WIDE_IN)
@@ -185,7 +193,8 @@ def _axes_around(body: Array) -> Axes:
 
 
 def _coloured(ax: Axes, broken: CrackBonds, *, below: bool) -> None:
-    """Bonds that broke on the way, by their steps, with the scale, beside the body or below."""
+    """Add the bonds that broke during the run, coloured by step, with a colour bar beside or below
+    the body."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.collections import LineCollection
     from matplotlib.colors import Normalize
@@ -197,6 +206,6 @@ def _coloured(ax: Axes, broken: CrackBonds, *, below: bool) -> None:
     lines.set_array(broken.step[later])
     ax.add_collection(lines, autolim=False)
     ticks = MaxNLocator(6, integer=True)
-    where: Any = {"location": "bottom" if below else "right", "aspect": 40 if below else 25}
-    bar = ax.figure.colorbar(ScalarMappable(scale, COLOURS), ax=ax, ticks=ticks, **where)
-    bar.set_label(label("time of breaking", "step", broad=TALL))
+    position: Any = {"location": "bottom" if below else "right", "aspect": 40 if below else 25}
+    bar = ax.figure.colorbar(ScalarMappable(scale, COLOURS), ax=ax, ticks=ticks, **position)
+    bar.set_label(label("time of breaking", "step", width=TALL))

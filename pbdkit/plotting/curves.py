@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 FORCE_OF = {"load": "load_resultant", "obstacle": "contact_force", "leader_group": "reaction"}
-"""The forces on a curve, by the dimension of what exerts them."""
+"""Variables of forces, by the dimension of the bodies that exert them."""
 NEEDED_FORCES = (
     "a curve of force over displacement needs a diagnostic of forces: add "
     "{type: load-displacement, youngs_modulus: ...} for loads, {type: contact, ...} for obstacles "
@@ -38,27 +38,27 @@ NEEDED_FORCES = (
 
 
 @dataclass(frozen=True)
-class Way:
-    """`force` over `displacement`, DataArrays along time that say along which axis."""
+class LoadCurve:
+    """`force` over `displacement`, DataArrays along time whose names contain the axis."""
 
     displacement: Any
     force: Any
 
 
-def way(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> Way:
-    """That of the chosen group, load or obstacle, else of the one that goes farthest, along the
-    axis along which it does.
+def load_curve(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> LoadCurve:
+    """Return force and displacement of the chosen group, load or obstacle, or of the one with the
+    largest displacement, along its main axis.
 
     Raises ExperimentError where the dataset has no such forces, or not of the chosen one.
     """
-    dim, moved = _moved(dataset, chosen)
+    dim, moved = _moving(dataset, chosen)
     force, place = in_units(dataset[FORCE_OF[dim]]), chosen.get(CHOSEN_BY[dim])
-    known = force[dim].values.tolist()
+    places = force[dim].values.tolist()
     if place is None:
-        place = known[int(np.argmax(_greatest(moved, dim)))]
-    if place not in known:
-        said = f"there is no {dim.replace('_', ' ')} {place}"
-        raise ExperimentError(f"{said}; there are {', '.join(map(str, known))}")
+        place = places[int(np.argmax(_greatest(moved, dim)))]
+    if place not in places:
+        meaning = f"there is no {dim.replace('_', ' ')} {place}"
+        raise ExperimentError(f"{meaning}; there are {', '.join(map(str, places))}")
     force, moved = force.sel({dim: place}), moved.sel({dim: place})
     leads = moved if _greatest(moved, "axis").any() else force
     axis = int(np.argmax(_greatest(leads, "axis")))
@@ -66,91 +66,99 @@ def way(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> Way:
     backwards = -float(leads.min()) > float(leads.max())
     along = f"{'−' if backwards else ''}{dataset['axis'].values[axis]}"
     name = f"{dim.replace('_', ' ')} {place} along {along}"
-    return Way(*(
-        (-values if backwards else values).assign_attrs(values.attrs | {"long_name": said})
-        for values, said in ((moved, f"displacement of {name}"), (force, f"force of {name}"))
+    return LoadCurve(*(
+        (-values if backwards else values).assign_attrs(values.attrs | {"long_name": meaning})
+        for values, meaning in ((moved, f"displacement of {name}"), (force, f"force of {name}"))
     ))  # fmt: skip
 
 
-def _moved(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> tuple[str, Any]:
-    """What exerts the forces, and how it moves: what is asked for, else the first that moves."""
-    asked = [dim for dim, argument in CHOSEN_BY.items() if chosen.get(argument) is not None]
-    there = [dim for dim in asked or FORCE_OF if FORCE_OF[dim] in dataset.variables]
-    found = [(dim, _displacements(dataset, dim)) for dim in there]
-    if not found:
+def _moving(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> tuple[str, Any]:
+    """Return the dimension of the forces and the displacements: of the chosen kind, or the first
+    that moves."""
+    requested = [dim for dim, argument in CHOSEN_BY.items() if chosen.get(argument) is not None]
+    available = [dim for dim in requested or FORCE_OF if FORCE_OF[dim] in dataset.variables]
+    candidates = [(dim, _displacements(dataset, dim)) for dim in available]
+    if not candidates:
         raise ExperimentError(NEEDED_FORCES)
-    return next((each for each in found if np.nan_to_num(each[1].values).any()), found[0])
+    return next((each for each in candidates if np.nan_to_num(each[1].values).any()), candidates[0])
 
 
 def _greatest(values: Any, dim: str) -> Floats:
-    """(place along dim,): the largest absolute value there."""
-    found = np.abs(values.transpose(dim, ...).values).reshape(values.sizes[dim], -1)
-    return np.asarray(np.nanmax(found, axis=1))
+    """Return the largest absolute value at each index along `dim`."""
+    sizes = np.abs(values.transpose(dim, ...).values).reshape(values.sizes[dim], -1)
+    return np.asarray(np.nanmax(sizes, axis=1))
 
 
 def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
-    """(time, group, axis): the mean displacement of whoever exerts the force, with units."""
+    """Return the mean displacement, (time, group, axis), of the particles or obstacles that exert
+    the force, with units."""
     import xarray
 
     if dim == "load":
         return in_units(dataset["load_displacement"])
-    if more := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:
+    if extra_dims := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:
         raise ExperimentError(
-            f"who moves how far is not known of all members of a sweep (along {', '.join(more)}): "
-            "take one with isel, or name x and y"
+            f"a sweep has no single force-displacement curve (along {', '.join(extra_dims)}): "
+            "select one member with isel, or name x and y"
         )
     scene = scene_of(dataset, "the way of leaders and obstacles")
     if dim == "obstacle":
         steps = dataset["time"].values
-        moved = np.stack([_of_barriers(scene, int(step)) for step in steps])
+        displacement = np.stack([_of_barriers(scene, int(step)) for step in steps])
     else:
-        moved = np.stack([_of_rows(dataset, leading.rows) for leading in scene.leading], axis=1)
+        displacement = np.stack(
+            [_of_rows(dataset, leading.rows) for leading in scene.leading], axis=1
+        )
     factor, units = in_its_units(dataset["position"].attrs)
     along = {"time": dataset["time"], dim: dataset[dim], "axis": dataset["axis"]}
-    return xarray.DataArray(moved * factor, along, ("time", dim, "axis"), attrs={"units": units})
+    return xarray.DataArray(
+        displacement * factor, along, ("time", dim, "axis"), attrs={"units": units}
+    )
 
 
 def _of_barriers(scene: Scene, step: int) -> Floats:
-    """(obstacle, axis): how far each has gone by a step; it stays where it last was."""
-    found = []
+    """Return the offset of each obstacle at a step, (obstacle, axis); it stays at its last
+    place."""
+    offsets = []
     for barrier in scene.barriers:
         n = min(step, barrier.group.last(step)) - barrier.group.from_ + 1
-        found.append(barrier.offset(n).mean(axis=0) if n > 0 else np.zeros(scene.axes))
-    return np.array(found)
+        offsets.append(barrier.offset(n).mean(axis=0) if n > 0 else np.zeros(scene.axes))
+    return np.array(offsets)
 
 
 def _of_rows(dataset: xarray.Dataset, rows: NDArray[Any]) -> Floats:
-    """(time, axis): the mean displacement of some particles, so many steps at a time."""
+    """Return the mean displacement of some particles, (time, axis), some steps at a time."""
     low, high = int(rows.min()), int(rows.max()) + 1
     reference = dataset["reference"].isel(particle=slice(low, high)).transpose("particle", "axis")
     position = dataset["position"].isel(particle=slice(low, high))
     block = max(1, SUM_BLOCK_BYTES // max(1, reference.nbytes))
-    found = []
+    means = []
     for begin in range(0, dataset.sizes["time"], block):
         part = position.isel(time=slice(begin, begin + block)).transpose("time", "particle", "axis")
-        moved = part.values[:, rows - low] - reference.values[rows - low]
-        found.append(moved.mean(axis=1))
-    return np.concatenate(found)
+        displacement = part.values[:, rows - low] - reference.values[rows - low]
+        means.append(displacement.mean(axis=1))
+    return np.concatenate(means)
 
 
 SIZE_IN, DPI = (4.8, 3.3), 200
 HUES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-"""Colours of Okabe and Ito, without the yellow that no white page shows."""
+"""Colours of Okabe and Ito, without yellow, which is invisible on white."""
 MANY, MOST, WITHIN, FEW_POINTS = "viridis", 12, 4, 40
-"""The colours of more lines than that; so many are told by a legend, and by one within the panel;
-so many points are marked."""
+"""Colour map for more lines than colours; maximum number of lines in a legend, and in one within
+the panel; maximum number of points with markers."""
 BROAD, TALL, NAMED = 44, 34, 34
-"""Characters of a line of a label below and beside the panel, and of the legend."""
+"""Characters a line of a label below and beside the panel, and of the legend."""
 QUICK, LEGEND_IN = 20_000, 1.9
-"""Of so many points it is found out where a legend hides none; so broad is one beside the panel."""
+"""Maximum number of points for which the best place of a legend is searched; width of a legend
+beside the panel."""
 ROUND = [1, 2, 5, 10]
-"""Ticks lie at multiples of these."""
+"""Ticks are multiples of these."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """Values `y` over `x`. Lines of one `hue`, a particle or a member of a sweep, have one colour,
-    which stands for `value` where there is a number; `dashed` tells a second component."""
+    """Values `y` over `x`. Lines of one `hue`, a particle or a member of a sweep, share a colour,
+    which represents `value` where that is a number; a second component is `dashed`."""
 
     x: Array
     y: Array
@@ -161,7 +169,7 @@ class Line:
 
 
 def new_axes(width: float = SIZE_IN[0], height: float = SIZE_IN[1]) -> Axes:
-    """The axes of a figure of that size, in inches."""
+    """Return the axes of a new figure of a size in inches."""
     refuse_no_matplotlib()
     from pbdkit.plotting.style import new_figure
 
@@ -169,8 +177,8 @@ def new_axes(width: float = SIZE_IN[0], height: float = SIZE_IN[1]) -> Axes:
 
 
 def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
-    """Draws lines with a legend; with a scale of colours, of what `hues` says, where they are more
-    than a legend tells."""
+    """Draw lines with a legend, or with a colour bar labelled `hues` where they are too many for
+    one."""
     from matplotlib import colormaps
     from matplotlib.ticker import MaxNLocator
 
@@ -191,7 +199,7 @@ def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
     ax.grid(color="#E8E8E8", lw=0.6)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
-    ax.set_title(label(title, broad=BROAD), fontsize="medium", pad=12)
+    ax.set_title(label(title, width=BROAD), fontsize="medium", pad=12)
     if len(lines) > MOST:
         _scale(ax, lines, order, hues)
     elif any(line.name for line in lines):
@@ -200,7 +208,7 @@ def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
 
 def _legend(ax: Axes, lines: Sequence[Line], hues: str) -> None:
     style: dict[str, Any] = {"frameon": False, "fontsize": "small", "title_fontsize": "small"}
-    style["title"] = label(hues, broad=NAMED)
+    style["title"] = label(hues, width=NAMED)
     if len(lines) <= WITHIN and sum(len(line.x) for line in lines) < QUICK:
         ax.legend(loc="best", **style)
         return
@@ -215,7 +223,7 @@ def _wrapped(name: str) -> str:
 
 
 def _shares(lines: Sequence[Line], order: dict[int, int]) -> dict[int, float]:
-    """Where the colour of each hue lies between the first and the last, 0 to 0.9."""
+    """Return the position of each hue in the colour map, from 0 to 0.9."""
     low, high = _range(lines, order)
     at = {line.hue: _value(line, order) for line in lines}
     return {hue: 0.9 * (value - low) / ((high - low) or 1.0) for hue, value in at.items()}
@@ -235,44 +243,44 @@ def _scale(ax: Axes, lines: Sequence[Line], order: dict[int, int], hues: str) ->
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 
-    shown = ListedColormap(colormaps[MANY](np.linspace(0.0, 0.9, 256)))
-    colours = ScalarMappable(Normalize(*_range(lines, order)), shown)
-    ax.figure.colorbar(colours, ax=ax, aspect=25).set_label(label(hues, broad=BROAD))
+    cmap = ListedColormap(colormaps[MANY](np.linspace(0.0, 0.9, 256)))
+    colours = ScalarMappable(Normalize(*_range(lines, order)), cmap)
+    ax.figure.colorbar(colours, ax=ax, aspect=25).set_label(label(hues, width=BROAD))
 
 
 def member_dims(values: Any) -> list[str]:
-    """The dimensions that are those of a sweep, or of runs put side by side."""
+    """Return the dimensions of a sweep, or of runs put side by side."""
     return [str(dim) for dim in values.dims if dim not in OF_A_RUN]
 
 
 def hues_of(values: Any) -> str:
-    """What the colours of members tell apart; nothing for a single run."""
+    """Return the label of the colours of members; empty for a single run."""
     dims = member_dims(values)
     return dims[0] if len(dims) == 1 else "member of the sweep" if dims else ""
 
 
 def lines_of(dataset: xarray.Dataset, x: Any, y: Any) -> list[Line]:
-    """The lines of y over x, DataArrays with one dimension of a run between them: each named by the
-    parameters of its member, without what is NaN."""
+    """Return the lines of y over x, DataArrays with one dimension of a run between them; each is
+    named by the parameters of its member and contains no NaN."""
     import xarray
 
     across, drawn = xarray.broadcast(x, y)
     dims = member_dims(drawn)
     across, drawn = (values.transpose(*dims, ...) for values in (across, drawn))
-    found = []
+    lines = []
     places = product(*(range(drawn.sizes[dim]) for dim in dims))
     for hue, place in enumerate(places):
         at, over = across.values[place], drawn.values[place]
-        there = np.isfinite(at) & np.isfinite(over)
+        finite = np.isfinite(at) & np.isfinite(over)
         along = dict(zip(dims, place, strict=True))
-        name = ", ".join(f"{dim} {_said(dataset, dim, n)}" for dim, n in along.items())
+        name = ", ".join(f"{dim} {_label_of(dataset, dim, n)}" for dim, n in along.items())
         value = _number(dataset, dims[0], place[0]) if len(dims) == 1 else None
-        if there.any():
-            found.append(Line(at[there], over[there], name, hue, value))
-    return found
+        if finite.any():
+            lines.append(Line(at[finite], over[finite], name, hue, value))
+    return lines
 
 
-def _said(dataset: xarray.Dataset, dim: str, place: int) -> str:
+def _label_of(dataset: xarray.Dataset, dim: str, place: int) -> str:
     for name in (f"{dim}{TEXT}", dim):
         if name in dataset.coords and dataset[name].dims == (dim,):
             value = dataset[name].values[place]
@@ -281,7 +289,7 @@ def _said(dataset: xarray.Dataset, dim: str, place: int) -> str:
 
 
 def _number(dataset: xarray.Dataset, dim: str, place: int) -> float | None:
-    """What a place stands for, where that is a number."""
+    """Return the coordinate at an index where it is a number, else None."""
     if f"{dim}{TEXT}" in dataset.coords or dim not in dataset.coords:
         return None
     value = dataset[dim].values[place]
@@ -290,7 +298,7 @@ def _number(dataset: xarray.Dataset, dim: str, place: int) -> float | None:
 
 Kind = Literal["load-displacement", "stress-strain", "energies"]
 KINDS: tuple[Kind, ...] = ("stress-strain", "load-displacement", "energies")
-"""In the order in which they are looked for."""
+"""Kinds of curves, in the order in which they are tried."""
 ENERGIES = ("strain_energy", "pe1", "pe1_intact", "pe2")
 NEEDED_DIAGNOSTICS = {
     "stress-strain": "stress over strain needs the diagnostic stress-strain: add "
@@ -357,8 +365,8 @@ def _of_kind(
     dataset: xarray.Dataset, kind: Kind, chosen: dict[str, int | None], ax: Axes | None
 ) -> Axes:
     if kind == "load-displacement":
-        found = way(dataset, chosen)
-        return _draw(dataset, found.displacement, [found.force], ax)
+        pair = load_curve(dataset, chosen)
+        return _draw(dataset, pair.displacement, [pair.force], ax)
     if kind not in NEEDED_DIAGNOSTICS:
         raise ExperimentError(f"there is no curve '{kind}'; there are {', '.join(KINDS)}")
     names = ["nominal_stress"] if kind == "stress-strain" else _energies(dataset)
@@ -370,33 +378,34 @@ def _of_kind(
 
 
 def _energies(dataset: xarray.Dataset) -> list[str]:
-    """Those that have one unit: the energy if there is one, else the pseudo-energies."""
-    there = [name for name in ENERGIES if name in dataset]
-    units = [dataset[name].attrs.get("units") for name in there]
-    return [name for name, unit in zip(there, units, strict=True) if unit == units[0]]
+    """Return the energies that have one unit: the energy if there is one, else the
+    pseudo-energies."""
+    names = [name for name in ENERGIES if name in dataset]
+    units = [dataset[name].attrs.get("units") for name in names]
+    return [name for name, unit in zip(names, units, strict=True) if unit == units[0]]
 
 
 def _draw(dataset: xarray.Dataset, x: Any, drawn: list[Any], ax: Axes | None) -> Axes:
-    several = len(drawn) > 1
+    is_list = len(drawn) > 1
     lines = []
     for n, y in enumerate(drawn):
         for line in lines_of(dataset, x, y):
-            said = [line.name, y.attrs["long_name"]] if several else [line.name]
+            parts = [line.name, y.attrs["long_name"]] if is_list else [line.name]
             hue = line.hue if member_dims(y) else n
-            name = ", ".join(filter(None, said))
+            name = ", ".join(filter(None, parts))
             lines.append(replace(line, name=name, hue=hue, dashed=n > 0))
     if not lines:
         raise ExperimentError(f"'{drawn[0].name}' has no value that could be drawn")
     ax = ax or new_axes()
-    ax.set_xlabel(label(x.attrs["long_name"], x.attrs["units"], broad=BROAD))
-    common = "pseudo-energy" if several else drawn[0].attrs["long_name"]
-    ax.set_ylabel(label(common, drawn[0].attrs["units"], broad=TALL))
+    ax.set_xlabel(label(x.attrs["long_name"], x.attrs["units"], width=BROAD))
+    common = "pseudo-energy" if is_list else drawn[0].attrs["long_name"]
+    ax.set_ylabel(label(common, drawn[0].attrs["units"], width=TALL))
     draw_lines(ax, lines, str(dataset.attrs.get("title", "")), hues_of(drawn[0]))
     return ax
 
 
 MOST_LINES = 200
-"""So many lines are drawn at most."""
+"""Maximum number of lines."""
 Numbers = int | Iterable[int]
 
 
@@ -412,8 +421,8 @@ def history(
 ) -> Axes:
     """Draw a variable of particles over the steps and return the axes.
 
-    The particles are told by number, one or several, or by their site indices: `i` and `j` are one
-    particle, one of them alone is a line of them. `name` is any variable of particles, a vector
+    The particles are selected by number, one or several, or by their site indices: `i` and `j` are
+    one particle, one of them alone is a line of them. `name` is any variable of particles, a vector
     (its first component is drawn through, the others dashed) or a component as `u_x`; by default
     the displacement `u`, made of positions where it was not recorded. `track` shows every step.
     `bond` names a bond by the numbers of its two particles: its strain, or a variable of bonds.
@@ -433,116 +442,126 @@ def history(
         numbers = _numbers(dataset, particle, i, j)
         drawn = _of_particles(dataset, name or "u", numbers)
     alone = len(drawn) == 1
-    lines = [line for n, one in enumerate(drawn) for line in _lines(dataset, one, n, alone)]
+    lines = [line for n, series in enumerate(drawn) for line in _lines(dataset, series, n, alone)]
     if not 0 < len(lines) <= MOST_LINES:
         what = f"{len(lines)} lines are too many" if lines else "there is no value to draw"
         raise ExperimentError(f"{what}; name other particles, for at most {MOST_LINES} lines")
-    shown, title = drawn[0].values, str(dataset.attrs.get("title", ""))
+    values, title = drawn[0].values, str(dataset.attrs.get("title", ""))
     hues = "bond" if bond is not None else "number of the particle"
-    if len(drawn) == 1 and (members := hues_of(shown)):
+    if len(drawn) == 1 and (members := hues_of(values)):
         title, hues = f"{title}, {hues} {drawn[0].name}".replace("number of the ", ""), members
     ax = ax or new_axes()
-    ax.set_xlabel(label("time", "step", broad=BROAD))
-    ax.set_ylabel(label(shown.attrs["long_name"], shown.attrs["units"], broad=TALL))
+    ax.set_xlabel(label("time", "step", width=BROAD))
+    ax.set_ylabel(label(values.attrs["long_name"], values.attrs["units"], width=TALL))
     draw_lines(ax, lines, title, hues)
     return ax
 
 
 @dataclass(frozen=True)
-class Followed:
-    """Of whom, by name and number, which `values`, a DataArray along time."""
+class Series:
+    """A series of a particle or bond: its name and number, and its `values`, a DataArray along
+    time."""
 
     name: str
     number: float | None
     values: Any
 
 
-def _lines(dataset: xarray.Dataset, one: Followed, n: int, alone: bool) -> Iterator[Line]:
-    """A line a component and a member of a sweep. Colours tell particles apart, or where there is
-    one particle alone the members."""
-    along = "step" if "step" in one.values.dims else "time"
-    vector = "axis" in one.values.dims
-    parts = [one.values.isel(axis=k) for k in range(one.values.sizes["axis"])] if vector else []
-    for k, part in enumerate(parts or [one.values]):
+def _lines(dataset: xarray.Dataset, series: Series, n: int, alone: bool) -> Iterator[Line]:
+    """Generate a line for each component and member of a sweep. Colours distinguish particles, or
+    members where there is only one particle."""
+    along = "step" if "step" in series.values.dims else "time"
+    vector = "axis" in series.values.dims
+    parts = (
+        [series.values.isel(axis=k) for k in range(series.values.sizes["axis"])] if vector else []
+    )
+    for k, part in enumerate(parts or [series.values]):
         axis = str(part["axis"].item()) if vector else ""
         for line in lines_of(dataset, part[along], part):
             by_member = alone and line.name
-            said = [line.name, axis] if by_member else [one.name, axis, line.name]
-            hue, value = (line.hue, line.value) if by_member else (n, one.number)
-            name = ", ".join(filter(None, said))
+            words = [line.name, axis] if by_member else [series.name, axis, line.name]
+            hue, value = (line.hue, line.value) if by_member else (n, series.number)
+            name = ", ".join(filter(None, words))
             yield replace(line, name=name, hue=hue, value=value, dashed=k > 0)
 
 
 def _numbers(
     dataset: xarray.Dataset, particle: Numbers | None, i: int | None, j: int | None
 ) -> list[int] | None:
-    """Those asked for; None where nothing is said, which only `track` knows what to do with."""
+    """Return the numbers of the requested particles; None without a request, which only `track`
+    accepts."""
     if particle is not None:
         if i is not None or j is not None:
             raise ExperimentError("name particles by number or by i and j, not by both")
         return [particle] if isinstance(particle, int | np.integer) else [*particle]
-    asked = {name: value for name, value in zip(INDICES, (i, j), strict=False) if value is not None}
-    return dataset["number"].values[rows_at(dataset, asked)].tolist() if asked else None
+    indices = {
+        name: value for name, value in zip(INDICES, (i, j), strict=False) if value is not None
+    }
+    return dataset["number"].values[rows_at(dataset, indices)].tolist() if indices else None
 
 
-def _of_particles(dataset: xarray.Dataset, name: str, numbers: list[int] | None) -> list[Followed]:
+def _of_particles(dataset: xarray.Dataset, name: str, wanted: list[int] | None) -> list[Series]:
     dim = "tracked" if name.partition("_")[0] == "track" else "particle"
-    if numbers is None and dim == "particle":
+    if wanted is None and dim == "particle":
         raise ExperimentError(
             f"history: no particle is given; write history('{name}', particle=67), or i=4, j=5"
         )
-    made = name.partition("_")[0] == "u" and "u" not in dataset.variables
-    found = variable(dataset, name.replace("u", "position", 1) if made else name)
-    if dim not in found.dims:
+    from_positions = name.partition("_")[0] == "u" and "u" not in dataset.variables
+    values = variable(dataset, name.replace("u", "position", 1) if from_positions else name)
+    if dim not in values.dims:
         raise ExperimentError(f"'{name}' has no values at particles; `curve` draws it")
-    known, followed = dataset[dim].values, []
-    for number in known if numbers is None else numbers:
-        if number not in known:
-            few = f"tracked are {known.tolist()}" if dim == "tracked" else f"there are {len(known)}"
-            raise ExperimentError(f"there is no particle {number}; {few}")
-        values = found.isel({dim: int(np.flatnonzero(known == number)[0])})
-        if made:
-            values = _displacement(dataset, values, number)
-        followed.append(Followed(_name(dataset, number), float(number), in_units(values)))
+    numbers, followed = dataset[dim].values, []
+    for number in numbers if wanted is None else wanted:
+        if number not in numbers:
+            remedy = (
+                f"tracked are {numbers.tolist()}"
+                if dim == "tracked"
+                else f"there are {len(numbers)}"
+            )
+            raise ExperimentError(f"there is no particle {number}; {remedy}")
+        part = values.isel({dim: int(np.flatnonzero(numbers == number)[0])})
+        if from_positions:
+            part = _displacement(dataset, part, number)
+        followed.append(Series(_name(dataset, number), float(number), in_units(part)))
     return followed
 
 
 def _displacement(dataset: xarray.Dataset, position: Any, number: int) -> Any:
-    """What is left of positions of a particle, or a component of them, less that at rest."""
+    """Return positions of a particle, or a component of them, minus those at rest."""
     reference = dataset["reference"].sel(particle=number)
     if "axis" not in position.dims:
         reference = reference.sel(axis=position["axis"])
-    said = str(position.attrs["long_name"]).replace("position", "displacement")
-    return (position - reference).assign_attrs(position.attrs | {"long_name": said})
+    meaning = str(position.attrs["long_name"]).replace("position", "displacement")
+    return (position - reference).assign_attrs(position.attrs | {"long_name": meaning})
 
 
 def _name(dataset: xarray.Dataset, number: int) -> str:
-    one = dataset["site"].sel(particle=number).values
-    return f"{number} ({', '.join(f'{n} {k}' for n, k in zip(INDICES, one, strict=False))})"
+    site = dataset["site"].sel(particle=number).values
+    return f"{number} ({', '.join(f'{n} {k}' for n, k in zip(INDICES, site, strict=False))})"
 
 
-def _of_bond(dataset: xarray.Dataset, name: str, bond: Sequence[int]) -> Followed:
-    """The strain between two particles, or what a bond remembers."""
+def _of_bond(dataset: xarray.Dataset, name: str, bond: Sequence[int]) -> Series:
+    """Return the strain between two particles, or a state variable of a bond."""
     ends = sorted(bond)
     if len(ends) != 2 or not np.isin(ends, dataset["number"].values).all():
         raise ExperimentError(f"a bond is named by two numbers of particles, not by {[*bond]}")
-    said = f"{ends[0]}-{ends[1]}"
+    label = f"{ends[0]}-{ends[1]}"
     if name == "strain":
-        return Followed(said, None, _strain(dataset, ends))
-    found = variable(dataset, name)
-    if {"bond", "time"} - {*found.dims}:
-        known = [n for n, v in dataset.data_vars.items() if {"bond", "time"} <= {*v.dims}]
-        raise ExperimentError(f"bonds have no history of '{name}'; they have {['strain', *known]}")
+        return Series(label, None, _strain(dataset, ends))
+    values = variable(dataset, name)
+    if {"bond", "time"} - {*values.dims}:
+        names = [n for n, v in dataset.data_vars.items() if {"bond", "time"} <= {*v.dims}]
+        raise ExperimentError(f"bonds have no history of '{name}'; they have {['strain', *names]}")
     rows = np.flatnonzero((dataset["bond_ends"].values == ends).all(axis=-1))
     if not len(rows):
         raise ExperimentError(f"there is no bond between {ends[0]} and {ends[1]}")
-    return Followed(said, None, in_units(found.isel(bond=int(rows[0]))))
+    return Series(label, None, in_units(values.isel(bond=int(rows[0]))))
 
 
 def _strain(dataset: xarray.Dataset, ends: list[int]) -> Any:
-    """By what share two particles are farther apart than at rest."""
+    """Return the relative change of the distance between two particles."""
     a, b = (dataset["position"].sel(particle=number) for number in ends)
     X, Y = (dataset["reference"].sel(particle=number) for number in ends)
     rest = float(np.hypot(*(Y.values - X.values)))
-    apart = ((b - a) ** 2).sum("axis", skipna=False) ** 0.5
-    return (apart / rest - 1.0).assign_attrs(long_name="strain of the bond", units="1")
+    distance = ((b - a) ** 2).sum("axis", skipna=False) ** 0.5
+    return (distance / rest - 1.0).assign_attrs(long_name="strain of the bond", units="1")

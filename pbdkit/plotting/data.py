@@ -1,5 +1,5 @@
-"""Datasets as pictures read them: the body with its cells and outline, recorded steps of it, the
-quantity that is drawn in colour, and variables by name as curves need them.
+"""Data of pictures: the body with its cells and outline, recorded steps, the plotted quantity, and
+variables by name for curves.
 
 Fields fill the cells of the body at rest, quadrilaterals or triangles, up to its outline.
 """
@@ -36,27 +36,28 @@ if TYPE_CHECKING:
 
 
 BRIDGE = 1.35
-"""A reference triangle longer than so many usual ones bridges a hole or a notch."""
+"""Triangles with a side longer than this multiple of the median bridge a hole or notch."""
 
 
 def cells_of(site: Array, reference: Array) -> Array:
-    """The rows of the corners of each cell, (cell, 4), in turn; of triangles the last one twice.
+    """Return the rows of the corners of each cell, (cell, 4), in turn; triangles have the last one
+    twice.
 
     `site` (particle, 2) are whole numbers. Where the places of sites (i, j) repeat along i, as on
     Bravais lattices, cells are Delaunay's of the lattice: squares and rectangles, else triangles.
     Elsewhere they are Delaunay's triangles without those that bridge gaps. None where all particles
     are in line.
     """
-    found = _of_sites(site, reference) if len(site) else None
-    if found is None:
+    cells = _of_sites(site, reference) if len(site) else None
+    if cells is None:
         triangles = triangles_of(reference)
-        found = triangles[:, [0, 1, 2, 2]]
-    return found
+        cells = triangles[:, [0, 1, 2, 2]]
+    return cells
 
 
 def triangles_of(reference: Array) -> Array:
-    """Delaunay's triangles, (triangle, 3), without those that bridge gaps; none where all places
-    are in line."""
+    """Return Delaunay's triangles, (triangle, 3), without those that bridge gaps; none where all
+    places are collinear."""
     from scipy.spatial import Delaunay, QhullError
 
     try:
@@ -70,8 +71,8 @@ def triangles_of(reference: Array) -> Array:
 
 
 def _of_sites(site: Array, reference: Array) -> Array | None:
-    """The cells between sites (i, j), (i+1, j), (i+1, j+1), (i, j+1), whole or halved along the
-    shorter diagonal; None where the places of sites do not repeat."""
+    """Return the cells between sites (i, j), (i+1, j), (i+1, j+1), (i, j+1), whole or divided along
+    the shorter diagonal; None where the places of sites do not repeat."""
     low = site.min(axis=0)
     shape = site.max(axis=0) - low + 1
     if shape.min() < 2 or shape.prod() > 20 * len(site):
@@ -99,36 +100,38 @@ def _of_sites(site: Array, reference: Array) -> Array | None:
     longer = ~equal & (rising > falling)
     triangles = [np.stack([a, b, c, c], 1)[shorter], np.stack([a, c, d, d], 1)[shorter],
                  np.stack([a, b, d, d], 1)[longer], np.stack([b, c, d, d], 1)[longer]]  # fmt: skip
-    found = np.concatenate([quads, *triangles])
-    there = np.bitwise_or.reduce([found[:, k] for k in range(4)]) >= 0  # -1 has the sign bit
-    return found if there.all() else found[there]
+    cells = np.concatenate([quads, *triangles])
+    complete = np.bitwise_or.reduce([cells[:, k] for k in range(4)]) >= 0  # -1 has the sign bit
+    return cells if complete.all() else cells[complete]
 
 
 def _steps(rows: Array, reference: Array, axis: int) -> Array:
-    """From each site to the next along an index, (pair, 2), where both are."""
+    """Return the differences between consecutive sites along an index, (pair, 2), where both
+    exist."""
     count = rows.shape[axis]
-    here, there = rows.take(range(count - 1), axis), rows.take(range(1, count), axis)
-    both = (here >= 0) & (there >= 0)
-    return np.asarray(reference[there[both]] - reference[here[both]])
+    rows_from, rows_to = rows.take(range(count - 1), axis), rows.take(range(1, count), axis)
+    both = (rows_from >= 0) & (rows_to >= 0)
+    return np.asarray(reference[rows_to[both]] - reference[rows_from[both]])
 
 
 def whole(cells: Array, pairs: Array, particles: int) -> Array:
-    """Which cells, (cell,), have none of these pairs of rows, (pair, 2), as a side or diagonal."""
-    kept = np.ones(len(cells), np.bool_)
+    """Return which cells have none of these pairs of rows, (pair, 2), as a side or diagonal,
+    (cell,)."""
+    intact = np.ones(len(cells), np.bool_)
     if not len(pairs):
-        return kept
+        return intact
     touched = np.zeros(particles, np.bool_)
     touched[pairs] = True
     near = np.flatnonzero(touched[cells].sum(axis=1) >= 2)
-    gone = np.unique(_codes(pairs, particles))
+    broken = np.unique(_codes(pairs, particles))
     ends = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)]
     sides = np.stack([_codes(cells[near][:, end], particles) for end in ends], axis=1)
-    kept[near[np.isin(sides, gone).any(axis=1)]] = False
-    return kept
+    intact[near[np.isin(sides, broken).any(axis=1)]] = False
+    return intact
 
 
 def outline(cells: Array, particles: int) -> Array:
-    """The sides of one cell only, as pairs of rows, (side, 2)."""
+    """Return the sides that belong to one cell only, as pairs of rows, (side, 2)."""
     sides = np.concatenate([cells[:, [k, (k + 1) % 4]] for k in range(4)])
     sides = sides[sides[:, 0] != sides[:, 1]]
     codes, counts = np.unique(_codes(sides, particles), return_counts=True)
@@ -136,23 +139,23 @@ def outline(cells: Array, particles: int) -> Array:
 
 
 def _codes(pairs: Array, particles: int) -> Array:
-    """One number for each pair, whichever comes first."""
+    """Return one number for each unordered pair."""
     low, high = np.sort(pairs.astype(np.int64), axis=1).T
     return np.asarray(low * particles + high)
 
 
 PARTS = 8
-"""Parts along each side of a cut cell, in each of which the outline is straight."""
+"""Parts of each side of a cut cell, in each of which the outline is straight."""
 MOST_POINTS = 400_000
-"""Points at which the distance to the outline is computed at most: where more cells are cut, these
-are small on the page, and have fewer parts."""
+"""Maximum number of points at which the distance to the outline is evaluated; where more cells are
+cut, they are small on the page and have fewer parts."""
 ON_IT = 1e-6
-"""Of a cell's size: a point that lies no farther beyond the outline counts as on it."""
+"""Tolerance relative to the cell's size for points on the outline."""
 
 
 def shape_of(dataset: xarray.Dataset) -> Shape | None:
-    """Return the outline of the body that a dataset carries; None where it carries none, and of a
-    body of given sites, which has none."""
+    """Return the outline of the body in a dataset; None where it has none, and for a body of given
+    sites."""
     try:
         shape: Shape = TypeAdapter(AnyBody).validate_python(
             json_attribute(dataset, "experiment")["body"]
@@ -163,17 +166,17 @@ def shape_of(dataset: xarray.Dataset) -> Shape | None:
 
 
 def lattice_unit(dataset: xarray.Dataset) -> float:
-    """Return what a lattice unit is in the units in which lengths of a dataset are drawn."""
+    """Return the length of a lattice unit in the units of drawing."""
     lengths = dataset["position"].attrs
     return float(in_its_units(lengths)[0] / lengths.get("lattice_factor", 1.0))
 
 
 @dataclass(frozen=True)
 class CutCells:
-    """The cells that an outline cuts.
+    """The cells that are cut by an outline.
 
     `row` (cell,) is the row of each cell in `distance`, -1 where it is not cut; `distance` (cut
-    cell, point, point) is the signed distance, positive beyond the outline, at points along both
+    cell, point, point) is the signed distance, positive outside the outline, at points along both
     sides of the cell: [v, u] lies between the corners as (1 - u)(1 - v), u(1 - v), uv, (1 - u)v
     weigh them.
     """
@@ -182,11 +185,11 @@ class CutCells:
     distance: Array
 
     @classmethod
-    def of(cls, shape: Shape, cells: Array, reference: Array, beyond: Array) -> CutCells:
-        """Of cells by the rows of their corners, (cell, 4), at their places at rest, some of which
-        lie `beyond` the outline."""
+    def of(cls, shape: Shape, cells: Array, reference: Array, outside: Array) -> CutCells:
+        """Compute the cut cells among cells (cell, 4) at rest, given the corners `outside` the
+        outline."""
         near = np.zeros(len(reference), bool)
-        near[cells[beyond[cells].any(axis=1)]] = True
+        near[cells[outside[cells].any(axis=1)]] = True
         candidates = np.flatnonzero(near[cells].any(axis=1))
         parts = int(min(PARTS, max(1.0, math.sqrt(MOST_POINTS / max(1, len(candidates))) - 1.0)))
         at = between(reference[cells[candidates]], np.linspace(0.0, 1.0, parts + 1))
@@ -197,9 +200,9 @@ class CutCells:
         row[candidates[is_cut]] = np.arange(np.count_nonzero(is_cut))
         return cls(row, distance[is_cut].astype(np.float32))
 
-    def beyond(self, rows: Array, middles: Array) -> Array:
-        """Return which samples of some cut cells lie beyond the outline, (cell, v, u): those at
-        `middles` along both sides."""
+    def outside(self, rows: Array, middles: Array) -> Array:
+        """Return which samples of some cut cells, those at `middles` along both sides, are outside
+        the outline, (cell, v, u)."""
         points = np.linspace(0.0, 1.0, self.distance.shape[1])
         hats = np.maximum(0.0, 1.0 - np.abs(middles[:, None] - points) * (len(points) - 1))
         hats = hats.astype(np.float32)
@@ -207,8 +210,7 @@ class CutCells:
 
 
 def outline_at_rest(shape: Shape, cut: CutCells, cells: Array, reference: Array) -> Array:
-    """Return the sides (side, end, axis) of the outline of a body, where cells are cut within
-    them."""
+    """Return the segments (side, end, axis) of the outline of a body with cut cells."""
     corners = reference[cells[cut.row >= 0]]
     return np.concatenate(
         [
@@ -219,24 +221,27 @@ def outline_at_rest(shape: Shape, cut: CutCells, cells: Array, reference: Array)
 
 
 def _through_cells(cut: CutCells, corners: Array) -> Array:
-    """Where the distance changes its sign, in triangles, each half of a part of a cut cell."""
+    """Return the zero line of the distance, in triangles, each half of a part of a cut cell."""
     at = between(corners, np.linspace(0.0, 1.0, cut.distance.shape[1]))
-    low, high, found = slice(None, -1), slice(1, None), []
+    low, high, segments = slice(None, -1), slice(1, None), []
     first, last = (low, low), (high, high)
     for triangle in ((first, (low, high), last), (first, last, (high, low))):
         place = np.stack([at[:, v, u].reshape(-1, 2) for v, u in triangle], axis=1)
-        away = np.stack([cut.distance[:, v, u].ravel() for v, u in triangle], axis=1)
-        mixed = (away > 0.0).any(axis=1) & (away <= 0.0).any(axis=1)
-        place, away = place[mixed], away[mixed]
-        after, away_after = np.roll(place, -1, axis=1), np.roll(away, -1, axis=1)
-        crossed = (away > 0.0) != (away_after > 0.0)
-        share = np.where(crossed, away / np.where(crossed, away - away_after, 1.0), 0.0)
-        found.append((place + share[..., None] * (after - place))[crossed].reshape(-1, 2, 2))
-    return np.concatenate(found)
+        distance = np.stack([cut.distance[:, v, u].ravel() for v, u in triangle], axis=1)
+        mixed = (distance > 0.0).any(axis=1) & (distance <= 0.0).any(axis=1)
+        place, distance = place[mixed], distance[mixed]
+        place_next, distance_next = np.roll(place, -1, axis=1), np.roll(distance, -1, axis=1)
+        crossed = (distance > 0.0) != (distance_next > 0.0)
+        share = np.where(crossed, distance / np.where(crossed, distance - distance_next, 1.0), 0.0)
+        segments.append(
+            (place + share[..., None] * (place_next - place))[crossed].reshape(-1, 2, 2)
+        )
+    return np.concatenate(segments)
 
 
 def _along_cells(shape: Shape, sides: Array) -> Array:
-    """Sides (side, end, axis) of one cell only, as far as they lie inside."""
+    """Return the parts of sides (side, end, axis) of the mesh boundary that are inside the
+    outline."""
     share = np.linspace(0.0, 1.0, PARTS + 1)[:, None]
     points = sides[:, :1] * (1.0 - share) + sides[:, 1:] * share
     size = np.ptp(sides, axis=1).max(initial=0.0)
@@ -261,15 +266,14 @@ def distance_from(shape: Shape, at: Array) -> Array:
 
 
 PLACES = ("position", "reference", "number", "particle", "site", *INDICES)
-"""Variables of where things are, or what they are called."""
+"""Variables with places or names of particles."""
 
 
 @dataclass(frozen=True)
 class PlottedQuantity:
-    """Values of each `owner`, particle or bond, out of the variable `variable`: its component
-    number `component`, or the length where it is a vector and that is None, times `factor` in its
-    `units`. `words` has the meanings of whole numbers that stand for words.
-    """
+    """Values of each `owner`, particle or bond, of the variable `variable`: its component number
+    `component`, or the length of a vector if that is None, times `factor` in `units`. `words` holds
+    the meanings of flag values."""
 
     variable: str
     owner: str
@@ -282,58 +286,64 @@ class PlottedQuantity:
 
     @property
     def is_place(self) -> bool:
-        """Whether it is where things are, or a number: zero is one of many."""
+        """Return whether the quantity is a place or a number, for which zero is not special."""
         return self.variable.split("_")[0] in PLACES
 
     @property
     def is_signed(self) -> bool:
-        """Whether zero is neutral, between values of both signs."""
+        """Return whether zero is neutral, between values of both signs."""
         return not self.is_place and (self.component is not None or not self.vector)
 
     def values(self, part: xarray.Dataset) -> Array:
-        """(time, owner), of a dataset in memory that has a time; NaN where there is none."""
+        """Return the values, (time, owner), of a loaded dataset with time; NaN where there is
+        none."""
         variable = part[self.variable]
-        found = np.asarray(variable.transpose("time", self.owner, "axis", missing_dims="ignore"))
-        found = found.astype(float) if found.dtype.kind in "biu" else found
+        values = np.asarray(variable.transpose("time", self.owner, "axis", missing_dims="ignore"))
+        values = values.astype(float) if values.dtype.kind in "biu" else values
         if self.vector:
             along = self.component
-            found = np.linalg.norm(found, axis=-1) if along is None else found[..., along]
+            values = np.linalg.norm(values, axis=-1) if along is None else values[..., along]
         if "time" not in variable.dims:
-            found = np.repeat(found[None], part.sizes["time"], axis=0)
+            values = np.repeat(values[None], part.sizes["time"], axis=0)
         if self.variable == "broken_step":  # -1 where it is whole, as it was at earlier steps
-            found = np.where(broken_by(found, part["time"].values[:, None]), found, np.nan)
-        return found if self.factor == 1.0 else self.factor * found
+            values = np.where(broken_by(values, part["time"].values[:, None]), values, np.nan)
+        return values if self.factor == 1.0 else self.factor * values
 
 
 def axes_of(dataset: xarray.Dataset) -> list[str]:
-    """The names of the axes along which vectors have components."""
+    """Return the names of the axes of vectors."""
     return [str(axis) for axis in dataset["axis"].values] if "axis" in dataset.coords else []
 
 
 def component_of(dataset: xarray.Dataset, name: str) -> tuple[str, int | None]:
-    """Of `u_x` the vector `u` and the place of x along its axis; of all else the name itself and
-    None."""
+    """Split `u_x` into the vector `u` and the index of x along its axis; other names are returned
+    with None."""
     stem, _, axis = name.rpartition("_")
-    axes, there = axes_of(dataset), dataset.variables
-    if name not in there and stem in there and axis in axes and "axis" in there[stem].dims:
+    axes, variables = axes_of(dataset), dataset.variables
+    if (
+        name not in variables
+        and stem in variables
+        and axis in axes
+        and "axis" in variables[stem].dims
+    ):
         return stem, axes.index(axis)
     return name, None
 
 
 def quantity_of(dataset: xarray.Dataset, name: str) -> PlottedQuantity:
-    """The quantity of that name: a variable, its length where it is a vector, or `u_x`, the
-    component along x of a vector `u`. Raises ExperimentError for what cannot be drawn."""
+    """Return the quantity of a name: a variable, the length of a vector, or `u_x`, the component
+    along x of a vector `u`. Raises ExperimentError for what cannot be drawn."""
     if not isinstance(name, str):
         raise ExperimentError(
             f"color: expected the name of a variable, such as 'pe1' or 'u_x', got {name!r}; a "
             "recorded step is given as time=400"
         )
-    found = {str(n): v for n, v in dataset.variables.items() if _is_drawable(v)}
+    drawable = {str(n): v for n, v in dataset.variables.items() if _is_drawable(v)}
     axes = axes_of(dataset)
     variable, component = component_of(dataset, name)
-    if variable not in found:
-        refuse_color(name, dataset, found, axes)
-    chosen = found[variable]
+    if variable not in drawable:
+        refuse_color(name, dataset, drawable, axes)
+    chosen = drawable[variable]
     vector, words = "axis" in chosen.dims, _words(chosen.attrs)
     meaning = str(chosen.attrs.get("long_name") or variable)
     if vector:
@@ -352,28 +362,28 @@ def quantity_of(dataset: xarray.Dataset, name: str) -> PlottedQuantity:
 
 
 def refuse_color(
-    name: str, dataset: xarray.Dataset, found: Iterable[str], axes: Iterable[str]
+    name: str, dataset: xarray.Dataset, drawable: Iterable[str], axes: Iterable[str]
 ) -> None:
-    """Raise ExperimentError that names the diagnostic which makes the variable, or what can be
-    drawn instead."""
-    known = [n for n in found if n in dataset.data_vars]
+    """Raise ExperimentError with the diagnostic that makes the variable, or the drawable
+    variables."""
+    names = [n for n in drawable if n in dataset.data_vars]
     if makers := makers_of_missing(dataset, name):
         raise ExperimentError(
             f"'{name}' was not recorded, and cannot be drawn: add {' or '.join(makers)} to "
-            f"`diagnostics`, and run again; what can be drawn now: {', '.join(known)}"
+            f"`diagnostics`, and run again; drawable: {', '.join(names)}"
         )
-    vectors = [n for n in (*known, *found) if "axis" in dataset[n].dims]
+    vectors = [n for n in (*names, *drawable) if "axis" in dataset[n].dims]
     parts = [f"{n}_{axis}" for n in vectors for axis in axes]
-    near = did_you_mean(name, [*found, *parts]) or ";"
+    suggestion = did_you_mean(name, [*drawable, *parts]) or ";"
     raise ExperimentError(
-        f"'{name}' cannot be drawn{near} what can be drawn: {', '.join(known)}; of vectors, the "
+        f"'{name}' cannot be drawn{suggestion} drawable: {', '.join(names)}; of vectors, the "
         f"length and components, as {parts[0]}"
     )
 
 
 def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
-    """Return the diagnostics that make the variable, or the vector of which it is a component, as
-    an experiment names them; none where it was recorded, or no diagnostic makes it."""
+    """Return the diagnostics that make the variable, or its vector, as an experiment names them;
+    none where it was recorded, or no diagnostic makes it."""
     vector, _, axis = name.rpartition("_")
     names = {name, vector} if axis in axes_of(dataset) else {name}
     recorded = [*map(str, dataset.variables)]
@@ -383,7 +393,8 @@ def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
 
 
 def _is_drawable(variable: xarray.Variable) -> bool:
-    """Whether it has a number or a vector for each particle, or a number for each bond."""
+    """Return whether a variable has a number or vector for each particle, or a number for each
+    bond."""
     shapes = ({"particle"}, {"particle", "axis"}, {"bond"})
     return {*variable.dims} - {"time"} in shapes and variable.dtype.kind in "biuf"
 
@@ -396,21 +407,22 @@ def _words(attributes: dict[Any, Any]) -> dict[int, str]:
 
 
 BLOCK_BYTES = 2**26
-"""So much is read of a file at a time."""
+"""Approximate number of bytes that are read from a file at a time."""
 UNKNOWN = FRAME + 1
-"""The kind of a particle of the body where kinds were not kept: it has no colour."""
+"""Kind of a particle of the body where kinds were not recorded: it has no colour."""
 MEASURED = 50_000
-"""The distance of particles is measured in bodies of up to so many, and else from their area."""
+"""Maximum number of particles for which the spacing is measured instead of estimated from the
+area."""
 
 
 @dataclass(frozen=True)
 class ReferenceBody:
-    """What does not change: `reference` (particle, axis), `site` (particle, index), `number`
-    (particle,), which are of the body and not of the frame (particle,), the rows of both ends of
-    each bond (bond, 2), and when each broke (bond,), -1 where it did not. Of the body `beyond` are
-    corners of cut cells that lie beyond its outline, `shape`, which is None where there are none or
-    it is not known. A lattice unit is `unit` in the units of lengths; those of the
-    shape are lattice units."""
+    """The constant data of a body: `reference` (particle, axis), `site` (particle, index), `number`
+    (particle,), whether a particle is of the body and not of the frame, `inside` (particle,), the
+    rows of both ends of each bond (bond, 2), and the step in which it broke (bond,), -1 if intact.
+    `outside` marks corners of cut cells outside the outline, `shape`, which is None where there are
+    none or it is unknown. A lattice unit is `unit` in the units of lengths; the shape is in lattice
+    units."""
 
     reference: Array
     site: Array
@@ -418,24 +430,24 @@ class ReferenceBody:
     inside: Array
     ends: Array
     broken_step: Array
-    beyond: Array
+    outside: Array
     shape: Shape | None
     unit: float
 
     @cached_property
     def cells(self) -> Array:
-        """The rows of the corners of the body's cells, (cell, 4)."""
+        """Rows of the corners of the body's cells, (cell, 4)."""
         rows = np.flatnonzero(self.inside)
         return np.asarray(rows[cells_of(self.site[rows], self.reference[rows])])
 
     @cached_property
     def cells_with_frame(self) -> Array:
-        """The same with those between body and frame."""
+        """Rows of the corners of all cells, including those between body and frame."""
         return cells_of(self.site, self.reference)
 
     @cached_property
     def spacing(self) -> float:
-        """How far apart particles are at rest: the median of a few, to the nearest."""
+        """Distance of particles at rest: the median of some distances to the nearest one."""
         x = self.reference
         if 1 < len(x) <= MEASURED:
             few = np.linspace(0, len(x) - 1, 50).astype(int)
@@ -446,21 +458,21 @@ class ReferenceBody:
 
     @cached_property
     def cut(self) -> CutCells | None:
-        """Those of `cells` that the outline cuts; None where there are none."""
+        """The `cells` cut by the outline; None where there is no outline."""
         if self.shape is None:
             return None
-        return CutCells.of(self.shape, self.cells, self.reference / self.unit, self.beyond)
+        return CutCells.of(self.shape, self.cells, self.reference / self.unit, self.outside)
 
     @cached_property
     def outline(self) -> Array:
-        """The outline at rest, as sides (side, end, axis)."""
+        """Outline at rest, as segments (side, end, axis)."""
         if self.shape is None or self.cut is None:
             return np.asarray(self.reference[outline(self.cells, len(self.reference))])
         at_rest = self.reference / self.unit
         return self.unit * outline_at_rest(self.shape, self.cut, self.cells, at_rest)
 
     def whole_cells(self, cells: Array, broken: Array) -> Array:
-        """The numbers of those without a broken bond along a side."""
+        """Return the indices of the cells without a broken bond along a side."""
         if not broken.any():
             return np.arange(len(cells))
         return np.flatnonzero(whole(cells, self.ends[broken], len(self.reference)))
@@ -469,7 +481,7 @@ class ReferenceBody:
 @dataclass(frozen=True)
 class Snapshot:
     """One step: `position` (particle, axis), `kind` (particle,), `values` of the quantity, if any,
-    and which bonds are `broken` (bond,)."""
+    and whether bonds are `broken` (bond,)."""
 
     step: float
     position: Array
@@ -479,8 +491,8 @@ class Snapshot:
 
 
 class Trajectory:
-    """The recorded steps of a dataset, with the quantity of that name, if any; in mm and so on
-    where the dataset says its scale.
+    """The recorded steps of a dataset, with the quantity `color`, if any; in mm and so on where the
+    dataset defines the scale.
 
     Raises ExperimentError for a dataset of several runs, for space that is no plane, and for a
     quantity that cannot be drawn. Only what is asked for is read.
@@ -499,24 +511,24 @@ class Trajectory:
 
     @property
     def axis_labels(self) -> tuple[str, str]:
-        """What stands at both axes."""
+        """Labels of both axes."""
         return label("x", self._length_units), label("y", self._length_units)
 
     @cached_property
     def _rows(self) -> Array:
-        """The particles that are there: of several runs joined, some are not in each."""
+        """Rows of the particles that exist: joined runs may lack some."""
         reference = self._dataset["reference"].transpose("particle", "axis").values
         return np.flatnonzero(np.isfinite(reference).all(axis=1))
 
     @cached_property
     def body(self) -> ReferenceBody:
-        """What does not change."""
+        """Data that do not change between steps."""
         dataset, rows = self._dataset, self._rows
         numbers = dataset["number"].values[rows]
         ends, broken = np.empty((0, 2), np.intp), np.empty(0)
         if "bond_ends" in dataset:
-            given = dataset["bond_ends"].transpose("bond", "end").values
-            ends = rows_of(numbers, given)
+            bond_ends = dataset["bond_ends"].transpose("bond", "end").values
+            ends = rows_of(numbers, bond_ends)
             self._bonds = np.flatnonzero((ends >= 0).all(axis=1))
             ends, broken = ends[self._bonds], np.full(len(self._bonds), -1.0)
         if "broken_step" in dataset and len(ends):
@@ -524,16 +536,17 @@ class Trajectory:
         reference = self._factor * dataset["reference"].transpose("particle", "axis").values[rows]
         site = np.stack([dataset[name].values[rows] for name in "ij"], axis=1).astype(np.int64)
         inside = dataset["role"].values[rows] == OF_BODY
-        beyond = np.zeros(len(rows), bool)
+        outside = np.zeros(len(rows), bool)
         if "inside" in dataset.variables:
-            beyond = inside & ~dataset["inside"].values[rows].astype(bool)
-        shape = shape_of(dataset) if beyond.any() else None
+            outside = inside & ~dataset["inside"].values[rows].astype(bool)
+        shape = shape_of(dataset) if outside.any() else None
         return ReferenceBody(
-            reference, site, numbers, inside, ends, broken, beyond, shape, lattice_unit(dataset)
+            reference, site, numbers, inside, ends, broken, outside, shape, lattice_unit(dataset)
         )
 
     def row(self, time: float | None) -> int:
-        """Where a step lies; None is the last. Raises ExperimentError where it was not recorded."""
+        """Return the index of a step; None is the last. Raises ExperimentError where it was not
+        recorded."""
         if time is None:
             return len(self.steps) - 1
         if not is_number(time):
@@ -542,8 +555,8 @@ class Trajectory:
                 "a variable is given as color='pe1'"
             )
         exactly = self.steps.dtype.kind == "i"
-        known = self.steps if exactly else np.array([as_step(step) for step in self.steps])
-        rows = np.flatnonzero(known == (time if exactly else as_step(time)))
+        steps = self.steps if exactly else np.array([as_step(step) for step in self.steps])
+        rows = np.flatnonzero(steps == (time if exactly else as_step(time)))
         if not len(rows):
             near = [*self.steps[self.steps < time][-1:], *self.steps[self.steps > time][:1]]
             raise ExperimentError(
@@ -553,13 +566,13 @@ class Trajectory:
         return int(rows[-1])
 
     def snapshots(self, rows: Sequence[int]) -> Iterator[Snapshot]:
-        """Those steps, in order, of which some at a time are in memory."""
+        """Generate steps in order, loading several at a time."""
         body, quantity = self.body, self.quantity
         names = {"position", "kind", *([quantity.variable] if quantity else [])}
         names &= {*map(str, self._dataset.variables)}
-        many = max(1, BLOCK_BYTES // (40 * max(1, len(body.reference))))
-        for start in range(0, len(rows), many):
-            chosen = list(rows[start : start + many])
+        block = max(1, BLOCK_BYTES // (40 * max(1, len(body.reference))))
+        for start in range(0, len(rows), block):
+            chosen = list(rows[start : start + block])
             part = self._dataset.isel(time=chosen).reset_coords()[[*names]].load()
             part = part.assign_coords(time=self.steps[chosen])
             position = part["position"].transpose("time", "particle", "axis").values
@@ -585,14 +598,14 @@ class Trajectory:
 
 
 def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
-    """The dataset, with a time even where it was one of several. Raises ExperimentError where its
-    positions are not those of one run in the plane."""
+    """Return the dataset with a time dimension. Raises ExperimentError where its positions are not
+    those of one run in the plane."""
     dataset = _with_positions(dataset)
     position = dataset["position"]
-    others = [str(d) for d in position.dims if d not in ("time", "particle", "axis")]
-    if others:
-        sizes = ", ".join(f"{d}: {position.sizes[d]}" for d in others)
-        first = ", ".join(f"{d}=0" for d in others)
+    extra_dims = [str(d) for d in position.dims if d not in ("time", "particle", "axis")]
+    if extra_dims:
+        sizes = ", ".join(f"{d}: {position.sizes[d]}" for d in extra_dims)
+        first = ", ".join(f"{d}=0" for d in extra_dims)
         raise ExperimentError(
             f"a picture is of one run, and this holds several ({sizes}); pick one with isel or "
             f"sel: ds.isel({first}).pbd.plot(...)"
@@ -604,18 +617,18 @@ def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
     if "particle" not in dataset.dims or not dataset.sizes["particle"]:
         raise ExperimentError("there are no particles to draw: keep the dimension `particle`")
     if "time" in position.dims:
-        there = dataset
+        run = dataset
     else:
-        again = {name: dataset[name].expand_dims("time") for name in ("position", "kind")}
-        there = dataset.assign(again)
-    if not there.sizes["time"]:
+        expanded = {name: dataset[name].expand_dims("time") for name in ("position", "kind")}
+        run = dataset.assign(expanded)
+    if not run.sizes["time"]:
         raise ExperimentError("no step was recorded")
-    return there
+    return run
 
 
 def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
-    """The dataset itself, or where positions were not kept, at rest. Raises ExperimentError where
-    the places at rest are not there either."""
+    """Return the dataset, at rest where positions were not recorded. Raises ExperimentError where
+    positions at rest are missing too."""
     if "position" in dataset.variables:
         return dataset
     if "reference" not in dataset.variables or "role" not in dataset.variables:
@@ -625,23 +638,23 @@ def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
     if "kind" not in dataset.variables:
         added["kind"] = dataset["role"].copy(data=unknown)
     if "time" in dataset.dims:
-        added = {name: one.expand_dims(time=dataset["time"]) for name, one in added.items()}
+        added = {name: values.expand_dims(time=dataset["time"]) for name, values in added.items()}
     title = f"{dataset.attrs.get('title', '')}, drawn at rest"
     return dataset.assign(added).assign_attrs(title=title)
 
 
 Box = tuple[float, float, float, float]
 MARGIN = 0.015
-"""So much of the longer side is left free around a body, and the distance of particles at least."""
+"""Margin around a body relative to its longer side; at least the distance of particles."""
 THINNEST = 40.0
-"""A body so many times as long as broad is not drawn thinner."""
+"""Maximum aspect ratio of a panel."""
 
 
 @dataclass(frozen=True)
 class Extent:
-    """What several steps cover: the `box` (left, right, bottom, top) that holds them, the lowest
-    and the highest value of the body and of all, frame and all, and the kinds, and classes of the
-    quantity, that are there."""
+    """Extent of several steps: the bounding `box` (left, right, bottom, top), the lowest and
+    highest value in the body and in total, frame included, and the kinds, and classes of the
+    quantity, that occur."""
 
     box: Box
     of_body: tuple[float, float]
@@ -650,39 +663,39 @@ class Extent:
     classes: frozenset[int]
 
 
-def extent_of(recording: Trajectory, shown: Iterable[Snapshot], look: Look) -> Extent:
-    """What steps of a recording cover, looked at one after another. Raises
-    ExperimentError where no particle has a place in them."""
+def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: Look) -> Extent:
+    """Compute the extent of steps of a recording, one after another. Raises ExperimentError where
+    no particle has a position."""
     body, quantity = recording.body, recording.quantity
     reference = body.reference if look.outline else np.empty((0, 2))
     low, high = [reference.min(axis=0, initial=np.inf)], [reference.max(axis=0, initial=-np.inf)]
     inner, outer, kinds, classes = [], [], set[int](), set[int]()
     inside = body.inside if quantity is None or quantity.owner == "particle" else slice(None)
-    for now in shown:
-        place = now.position[np.isfinite(now.position).all(axis=1)]
+    for snapshot in snapshots:
+        place = snapshot.position[np.isfinite(snapshot.position).all(axis=1)]
         low.append(place.min(axis=0, initial=np.inf))
         high.append(place.max(axis=0, initial=-np.inf))
-        kinds |= _numbers(now.kind)
-        if now.values is not None:
-            inner.append(_range(now.values[inside]))
-            outer.append(_range(now.values))
+        kinds |= _numbers(snapshot.kind)
+        if snapshot.values is not None:
+            inner.append(_range(snapshot.values[inside]))
+            outer.append(_range(snapshot.values))
             if quantity and quantity.words:
-                classes |= _numbers(now.values)
+                classes |= _numbers(snapshot.values)
     lowest, highest = np.min(low, axis=0), np.max(high, axis=0)
     if not (lowest <= highest).all():
         raise ExperimentError("no particle has a place in what is to be drawn: positions are NaN")
     margin = max(body.spacing, MARGIN * float(np.max(highest - lowest)))
-    (left, bottom), (right, top) = lowest - margin, highest + margin
-    box = _no_thinner(left, right, bottom, top)
+    (xmin, ymin), (xmax, ymax) = lowest - margin, highest + margin
+    box = _no_thinner(xmin, xmax, ymin, ymax)
     return Extent(box, _joined(inner), _joined(outer), frozenset(kinds), frozenset(classes))
 
 
-def joined(extents: Sequence[Extent]) -> Extent:
-    """What several cover together."""
+def combine(extents: Sequence[Extent]) -> Extent:
+    """Combine the extents of several recordings."""
     boxes = np.array([e.box for e in extents])
-    (left, _, bottom, _), (_, right, _, top) = boxes.min(axis=0), boxes.max(axis=0)
+    (xmin, _, ymin, _), (_, xmax, _, ymax) = boxes.min(axis=0), boxes.max(axis=0)
     return Extent(
-        _no_thinner(left, right, bottom, top),
+        _no_thinner(xmin, xmax, ymin, ymax),
         _joined([e.of_body for e in extents]),
         _joined([e.of_all for e in extents]),
         frozenset().union(*(e.kinds for e in extents)),
@@ -690,42 +703,42 @@ def joined(extents: Sequence[Extent]) -> Extent:
     )
 
 
-def _no_thinner(left: float, right: float, bottom: float, top: float) -> Box:
-    least = max(right - left, top - bottom) / THINNEST
-    across, up = (max(0.0, least - side) / 2 for side in (right - left, top - bottom))
-    return (float(left - across), float(right + across), float(bottom - up), float(top + up))
+def _no_thinner(xmin: float, xmax: float, ymin: float, ymax: float) -> Box:
+    thinnest = max(xmax - xmin, ymax - ymin) / THINNEST
+    across, up = (max(0.0, thinnest - side) / 2 for side in (xmax - xmin, ymax - ymin))
+    return (float(xmin - across), float(xmax + across), float(ymin - up), float(ymax + up))
 
 
-def _numbers(of: Array) -> set[int]:
-    """Which small whole numbers there are."""
-    found = of[np.isfinite(of)].astype(int)
-    return {int(low) for low in np.flatnonzero(np.bincount(found))}
+def _numbers(values: Array) -> set[int]:
+    """Return the small whole numbers that occur."""
+    integers = values[np.isfinite(values)].astype(int)
+    return {int(low) for low in np.flatnonzero(np.bincount(integers))}
 
 
 def _range(values: Array) -> tuple[float, float]:
-    """The lowest and the highest; NaN twice where there is none."""
+    """Return the lowest and the highest value; NaN twice where there is none."""
     finite = values[np.isfinite(values)]
     return (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
 
 
 def _joined(ranges: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """That of all of them; 0 to 1 where there are none."""
-    found = [r for r in ranges if np.isfinite(r[0])]
-    return (min(r[0] for r in found), max(r[1] for r in found)) if found else (0.0, 1.0)
+    """Combine several ranges; 0 to 1 where there are none."""
+    finite = [r for r in ranges if np.isfinite(r[0])]
+    return (min(r[0] for r in finite), max(r[1] for r in finite)) if finite else (0.0, 1.0)
 
 
 SUM_BLOCK_BYTES = 2**25
-"""About so much is in memory at a time of what is summed."""
+"""Approximate number of bytes that are summed at a time."""
 SUMMED = ("pe1", "pe1_intact", "contact")
-"""What adds up over particles; of all else the mean is taken."""
+"""Variables that are summed over particles; of all others the mean is drawn."""
 CHOSEN_BY = {"leader_group": "group", "load": "load", "obstacle": "obstacle"}
-"""The dimensions of which one place is taken, and the arguments that say which."""
+"""Dimensions from which one index is selected, and the arguments that select it."""
 OF_A_RUN = {"time", "step", "crack", "particle", "bond", "axis", "tracked", "end", *CHOSEN_BY}
-"""The dimensions of one run; others are those of a sweep."""
+"""Dimensions of one run; all others belong to a sweep."""
 
 
 def variable(dataset: xarray.Dataset, name: str) -> xarray.DataArray:
-    """A variable, or of `u_x` the component of `u`; nothing is read yet.
+    """Return a variable, or for `u_x` the component of `u`, without reading its values.
 
     Raises ExperimentError where there is none of that name.
     """
@@ -736,96 +749,99 @@ def variable(dataset: xarray.Dataset, name: str) -> xarray.DataArray:
         raise ExperimentError(_unknown(dataset, name, axes))
     if component is None:
         return dataset[whole]
-    found = dataset[whole].isel(axis=component)
-    meaning = f"{found.attrs.get('long_name', whole)}, {axes[component]} component"
-    return found.assign_attrs(long_name=meaning)
+    component_values = dataset[whole].isel(axis=component)
+    meaning = f"{component_values.attrs.get('long_name', whole)}, {axes[component]} component"
+    return component_values.assign_attrs(long_name=meaning)
 
 
 def _unknown(dataset: xarray.Dataset, name: str, axes: list[str]) -> str:
-    known: list[str] = []
+    names: list[str] = []
     for each, values in dataset.data_vars.items():
         if values.dtype.kind in "biuf":
             parts = [f"{each}_{axis}" for axis in axes] if "axis" in values.dims else [str(each)]
-            known += parts
+            names += parts
     if makers := makers_of_missing(dataset, name):
         return (
             f"'{name}' was not recorded: add {' or '.join(makers)} to `diagnostics`, and run again"
         )
-    near = did_you_mean(name, known) or ";"
-    return f"there is no variable '{name}'{near} what there is: {', '.join(known)}"
+    suggestion = did_you_mean(name, names) or ";"
+    return f"there is no variable '{name}'{suggestion} available: {', '.join(names)}"
 
 
 def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None]) -> Any:
-    """A DataArray along time, and along the dimensions of a sweep: of particles and bonds their sum
-    or mean, of leader groups, loads and obstacles the `chosen` one, in the units that the variable
-    says.
+    """Return a DataArray along time and the dimensions of a sweep: the sum or mean over particles
+    or bonds, the `chosen` leader group, load or obstacle, in the units of the variable.
 
     Raises ExperimentError for what is no number a step.
     """
-    found = variable(dataset, name)
-    if "axis" in found.dims:
-        some = ", ".join(f"'{name}_{axis}'" for axis in dataset["axis"].values)
-        raise ExperimentError(f"'{name}' is a vector; take one of {some}")
-    if found.dtype.kind not in "biuf":
+    values = variable(dataset, name)
+    if "axis" in values.dims:
+        components = ", ".join(f"'{name}_{axis}'" for axis in dataset["axis"].values)
+        raise ExperimentError(f"'{name}' is a vector; take one of {components}")
+    if values.dtype.kind not in "biuf":
         raise ExperimentError(f"'{name}' holds no numbers")
     for dim, argument in CHOSEN_BY.items():
-        if dim in found.dims:
-            found = _one_of(found, dim, argument, chosen.get(argument))
+        if dim in values.dims:
+            values = _one_of(values, dim, argument, chosen.get(argument))
     for dim in ("particle", "bond"):
-        if dim in found.dims:
-            found = _over(found, dataset, dim)
-    more = [str(d) for d in found.dims if d in OF_A_RUN]
-    if len(more) > 1:
-        raise ExperimentError(f"'{name}' is no single number a step: it has {' and '.join(more)}")
-    return in_units(found)
+        if dim in values.dims:
+            values = _over(values, dataset, dim)
+    run_dims = [str(d) for d in values.dims if d in OF_A_RUN]
+    if len(run_dims) > 1:
+        raise ExperimentError(
+            f"'{name}' is no single number a step: it has {' and '.join(run_dims)}"
+        )
+    return in_units(values)
 
 
-def in_units(found: xarray.DataArray) -> xarray.DataArray:
-    """The values, now read, in mm and so on where the variable says its scale."""
-    factor, units = in_its_units(found.attrs)
-    said = {"long_name": found.attrs.get("long_name", str(found.name)), "units": units}
-    read = found.astype(float) * factor
-    read.attrs = said
-    return read
+def in_units(values: xarray.DataArray) -> xarray.DataArray:
+    """Return the values, read, in mm and so on where the variable defines the scale."""
+    factor, units = in_its_units(values.attrs)
+    attributes = {"long_name": values.attrs.get("long_name", str(values.name)), "units": units}
+    converted = values.astype(float) * factor
+    converted.attrs = attributes
+    return converted
 
 
-def _one_of(found: xarray.DataArray, dim: str, argument: str, place: int | None) -> Any:
-    known = found[dim].values.tolist()
-    if place is None and len(known) == 1:
-        (place,) = known
-    if place not in known:
-        text = "which is meant" if place is None else f"there is no {place}"
-        said = f"'{found.name}' has {dim.replace('_', ' ')}s {', '.join(map(str, known))}"
-        raise ExperimentError(f"{said}: {text}; say {argument}={known[-1]}")
-    meaning = f"{found.attrs.get('long_name', found.name)} {place}"
-    return found.sel({dim: place}).assign_attrs(long_name=meaning)
+def _one_of(values: xarray.DataArray, dim: str, argument: str, place: int | None) -> Any:
+    places = values[dim].values.tolist()
+    if place is None and len(places) == 1:
+        (place,) = places
+    if place not in places:
+        text = "several are recorded" if place is None else f"there is no {place}"
+        description = f"'{values.name}' has {dim.replace('_', ' ')}s {', '.join(map(str, places))}"
+        raise ExperimentError(f"{description}: {text}; select one by {argument}={places[-1]}")
+    meaning = f"{values.attrs.get('long_name', values.name)} {place}"
+    return values.sel({dim: place}).assign_attrs(long_name=meaning)
 
 
-def _over(found: xarray.DataArray, dataset: xarray.Dataset, dim: str) -> Any:
-    """The sum or mean over body particles or bonds, so many steps at a time."""
+def _over(values: xarray.DataArray, dataset: xarray.Dataset, dim: str) -> Any:
+    """Return the sum or mean over body particles or bonds, some steps at a time."""
     import xarray
 
-    summed = found.name in SUMMED
+    summed = values.name in SUMMED
     what = (
         "sum over the body" if summed else f"mean over {'bonds' if dim == 'bond' else 'the body'}"
     )
-    said = found.attrs | {"long_name": f"{found.attrs.get('long_name', found.name)}, {what}"}
+    attributes = values.attrs | {
+        "long_name": f"{values.attrs.get('long_name', values.name)}, {what}"
+    }
     role = dataset.get("role") if dim == "particle" else None
     body = slice(None) if role is None or role.dims != (dim,) else role.values == OF_BODY
 
     def reduced(part: xarray.DataArray) -> xarray.DataArray:
         whole = part.transpose(..., dim)
-        values = np.asarray(whole.values, float)[..., body]
-        some = np.isfinite(values).any(axis=-1)
-        total = np.nansum(values, axis=-1)
+        numbers = np.asarray(whole.values, float)[..., body]
+        finite = np.isfinite(numbers).any(axis=-1)
+        total = np.nansum(numbers, axis=-1)
         if not summed:
-            total = total / np.maximum(np.isfinite(values).sum(axis=-1), 1)
-        return whole.isel({dim: 0}, drop=True).copy(data=np.where(some, total, np.nan))
+            total = total / np.maximum(np.isfinite(numbers).sum(axis=-1), 1)
+        return whole.isel({dim: 0}, drop=True).copy(data=np.where(finite, total, np.nan))
 
-    if "time" not in found.dims:
-        return reduced(found).assign_attrs(said)
-    each = max(1, found.nbytes // max(1, found.sizes["time"]))
+    if "time" not in values.dims:
+        return reduced(values).assign_attrs(attributes)
+    each = max(1, values.nbytes // max(1, values.sizes["time"]))
     block = max(1, SUM_BLOCK_BYTES // each)
-    starts = range(0, found.sizes["time"], block)
-    parts = [reduced(found.isel(time=slice(n, n + block))) for n in starts]
-    return xarray.concat(parts, "time").assign_attrs(said)
+    starts = range(0, values.sizes["time"], block)
+    parts = [reduced(values.isel(time=slice(n, n + block))) for n in starts]
+    return xarray.concat(parts, "time").assign_attrs(attributes)

@@ -91,9 +91,9 @@ class Panels:
 
     @property
     def shape(self) -> float:
-        """Width over height."""
-        left, right, bottom, top = self.box
-        return (right - left) / (top - bottom)
+        """Ratio of width to height."""
+        xmin, xmax, ymin, ymax = self.box
+        return (xmax - xmin) / (ymax - ymin)
 
 
 @dataclass(frozen=True)
@@ -117,13 +117,13 @@ class Page:
     """A new figure with its axes, arranged again when its colour bar and legend are known.
 
     `size` is that of the figure in inches; without it the figure is as large as it needs to be. A
-    figure that is `alone` is not one of pyplot.
+    `standalone` figure is not managed by pyplot.
     """
 
     def __init__(
-        self, panels: Panels, dpi: float, size: tuple[float, float] | None, *, alone: bool
+        self, panels: Panels, dpi: float, size: tuple[float, float] | None, *, standalone: bool
     ) -> None:
-        self.figure = new_figure(alone=alone, dpi=dpi)
+        self.figure = new_figure(standalone=standalone, dpi=dpi)
         self._panels, self._size, self._single = panels, size, len(panels.titles) == 1
         self.axes = [self._panel(title) for title in panels.titles]
         self._labels = [self.figure.text(0, 0, text, fontsize=TEXT_PT) for text in panels.labels]
@@ -136,8 +136,8 @@ class Page:
 
     def _panel(self, title: str) -> Axes:
         ax = self.figure.add_axes((0, 0, 1, 1), label=f"panel {len(self.figure.axes)}")
-        left, right, bottom, top = self._panels.box
-        ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+        xmin, xmax, ymin, ymax = self._panels.box
+        ax.set(xlim=(xmin, xmax), ylim=(ymin, ymax), aspect="equal")
         ax.set_title(title, fontsize=HEADING_PT if self._single else TEXT_PT, pad=4)
         ax.tick_params(labelsize=TICK_PT - (not self._single), length=3, pad=2)
         return ax
@@ -197,14 +197,14 @@ class Page:
         from matplotlib.transforms import Bbox
 
         grid, (width, height) = self._grid, self._grid.size
-        least = self._before + self._after + (width, height)
-        page = np.array(self._size or least)
+        smallest = self._before + self._after + (width, height)
+        page = np.array(self._size or smallest)
         self.figure.set_size_inches(*page)
-        left, bottom = self._before + np.maximum(0.0, page - least) / 2
-        self._block = Bbox.from_bounds(left, bottom, width, height)
+        x0, y0 = self._before + np.maximum(0.0, page - smallest) / 2
+        self._block = Bbox.from_bounds(x0, y0, width, height)
         for n, ax in enumerate(self.axes):
             row, column = divmod(n, grid.columns)
-            x, y = left + column * grid.pitch[0], bottom + (grid.rows - 1 - row) * grid.pitch[1]
+            x, y = x0 + column * grid.pitch[0], y0 + (grid.rows - 1 - row) * grid.pitch[1]
             ax.set_position(np.array((x, y, grid.width, grid.height)) / np.tile(page, 2))
             ax.tick_params(labelleft=column == 0, labelbottom=n + grid.columns >= len(self.axes))
             ax.xaxis.set_major_locator(_locator(*self._panels.box[:2], grid.width, 0.5))
@@ -240,13 +240,13 @@ class Page:
         width, height = self._grid.size
         broad = int(min(height, BAR_LENGTH_IN) * CHARACTERS_PER_IN)
         lines = textwrap.wrap(text, max(1, broad), break_long_words=False)
-        beside = height >= SIDE_BAR_HEIGHT_IN and len(lines) <= LABEL_LINES
-        beside = beside and max(map(len, lines)) <= broad
-        if not beside:
+        is_vertical = height >= SIDE_BAR_HEIGHT_IN and len(lines) <= LABEL_LINES
+        is_vertical = is_vertical and max(map(len, lines)) <= broad
+        if not is_vertical:
             lines = textwrap.wrap(text, int(max(width, BAR_LENGTH_IN) * CHARACTERS_PER_IN))
         bar = self.figure.colorbar(
             ScalarMappable(scale.norm, scale.colours), cax=self.figure.add_axes((0, 0, 1, 1)),
-            orientation="vertical" if beside else "horizontal", extend=scale.extend,
+            orientation="vertical" if is_vertical else "horizontal", extend=scale.extend,
             extendfrac=0.04,
         )  # fmt: skip
         style_bar(bar, scale)
@@ -273,8 +273,8 @@ class Page:
         middle = block.get_points().mean(axis=0)
         low = self._drawn([*self.axes, self._labels[0]]).y0 - 0.08
         if bar and bar.orientation == "vertical":
-            length, left = min(block.height - 0.12, BAR_LENGTH_IN), block.x1 + self._overhang
-            place = np.array((left + GAP_IN, middle[1] - length / 2, BAR_WIDTH_IN, length))
+            length, x0 = min(block.height - 0.12, BAR_LENGTH_IN), block.x1 + self._overhang
+            place = np.array((x0 + GAP_IN, middle[1] - length / 2, BAR_WIDTH_IN, length))
             bar.ax.set_position(place / np.tile(page, 2))
         elif bar:
             length = min(max(block.width, SIDE_BAR_HEIGHT_IN), BAR_LENGTH_IN)
@@ -284,12 +284,12 @@ class Page:
         if legend:
             legend.set_bbox_to_anchor((middle[0], low), self.figure.dpi_scale_trans)
 
-    def _drawn(self, artists: Iterable[Any], **more: Any) -> Bbox:
+    def _drawn(self, artists: Iterable[Any], **options: Any) -> Bbox:
         """Return the box around artists with all that belongs to them, in inches."""
         from matplotlib.transforms import Bbox
 
         renderer = renderer_of(self.figure)
-        boxes = [box for artist in artists if (box := artist.get_tightbbox(renderer, **more))]
+        boxes = [box for artist in artists if (box := artist.get_tightbbox(renderer, **options))]
         return Bbox(Bbox.union(boxes).get_points() / self.figure.dpi)
 
     def _measure(self) -> None:
@@ -300,9 +300,9 @@ class Page:
         self._after = np.subtract(drawn.max, self._block.max) + EDGE_IN
         # Titles may be wider than the panels, and make the page wider instead of these narrower.
         narrow = self._drawn(self.figure.axes, for_layout_only=True)
-        left = min(narrow.x0, self._drawn([self._labels[1]]).x0)
+        x0 = min(narrow.x0, self._drawn([self._labels[1]]).x0)
         self._around = self._before + self._after
-        self._around[0] = narrow.x1 - left - self._block.width + 2 * EDGE_IN
+        self._around[0] = narrow.x1 - x0 - self._block.width + 2 * EDGE_IN
         ticks = self._drawn([self.axes[-1].xaxis])
         self._overhang = max(0.0, ticks.width - self._grid.width) / 2
 

@@ -1,6 +1,5 @@
-"""The picture of a fit: measurements, fitted values, residuals, and where the data determine each
-parameter.
-"""
+"""Figure of a fit: measurements, fitted values, residuals, and the sensitivity of the data to each
+parameter."""
 
 from __future__ import annotations
 
@@ -22,14 +21,16 @@ if TYPE_CHECKING:
 
 PANEL_IN, MARGIN_IN, CURVE_IN, CURVES = 3.8, 0.75, 2.5, 3
 WITHIN = 3.0
-"""Residuals beyond so many times the noise have the last colour."""
+"""Limit of the colours of residuals, in multiples of the noise."""
 
 
 def draw_fit(fitted: Fitted) -> Figure:
-    """Each measurement by itself. A field: ux and uy as measured, as fitted, the residual over its
-    noise, and for each parameter how much each point tells of it; side by side where the body is
-    wide, else below each other. Tracks and curves: what was measured and fitted, the residual, and
-    what is told, along time or displacement. Raises ExperimentError where matplotlib is missing.
+    """Draw each measurement of a fit.
+
+    A field has panels of ux and uy, measured and fitted, of the residual over the noise, and of the
+    sensitivity to each parameter; beside each other for wide bodies, else below. Tracks and curves
+    have the measured and fitted values, residual and sensitivity along time or displacement. Raises
+    ExperimentError where matplotlib is missing.
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.style import new_figure
@@ -66,7 +67,7 @@ def _curve_size(count: int) -> tuple[float, float]:
 
 def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
     field, information = fitted.field(n), fitted.information(n)
-    noise, most = fitted.met[n].noise, max(t.max() for t in information.values())
+    noise, largest = fitted.met[n].noise, max(t.max() for t in information.values())
     factor, unit = fitted.met[n].factor, fitted.met[n].unit
     counted = f" ({unit})" if unit else ""
     wide, count = _is_wide(fitted, n), 3 + len(information)
@@ -75,22 +76,22 @@ def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
     area = float(np.prod(np.ptp(field.points, axis=0)) / np.ptp(field.points, axis=0)[0] ** 2)
     size = max(0.5, 0.55 * 72 * PANEL_IN * np.sqrt(area / len(field.points)))
     for column, name in enumerate(("ux", "uy")):
-        measured, left = factor * field.measured[:, column], factor * field.residual[:, column]
-        shown = [
+        measured, residual = factor * field.measured[:, column], factor * field.residual[:, column]
+        panels = [
             (f"{name} measured{counted}", measured, (measured.min(), measured.max()), "viridis"),
             (
                 f"{name} fitted{counted}",
-                measured - left,
+                measured - residual,
                 (measured.min(), measured.max()),
                 "viridis",
             ),
-            (f"{name} residual / noise", left / (factor * noise), (-WITHIN, WITHIN), "RdBu_r"),
+            (f"{name} residual / noise", residual / (factor * noise), (-WITHIN, WITHIN), "RdBu_r"),
         ]
-        for path, told in information.items():
-            share = told.reshape(2, -1)[column] / most
-            shown.append((f"{name} tells {path}", share, (0.0, 1.0), "magma_r"))
-        own = axes[:, column] if wide else axes[column]
-        for ax, (title, values, limits, colours) in zip(own, shown, strict=True):
+        for path, sensitivity in information.items():
+            share = sensitivity.reshape(2, -1)[column] / largest
+            panels.append((f"{name}, sensitivity to {path}", share, (0.0, 1.0), "magma_r"))
+        column_axes = axes[:, column] if wide else axes[column]
+        for ax, (title, values, limits, colours) in zip(column_axes, panels, strict=True):
             _scatter(ax, factor * field.points, values, limits, colours, size)
             ax.set_title(title, fontsize=9)
     for ax in axes[-1]:
@@ -120,10 +121,10 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
     axes[2].plot(along, numbers.residual / fitted.met[n].noise, ".", markersize=3)
     axes[2].axhline(0.0, color="0.6", linewidth=0.8)
     titles = [what, "fitted over measured", "residual / noise"]
-    most = max(t.max() for t in information.values())
-    for ax, (path, told) in zip(axes[3:], information.items(), strict=False):
-        ax.plot(along, told / most, ".", markersize=3)
-        titles.append(f"tells {path}")
+    largest = max(t.max() for t in information.values())
+    for ax, (path, sensitivity) in zip(axes[3:], information.items(), strict=False):
+        ax.plot(along, sensitivity / largest, ".", markersize=3)
+        titles.append(f"sensitivity to {path}")
     for k, (ax, title) in enumerate(zip(axes, titles, strict=False)):
         ax.set_title(title, fontsize=9)
         ax.set_xlabel("measured" if k == 1 else over, fontsize=9)
@@ -131,20 +132,20 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
 
 
 def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
-    """Of tracks or a curve: by what its numbers are multiplied, what they go over, and what both
-    are, in the units of the experiment where it has some."""
-    numbers, met = fitted.numbers(n), fitted.met[n]
+    """Return for tracks or a curve the factor of its values, the abscissa, and the labels of both,
+    in the units of the experiment where it has some."""
+    numbers, observed = fitted.numbers(n), fitted.met[n]
     units = fitted.problem.observations[n].experiment.units
     if units is None:
         return 1.0, numbers.along, numbers.what, numbers.over
     over_time = numbers.over.startswith("time")
     along = numbers.along if over_time else units.length_mm * numbers.along
     over = numbers.over if over_time else f"{numbers.over} ({LENGTH.unit})"
-    return met.factor, along, f"{numbers.what} ({met.unit})", over
+    return observed.factor, along, f"{numbers.what} ({observed.unit})", over
 
 
 def _line(joined: bool) -> dict[str, Any]:
-    """Of a curve; tracks of many points at one time are not joined."""
+    """Return the style of a fitted curve; tracks of many points at one time are not joined."""
     return (
         {"color": "C0", "linewidth": 1.2}
         if joined

@@ -23,29 +23,30 @@ if TYPE_CHECKING:
 
 
 SAMPLES = 2_000_000
-"""So many are taken at a time."""
+"""Maximum number of samples that are evaluated at a time."""
 MOST = 60_000_000
-"""So many in all: where a body folds over itself again and again, fewer than there are pixels."""
+"""Maximum total number of samples: a body folded over itself many times has fewer than pixels."""
 
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """The pixels of a picture: `box` (left, right, bottom, top) and how many `across` and `up`."""
+    """Pixels of a picture: `box` (left, right, bottom, top) and their numbers `across` and `up`."""
 
     box: tuple[float, float, float, float]
     across: int
     up: int
 
     def places(self, position: Array) -> Array:
-        """Positions, (..., 2), in pixels from the lower left corner."""
-        left, right, bottom, top = self.box
-        scale = np.array([self.across / (right - left), self.up / (top - bottom)], np.float32)
-        return np.asarray((position - np.array([left, bottom])).astype(np.float32) * scale)
+        """Return positions, (..., 2), in pixels from the lower left corner."""
+        xmin, xmax, ymin, ymax = self.box
+        scale = np.array([self.across / (xmax - xmin), self.up / (ymax - ymin)], np.float32)
+        return np.asarray((position - np.array([xmin, ymin])).astype(np.float32) * scale)
 
     def mean(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
-        """The values of cells, (up, across), between those at their corners, (cell, 4), in pixels
-        (cell, 4, 2); NaN where no cell is, or what is `cut` off, and the mean where several are. No
-        pixel within a cell is missed: samples lie no further apart than pixels are wide."""
+        """Interpolate the values of cells, (up, across), between those at their corners, (cell, 4),
+        in pixels (cell, 4, 2); NaN outside all cells and where they are `cut` off, and the mean
+        where several overlap. No pixel within a cell is missed: samples are no further apart than
+        pixels are wide."""
         sums, counts = np.zeros(self.across * self.up), np.zeros(self.across * self.up)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
@@ -57,54 +58,56 @@ class PixelGrid:
             return (sums / counts).reshape(self.up, self.across)
 
     def latest(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
-        """The same of values that cannot be averaged: that of the nearest corner; of several in a
-        pixel the largest."""
-        found = np.full(self.across * self.up, -np.inf)
+        """Evaluate values that cannot be averaged likewise: that of the nearest corner; of several
+        in a pixel the largest."""
+        largest = np.full(self.across * self.up, -np.inf)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
             pixels, inside = self._pixels(corners[cells], weights, _kept(cut, cells, middles))
             nearest = values[cells][:, weights.argmax(axis=1)].ravel()[inside]
-            np.maximum.at(found, pixels, nearest)
-        found[np.isinf(found)] = np.nan
-        return found.reshape(self.up, self.across)
+            np.maximum.at(largest, pixels, nearest)
+        largest[np.isinf(largest)] = np.nan
+        return largest.reshape(self.up, self.across)
 
-    def _pixels(self, corners: Array, weights: Array, kept: Array | None) -> tuple[Array, Array]:
-        """In which pixel each sample lies, and which samples lie in any; of those `kept`."""
+    def _pixels(self, corners: Array, weights: Array, mask: Array | None) -> tuple[Array, Array]:
+        """Return the pixel of each sample and the indices of the samples within the picture and
+        `mask`."""
         x, y = ((corners[..., axis] @ weights.T).ravel() for axis in (0, 1))
-        there = (x >= 0) & (x < self.across) & (y >= 0) & (y < self.up)
-        inside = np.flatnonzero(there if kept is None else there & kept)
+        within_box = (x >= 0) & (x < self.across) & (y >= 0) & (y < self.up)
+        inside = np.flatnonzero(within_box if mask is None else within_box & mask)
         return y[inside].astype(np.int64) * self.across + x[inside].astype(np.int64), inside
 
 
 @dataclass(frozen=True)
 class OutlineCut:
-    """What an outline cuts off some cells: `row` (cell,) is the row of each in the cells that are
-    cut, -1 where it is not."""
+    """The parts of cells cut off by an outline: `row` (cell,) is the row of each among the cut
+    cells, -1 if it is not cut."""
 
     cells: CutCells
     row: Array
 
 
 def _kept(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
-    """Which samples of some cells are not cut off, (cell and sample,); None where all are."""
+    """Return which samples of some cells are not cut off, (cell and sample,); None if all are."""
     rows = cut.row[cells] if cut else np.empty(0, int)
-    some = np.flatnonzero(rows >= 0)
-    if cut is None or not len(some):
+    cut_cells = np.flatnonzero(rows >= 0)
+    if cut is None or not len(cut_cells):
         return None
-    kept = np.ones((len(cells), len(middles) ** 2), bool)
-    kept[some] = ~cut.cells.beyond(rows[some], middles).reshape(len(some), -1)
-    return kept.ravel()
+    mask = np.ones((len(cells), len(middles) ** 2), bool)
+    mask[cut_cells] = ~cut.cells.outside(rows[cut_cells], middles).reshape(len(cut_cells), -1)
+    return mask.ravel()
 
 
 def _weights(middles: Array) -> Array:
-    """What corners weigh in each sample, (sample, 4), at some places along both sides."""
+    """Return the weights of the corners in each sample, (sample, 4), at `middles` along both
+    sides."""
     u, v = (part.ravel() for part in np.meshgrid(middles, middles))
     return np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1)
 
 
 def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
-    """Cells, by their rows, that take as many samples, and where these lie along both sides, as
-    shares."""
+    """Generate the rows of cells with equally many samples, and the positions of these along both
+    sides, from 0 to 1."""
     a, b, c, d = (corners[:, k] for k in range(4))
     along = np.maximum(abs(b - a), abs(c - d)), np.maximum(abs(d - a), abs(c - b))
     # Steps of samples along both sides together reach no further than a pixel: none is missed.
@@ -116,9 +119,9 @@ def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
         count = math.ceil(2 ** (level / 2))
         middles = (np.arange(count, dtype=np.float32) + 0.5) / count
         cells = np.flatnonzero(levels == level)
-        many = max(1, SAMPLES // count**2)
-        for start in range(0, len(cells), many):
-            yield cells[start : start + many], middles
+        block = max(1, SAMPLES // count**2)
+        for start in range(0, len(cells), block):
+            yield cells[start : start + block], middles
 
 
 INK, LINE, TORN, REST = "#404040", "#B0B0B0", "#CC3311", "#888888"
@@ -130,14 +133,14 @@ class Layer(ABC):
     artists: list[Artist]
 
     @abstractmethod
-    def show(self, now: Snapshot) -> None:
-        """Shows that step in place of the one before."""
+    def show(self, snapshot: Snapshot) -> None:
+        """Show a step in place of the previous one."""
 
 
 class PixelField(Layer):
-    """A quantity of particles over whole cells up to the outline, as pixels; particles in none are
-    dots of a size in points, and a pixel where that is next to nothing. A corner beyond the outline
-    that has no value takes the mean of the cells that meet there."""
+    """A quantity of particles over whole cells up to the outline, as pixels; particles outside all
+    cells are dots of a size in points, or a pixel where that would be invisible. A corner outside
+    the outline without a value has the mean of the cells that meet there."""
 
     def __init__(
         self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale, size: float
@@ -148,19 +151,19 @@ class PixelField(Layer):
         self._alone.set(cmap=scale.colours, norm=scale.norm)
         self.artists = [self._image, self._alone]
 
-    def show(self, now: Snapshot) -> None:
-        """The mean of what lies in a pixel."""
-        assert now.values is not None
-        body, values = self._body, now.values.astype(np.float32)
-        chosen = body.whole_cells(body.cells, now.broken)
+    def show(self, snapshot: Snapshot) -> None:
+        """Show the mean in each pixel."""
+        assert snapshot.values is not None
+        body, values = self._body, snapshot.values.astype(np.float32)
+        chosen = body.whole_cells(body.cells, snapshot.broken)
         if not np.isfinite(values[body.inside]).all():
-            values = _filled(values, body.cells[chosen], body.beyond)
+            values = _filled(values, body.cells[chosen], body.outside)
             chosen = chosen[np.isfinite(values)[body.cells[chosen]].all(axis=1)]
-        alone = _alone(body.cells[chosen], body.inside & ~body.beyond & np.isfinite(values))
-        self._alone.set_offsets(now.position[alone])
-        self._alone.set_array(now.values[alone])
+        alone = _alone(body.cells[chosen], body.inside & ~body.outside & np.isfinite(values))
+        self._alone.set_offsets(snapshot.position[alone])
+        self._alone.set_array(snapshot.values[alone])
         cells = _with(body.cells[chosen], alone)
-        corners, cut = self._grid.places(now.position)[cells], _cut(body, chosen, len(alone))
+        corners, cut = self._grid.places(snapshot.position)[cells], _cut(body, chosen, len(alone))
         self._image.set_data(self._grid.mean(corners, values[cells], cut))
 
 
@@ -171,17 +174,17 @@ class BondField(Layer):
         self._body, self._grid, self._image = body, grid, _image(ax, grid, scale)
         self.artists = [self._image]
 
-    def show(self, now: Snapshot) -> None:
-        """The mean of what lies in a pixel."""
-        assert now.values is not None
-        shown = np.isfinite(now.values)
-        corners = self._grid.places(now.position)[self._body.ends[shown][:, [0, 1, 1, 0]]]
-        values = np.repeat(now.values[shown, None], 4, axis=1)
+    def show(self, snapshot: Snapshot) -> None:
+        """Show the mean in each pixel."""
+        assert snapshot.values is not None
+        finite = np.isfinite(snapshot.values)
+        corners = self._grid.places(snapshot.position)[self._body.ends[finite][:, [0, 1, 1, 0]]]
+        values = np.repeat(snapshot.values[finite, None], 4, axis=1)
         self._image.set_data(self._grid.mean(corners, values))
 
 
 class Classes(Layer):
-    """What has a name, of particles too many for dots, as pixels."""
+    """Classes of particles that are too many for dots, as pixels."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, palette: Palette) -> None:
         from matplotlib.colors import ListedColormap, Normalize
@@ -195,21 +198,24 @@ class Classes(Layer):
         )  # fmt: skip
         self.artists = [self._image]
 
-    def show(self, now: Snapshot) -> None:
-        """That of the nearest particle; of several in a pixel, the one on top."""
-        body, ranks = self._body, self._palette.ranks(now)
-        chosen, there = body.whole_cells(body.cells_with_frame, now.broken), np.isfinite(ranks)
-        chosen = chosen[there[body.cells_with_frame[chosen]].all(axis=1)]
-        alone = _alone(body.cells_with_frame[chosen], there & ~body.beyond)
+    def show(self, snapshot: Snapshot) -> None:
+        """Show the class of the nearest particle; of several in a pixel, the topmost."""
+        body, ranks = self._body, self._palette.ranks(snapshot)
+        chosen, has_class = (
+            body.whole_cells(body.cells_with_frame, snapshot.broken),
+            np.isfinite(ranks),
+        )
+        chosen = chosen[has_class[body.cells_with_frame[chosen]].all(axis=1)]
+        alone = _alone(body.cells_with_frame[chosen], has_class & ~body.outside)
         cells = _with(body.cells_with_frame[chosen], alone)
         # Where cells are cut the body is all there is: both kinds of cells are the same.
         cut = _cut(body, chosen, len(alone)) if body.inside.all() else None
-        corners = self._grid.places(now.position)[cells]
+        corners = self._grid.places(snapshot.position)[cells]
         self._image.set_data(self._grid.latest(corners, ranks[cells], cut))
 
 
 class Dots(Layer):
-    """A dot at each particle, in the colour of its value or its class; none at those `hidden`."""
+    """A dot for each particle, in the colour of its value or class; none for `hidden` ones."""
 
     def __init__(self, ax: Axes, size: float, colours: Scale | Palette, hidden: Array) -> None:
         self._colours, self._hidden = colours, hidden
@@ -219,23 +225,23 @@ class Dots(Layer):
             self._dots.set(cmap=colours.colours, norm=colours.norm)
         self.artists = [self._dots]
 
-    def show(self, now: Snapshot) -> None:
-        """Leaders over followers over the frame."""
+    def show(self, snapshot: Snapshot) -> None:
+        """Show leaders over followers over the frame."""
         palette = self._colours if isinstance(self._colours, Palette) else OF_KINDS
-        ranks = palette.ranks(now)
+        ranks = palette.ranks(snapshot)
         order = np.argsort(ranks, kind="stable")
         order = order[np.isfinite(ranks[order]) & ~self._hidden[order]]
-        self._dots.set_offsets(now.position[order])
+        self._dots.set_offsets(snapshot.position[order])
         if isinstance(self._colours, Scale):
-            assert now.values is not None
-            self._dots.set_array(np.ma.masked_invalid(now.values[order]))
+            assert snapshot.values is not None
+            self._dots.set_array(np.ma.masked_invalid(snapshot.values[order]))
         else:
             colours = [colour for _, colour in palette.colours.values()]
             self._dots.set_facecolor([colours[int(rank)] for rank in ranks[order]])
 
 
 class BondLines(Layer):
-    """Lines between neighbours: those that are whole, or, `broken`, those that are not."""
+    """Lines of whole bonds or, with `broken`, of broken ones."""
 
     def __init__(
         self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False
@@ -250,14 +256,14 @@ class BondLines(Layer):
         ax.add_collection(self._lines, autolim=False)
         self.artists = [self._lines]
 
-    def show(self, now: Snapshot) -> None:
-        """At the places where the particles are."""
-        ends = self._body.ends[now.broken == self._broken]
-        self._lines.set_segments(list(now.position[ends]))
+    def show(self, snapshot: Snapshot) -> None:
+        """Show the bonds at the current positions."""
+        ends = self._body.ends[snapshot.broken == self._broken]
+        self._lines.set_segments(list(snapshot.position[ends]))
 
 
 class BondValues(Layer):
-    """A quantity of bonds, as the colours of lines; those without a value are not drawn."""
+    """A quantity of bonds, as the colours of lines; bonds without a value are not drawn."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, width: float, scale: Scale) -> None:
         from matplotlib.collections import LineCollection
@@ -269,44 +275,44 @@ class BondValues(Layer):
         ax.add_collection(self._lines, autolim=False)
         self.artists = [self._lines]
 
-    def show(self, now: Snapshot) -> None:
-        """At the places where the particles are."""
-        assert now.values is not None
-        shown = np.isfinite(now.values)
-        self._lines.set_segments(list(now.position[self._body.ends[shown]]))
-        self._lines.set_array(now.values[shown])
+    def show(self, snapshot: Snapshot) -> None:
+        """Show the bonds at the current positions."""
+        assert snapshot.values is not None
+        finite = np.isfinite(snapshot.values)
+        self._lines.set_segments(list(snapshot.position[self._body.ends[finite]]))
+        self._lines.set_array(snapshot.values[finite])
 
 
 def draw_outline(ax: Axes, sides: Array) -> None:
-    """Lines, (side, end, axis), that stay."""
+    """Draw static segments, (side, end, axis)."""
     from matplotlib.collections import LineCollection
 
     lines = LineCollection(list(sides), colors=REST, linewidths=0.7, zorder=2.5)
     ax.add_collection(lines, autolim=False)
 
 
-def draw_numbers(ax: Axes, numbers: Array, now: Snapshot, size: float) -> None:
-    """The numbers of particles, to the upper right of dots of that size, in points; as many as do
-    not overprint each other."""
-    places, font = ax.transData.transform(now.position), 6.0
+def draw_numbers(ax: Axes, numbers: Array, snapshot: Snapshot, size: float) -> None:
+    """Write the numbers of particles to the upper right of dots of a size in points, except where
+    they would overlap."""
+    places, font = ax.transData.transform(snapshot.position), 6.0
     point = figure_of(ax).dpi / 72
-    taken: set[tuple[int, int]] = set()
+    occupied: set[tuple[int, int]] = set()
     box = ax.bbox
-    for number, (x, y), place in zip(numbers, places, now.position, strict=True):
+    for number, (x, y), place in zip(numbers, places, snapshot.position, strict=True):
         text = str(int(number))
-        left, low = x + 0.5 * size * point, y + 0.5 * size * point
-        right, high = left + (0.68 * len(text) * font + 1.5) * point, low + 1.25 * font * point
-        columns = range(int(left / point), int(right / point) + 1)
-        covered = {(c, r) for c in columns for r in range(int(low / point), int(high / point) + 1)}
-        if covered & taken or right > box.x1 or high > box.y1:
+        xmin, ymin = x + 0.5 * size * point, y + 0.5 * size * point
+        xmax, ymax = xmin + (0.68 * len(text) * font + 1.5) * point, ymin + 1.25 * font * point
+        columns = range(int(xmin / point), int(xmax / point) + 1)
+        covered = {(c, r) for c in columns for r in range(int(ymin / point), int(ymax / point) + 1)}
+        if covered & occupied or xmax > box.x1 or ymax > box.y1:
             continue
-        taken |= covered
-        beside = (0.5 * size, 0.5 * size)
-        ax.annotate(text, place, beside, textcoords="offset points", fontsize=font, zorder=4)
+        occupied |= covered
+        offset = (0.5 * size, 0.5 * size)
+        ax.annotate(text, place, offset, textcoords="offset points", fontsize=font, zorder=4)
 
 
 def _image(ax: Axes, grid: PixelGrid, scale: Scale) -> AxesImage:
-    """Of the pixels of a grid; nothing where there is no value."""
+    """Return an empty image on the pixels of a grid."""
     return ax.imshow(
         np.full((2, 2), np.nan), cmap=scale.colours.with_extremes(bad=(0, 0, 0, 0)),
         norm=scale.norm, extent=grid.box, origin="lower", aspect="equal", zorder=0,
@@ -314,33 +320,34 @@ def _image(ax: Axes, grid: PixelGrid, scale: Scale) -> AxesImage:
     )  # fmt: skip
 
 
-def _filled(values: Array, cells: Array, beyond: Array) -> Array:
-    """The values, with those missing beyond the outline: each the mean of the cells that meet
-    there, of which each counts the mean of its known corners."""
-    known = np.isfinite(values)
-    some = cells[(beyond & ~known)[cells].any(axis=1) & known[cells].any(axis=1)]
-    means = np.nanmean(values[some], axis=1)
-    corners = some.ravel()
+def _filled(values: Array, cells: Array, outside: Array) -> Array:
+    """Return the values, with missing ones `outside` the outline replaced by the mean of the cells
+    that meet there, each of which has the mean of its finite corners."""
+    finite = np.isfinite(values)
+    mixed = cells[(outside & ~finite)[cells].any(axis=1) & finite[cells].any(axis=1)]
+    means = np.nanmean(values[mixed], axis=1)
+    corners = mixed.ravel()
     count = np.bincount(corners, minlength=len(values))
-    total = np.bincount(corners, np.repeat(means, some.shape[1]), len(values))
-    taken = beyond & ~known & (count > 0)
-    return np.where(taken, total / np.maximum(count, 1), values).astype(np.float32)
+    total = np.bincount(corners, np.repeat(means, mixed.shape[1]), len(values))
+    fillable = outside & ~finite & (count > 0)
+    return np.where(fillable, total / np.maximum(count, 1), values).astype(np.float32)
 
 
 def _cut(body: ReferenceBody, chosen: Array, alone: int) -> OutlineCut | None:
-    """What the outline cuts off the chosen cells, with some after them that are not cut."""
+    """Return the parts that the outline cuts off the chosen cells, followed by `alone` uncut
+    ones."""
     if body.cut is None:
         return None
     return OutlineCut(body.cut, np.append(body.cut.row[chosen], np.full(alone, -1)))
 
 
 def _alone(cells: Array, chosen: Array) -> Array:
-    """The rows of the chosen particles that are in none of the cells."""
+    """Return the rows of the chosen particles that are in none of the cells."""
     alone = chosen.copy()
     alone[cells] = False
     return np.flatnonzero(alone)
 
 
 def _with(cells: Array, alone: Array) -> Array:
-    """The cells, and one of no extent for each of those particles."""
+    """Append a cell of zero extent for each of these particles."""
     return np.concatenate([cells, np.repeat(alone[:, None], 4, axis=1)])

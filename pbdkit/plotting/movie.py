@@ -1,4 +1,4 @@
-"""Movies of a dataset: every recorded step, with the same limits and colours from first to last."""
+"""Movies of a dataset: all recorded steps with the same limits and colours."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ if TYPE_CHECKING:
 
 Show = Callable[[str, float], None]
 Frame = NDArray[np.uint8]
-"""(row, column, red green blue)."""
+"""Pixels, (row, column, red green blue)."""
 FORMATS = (".mp4", ".gif")
 WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
 DPI, GIF_COLOURS = 120, 128
 SLOWEST, FASTEST, FASTEST_GIF = 0.1, 240, 50
-"""Frames a second, as players show them."""
+"""Minimum and maximum frame rates of players, in 1/s."""
 FINER = 0.6
-"""So many times the pixels of the movie, either way, are those of a field, which is then smooth."""
+"""Resolution of fields relative to the pixels of the movie; coarser ones are interpolated."""
 NEARLY_WHITE = 240
 FRAMES = 60
-"""So many steps a page in a notebook holds at most."""
+"""Maximum number of steps in an animation for notebooks."""
 
 
 def silent(what: str, share: float) -> None:
-    """Tells nobody how far it is."""
+    """Ignore the progress of a movie."""
 
 
 def animate(
@@ -102,7 +102,7 @@ def animate(
     recording = Trajectory(dataset, color or "kind")
     rows = [*range(0, len(recording.steps), every)]
     rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
-    moving = Moving(recording, rows, look, show)
+    moving = MovieSheet(recording, rows, look, show)
     frames = moving.frames(rows, show)
     with open_atomic(path, NewFile, replace=replace) as new:
         if path.suffix == ".gif":
@@ -113,7 +113,7 @@ def animate(
 
 
 def _refuse_speed(path: Path, fps: float, every: int) -> None:
-    """Raise ExperimentError for a number of steps that no movie shows."""
+    """Raise ExperimentError for a frame rate or step interval outside the supported range."""
     fastest = FASTEST_GIF if path.suffix == ".gif" else FASTEST
     if not SLOWEST <= fps <= fastest:
         raise ExperimentError(f"fps: {fps:g} is not between {SLOWEST:g} and {fastest}")
@@ -166,17 +166,17 @@ def animation(
     recording = Trajectory(dataset, color or "kind")
     last = len(recording.steps) - 1
     rows = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int)).tolist()
-    moving = Moving(recording, rows, look, silent, alone=False)
-    shown = [*recording.snapshots(rows)]
+    moving = MovieSheet(recording, rows, look, silent, standalone=False)
+    snapshots = [*recording.snapshots(rows)]
     return FuncAnimation(
-        moving.sheet.figure, lambda n: moving.put(shown[n]), frames=len(shown), interval=80,
+        moving.sheet.figure, lambda n: moving.put(snapshots[n]), frames=len(snapshots), interval=80,
         blit=False,
     )  # fmt: skip
 
 
 def refuse_no_movie(path: Path) -> None:
-    """Raises ExperimentError where the name is that of no movie, or nothing here can write it, and
-    StorageError where there is no such folder."""
+    """Raise ExperimentError where the suffix is not that of a movie, or its writer is not
+    installed, and StorageError where the folder does not exist."""
     if path.suffix not in FORMATS:
         raise ExperimentError(f"{path}: a movie ends in {' or '.join(FORMATS)}")
     writer = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
@@ -186,7 +186,7 @@ def refuse_no_movie(path: Path) -> None:
         raise StorageError(f"{path}: there is no folder {path.parent}")
 
 
-class Moving:
+class MovieSheet:
     """A sheet of one panel whose layers show step after step, over a background drawn once."""
 
     def __init__(
@@ -196,15 +196,19 @@ class Moving:
         look: Look,
         show: Show,
         *,
-        alone: bool = True,
+        standalone: bool = True,
     ) -> None:
         from pbdkit.plotting.configuration import Sheet
 
         self._recording, self._name = recording, recording.title
-        looked_at = _told(recording.snapshots(rows), len(rows), "the scale of colours", show)
+        looked_at = _with_progress(
+            recording.snapshots(rows), len(rows), "the scale of colours", show
+        )
         extent: Extent = extent_of(recording, looked_at, look)
         title = self._title(as_step(recording.steps[-1]))
-        self.sheet: Sheet = Sheet([recording], [title], "", extent, look, finer=FINER, alone=alone)
+        self.sheet: Sheet = Sheet(
+            [recording], [title], "", extent, look, finer=FINER, standalone=standalone
+        )
         (self._panel,) = self.sheet.panels
         self._heading = self._panel.ax.title
         if self._heading.get_text() != title:  # it was too long
@@ -213,14 +217,14 @@ class Moving:
     def _title(self, step: float) -> str:
         return f"{self._name}, step {step}".lstrip(", ")
 
-    def put(self, now: Snapshot) -> list[Any]:
-        """Shows a step, and returns what changed."""
-        self._panel.show(now)
-        self._heading.set_text(self._title(now.step))
+    def put(self, snapshot: Snapshot) -> list[Any]:
+        """Show a step, and return the changed artists."""
+        self._panel.show(snapshot)
+        self._heading.set_text(self._title(snapshot.step))
         return [*self._panel.artists, self._heading]
 
     def frames(self, rows: Sequence[int], show: Show = silent) -> Iterator[Frame]:
-        """Each of those steps as pixels, an even number of them across and up."""
+        """Generate the steps as pixels, in an even number across and up."""
         figure = self.sheet.figure
         pixels = np.ceil(figure.get_size_inches() * figure.dpi / 2 - 1e-9) * 2
         figure.set_size_inches(*(pixels / figure.dpi))
@@ -230,31 +234,35 @@ class Moving:
             artist.set_animated(True)
         canvas.draw()
         background = canvas.copy_from_bbox(figure.bbox)
-        for now in _told(self._recording.snapshots(rows), len(rows), "the movie", show):
+        for snapshot in _with_progress(
+            self._recording.snapshots(rows), len(rows), "the movie", show
+        ):
             canvas.restore_region(background)
-            for artist in sorted(self.put(now), key=lambda a: a.get_zorder()):
+            for artist in sorted(self.put(snapshot), key=lambda a: a.get_zorder()):
                 figure.draw_artist(artist)
             yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _told(shown: Iterator[Snapshot], count: int, what: str, show: Show) -> Iterator[Snapshot]:
-    for n, now in enumerate(shown):
-        yield now
-        show(what, (n + 1) / count)
+def _with_progress(
+    snapshots: Iterator[Snapshot], count: int, task: str, show: Show
+) -> Iterator[Snapshot]:
+    for n, snapshot in enumerate(snapshots):
+        yield snapshot
+        show(task, (n + 1) / count)
 
 
 def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
-    """By ffmpeg, in another process, as every player shows it, under the name of the file."""
+    """Encode by ffmpeg in a separate process, for all players, under the name of the file."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     first = next(frames)
     height, width, _ = first.shape
-    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}"]
-    coded = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-preset", "veryfast"]
-    command = [get_ffmpeg_exe(), "-y", "-v", "error", *given, "-i", "-", *coded,
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}"]
+    codec = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-preset", "veryfast"]
+    command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, "-i", "-", *codec,
                "-movflags", "+faststart", "-f", "mp4", str(file.disk.name)]  # fmt: skip
-    with TemporaryFile() as said:
-        with Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=said) as ffmpeg:
+    with TemporaryFile() as log:
+        with Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=log) as ffmpeg:
             assert ffmpeg.stdin is not None
             try:
                 with suppress(BrokenPipeError), ffmpeg.stdin as pipe:
@@ -264,14 +272,14 @@ def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
                 ffmpeg.kill()
                 ffmpeg.wait()
                 raise
-        said.seek(0)
-        fault = one_line(said.read().decode(errors="replace"))
+        log.seek(0)
+        fault = one_line(log.read().decode(errors="replace"))
         if fault or ffmpeg.returncode:
             file.fail(OSError(0, fault or f"ffmpeg ended with status {ffmpeg.returncode}"))
 
 
 def _write_gif(file: NewFile, few: Frame, frames: Iterator[Frame], fps: float) -> None:
-    """With one palette, that of `few` of them, so that what does not move does not change."""
+    """Write with one palette, that of a `few` frames, so that static parts do not flicker."""
     from PIL import Image
 
     palette = Image.fromarray(few).quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)

@@ -30,19 +30,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 HEAD = 7.0
-"""The length of an arrow's head, pixels."""
+"""Length of an arrow's head in pixels."""
 
 
 class Svg:
-    """A picture of the coordinates from `low` to `high` within so many pixels, `margin` around
-    them: with it the picture reaches from `self.low` to `self.high`. y goes up. Shapes stand in the
-    order in which they are added."""
+    """Picture of the coordinates from `low` to `high` within `limits` in pixels, with a `margin`
+    around them: the picture reaches from `self.low` to `self.high`. y points up. Shapes are drawn
+    in the order of their addition."""
 
     def __init__(
-        self, low: Floats, high: Floats, within: tuple[float, float], margin: float
+        self, low: Floats, high: Floats, limits: tuple[float, float], margin: float
     ) -> None:
         size = np.maximum(high - low, 1e-9 * max(1.0, *np.abs(high), *np.abs(low)))
-        self.scale = float(((np.array(within) - 2.0 * margin) / size).min())
+        self.scale = float(((np.array(limits) - 2.0 * margin) / size).min())
         self.width, self.height = (float(s) for s in size * self.scale + 2.0 * margin)
         self._origin = np.array([margin - low[0] * self.scale, margin + high[1] * self.scale])
         self.low: Floats = self._origin * (-1.0, 1.0) / self.scale - (0.0, self.height / self.scale)
@@ -50,7 +50,7 @@ class Svg:
         self._shapes: list[str] = []
 
     def at(self, places: Floats) -> Floats:
-        """The pixels of places, (..., axis)."""
+        """Return the pixel coordinates of places, (..., axis)."""
         return np.asarray(self._origin + np.asarray(places) * (self.scale, -self.scale))
 
     def dots(
@@ -62,27 +62,27 @@ class Svg:
         square: bool = False,
         opacity: float = 1.0,
     ) -> None:
-        """Dots of one size, pixels: one path for all, as many elements are slow to show."""
+        """Draw dots of one size in pixels, as one path: many elements would be slow."""
         path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in self.at(places))
         cap = "square" if square else "round"
         style = f'stroke="{colour}" stroke-width="{size:.2f}" stroke-linecap="{cap}"'
         self._add(f'<path d="{path}" {style} stroke-opacity="{opacity:g}"/>' if path else "")
 
     def line(self, places: Floats, colour: str, width: float, dashes: str = "") -> None:
-        """A line from place to place; `dashes` as SVG writes them."""
+        """Draw a polyline; `dashes` as in SVG."""
         path = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in self.at(places))
         dashed = f' stroke-dasharray="{dashes}"' if dashes else ""
         style = f'fill="none" stroke="{colour}" stroke-width="{width:g}" stroke-linecap="round"'
         self._add(f'<path d="{path}" {style}{dashed}/>')
 
     def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
-        """What lies between closed outlines: an inner one is a hole."""
+        """Fill the area between closed outlines: an inner one is a hole."""
         parts = ("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in self.at(o)) + "Z" for o in outlines)
         style = f'fill="{fill}" stroke="{edge}" fill-rule="evenodd"'
         self._add(f'<path d="{"".join(parts)}" {style}/>')
 
     def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
-        """An arrow from a place, by so many pixels, y up."""
+        """Draw an arrow from a place, by a vector in pixels, y up."""
         (x, y), (dx, dy) = self.at(tail), (float(way[0]), -float(way[1]))
         length = math.hypot(dx, dy)
         if length < 1e-9:
@@ -101,7 +101,7 @@ class Svg:
         )
 
     def text(self, title: str) -> str:
-        """The whole as an element of HTML, with what it says to those who do not see it."""
+        """Return the picture as an HTML element with a text for screen readers."""
         w, h = f"{self.width:.0f}", f"{self.height:.0f}"
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{w}" height="{h}" '
@@ -114,8 +114,8 @@ class Svg:
 
 
 def extreme(motion: Motion, reference: Floats, steps: int) -> Floats:
-    """(particle or 1, axis): the farthest that a motion goes from its start, of those moments at
-    which it changes; of a turn the way of its first step."""
+    """Return the largest displacement of a motion, (particle or 1, axis), among the moments at
+    which it changes; for a rotation that of its first step."""
     if isinstance(motion, Rotation):
         return np.atleast_2d(motion.offset(1, reference))
     if isinstance(motion, Oscillation):
@@ -128,34 +128,35 @@ def extreme(motion: Motion, reference: Floats, steps: int) -> Floats:
 
 
 def greatest(force: Any) -> float:
-    """A component of a force, or the greatest that its course takes."""
+    """Return a component of a force, or the largest value of its schedule."""
     values = getattr(force, "values", None)
     return float(max(values, key=abs)) if values is not None else float(force)
 
 
 def force_of(load: Load) -> Floats:
-    """(axis,): the greatest that a load becomes, in all or of a unit of area."""
+    """Return the largest force of a load, (axis,), in total or per unit of area."""
     return np.array([greatest(f) for f in load.force or load.body_force or ()])
 
 
 WITHIN, MARGIN, ARROW, LEAST, APART = (480.0, 400.0), 44.0, 34.0, 14.0, 14.0
-"""Pixels: of the picture, around the body, of the longest arrow and the shortest, between two."""
+"""Sizes in pixels: of the picture, of the margin around the body, of the longest and the shortest
+arrow, and the distance between arrows."""
 BODY, OUTLINE, FRAME_POINT, LEADS, HELD = "#0072B2", "#5A87A8", "#DCCB2E", "#D55E00", "#7A3300"
 ACTS, CUT, STANDS, DRIVEN = "#007A5A", "#C2185B", "#9A9A9A", "#404040"
 TINTS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
 DOTS, TINTED, ARROWS, BEYOND = 3000, 1500, 5, 0.35
-"""Bodies of more particles show their edge alone; so many dots at most of a region, so many arrows
-of a group; by so much of the body's size the picture goes beyond it to show obstacles."""
+"""Maximum number of particles for which all are drawn, of dots of a region, and of arrows of a
+group; margin for obstacles relative to the body's size."""
 Rows = NDArray[np.intp]
 
 
 SceneLegend = tuple[tuple[str, str], ...]
-"""What colours mean: (colour, words)."""
+"""Meanings of colours: (colour, text)."""
 
 
 class Canvas(Protocol):
-    """What a scene is drawn on: places are in lattice units, sizes and widths in pixels, of which
-    `scale` make a lattice unit; the picture reaches from the corner `low` to `high`."""
+    """Surface on which a scene is drawn: places are in lattice units, sizes and widths in pixels,
+    of which `scale` make a lattice unit; the picture reaches from the corner `low` to `high`."""
 
     scale: float
     low: Floats
@@ -178,7 +179,7 @@ class Canvas(Protocol):
 
 @dataclass(frozen=True)
 class Picture:
-    """The element to be shown, and what its colours mean: (colour, words)."""
+    """SVG element and the meanings of its colours: (colour, text)."""
 
     svg: str
     legend: SceneLegend
@@ -194,17 +195,17 @@ def picture_of(scene: Scene) -> Picture | None:
 
 
 def draw_scene(scene: Scene, canvas: Canvas) -> SceneLegend:
-    """Draw a scene in a plane, and return what its colours mean. Arrows show where to and how far
-    in proportion to each other, not to the body."""
+    """Draw a scene in a plane, and return the meanings of its colours. Lengths of arrows are
+    proportional to each other, not to the body."""
     drawing = _Drawing(scene, canvas)
     drawing.draw()
     return tuple(drawing.legend)
 
 
 def corners(scene: Scene) -> tuple[Floats, Floats]:
-    """Return the lower left and the upper right corner of what a picture of a scene shows."""
-    shown = _shown(scene)
-    return _with_obstacles(scene.barriers, shown.min(axis=0), shown.max(axis=0))
+    """Return the lower left and the upper right corner of the picture of a scene."""
+    places = _shown(scene)
+    return _with_obstacles(scene.barriers, places.min(axis=0), places.max(axis=0))
 
 
 def _is_small(scene: Scene) -> bool:
@@ -212,43 +213,45 @@ def _is_small(scene: Scene) -> bool:
 
 
 def _shown(scene: Scene) -> Floats:
-    """The particles of a small body and its frame, and of a large body alone."""
+    """Return the particles of a small body and its frame, or of a large body alone."""
     X = scene.raster.reference()
     return X if _is_small(scene) else X[scene.raster.table_kind == FOLLOWER]
 
 
 class _Drawing:
-    """One picture in the making."""
+    """State of the drawing of one picture."""
 
     def __init__(self, scene: Scene, canvas: Canvas) -> None:
         self.scene, self.canvas, self.legend = scene, canvas, list[tuple[str, str]]()
         self.X = scene.raster.reference()
         self.body = scene.raster.table_kind == FOLLOWER
-        self.few, shown = _is_small(scene), _shown(scene)
-        self.middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
+        self.few, places = _is_small(scene), _shown(scene)
+        self.middle = (places.min(axis=0) + places.max(axis=0)) / 2
         self.dot = min(max(0.5 * spacing(scene.raster) * canvas.scale, 1.2), 7.0)
 
     def draw(self) -> None:
-        """From what lies below to what must be seen."""
+        """Draw from the lowest to the topmost layer."""
         self._regions()
         self._obstacles()
         if self.few:
-            self._tell(self.canvas.dots, self.X[~self.body], 0.6 * self.dot, FRAME_POINT, "frame")
-        shown = self.body if self.few else edge_of(self.scene.raster)
-        colour, said = (BODY, "body") if self.few else (OUTLINE, "edge of the body")
-        self._tell(self.canvas.dots, self.X[shown], self.dot, colour, said)
+            self._draw_named(
+                self.canvas.dots, self.X[~self.body], 0.6 * self.dot, FRAME_POINT, "frame"
+            )
+        rows = self.body if self.few else edge_of(self.scene.raster)
+        colour, text = (BODY, "body") if self.few else (OUTLINE, "edge of the body")
+        self._draw_named(self.canvas.dots, self.X[rows], self.dot, colour, text)
         self._cuts()
         self._leaders()
         self._loads()
 
-    def _tell(self, draw: Any, places: Floats, size: float, colour: str, said: str) -> None:
+    def _draw_named(self, draw: Any, places: Floats, size: float, colour: str, text: str) -> None:
         if len(places):
             draw(places, size, colour)
-            self._note(colour, said)
+            self._note(colour, text)
 
-    def _note(self, colour: str, said: str) -> None:
-        if (colour, said) not in self.legend:
-            self.legend.append((colour, said))
+    def _note(self, colour: str, text: str) -> None:
+        if (colour, text) not in self.legend:
+            self.legend.append((colour, text))
 
     def _regions(self) -> None:
         cell = self.scene.raster.cell
@@ -279,7 +282,7 @@ class _Drawing:
 
     @property
     def _longest(self) -> float:
-        """The longest way of a motion."""
+        """Longest displacement of a motion."""
         driven = self.scene.driven
         ways = [extreme(d.group.motion, d.reference, self.scene.experiment.steps) for d in driven]
         return max((float(np.hypot(*way.T).max()) for way in ways), default=0.0)
@@ -292,13 +295,13 @@ class _Drawing:
             nearest = ring[np.argmin(np.hypot(*(ring - self.middle).T))]
             self._arrows(nearest[None], way.mean(axis=0, keepdims=True), longest, DRIVEN)
         for leading in self.scene.leading:
-            motion, held = leading.group.motion, isinstance(leading.group.motion, Hold)
-            colour = HELD if held else LEADS
-            said = "mass" if isinstance(motion, Newton) else "held" if held else "led"
+            motion, is_fixed = leading.group.motion, isinstance(leading.group.motion, Hold)
+            colour = HELD if is_fixed else LEADS
+            text = "mass" if isinstance(motion, Newton) else "held" if is_fixed else "led"
             if leading.group.axes:
-                said += f" along {' and '.join(leading.group.axes)}"
-            self.canvas.dots(leading.reference, max(1.4 * self.dot, 3.0), colour, square=held)
-            self._note(colour, said)
+                text += f" along {' and '.join(leading.group.axes)}"
+            self.canvas.dots(leading.reference, max(1.4 * self.dot, 3.0), colour, square=is_fixed)
+            self._note(colour, text)
             ways = np.zeros((len(leading.rows), 2)) + extreme(
                 motion, leading.reference, self.scene.experiment.steps
             )
@@ -320,12 +323,13 @@ class _Drawing:
             self._note(ACTS, "body force" if loading.load.body_force else "force")
 
     def _arrows(self, at: Floats, ways: Floats, longest: float, colour: str) -> None:
-        """At some of the places, from them outwards or, into the body, towards them."""
+        """Draw arrows at some of the places, away from them or, where they point into the body,
+        towards them."""
         extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
         count = min(max(int(extent / APART), 1), ARROWS)
         ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])
-        some = np.unique(ends.round().astype(int))
-        for place, way in zip(at[some], ways[some], strict=True):
+        selection = np.unique(ends.round().astype(int))
+        for place, way in zip(at[selection], ways[selection], strict=True):
             pixels = _pixels(way, longest)
             inwards = float((self.middle - place) @ way) > 1e-9 * float(np.hypot(*way))
             tail = place - pixels / self.canvas.scale if inwards else place
@@ -333,7 +337,7 @@ class _Drawing:
 
 
 def _pixels(way: Floats, longest: float) -> Floats:
-    """An arrow for a way, the longest of all ARROW pixels long; none for none."""
+    """Return the arrow of a displacement, the longest being ARROW pixels long; zero for none."""
     length = float(np.hypot(*way))
     if length <= 1e-12 * longest or longest == 0.0:
         return np.zeros(2)
@@ -341,21 +345,21 @@ def _pixels(way: Floats, longest: float) -> Floats:
 
 
 def edge_of(raster: Raster) -> Rows:
-    """The rows of the body's particles that have not all four beside them, of their sublattice."""
+    """Return the rows of the body's particles without all four neighbours in their sublattice."""
     places = []
     for kinds in raster.kind == FOLLOWER:
         around = np.pad(kinds, 1)
         inner = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
         places.append(kinds & ~inner)
-    found = np.nonzero(np.stack(places))
-    rows = raster.rows_at(found[0], *found[1:])
+    indices = np.nonzero(np.stack(places))
+    rows = raster.rows_at(indices[0], *indices[1:])
     return np.asarray(rows)
 
 
 def _with_obstacles(
     barriers: Iterable[Barrier], low: Floats, high: Floats
 ) -> tuple[Floats, Floats]:
-    """The corners of what is to be seen with obstacles, as far as they are near."""
+    """Extend the corners of the picture to nearby obstacles."""
     room = BEYOND * float((high - low).max())
     for barrier in barriers:
         box = barrier.start.box
@@ -365,7 +369,7 @@ def _with_obstacles(
 
 
 def _outlines(outline: Outline, low: Floats, high: Floats) -> list[Floats]:
-    """Closed lines around an obstacle, of a half-plane as far as the picture goes."""
+    """Return closed outlines of an obstacle; a half-plane is cropped at the picture."""
     if outline.kind == HALF_PLANE:
         point, normal = outline.points[0], outline.points[1] - outline.points[0]
         along, far = np.array([-normal[1], normal[0]]), 2.0 * float(np.hypot(*(high - low)))
@@ -381,18 +385,18 @@ def _outlines(outline: Outline, low: Floats, high: Floats) -> list[Floats]:
 
 
 POINTS = 0.75
-"""Points a pixel: 96 pixels are an inch."""
+"""Points per pixel: 96 pixels are an inch."""
 
 
 class AxesCanvas:
-    """Axes as a canvas: their coordinates are `unit` times lattice units, their limits stay. Shapes
-    stand in the order in which they are added."""
+    """Axes as a canvas: their coordinates are `unit` times lattice units, their limits are
+    constant. Shapes are drawn in the order of their addition."""
 
     def __init__(self, ax: Axes, unit: float) -> None:
         self._ax, self._unit, self._order = ax, unit, 1
-        (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-        self.low: Floats = np.array([left, bottom]) / unit
-        self.high: Floats = np.array([right, top]) / unit
+        (xmin, xmax), (ymin, ymax) = ax.get_xlim(), ax.get_ylim()
+        self.low: Floats = np.array([xmin, ymin]) / unit
+        self.high: Floats = np.array([xmax, ymax]) / unit
         inches = ax.get_window_extent().width / figure_of(ax).dpi
         self.scale = 72 * inches / POINTS / float(self.high[0] - self.low[0])
 
@@ -432,9 +436,9 @@ class AxesCanvas:
             return
         tip = self._unit * (np.asarray(tail) + np.asarray(way) / self.scale)
         style = {"arrowstyle": "-|>,head_width=0.2,head_length=0.4", "color": colour}
-        more: dict[str, Any] = {"shrinkA": 0.0, "shrinkB": 0.0, "lw": 1.6 * POINTS}
+        lengths: dict[str, Any] = {"shrinkA": 0.0, "shrinkB": 0.0, "lw": 1.6 * POINTS}
         ends = (*tip,), (*(self._unit * np.asarray(tail)),)
-        self._ax.annotate("", *ends, arrowprops=style | more, zorder=self._next)
+        self._ax.annotate("", *ends, arrowprops=style | lengths, zorder=self._next)
 
     def _plot(self, places: Floats, **style: Any) -> None:
         x, y = self._unit * np.asarray(places).reshape(-1, 2).T
@@ -442,7 +446,7 @@ class AxesCanvas:
 
     @property
     def _next(self) -> float:
-        """The place of the next shape over those before."""
+        """Z-order of the next shape, above all previous ones."""
         self._order += 1
         return 1.0 + 1e-3 * self._order
 
@@ -458,16 +462,19 @@ def draw_on_axes(scene: Scene, look: Look, ax: Axes | None) -> Axes:
     low, high = corners(scene)
     size = np.maximum(high - low, 1e-9 * max(1.0, *np.abs(high), *np.abs(low)))
     margin = MARGIN / ((np.array(WITHIN) - 2.0 * MARGIN) / size).min()
-    (left, bottom), (right, top) = unit * (low - margin), unit * (high + margin)
+    (xmin, ymin), (xmax, ymax) = unit * (low - margin), unit * (high + margin)
     title, labels = plain(scene.experiment.name), (label("x", words), label("y", words))
     if ax is not None:
-        ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", title=title)
+        ax.set(xlim=(xmin, xmax), ylim=(ymin, ymax), aspect="equal", title=title)
         ax.set(xlabel=labels[0], ylabel=labels[1])
         meanings = draw_scene(scene, AxesCanvas(ax, unit))
         ax.legend(handles=_handles(meanings), fontsize="small")
         return ax
     page = Page(
-        Panels((left, right, bottom, top), [title], "", labels), look.dpi, look.figsize, alone=True
+        Panels((xmin, xmax, ymin, ymax), [title], "", labels),
+        look.dpi,
+        look.figsize,
+        standalone=True,
     )
     page.arrange()
     ax = page.axes[0]
@@ -477,8 +484,8 @@ def draw_on_axes(scene: Scene, look: Look, ax: Axes | None) -> Axes:
 
 
 def _handles(meanings: SceneLegend) -> list[Any]:
-    """A dot with its words for each colour."""
-    named: dict[str, list[str]] = {}
+    """Return a legend handle for each colour."""
+    texts: dict[str, list[str]] = {}
     for colour, words in meanings:
-        named.setdefault(colour, []).append(words)
-    return [handle("; ".join(words), colour) for colour, words in named.items()]
+        texts.setdefault(colour, []).append(words)
+    return [handle("; ".join(words), colour) for colour, words in texts.items()]

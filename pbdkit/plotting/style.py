@@ -1,4 +1,4 @@
-"""Figures, words and options that all pictures have in common."""
+"""Figures, labels and options common to all pictures."""
 
 from __future__ import annotations
 
@@ -26,82 +26,85 @@ PYPLOT = "matplotlib.pyplot"
 
 
 def figure_of(ax: Axes) -> Figure:
-    """The whole that axes are in."""
-    found = ax.get_figure(root=True)
-    assert found is not None
-    return found
+    """Return the figure of axes."""
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    return figure
 
 
 def renderer_of(figure: Figure) -> RendererBase:
-    """What measures text: figures made here have Agg's."""
+    """Return the renderer, which measures text; figures made here use Agg."""
     canvas: Any = figure.canvas
-    found: RendererBase = canvas.get_renderer()
-    return found
+    renderer: RendererBase = canvas.get_renderer()
+    return renderer
 
 
-def new_figure(*, alone: bool = False, **how: Any) -> Figure:
-    """A figure made by matplotlib with these arguments. Where pyplot is in use, or in a notebook,
-    it is pyplot's, unless it is to be `alone`: then whoever made it shows or saves it."""
-    if not alone and (PYPLOT in sys.modules or in_notebook()):
+def new_figure(*, standalone: bool = False, **options: Any) -> Figure:
+    """Return a new figure with these arguments of matplotlib.
+
+    Where pyplot is in use, or in a notebook, pyplot manages it, unless it is to be `standalone`, to
+    be shown or saved by the caller.
+    """
+    if not standalone and (PYPLOT in sys.modules or in_notebook()):
         pyplot = import_module(PYPLOT)
-        found: Figure = pyplot.figure(**how)
-        if hasattr(found.canvas, "get_renderer"):
-            return found
-        pyplot.close(found)  # of a backend that cannot measure text
+        figure: Figure = pyplot.figure(**options)
+        if hasattr(figure.canvas, "get_renderer"):
+            return figure
+        pyplot.close(figure)  # of a backend that cannot measure text
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    found = Figure(**how)
-    FigureCanvasAgg(found)
-    return found
+    figure = Figure(**options)
+    FigureCanvasAgg(figure)
+    return figure
 
 
 LONGEST = 200
-"""So many characters of a title or name are shown."""
+"""Maximum number of characters of a title or name."""
 RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 SIGNS = {"^2": "²", "^3": "³", " * ": " × "}
 
 
 def plain(text: object) -> str:
-    """A text for a picture: short, and never taken for a formula."""
+    """Return a short text that matplotlib does not interpret as a formula."""
     return one_line(str(text)[:LONGEST]).replace("$", r"\$")
 
 
 def signed(units: str) -> str:
-    """Units with the signs of print; nothing of plain numbers."""
+    """Return units with typographic signs; empty for dimensionless numbers."""
     for typed, sign in SIGNS.items():
         units = units.replace(typed, sign)
     return "" if units == "1" else units
 
 
 def in_its_units(attributes: Mapping[Any, Any]) -> tuple[float, str]:
-    """By what the values of a variable are multiplied to be in mm and so on, and those units, as
-    far as it says them; else 1 and its own."""
+    """Return the factor that converts a variable to mm and so on, and those units, where its
+    attributes define them; else 1 and its own units."""
     if UNITS in attributes and FACTOR in attributes:
         return float(attributes[FACTOR]), str(attributes[UNITS])
     return 1.0, str(attributes.get("units", ""))
 
 
 def label(
-    meaning: object, units: object = "", exponent: int = 0, *, broad: int | None = None
+    meaning: object, units: object = "", exponent: int = 0, *, width: int | None = None
 ) -> str:
-    """A quantity and its units, as they stand at an axis whose numbers are to be multiplied by ten
-    to the `exponent`; in lines of so many characters if it is said how `broad`, the units on one of
-    their own where both are too long for one."""
-    said, counted = plain(meaning), signed(plain(units))
+    """Return the label of an axis: quantity and units, with a power of ten for its tick labels;
+    with a `width` in characters it is wrapped, with the units on a line of their own where
+    necessary."""
+    text, unit_text = plain(meaning), signed(plain(units))
     ten = f"10{str(exponent).translate(RAISED)}" if exponent else ""
-    counted = " ".join(filter(None, (ten, counted)))
-    whole = f"{said} ({counted})" if counted else said
-    if broad is None or len(whole) <= broad:
-        return whole
-    units_below = f"\n{textwrap.fill(f'({counted})', broad)}" if counted else ""
-    return f"{_even(said, broad)}{units_below}"
+    unit_text = " ".join(filter(None, (ten, unit_text)))
+    single = f"{text} ({unit_text})" if unit_text else text
+    if width is None or len(single) <= width:
+        return single
+    units_below = f"\n{textwrap.fill(f'({unit_text})', width)}" if unit_text else ""
+    return f"{_even(text, width)}{units_below}"
 
 
-def _even(text: str, broad: int) -> str:
-    """The text on as few lines as it takes, and these as equal as can be."""
-    lines = len(textwrap.wrap(text, broad))
-    every = (textwrap.wrap(text, width) for width in range(1, broad + 1))
+def _even(text: str, width: int) -> str:
+    """Wrap a text into the smallest number of lines of equal length."""
+    lines = len(textwrap.wrap(text, width))
+    every = (textwrap.wrap(text, length) for length in range(1, width + 1))
     return "\n".join(next((wrapped for wrapped in every if len(wrapped) == lines), []))
 
 
@@ -141,7 +144,7 @@ class Look:
                 f"dpi: {self.dpi} is not between {SMALLEST_DPI} and {LARGEST_DPI}"
             )
         if self.contours and self.filled is False:
-            raise ExperimentError("contours are of a filled field, and this is to be dots")
+            raise ExperimentError("contours need filled=True, got filled=False")
 
     def _check_limits(self) -> None:
         for name, limit in (("vmin", self.vmin), ("vmax", self.vmax)):

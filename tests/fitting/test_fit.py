@@ -442,7 +442,7 @@ def test_the_picture_has_a_row_an_axis_and_no_text_over_another(tmp_path):
     titles = [ax.title for ax in figure.axes if ax.get_title()]
     assert [t.get_text() for t in titles] == [  # the plate is wide: side by side
         f"u{axis} {what}"
-        for what in ("measured", "fitted", "residual / noise", "tells rule.poisson_ratio")
+        for what in ("measured", "fitted", "residual / noise", "sensitivity to rule.poisson_ratio")
         for axis in "xy"
     ]
     boxes = [title.get_window_extent() for title in titles]

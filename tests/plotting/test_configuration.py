@@ -263,19 +263,19 @@ REFUSED = {
     "no time": ({"time": []}, "a figure needs at least one time"),
     "misspelt": (
         {"color": "pe1_intat"},
-        "'pe1_intat' cannot be drawn; did you mean 'pe1_intact'? what can be drawn: position, ",
+        "'pe1_intat' cannot be drawn; did you mean 'pe1_intact'? drawable: position, ",
     ),
     "component": ({"color": "position_z"}, "did you mean 'position_"),
     "not measured": ({"color": "u_x"}, "add {type: displacement} to `diagnostics`"),
     "of nothing": ({"color": "track"}, "'track' cannot be drawn"),
     "field of names": ({"contours": True}, "contours need numbers at particles as color"),
     "field of bonds": ({"color": "broken_step", "filled": True}, "contours need numbers at"),
-    "dots and contours": ({"color": "pe1", "filled": False, "contours": True}, "to be dots"),
+    "dots and contours": ({"color": "pe1", "filled": False, "contours": True}, "need filled=True"),
     "limits": (
         {"color": "pe1", "vmin": 2.0, "vmax": 1.0},
         "2 (vmin), is not below the upper one, 1",
     ),
-    "map": ({"color": "pe1", "cmap": "virids"}, "'virids' is no map of colours; did you mean"),
+    "map": ({"color": "pe1", "cmap": "virids"}, "'virids' is not a colour map; did you mean"),
     "size": (
         {"figsize": (0.0, 3.0)},
         "a height in inches, each above 0 and at most 100; got (0.0, 3",

@@ -318,7 +318,7 @@ def test_what_is_no_curve_is_said(torn, asked, said):
 
 def test_which_group_is_meant_is_asked(pulled):
     with pytest.raises(
-        pbdkit.ExperimentError, match="leader groups 0, 1: which is meant; say grou"
+        pbdkit.ExperimentError, match="leader groups 0, 1: several are recorded; select one by grou"
     ):
         pulled.pbd.curve(y="reaction_x")
     with pytest.raises(pbdkit.ExperimentError, match="there is no leader group 7; there are 0, 1"):

@@ -16,7 +16,7 @@ import imageio_ffmpeg
 from PIL import Image
 
 from pbdkit.plotting.data import Trajectory
-from pbdkit.plotting.movie import Moving
+from pbdkit.plotting.movie import MovieSheet
 from pbdkit.plotting.style import Look
 
 SMALL = {"figsize": (3.01, 2.47), "dpi": 61}
@@ -63,7 +63,7 @@ def test_every_recorded_step_is_there(torn, tmp_path, suffix):
 
 def test_a_frame_is_the_picture_of_its_step(torn):
     recording = Trajectory(torn, "pe1_intact")
-    moving = Moving(recording, range(25), Look(**SMALL), lambda what, share: None)
+    moving = MovieSheet(recording, range(25), Look(**SMALL), lambda what, share: None)
     frames = [*moving.frames(range(25))]
     assert moving.sheet.axes[0].get_title().endswith("step 24")
     again = next(iter(moving.frames([7])))
