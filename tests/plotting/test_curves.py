@@ -171,7 +171,7 @@ def test_the_crack_of_a_part_of_a_body_is_that_between_its_particles(torn):
     assert 0 < (there & of_body).sum() < of_body.sum()
     (line,) = drawn(part.pbd.crack("bonds"))
     assert line[1].max() == (there & of_body).sum()
-    with pytest.raises(pbdkit.ExperimentError, match="none is between particles that are here"):
+    with pytest.raises(pbdkit.ExperimentError, match="no broken bond is between particles"):
         torn.isel(particle=[0, 1]).pbd.crack()
 
 
@@ -368,7 +368,7 @@ def test_who_leads_is_not_known_of_sweeps():
     led = experiment(**CALIBRATED, leaders=[HELD, pull_right(0.01, 0.0)], steps=2,
                      diagnostics=[{"type": "reaction", "youngs_modulus": 2.0}])  # fmt: skip
     found = pbdkit.sweep(led, vary={"solver.relaxation": [0.5, 1.0]}, workers=1, progress=False)
-    with pytest.raises(pbdkit.ExperimentError, match=r"along relaxation.: take one with isel"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"along relaxation.: select one member with isel"):
         found.pbd.curve()
 
 
@@ -468,7 +468,7 @@ def test_cracks_of_long_bodies_keep_their_text_apart(columns, rows):
 
 
 def test_labels_are_wrapped_and_never_formulas():
-    long = label("force of leader group 1", "stress unit * thickness unit * lattice unit", broad=34)
+    long = label("force of leader group 1", "stress unit * thickness unit * lattice unit", width=34)
     assert max(map(len, long.splitlines())) <= 34
     assert "stress unit × thickness unit" in long
     assert label("a $b$", "lattice unit^2") == r"a \$b\$ (lattice unit²)"
