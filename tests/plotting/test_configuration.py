@@ -480,7 +480,7 @@ def test_a_difference_is_of_particles_of_one_number(bodies):
     assert moved.get_title() == "a/plate less a/plate, step 12"
     with pytest.raises(ExperimentError, match="no particle in common: no number is in both"):
         compare(ds.isel(particle=[0]), ds.isel(particle=[1]), color="pe1", difference=True)
-    with pytest.raises(ExperimentError, match="a variable of particles, and 'broken_step' is one of bonds"):
+    with pytest.raises(ExperimentError, match="of particles, and 'broken_step' is one of bonds"):
         compare(ds, ds, color="broken_step", difference=True)
 
 

@@ -368,7 +368,7 @@ def test_who_leads_is_not_known_of_sweeps():
     led = experiment(**CALIBRATED, leaders=[HELD, pull_right(0.01, 0.0)], steps=2,
                      diagnostics=[{"type": "reaction", "youngs_modulus": 2.0}])  # fmt: skip
     found = pbdkit.sweep(led, vary={"solver.relaxation": [0.5, 1.0]}, workers=1, progress=False)
-    with pytest.raises(pbdkit.ExperimentError, match=r"along relaxation.: select one member with isel"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"relaxation.: select one member with isel"):
         found.pbd.curve()
 
 
@@ -473,7 +473,7 @@ def test_labels_are_wrapped_and_never_formulas():
     assert "stress unit × thickness unit" in long
     assert label("a $b$", "lattice unit^2") == r"a \$b\$ (lattice unit²)"
     assert label("strain", "1") == "strain"
-    assert label("sum of all over the body", "", broad=20) == "sum of all\nover the body"
+    assert label("sum of all over the body", "", width=20) == "sum of all\nover the body"
 
 
 # The command
