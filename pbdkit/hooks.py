@@ -34,6 +34,12 @@ hookimpl = pluggy.HookimplMarker(GROUP)
 """Marks a function of a plugin as the implementation of a hook of the same name."""
 
 
+def import_object(target: str) -> Any:
+    """Import and return an object, given as ``module:attribute``."""
+    module, _, attribute = target.partition(":")
+    return getattr(import_module(module), attribute)
+
+
 @dataclass(frozen=True)
 class Command:
     """A command of the program `pbdkit`.
@@ -57,8 +63,7 @@ class Command:
 
     def load(self) -> Any:
         """Import the click command."""
-        module, _, attribute = self.target.partition(":")
-        return getattr(import_module(module), attribute)
+        return import_object(self.target)
 
 
 class Hooks:

@@ -1,11 +1,14 @@
-"""Progress reporting and cancellation: a bar on a terminal, or a line in a notebook."""
+"""Progress reporting and cancellation: a bar on a terminal or a line in a notebook, and signals."""
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 DELAY_S = 1.0
 """Delay in seconds before the bar appears."""
@@ -101,10 +104,9 @@ class _Bar:
     """A progress bar of rich on a terminal."""
 
     def __init__(self) -> None:
-        from rich.console import Console
-        from rich.progress import Progress
+        from rich import console, progress
 
-        self._bar = Progress(console=Console(file=sys.stderr), transient=True)
+        self._bar = progress.Progress(console=console.Console(file=sys.stderr), transient=True)
         self._bar.start()
         self._bar.add_task("", total=1)
 
@@ -139,3 +141,97 @@ def in_notebook() -> bool:
     """Return whether the code runs in a kernel of a notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel")
+
+
+@contextmanager
+def waiting(task: str, *, silent: bool = False) -> Iterator[Callable[[str], None]]:
+    """Show a task and its duration on stderr after a second, until the block ends.
+
+    Nothing is shown if `silent`, or if stderr is no terminal.
+
+    Yields
+    ------
+    callable
+        Function that replaces the description of the task.
+    """
+    if silent or not sys.stderr.isatty():
+        yield lambda task: None
+        return
+    line = _line(task)
+    timer = threading.Timer(DELAY_S, line.start)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield lambda task: line.update(line.task_ids[0], description=task)
+    finally:
+        timer.cancel()
+        timer.join()
+        if line.live.is_started:
+            line.stop()
+
+
+def _line(task: str) -> Any:
+    from rich import console, progress
+
+    columns = (
+        progress.SpinnerColumn(),
+        progress.TextColumn("{task.description}", markup=False),
+        progress.TimeElapsedColumn(),
+    )
+    line = progress.Progress(*columns, console=console.Console(file=sys.stderr), transient=True)
+    line.add_task(task, total=None)
+    return line
+
+
+SIGNAL_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+"""Signals that end a run: Ctrl-C, termination, a closed terminal, and the warning of batch systems.
+Some do not exist on every system."""
+
+
+class Stop:
+    """Request to stop the process, by a signal; calling it returns whether there was one."""
+
+    def __init__(self) -> None:
+        self.signal: signal.Signals | None = None
+
+    def __call__(self) -> bool:
+        """Return whether the process was asked to stop."""
+        return self.signal is not None
+
+    @property
+    def exit_status(self) -> int:
+        """Return 130 for Ctrl-C, else 128 plus the number of the signal."""
+        return 128 + (self.signal or signal.SIGINT)
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """Record signals in the block instead of ending the process; a second Ctrl-C ends it at once.
+
+    Outside the main thread signals cannot be handled.
+    """
+    stop = Stop()
+
+    def note(number: int, frame: Any) -> None:
+        if stop():
+            raise KeyboardInterrupt
+        stop.signal = signal.Signals(number)
+
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    signals = (
+        [getattr(signal, name) for name in SIGNAL_NAMES if hasattr(signal, name)]
+        if is_main_thread
+        else []
+    )
+    # A process started with `nohup` must survive the terminal.
+    is_handled = {
+        number: number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN
+        for number in signals
+    }
+    numbers = [number for number in signals if is_handled[number]]
+    previous = {number: signal.signal(number, note) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from queue import Queue
 from typing import Any
 
+from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.mpi.distributed_run import DistributedExecution
 
 PATIENCE_S = 120.0
@@ -67,6 +68,6 @@ def on_ranks(size: int, work: Callable[[DistributedExecution], Any]) -> list[Any
         (a, b): Queue() for a in range(size) for b in range(size)
     }
     with ThreadPoolExecutor(size) as threads:
-        comms = [ThreadComm(rank, size, boxes) for rank in range(size)]
+        comms = [MPICommunicator(ThreadComm(rank, size, boxes)) for rank in range(size)]
         every = [threads.submit(work, DistributedExecution(comm)) for comm in comms]
         return [one.result() for one in every]

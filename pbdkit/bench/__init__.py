@@ -2,11 +2,43 @@
 
 from __future__ import annotations
 
-from pbdkit.hooks import Command, hookimpl
+from typing import Any
+
+import click
+
+from pbdkit.cli.options import PATH, experiment_argument, load_experiment, set_option
+from pbdkit.hooks import Command, hookimpl, import_object
 
 
 @hookimpl
 def pbdkit_commands() -> list[Command]:
     """Return the command `bench`."""
     does = "Measures speed against error, to choose a solver."
-    return [Command("bench", "pbdkit.bench.command:bench", does, "Understand")]
+    return [Command("bench", "pbdkit.bench:bench", does, "Understand")]
+
+
+def _sizes(context: click.Context, option: click.Parameter, text: str | None) -> tuple[int, ...]:
+    """Return numbers of sites, which are separated by commas."""
+    words = [word.strip() for word in text.split(",")] if text is not None else []
+    for word in words:
+        if not (word.isascii() and word.isdecimal()) or not 2 <= int(word) < 2**31:
+            raise click.BadParameter(
+                f"'{word}' is not a number of sites of at least 2; write for instance 50,100,200"
+            )
+    return tuple(dict.fromkeys(map(int, words)))
+
+
+@click.command()
+@experiment_argument
+@click.option("--sizes", callback=_sizes, help="Sites along the longer side, e.g. 50,100,200.")
+@click.option("--steps", type=click.IntRange(min=1), help="Steps of each run; else its own.")
+@click.option("--json", "json_file", type=PATH, help="Write the figures.")
+@click.option("--plot", "picture", type=PATH, help="PNG, SVG or PDF.")
+@set_option
+def bench(experiment: str, settings: tuple[str, ...], steps: int | None, **options: Any) -> None:
+    """Measure speed against error, at one or several sizes: engines, precisions and threads; where
+    the solver is `equilibrium`, its methods and the steps, over tolerances."""
+    changes = (*settings, *([f"steps={steps}"] if steps else ()))
+    loaded = load_experiment(experiment, changes)
+    show = import_object("pbdkit.bench.work_precision:show_work_precision")
+    show(loaded, experiment, settings, changes, **options)

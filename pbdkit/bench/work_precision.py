@@ -18,25 +18,29 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import cycle, groupby
+from itertools import count, cycle, groupby
 from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.api import load
 from pbdkit.array_types import Floats
+from pbdkit.cli.output import refuse_output, refuse_unwritable, save
+from pbdkit.cli.tables import SIMPLE_HEAD, Table, add_rows, show_table
 from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, scale_of
 from pbdkit.equilibrium.lattice_system import SlowMode
 from pbdkit.equilibrium.linearise import linearised
 from pbdkit.equilibrium.solve import settle
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.io.atomic_file import write
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.bodies import Grid
 from pbdkit.model.experiment import Experiment
-from pbdkit.progress import Watch
+from pbdkit.progress import Watch, waiting
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import peak_memory
@@ -46,7 +50,6 @@ from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from rich.table import Table
 
 
 def resized(experiment: Experiment, size: int) -> tuple[str, ...]:
@@ -180,9 +183,9 @@ def engines() -> list[tuple[str, str, int]]:
     return [(name, kind, threads) for name, threads in ways for kind in ("float64", "float32")]
 
 
-def ways(asked: Experiment) -> int:
+def methods_count(experiment: Experiment) -> int:
     """Return the maximum number of rows that `measure` returns for a size."""
-    if asked.solver.makes_steps:
+    if experiment.solver.makes_steps:
         return len(engines())
     return 2 + len(TOLERANCES) * len(METHODS)
 
@@ -343,22 +346,18 @@ FLOOR = 1e-18
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """A row each, with the columns in which there is something; sizes apart by a line."""
-    from rich import box
-    from rich.table import Table
-
-    found, shown = Table(box=box.SIMPLE_HEAD, pad_edge=False), _shown(rows)
-    for name in shown:
+    """Return a table of the columns that have values, with a line between sizes."""
+    table, columns = Table(box=SIMPLE_HEAD, pad_edge=False), _columns_with_values(rows)
+    for name in columns:
         is_word = name in ("method", "precision")
-        found.add_column(COLUMNS[name][0], justify="left" if is_word else "right", no_wrap=is_word)
+        table.add_column(COLUMNS[name][0], justify="left" if is_word else "right", no_wrap=is_word)
     for _, block in groupby(rows, key=lambda row: row.size):
-        for row in block:
-            found.add_row(*(_cell(row, name) for name in shown))
-        found.add_section()
-    return found
+        add_rows(table, ([_cell(row, name) for name in columns] for row in block))
+        table.add_section()
+    return table
 
 
-def _shown(rows: Sequence[Row]) -> list[str]:
+def _columns_with_values(rows: Sequence[Row]) -> list[str]:
     return [n for n in COLUMNS if n == "size" or any(getattr(r, n) is not None for r in rows)]
 
 
@@ -376,11 +375,12 @@ def _cell(row: Row, name: str) -> str:
 
 def lines(rows: Sequence[Row]) -> list[str]:
     """Return the meaning of the columns, and the reason for each missing row."""
-    told = [f"{COLUMNS[n][0]}: {COLUMNS[n][2]}" for n in _shown(rows) if COLUMNS[n][2]]
+    columns = (COLUMNS[name] for name in _columns_with_values(rows))
+    texts = [f"{heading}: {meaning}" for heading, _, meaning in columns if meaning]
     for row in (row for row in rows if row.reason):
         place = f"size {_cell(row, 'size')}" + (f", {row.tolerance:.0e}" if row.tolerance else "")
-        told.append(f"left out: {row.line} at {place}: {row.reason}")
-    return list(dict.fromkeys(told))
+        texts.append(f"left out: {row.line} at {place}: {row.reason}")
+    return list(dict.fromkeys(texts))
 
 
 def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row]) -> dict[str, Any]:
@@ -392,7 +392,7 @@ def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row])
     return asked | {"machine": machine, "rows": figures}
 
 
-def picture(rows: Sequence[Row], title: str) -> Figure:
+def work_precision_figure(rows: Sequence[Row], title: str) -> Figure:
     """Error against cost, both logarithmic: a panel a size, a colour a method (and its threads), a
     marker each row. What was predicted is hollow, errors of exactly zero lie on a line of their own
     at the bottom; runs that left the finite numbers are not drawn."""
@@ -434,6 +434,53 @@ def picture(rows: Sequence[Row], title: str) -> Figure:
 
 def _x(row: Row) -> float:
     return row.ns_per_particle_step or row.cpu_s or 0.0
+
+
+def show_work_precision(
+    experiment: Experiment,
+    name: str,
+    settings: tuple[str, ...],
+    changes: tuple[str, ...],
+    *,
+    sizes: tuple[int, ...],
+    json_file: Path | None,
+    picture: Path | None,
+) -> None:
+    """Measure an experiment, print the rows, and write them to files.
+
+    Parameters
+    ----------
+    experiment
+        Experiment.
+    name, settings
+        Name and settings by which it is described in the JSON file.
+    changes
+        All settings with which it is loaded by `name`.
+    sizes
+        Numbers of sites along the longer side; empty for its own size.
+    json_file, picture
+        Files to write.
+    """
+    for path in filter(None, (picture, json_file)):
+        refuse_output(path, force=True, experiment=Path(name))
+    refuse_unwritable(picture, json_file)
+    total, measured = methods_count(experiment) * max(1, len(sizes)), count(1)
+    with waiting(f"measuring {total} methods, each in a process of its own") as show:
+
+        def report(text: str) -> None:
+            show(f"measured {text}; {next(measured)} of {total}")
+
+        rows = [row for n in sizes or (None,) for row in measure(name, changes, n, report)]
+    title = f"{experiment.name}, {experiment.solver.type}, {experiment.steps} steps"
+    click.echo(title)
+    show_table(table(rows))
+    click.echo("\n".join(lines(rows)))
+    if json_file:
+        figures = as_dict(name, settings, experiment.steps, rows)
+        write(json_file, json.dumps(figures, indent=1) + "\n", replace=True)
+        click.echo(f"{json_file} written")
+    if picture:
+        save(picture, work_precision_figure(rows, title), replace=True)
 
 
 Task = dict[str, Any]

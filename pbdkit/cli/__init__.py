@@ -95,9 +95,9 @@ def _exit_status(arguments: list[str] | None) -> int:
             warnings.showwarning = _warn_once()
             refuse_little_memory()
             if COMPLETING in os.environ:
-                from pbdkit.cli.completion import speak_bash
+                from pbdkit.cli.completion import register_bash
 
-                speak_bash()
+                register_bash()
             code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
         sys.stdout.flush()
     except (click.exceptions.Abort, KeyboardInterrupt) as error:

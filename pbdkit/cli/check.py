@@ -1,69 +1,57 @@
-"""Commands ``pbdkit check`` and ``pbdkit identify``: forecast of an experiment, identity of a
-rule."""
+"""Command ``pbdkit check``: forecast of an experiment."""
 
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import click
 import numpy as np
 
-from pbdkit.cli.options import experiment_argument, json_option, set_option, verbose_option
-from pbdkit.plugin.units import BODY_FORCE, FORCE, in_lengths
-
-if TYPE_CHECKING:
-    from pbdkit.identification.identity import Identity
-    from pbdkit.model.boundary_conditions import Driven, LeaderGroup, Load
-    from pbdkit.model.experiment import Experiment
-    from pbdkit.plugin.units import Units
-    from pbdkit.scene.scene import Scene
-    from pbdkit.stability.forecast import Forecast
-
+from pbdkit.model.boundary_conditions import Driven, LeaderGroup, Load
+from pbdkit.model.experiment import Experiment
+from pbdkit.plugin import RenewsParticles
+from pbdkit.plugin.units import BODY_FORCE, FORCE, Units, in_lengths
+from pbdkit.progress import waiting
+from pbdkit.scene.constants import signed_distance
+from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.simulation import rehearse
+from pbdkit.stability.forecast import Forecast, forecast, refuse_unheld_loads
+from pbdkit.stability.relaxation import tuned
 
 Row = tuple[str, str]
 MAX_LISTED = 3
 """Number of groups that are listed in a line without --verbose."""
 
 
-@click.command()
-@experiment_argument
-@set_option
-@verbose_option
-@json_option
-def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bool) -> None:
-    """Forecast a run without running it: supports and leaders, stability, steps to convergence,
-    time and memory."""
-    from pbdkit.cli.options import waiting
-    from pbdkit.errors import PbdkitWarning
-    from pbdkit.model.loading import load_experiment
+def check(
+    experiment: Experiment, loading_warnings: list[str], *, verbose: bool, as_json: bool
+) -> None:
+    """Print the forecast of an experiment.
 
-    with warnings.catch_warnings(record=True) as loading_warnings:
-        warnings.simplefilter("always", PbdkitWarning)
-        loaded = load_experiment(experiment, settings)
-    from pbdkit.scene.scene import build_scene
-    from pbdkit.simulation import rehearse
-    from pbdkit.stability.forecast import forecast, refuse_unheld_loads
-    from pbdkit.stability.relaxation import tuned
-
-    with waiting(f"checking {loaded.name}", silent=as_json):
-        scene = tuned(build_scene(loaded))
+    Parameters
+    ----------
+    experiment
+        Experiment.
+    loading_warnings
+        Warnings that were issued when it was loaded.
+    verbose, as_json
+        Whether all details, or one JSON object, are printed.
+    """
+    with waiting(f"checking {experiment.name}", silent=as_json):
+        scene = tuned(build_scene(experiment))
         rehearse(scene)
         refuse_unheld_loads(scene)
         predicted = forecast(scene)
-    predicted = replace(
-        predicted, warnings=[*(str(w.message) for w in loading_warnings), *predicted.warnings]
-    )
+    predicted = replace(predicted, warnings=[*loading_warnings, *predicted.warnings])
     if as_json:
         click.echo(json.dumps(predicted.as_dict()))
         return
-    click.echo(f"{loaded.name}: valid")
+    click.echo(f"{experiment.name}: valid")
     rows = [
         *_boundary_rows(scene, predicted, MAX_LISTED if not verbose else None),
-        *_run_rows(loaded, scene, predicted),
+        *_run_rows(experiment, scene, predicted),
     ]
     for title, text in [*rows, *_detail_rows(scene, predicted)] if verbose else rows:
         click.echo(f"  {title:<10} {text}")
@@ -178,8 +166,6 @@ def _force(load: Load, units: Units | None) -> str:
 
 def _in_regions(scene: Scene) -> Iterator[str]:
     """Yield the number of particles of the body in each region."""
-    from pbdkit.scene.constants import signed_distance
-
     raster = scene.raster
     x = raster.reference(raster.body_rows)
     for name, region in scene.experiment.regions.items():
@@ -233,8 +219,6 @@ def _seconds(seconds: float) -> str:
 
 def _detail_rows(scene: Scene, predicted: Forecast) -> Iterator[Row]:
     """Yield the rows that --verbose adds."""
-    from pbdkit.plugin import RenewsParticles
-
     experiment = scene.experiment
     records = experiment.record_count
     yield "records", f"{records} states in {experiment.steps} steps, that of time 0 included"
@@ -265,49 +249,3 @@ def _detail_rows(scene: Scene, predicted: Forecast) -> Iterator[Row]:
         reached = "" if end is None else f", {size * end:.4g} when they end"
         text = f"{size * predicted.lag:.4g} {unit} behind equilibrium if the leaders' fastest steps"
         yield "lag", f"{text} went on{reached}"
-
-
-@click.command()
-@experiment_argument
-@set_option
-@verbose_option
-@json_option
-def identify(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bool) -> None:
-    """Identify the rule of an experiment: diffusion or an elastic body, with its constants."""
-    from pbdkit.api import identify, load
-    from pbdkit.cli.options import waiting
-
-    materials = load(experiment, settings=settings).materials()
-    with waiting("identifying", silent=as_json):
-        identities = {name: identify(material) for name, material in materials.items()}
-    if as_json:
-        identity = identities.get("")
-        content = (
-            identity.as_dict()
-            if identity
-            else {name: value.as_dict() for name, value in identities.items()}
-        )
-        click.echo(json.dumps(content))
-        return
-    groups: dict[str, list[str]] = {}
-    for name, result in identities.items():
-        groups.setdefault(json.dumps(result.as_dict()), []).append(name)
-    for names in groups.values():
-        _show(identities[names[0]], ", ".join(filter(None, names)), verbose)
-    for note in dict.fromkeys(note for result in identities.values() for note in result.notes):
-        names = [name for name, result in identities.items() if note in result.notes]
-        remark = f" ({', '.join(names)})" if len(names) < len(identities) else ""
-        click.echo(f"note{remark}: {note}")
-
-
-def _show(identity: Identity, materials: str, verbose: bool) -> None:
-    """Print the table of one material, or of several with the same identity."""
-    from pbdkit.cli.options import show_table
-    from pbdkit.identification.identity import table
-
-    remark = f" ({materials})" if materials else ""
-    click.echo(
-        f"{identity.name}: {identity.rule}{remark}, {identity.lattice} lattice, "
-        f"{identity.neighbours}"
-    )
-    show_table(table(identity, whole=verbose))

@@ -65,39 +65,39 @@ def pbdkit_commands() -> list[Command]:
     """Return the commands of `pbdkit.cli`."""
     sentences: dict[str, dict[str, str]] = {
         "Start": {
-            "sweep:init": "Writes an experiment to start from, or copies a shipped one.",
-            "sweep:experiments": "Lists the shipped experiments, or prints one.",
+            "init": "Writes an experiment to start from, or copies a shipped one.",
+            "experiments": "Lists the shipped experiments, or prints one.",
         },
         "Run": {
-            "run:run": "Runs an experiment, and writes its result to a file.",
-            "run:resume": "Goes on with an interrupted run, or makes one longer.",
-            "result:status": "Says how far a run is, and when it will end.",
+            "run": "Runs an experiment, and writes its result to a file.",
+            "resume": "Goes on with an interrupted run, or makes one longer.",
+            "status": "Says how far a run is, and when it will end.",
         },
         "Look": {
-            "plot:plot": "Draws a result, or the set-up of an experiment before it runs.",
-            "plot:animate": "Makes a movie of a result.",
-            "plot:curve": "Draws what changes: a curve, a history, the crack.",
-            "result:export": "Writes a result for ParaView.",
-            "result:explain": "Says which bonds broke, when and why.",
-            "result:verify": "Says whether results are as they were written.",
+            "plot": "Draws a result, or the set-up of an experiment before it runs.",
+            "animate": "Makes a movie of a result.",
+            "curve": "Draws what changes: a curve, a history, the crack.",
+            "export": "Writes a result for ParaView.",
+            "explain": "Says which bonds broke, when and why.",
+            "verify": "Says whether results are as they were written.",
         },
         "Understand": {
-            "check:check": "Says before a run whether it is stable, and how long it takes.",
-            "check:identify": "Says what a rule is physically, with its constants.",
+            "check": "Says before a run whether it is stable, and how long it takes.",
+            "identify": "Says what a rule is physically, with its constants.",
         },
         "Vary and fit": {
-            "sweep:sweep": "Runs an experiment over many values of its parameters.",
-            "sweep:fit": "Finds the parameters that meet what was measured, with errors.",
+            "sweep": "Runs an experiment over many values of its parameters.",
+            "fit": "Finds the parameters that meet what was measured, with errors.",
         },
         "Extend": {
-            "plugins:plugins": "Lists, checks and begins components of your own.",
-            "sweep:schema": "Prints the JSON Schema, for completion in an editor.",
+            "plugins": "Lists, checks and begins components of your own.",
+            "schema": "Prints the JSON Schema, for completion in an editor.",
         },
     }
     return [
-        Command(target.partition(":")[2], f"pbdkit.cli.{target}", does, group)
-        for group, targets in sentences.items()
-        for target, does in targets.items()
+        Command(name, f"pbdkit.cli.interface:{name}", does, group)
+        for group, names in sentences.items()
+        for name, does in names.items()
     ]
 
 

@@ -1,31 +1,21 @@
-"""Arguments and options shared by commands, checks of output paths, tables, and progress on a
-terminal."""
+"""Arguments and options that several commands have."""
 
 from __future__ import annotations
 
-import io
 import os
-import shutil
-import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import chdir, contextmanager, suppress
-from importlib import import_module
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from pbdkit.errors import ExperimentError, StorageError, refuse_no_matplotlib
-from pbdkit.progress import DELAY_S
+from pbdkit.hooks import import_object
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
-    from matplotlib.figure import Figure
-    from rich.table import Table
 
     from pbdkit.cli.completion import Completer
-    from pbdkit.scene.scene import Scene
+    from pbdkit.model.experiment import Experiment
 
 
 PATH = click.Path(path_type=Path)
@@ -33,14 +23,33 @@ C = TypeVar("C", bound=click.Command)
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+def call(target: str, *args: Any, **options: Any) -> int | None:
+    """Import a function of `pbdkit.cli`, given as ``file:name``, call it, and return its exit
+    status."""
+    status: int | None = import_object(f"pbdkit.cli.{target}")(*args, **options)
+    return status
+
+
+def load_experiment(name: str, settings: tuple[str, ...]) -> Experiment:
+    """Return an experiment by its file or shipped name, with settings.
+
+    It is read before anything is imported that validates it, so that a mistyped name ends early.
+    """
+    from pbdkit.model.shipped import read_experiment
+
+    source = read_experiment(name)
+    from pbdkit.model.loading import experiment_of_source
+
+    return experiment_of_source(source, settings)
+
+
 def completed_by(name: str) -> Completer:
-    """Return the completer of a name in `completion`, which is imported only when a shell needs
-    it."""
+    """Return a completer, given as ``file:name``, which is imported only when a shell needs it."""
 
     def complete(
         context: click.Context, parameter: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        completer: Completer = getattr(import_module("pbdkit.cli.completion"), name)
+        completer: Completer = import_object(f"pbdkit.cli.{name}")
         return completer(context, parameter, incomplete)
 
     return complete
@@ -48,7 +57,7 @@ def completed_by(name: str) -> Completer:
 
 def result_argument(name: str, metavar: str = "OUT.nc", **more: Any) -> Callable[[F], F]:
     """Return a click argument for one result or several."""
-    complete = completed_by("results")
+    complete = completed_by("completion:results")
     return click.argument(name, metavar=metavar, type=PATH, shell_complete=complete, **more)
 
 
@@ -56,7 +65,7 @@ color_option = click.option(
     "--color",
     metavar="VARIABLE",
     help="Variable that gives the colours, e.g. pe1, u, u_x; an unknown name lists all.",
-    shell_complete=completed_by("variables"),
+    shell_complete=completed_by("completion:variables"),
 )
 times_option = click.option(
     "--time",
@@ -64,14 +73,14 @@ times_option = click.option(
     type=float,
     multiple=True,
     help="Recorded step to draw, default the last; repeat it for further panels.",
-    shell_complete=completed_by("times"),
+    shell_complete=completed_by("completion:times"),
 )
 set_option = click.option(
     "--set",
     "settings",
     multiple=True,
     metavar="PATH=VALUE",
-    shell_complete=completed_by("settings"),
+    shell_complete=completed_by("setting_completion:settings"),
     help="Change a value of the experiment, e.g. rule.K=-0.002 or leaders.1.until=20.",
 )
 
@@ -97,17 +106,17 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 verbose_option = click.option("--verbose", is_flag=True, help="Print all details.")
 
 
-def _setting(module: str, name: str) -> Callable[[click.Context, click.Parameter, bool], None]:
+def _setting(constant: str) -> Callable[[click.Context, click.Parameter, bool], None]:
     """Return the callback of a flag that sets an environment variable to "*".
 
-    The variable is set for this call and the processes that it starts. Its name is the constant
-    `name` of a module.
+    The variable is set for this call and the processes that it starts. Its name is a constant,
+    given as ``module:name``.
     """
 
     def set_variable(context: click.Context, option: click.Parameter, flag: bool) -> None:
         if not flag:
             return
-        variable = getattr(import_module(module), name)
+        variable = import_object(constant)
         previous = os.environ.get(variable)
         os.environ[variable] = "*"
 
@@ -125,7 +134,7 @@ outside_option = click.option(
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_setting("pbdkit.model.reading", "ALLOW_OUTSIDE"),
+    callback=_setting("pbdkit.model.reading:ALLOW_OUTSIDE"),
     help="Read files outside the folder of the file that names them.",
 )
 
@@ -133,7 +142,7 @@ outside_option = click.option(
 def experiment_argument(command: F) -> F:
     """Add the argument EXPERIMENT, and the option that permits files elsewhere."""
     argument = click.argument(
-        "experiment", metavar="EXPERIMENT", shell_complete=completed_by("experiments")
+        "experiment", metavar="EXPERIMENT", shell_complete=completed_by("completion:experiments")
     )
     return outside_option(argument(command))
 
@@ -143,7 +152,7 @@ NO_PLUGINS = click.Option(
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_setting("pbdkit.hooks", "DISABLE"),
+    callback=_setting("pbdkit.hooks:DISABLE"),
     help="Load no plugins, as if pbdkit alone were installed.",
 )
 
@@ -155,179 +164,3 @@ def with_no_plugins(command: C) -> C:
     for inner in getattr(command, "commands", {}).values():
         with_no_plugins(inner)
     return command
-
-
-FORMATS = (".png", ".svg", ".pdf")
-"""File name extensions of pictures."""
-UNLIMITED = 10_000
-"""Width of tables that are not printed on a terminal."""
-
-
-@contextmanager
-def refusals_as(subject: str) -> Iterator[None]:
-    """Raise a StorageError that begins with `subject` for each OSError in the block."""
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(f"{subject}: {error.strerror}") from None
-
-
-@contextmanager
-def folder_kept() -> Iterator[None]:
-    """Return to the current folder after the block: plugins may change it when they are imported.
-
-    Raises
-    ------
-    StorageError
-        If there is no current folder.
-    """
-    with refusals_as("the current folder"):
-        folder = Path.cwd()
-    with chdir(folder):
-        yield
-
-
-def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:
-    """Check that a file may be written at a path.
-
-    Parameters
-    ----------
-    force
-        Whether an existing file may be replaced.
-    experiment
-        Experiment file, which is never replaced.
-
-    Raises
-    ------
-    ExperimentError
-        If the name is not UTF-8, if the path is a folder or no regular file, if it is the
-        experiment under any name, or if a file exists and `force` is not set.
-    StorageError
-        If the file system returns an error.
-    """
-    from pbdkit.io.atomic_file import kind_of
-
-    try:  # in the bytes of the file system, whatever the locale
-        os.fsencode(path.absolute()).decode()
-    except UnicodeDecodeError:
-        shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
-        raise ExperimentError(
-            f"{shown}: the name is not UTF-8; name another file with -o"
-        ) from None
-    with refusals_as(f"{str(path)[:80]}..."):
-        kind, exists = kind_of(path), os.path.lexists(path)
-    if not exists:
-        return
-    if kind == "a folder":
-        raise ExperimentError(f"{path}: is a folder; name a file with -o")
-    if kind:
-        raise ExperimentError(
-            f"{path}: is {kind}, which is not replaced; remove it, or name another file with -o"
-        )
-    if experiment and experiment.exists() and path.samefile(experiment):
-        raise ExperimentError(f"{path}: is the experiment itself; name another file with -o")
-    if not force:
-        raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
-
-
-def refuse_unfinished(path: Path, *, force: bool) -> None:
-    """Raise ExperimentError beside an unfinished run, unless `force` discards it.
-
-    A run that another process is writing is never discarded.
-    """
-    from pbdkit.io.run_store import make_room
-
-    if not make_room(path, discard=force):
-        raise ExperimentError(
-            f"{path}: there is an unfinished run; `pbdkit resume {path}` continues it, "
-            "--force discards it, -o names another file"
-        )
-
-
-def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
-    """Warn if the output may not fit on its disk."""
-    from pbdkit.scene.memory_estimate import MIB, sizes_of
-
-    output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total).output
-    with suppress(OSError):  # a missing folder is reported when the file is opened
-        if output > (free := shutil.disk_usage(path.parent).free):
-            yield (
-                f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
-                f"{free / MIB:.3g} MiB that are free in {path.parent}; record fewer steps, or "
-                "name a file on another disk with -o"
-            )
-
-
-def show_table(table: Table) -> None:
-    """Print a table; one line for each row if the output is no terminal."""
-    from rich.console import Console
-
-    width = None if sys.stdout.isatty() else UNLIMITED
-    Console(width=width, highlight=False).print(table)
-
-
-def refuse_unwritable(picture: Path | None, *files: Path | None) -> None:
-    """Raise ExperimentError or StorageError if a picture or another file cannot be written."""
-    if picture and picture.suffix not in FORMATS:
-        raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
-    if picture:
-        refuse_no_matplotlib()
-    for path in (picture, *files):
-        if path and path.is_dir():
-            raise ExperimentError(f"{path}: is a folder; name a file")
-        if path and not path.parent.is_dir():
-            raise StorageError(f"{path}: there is no folder {path.parent}")
-
-
-def save(picture: Path, figure: Figure, *, replace: bool, quiet: bool = False) -> None:
-    """Write a figure, and print its path unless `quiet`.
-
-    Raises
-    ------
-    WriteError
-        If the file system returns an error.
-    """
-    from pbdkit.io.atomic_file import write
-
-    content = io.BytesIO()
-    figure.savefig(content, format=picture.suffix.removeprefix("."))
-    write(picture, content.getvalue(), replace=replace)
-    if not quiet:
-        click.echo(f"{picture} written")
-
-
-@contextmanager
-def waiting(task: str, *, silent: bool = False) -> Iterator[Callable[[str], None]]:
-    """Show a task and its duration on stderr after a second, until the block ends.
-
-    Nothing is shown if `silent`, or if stderr is no terminal.
-
-    Yields
-    ------
-    callable
-        Function that replaces the description of the task.
-    """
-    if silent or not sys.stderr.isatty():
-        yield lambda task: None
-        return
-    line = _line(task)
-    timer = threading.Timer(DELAY_S, line.start)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield lambda task: line.update(line.task_ids[0], description=task)
-    finally:
-        timer.cancel()
-        timer.join()
-        if line.live.is_started:
-            line.stop()
-
-
-def _line(task: str) -> Any:
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
-    line = Progress(*columns, console=Console(file=sys.stderr), transient=True)
-    line.add_task(task, total=None)
-    return line

@@ -19,39 +19,18 @@ import click
 
 from pbdkit import __version__
 from pbdkit.cli.commands import own_commands, plugins_with_commands
-from pbdkit.cli.options import json_option
-from pbdkit.errors import ExperimentError
-from pbdkit.hooks import canonical
+from pbdkit.errors import ExperimentError, PluginError, did_you_mean
+from pbdkit.hooks import Plugin, canonical
 from pbdkit.io.atomic_file import write_folder
 from pbdkit.plugin import BUILTIN, INTERFACES, LISTS
 from pbdkit.plugin.registry import Registry
 
 if TYPE_CHECKING:
-    from pbdkit.hooks import Plugin
     from pbdkit.testing import Report
 
 
-INTERFACE_NAMES = (
-    "FollowerRule", "Lattice", "NeighbourMetric", "FramePolicy", "FractureModel",
-    "ParticleOperation", "Diagnostic",
-)  # fmt: skip
-"""Names of the open interfaces, listed here so that `--help` imports none of them."""
-
-
-@click.group(invoke_without_command=True)
-@click.pass_context
-def plugins(context: click.Context) -> None:
-    """List, check and create plugins."""
-    if context.invoked_subcommand is None:
-        click.echo(context.get_help())
-
-
-@plugins.command("list")
-@json_option
 def list_(as_json: bool) -> None:
     """List components and plugins, and their states."""
-    from pbdkit.plugin.registry import Registry
-
     registry = Registry()
     rows = [row for plugin in registry.plugins for row in _rows(plugin)]
     rows += [row for plugin in plugins_with_commands() for row in _rows(plugin)]
@@ -60,38 +39,17 @@ def list_(as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(rows))
         return
-    from rich.table import Table
-    from rich.text import Text
-
-    from pbdkit.cli.options import show_table
+    from pbdkit.cli.tables import Table, add_rows, show_table
 
     table = Table(box=None, pad_edge=False)
     for column in rows[0]:
         table.add_column(column, overflow="fold", no_wrap=column not in ("reason", "type"))
-    for row in rows:
-        table.add_row(*map(Text, row.values()))  # as Text, so that [x] is no markup
+    add_rows(table, ([*row.values()] for row in rows))
     show_table(table)
 
 
-@plugins.command(short_help="Write a plugin project that installs and runs.")
-@click.argument("name")
-@click.option(
-    "--interface",
-    type=click.Choice(INTERFACE_NAMES),
-    default=INTERFACE_NAMES[0],
-    show_default=True,
-    help="Interface of the component.",
-)
-@click.option(
-    "--dir",
-    "parent",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
-    default=".",
-    help="Folder in which the project is created; default the current one.",
-)
 def new(name: str, interface: str, parent: Path) -> None:
     """Write a plugin project NAME, e.g. pbdkit-my-rule, that installs and runs as it stands."""
-
     project = project_of(name, interface)
     folder = project.write(parent)
     click.echo(
@@ -101,18 +59,13 @@ def new(name: str, interface: str, parent: Path) -> None:
     )
 
 
-@plugins.command(short_help="Check the components of plugins for conformance.")
-@click.argument("distributions", metavar="[DISTRIBUTION]...", nargs=-1)
-@click.option("--verbose", is_flag=True, help="Show every property: passed, failed and skipped.")
-@json_option
-@click.pass_context
-def check(
-    context: click.Context, distributions: tuple[str, ...], verbose: bool, as_json: bool
-) -> None:
-    """Check the components of a distribution against the properties of their interface.
+def check_plugins(distributions: tuple[str, ...], verbose: bool, as_json: bool) -> int:
+    """Check the components of distributions, by default of all plugins.
 
-    Components of all plugins are checked by default. `pbdkit` is the distribution of the built-in
-    components. The exit status is 3 if a property fails, or if a plugin does not load.
+    Returns
+    -------
+    int
+        Exit status: 3 if a property fails, or if a plugin does not load.
     """
     from pbdkit.testing import examine_all
 
@@ -131,7 +84,7 @@ def check(
     elif success:
         examples = "1 example" if len(rows) == 1 else f"{len(rows)} examples"
         click.echo(f"all properties hold for {examples} of its components")
-    context.exit(0 if success else 3)
+    return 0 if success else 3
 
 
 def _rows(plugin: Plugin) -> list[dict[str, str]]:
@@ -159,11 +112,6 @@ def _selected_plugins(distributions: tuple[str, ...]) -> list[Plugin]:
     PluginError
         For a distribution that is not installed, or if there is no plugin.
     """
-    from pbdkit.errors import PluginError, did_you_mean
-    from pbdkit.hooks import canonical
-    from pbdkit.plugin import BUILTIN
-    from pbdkit.plugin.registry import Registry
-
     by_distribution: dict[str, list[Plugin]] = {}
     for plugin in Registry().plugins:
         by_distribution.setdefault(canonical(plugin.distribution), []).append(plugin)

@@ -1,5 +1,4 @@
-"""Commands ``pbdkit explain``, ``status``, ``verify`` and ``export``: inspect and convert
-results."""
+"""Commands ``pbdkit explain`` and ``pbdkit export``: fracture in a result, and its conversion."""
 
 from __future__ import annotations
 
@@ -11,123 +10,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
-from pbdkit.cli.options import PATH, at_option, json_option, result_argument
+from pbdkit.cli.output import refuse_output
+from pbdkit.errors import ExperimentError, PbdkitError, StorageError
+from pbdkit.io import vtkhdf
+from pbdkit.io.explain import BondStatus, BondTable
+from pbdkit.io.layout import scene_of
+from pbdkit.io.open import reading
+from pbdkit.io.other_files import refuse_other_file
+from pbdkit.progress import waiting
+from pbdkit.scene.scene import Scene
 
 if TYPE_CHECKING:
     import xarray
-
-    from pbdkit.io.explain import BondStatus, BondTable
-    from pbdkit.scene.scene import Scene
-
 
 MAX_LISTED = 20
 """Number of broken bonds that are listed as text; --json lists all."""
 
 
-@click.command()
-@result_argument("files", "FILE...", nargs=-1, required=True)
-def verify(files: tuple[Path, ...]) -> int:
-    """Recompute the checksums of results, and report for each file whether it is unchanged."""
-    from pbdkit.cli.options import waiting
-
-    faults = []
-    for file in files:
-        with waiting(f"reading {file}"):
-            fault = _fault_of(file)
-        click.echo(fault or f"{file}: unchanged since it was written")
-        faults += [fault] if fault else []
-    return 6 if faults else 0
-
-
-def _fault_of(file: Path) -> str:
-    """Return the fault of a result, or an empty string."""
-    from pbdkit.cli.options import refusals_as
-    from pbdkit.errors import StorageError
-    from pbdkit.io.open import UNSEALED, refuse_no_file
-    from pbdkit.io.other_files import other_file
-    from pbdkit.io.seal import SealedFile
-    from pbdkit.untrusted_files import refuse_no_result
-
-    fault = ""
-    try:
-        if description := other_file(file):
-            raise StorageError(f"{file}: {description}")
-        refuse_no_file(file)
-        with refusals_as(str(file)), SealedFile(file) as content:
-            content.check()
-            if content.seal is None:
-                refuse_no_result(file)
-                fault = f"{file}: {UNSEALED}"
-            else:
-                _refuse_elsewhere(file)
-    except StorageError as error:
-        fault = str(error)
-    return fault
-
-
-def _refuse_elsewhere(file: Path) -> None:
-    """Raise StorageError if the bytes are those that were sealed, but refer to other files."""
-    from pbdkit.errors import StorageError, one_line
-    from pbdkit.io.seal import open_sealed
-
-    try:
-        open_sealed(file).close()
-    except StorageError:
-        raise
-    except Exception as error:  # h5py raises errors of many types
-        raise StorageError(f"{file}: cannot be read as netCDF-4: {one_line(str(error))}") from None
-
-
-@click.command()
-@result_argument("output")
-@json_option
-def status(output: Path, as_json: bool) -> None:
-    """Report the progress of an unfinished run: step, rate and remaining time."""
-    from pbdkit.errors import ExperimentError
-    from pbdkit.io.other_files import refuse_other_file, refuse_store
-    from pbdkit.io.run_store import status_of
-
-    refuse_store(output)
-    facts = status_of(output)
-    if facts is None:
-        refuse_other_file(output)
-        state = "is finished" if output.exists() else "there is no such run"
-        raise ExperimentError(f"{output}: {state}; runs of less than a second have no status")
-    if as_json:
-        click.echo(json.dumps(facts))
-        return
-    click.echo(f"{output}: step {facts['step']} of {facts['steps']}, {facts['state']}")
-    if facts["rate"]:
-        click.echo(f"rate: {facts['rate']:.3g} steps a second")
-    if facts["state"] == "running" and facts["left_s"] is not None:
-        click.echo(f"time left: about {_duration(facts['left_s'])}")
-    elif facts["state"] != "running":
-        click.echo(f"`pbdkit resume {output}` continues it")
-
-
-def _duration(seconds: float) -> str:
-    hours, rest = divmod(round(seconds), 3600)
-    return f"{hours} h {rest // 60} min" if hours else f"{rest // 60} min {rest % 60} s"
-
-
-@click.command()
-@result_argument("file")
-@click.option(
-    "--bond", nargs=2, type=int, metavar="A B", help="Numbers of the two particles of a bond."
-)
-@at_option
-@json_option
 def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_json: bool) -> None:
     """Explain fracture: which bonds broke, when, at which strain and in which order.
 
     For one bond, report its distance from breaking, or its break, and what happened around it.
     """
-    from pbdkit.cli.options import waiting
-    from pbdkit.io.explain import BondTable
-    from pbdkit.io.layout import scene_of
-    from pbdkit.io.open import reading
-
     with waiting(f"reading {file}", silent=as_json), reading(file, at=at) as dataset:
         explained = BondTable(dataset, scene_of(dataset, "explain"))
         facts = _bond_facts(explained, *bond) if bond else _run_facts(explained)
@@ -150,8 +56,6 @@ def _run_facts(explained: BondTable) -> dict[str, Any]:
 
 
 def _bond_facts(explained: BondTable, a: int, b: int) -> dict[str, Any]:
-    import numpy as np
-
     row = explained.row(a, b)
     step, strain = explained.most_strained(row)
     (standing,) = explained.statuses(np.array([row]))
@@ -250,23 +154,12 @@ SUFFIX = ".vtkhdf"
 """File name extension of VTKHDF files."""
 
 
-@click.command()
-@result_argument("file")
-@click.option("-o", "--output", type=PATH, help="A .vtkhdf file; default OUT.vtkhdf.")
-@at_option
-@click.option("--force", is_flag=True, help="Replace an existing file.")
 def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> None:
     """Write a result as VTKHDF for ParaView: every recorded step with all variables.
 
     Particles are vertices, bonds lines, and the cells of the lattice triangles and quads. The cell
     array `part` distinguishes them (0, 1, 2), and `broken` marks torn cells.
     """
-    from pbdkit.cli.options import refuse_output
-    from pbdkit.errors import ExperimentError, StorageError
-    from pbdkit.io.open import reading
-    from pbdkit.io.other_files import refuse_other_file
-    from pbdkit.io.vtkhdf import export as write
-
     refuse_other_file(file)
     path = output or file.with_suffix(SUFFIX)
     if path.suffix != SUFFIX:
@@ -277,15 +170,12 @@ def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> 
     if not path.parent.is_dir():
         raise StorageError(f"{path}: there is no folder {path.parent}")
     with reading(file, at=at) as dataset:
-        write(dataset, path, _scene_of(dataset), replace=force)
+        vtkhdf.export(dataset, path, _scene_of(dataset), replace=force)
     click.echo(f"{path} written")
 
 
 def _scene_of(dataset: xarray.Dataset) -> Scene | None:
     """Return the scene of the cells; without it, warn that there are no cells."""
-    from pbdkit.errors import PbdkitError
-    from pbdkit.io.layout import scene_of
-
     try:
         return scene_of(dataset, "a grid of cells")
     except PbdkitError as error:

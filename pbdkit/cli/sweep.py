@@ -1,55 +1,42 @@
-"""Commands ``pbdkit sweep`` and ``fit``, and those to start from: ``experiments``, ``init`` and
-``schema``."""
+"""Commands ``pbdkit sweep`` and ``fit``, and ``schema`` of the files that they take."""
 
 from __future__ import annotations
 
 import json
 import logging
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from pbdkit.cli.options import completed_by, outside_option
+import pbdkit
+from pbdkit.cli.output import refusals_as, refuse_output, refuse_unwritable, save
+from pbdkit.errors import ExperimentError
+from pbdkit.fitting.fit_result import Fitted
+from pbdkit.fitting.fit_schema import fit_schema
+from pbdkit.fitting.strength import is_strength_fit
+from pbdkit.io.atomic_file import write
+from pbdkit.io.layout import dataset_schema
+from pbdkit.model.schema import experiment_schema
+from pbdkit.plotting.fit_figures import draw_fit
+from pbdkit.plugin.registry import Registry
+from pbdkit.progress import Stop, progress_bar, stop_on_signals, waiting
+from pbdkit.sweeps.execute import Summary, carry_out, crew_of
+from pbdkit.sweeps.specification import SweepPlan, read_sweep, sweep_schema
 
-if TYPE_CHECKING:
-    from pbdkit.cli.run import Stop
-    from pbdkit.sweeps.execute import Summary
-
-
-PATH = click.Path(path_type=Path)
 CONNECT_S = 10.0
 """Timeout for the connection to a cluster in seconds."""
 MAX_LISTED = 20
 """Number of failures that are listed; `message` in the dataset has all."""
 
 
-@click.command()
-@click.argument("file", metavar="SWEEP", type=PATH)
-@click.option("-o", "--output", "folder", type=PATH, help="Folder of the results of members.")
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    help="Number of processes; default one for each processor.",
-)
-@click.option(
-    "--dask", "address", metavar="ADDRESS", help="Run on the dask cluster at this address."
-)
-@outside_option
-@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 def sweep(
     file: Path, folder: Path | None, workers: int | None, address: str | None, quiet: bool
 ) -> int:
     """Run an experiment for many parameter values; a second call runs the remaining members."""
-    from pbdkit.cli.run import stop_on_signals
-    from pbdkit.progress import progress_bar
-    from pbdkit.sweeps.execute import carry_out, crew_of
-    from pbdkit.sweeps.specification import SweepPlan, read_sweep
-
     specified, base, source = read_sweep(file)
     plan, path = SweepPlan(specified, base, source), folder or Path(file.stem)
     _refuse_folder(path)
@@ -66,9 +53,6 @@ def sweep(
 
 def _refuse_folder(folder: Path) -> None:
     """Raise ExperimentError if the path exists and is no folder."""
-    from pbdkit.cli.options import refusals_as
-    from pbdkit.errors import ExperimentError
-
     with refusals_as(str(folder)[:80]):
         if folder.exists() and not folder.is_dir():
             raise ExperimentError(f"{folder}: is not a folder; name one with -o")
@@ -77,22 +61,18 @@ def _refuse_folder(folder: Path) -> None:
 @contextmanager
 def _client(address: str | None) -> Iterator[Any]:
     """Yield the client of the cluster at an address, or None without one; raise ExperimentError."""
-    from pbdkit.errors import ExperimentError
-
     if address is None:
         yield None
         return
     try:
-        from distributed import Client
-
-        connect: Any = Client
+        import distributed
     except ImportError:
         what = "--dask needs dask.distributed: pip install 'pbdkit[sweep]'"
         raise ExperimentError(what) from None
     # Its log messages about lost connections, with tracebacks, would hide those of the program.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
-        client = connect(address, timeout=CONNECT_S)
+        client: Any = distributed.Client(address, timeout=CONNECT_S)  # type: ignore[no-untyped-call]  # distributed is untyped
     except (OSError, ValueError, ImportError) as error:
         raise ExperimentError(f"--dask {address}: no scheduler responds: {error}") from None
     with client:
@@ -118,42 +98,21 @@ def _report_end(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
 
 
 def _show(summary: Summary) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from pbdkit.cli.options import UNLIMITED
+    """Print a table of the members that have no values."""
+    from pbdkit.cli.tables import Table, add_rows, show_table
 
     failures = summary.failures
     table = Table("member", "status", "message", title=f"{len(failures)} members have no values")
-    for member, status, message in failures[:MAX_LISTED]:
-        table.add_row(*map(Text, (member.words, status, message.splitlines()[0])))
-    width = None if sys.stderr.isatty() else UNLIMITED
-    Console(stderr=True, width=width, highlight=False).print(table)
+    rows = ((member.words, status, text) for member, status, text in failures[:MAX_LISTED])
+    add_rows(table, ((words, status, text.splitlines()[0]) for words, status, text in rows))
+    show_table(table, stderr=True)
     if len(failures) > MAX_LISTED:
         rest = f"and {len(failures) - MAX_LISTED} more: `status` and `message` in {summary.path}"
         click.echo(rest, err=True)
 
 
-@click.command()
-@click.argument("file", metavar="FIT")
-@click.option("-o", "--output", type=PATH, help="JSON file; default the name of FIT with .json.")
-@click.option(
-    "--plot",
-    "picture",
-    type=PATH,
-    help="Picture (PNG, SVG or PDF): measurement, fit and residuals.",
-)
-@click.option("--force", is_flag=True, help="Replace an existing file.")
-@outside_option
-@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet: bool) -> None:
     """Fit parameters to measured fields, or strengths to repeated tests, with their errors."""
-    import pbdkit
-    from pbdkit.cli.options import refuse_output, refuse_unwritable, save, waiting
-    from pbdkit.fitting.strength import is_strength_fit
-    from pbdkit.io.atomic_file import write
-
     path = output or Path(Path(file).name or "fit").with_suffix(".json")
     refuse_output(path, force=force, experiment=Path(file))
     if picture:
@@ -161,7 +120,7 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
     refuse_unwritable(picture, path)
     repeats = is_strength_fit(file)
     if picture and repeats:
-        raise pbdkit.ExperimentError("a strength fit has no picture; leave --plot out")
+        raise ExperimentError("a strength fit has no picture; leave --plot out")
     with waiting(f"fitting {file}", silent=quiet):
         result = pbdkit.fit_strength(file) if repeats else pbdkit.fit(file)
     write(path, json.dumps(result.as_dict(), indent=2) + "\n", replace=force)
@@ -169,80 +128,12 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         click.echo(str(result))
         click.echo(f"{path} written")
     if picture:
-        from pbdkit.fitting.fit_result import Fitted
-        from pbdkit.plotting.fit_figures import draw_fit
-
         assert isinstance(result, Fitted)
         save(picture, draw_fit(result), replace=force, quiet=quiet)
 
 
-START = "start"
-"""The shipped experiment that `init` writes by default."""
-
-
-@click.command()
-@click.argument("name", required=False, shell_complete=completed_by("shipped"))
-def experiments(name: str | None) -> None:
-    """List the shipped experiments, or print the file of one, e.g. paper/f1."""
-    from pbdkit.model.shipped import shipped_names, shipped_text, shipped_title
-
-    if name is not None:
-        click.echo(shipped_text(name), nl=False)
-        return
-    width = max(map(len, names := shipped_names()))
-    for shipped in names:
-        click.echo(f"{shipped:<{width}}  {shipped_title(shipped)}")
-
-
-@click.command()
-@click.argument("file", required=False, type=PATH)
-@click.option(
-    "--from",
-    "origin",
-    metavar="NAME",
-    shell_complete=completed_by("shipped"),
-    help="Shipped experiment to copy with its data files, e.g. paper/f1.",
-)
-def init(file: Path | None, origin: str | None) -> None:
-    """Write an experiment to start from: a commented one, or a copy of a shipped one.
-
-    FILE is experiment.yaml by default, or with --from the last part of NAME with .yaml.
-    """
-    from pbdkit.errors import ExperimentError
-    from pbdkit.io.atomic_file import write_together
-    from pbdkit.model.shipped import SUFFIX, shipped_data, shipped_names, shipped_text
-
-    path, text = (
-        file or Path(Path(origin or "experiment").name + SUFFIX),
-        shipped_text(origin or START),
-    )
-    if origin is None and str(path) in shipped_names():
-        copy = f"`pbdkit init {path.name}{SUFFIX} --from {path}` copies it"
-        raise ExperimentError(f"{path}: is the name of a shipped experiment, not a file; {copy}")
-    data = shipped_data(origin) if origin else []
-    files = {path.with_name(d.name): d.read_bytes() for d in data} | {path: text.encode()}
-    for target in files:
-        if os.path.lexists(target):
-            raise ExperimentError(f"{target}: exists and is not changed; name another file")
-    write_together(files)
-    remark = f" with {', '.join(d.name for d in data)}" if data else ""
-    click.echo(f"{path} written{remark}; next: pbdkit check {path}, then pbdkit run {path}")
-
-
-@click.command()
-@click.argument(
-    "what", type=click.Choice(["experiment", "dataset", "sweep", "fit"]), default="experiment"
-)
-@click.option("--builtin", is_flag=True, help="Leave out third-party components.")
 def schema(what: str, builtin: bool) -> None:
-    """Print the JSON Schema of experiments, datasets, sweeps or fits, with all installed
-    components."""
-    from pbdkit.fitting.fit_schema import fit_schema
-    from pbdkit.io.layout import dataset_schema
-    from pbdkit.model.schema import experiment_schema
-    from pbdkit.plugin.registry import Registry
-    from pbdkit.sweeps.specification import sweep_schema
-
+    """Print the JSON Schema of experiments, datasets, sweeps or fits."""
     if what in (schemas := {"sweep": sweep_schema, "fit": fit_schema}):
         result = schemas[what]()
     else:

@@ -32,8 +32,8 @@ from pbdkit.fitting.observations import (
     TracksObservation,
 )
 from pbdkit.fitting.problem import Loss
-from pbdkit.model.base import Base, base_source
 from pbdkit.model.experiment import Experiment, Version
+from pbdkit.model.loading import Base, base_source
 from pbdkit.model.motions import read_columns
 from pbdkit.model.reading import (
     FIT,

@@ -46,8 +46,8 @@ from pbdkit.fitting.problem import TELLS
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import FOLLOWER, Places
-from pbdkit.model.base import Base, base_source
 from pbdkit.model.experiment import Experiment, Version, given_classes
+from pbdkit.model.loading import Base, base_source
 from pbdkit.model.motions import read_columns
 from pbdkit.model.reading import FIT, OF_PROGRAM, Source, of_kind, read_file, with_value
 from pbdkit.model.solver import Equilibrium

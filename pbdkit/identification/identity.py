@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from pbdkit.identification.elastic_constants import DIFFUSION, ELASTICITY, NEITH
 from pbdkit.identification.waves import DirectionalRange, LongWaves, Primitive, WaveSpectrum
 from pbdkit.linear.spectrum import NEUTRAL
 from pbdkit.scene.scene import Scene
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -155,29 +152,6 @@ def verdict(identity: Identity) -> str:
     if identity.kind == NEITHER:
         return "neither diffusion nor elasticity"
     return SYMMETRIES[identity.symmetry or "general"].format(identity.kind)
-
-
-def table(identity: Identity, *, whole: bool = True) -> Table:
-    """Return a table with a row for each property; h is the spacing.
-
-    Parameters
-    ----------
-    whole
-        Whether all properties are listed, or the verdict and the constants alone.
-    """
-    from rich import box
-    from rich.table import Column, Table
-
-    rows = Table(
-        Column(no_wrap=True, min_width=TITLE_WIDTH),
-        "",
-        box=box.SIMPLE,
-        show_header=False,
-        pad_edge=False,
-    )
-    for row in rows_of(identity, whole=whole):
-        rows.add_row(*row)
-    return rows
 
 
 def rows_of(identity: Identity, *, whole: bool = False) -> list[Row]:

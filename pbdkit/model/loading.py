@@ -1,25 +1,37 @@
-"""Load experiments from a file, a shipped name, a dict of parts, or an object.
-
-Modules for validation are imported only after the file is read.
-"""
+"""Load experiments from a file, a shipped name, a dict of parts, or an object; and the base
+experiment of a sweep or a fit, which is a field of its file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-from pbdkit.errors import ExperimentError
-from pbdkit.model.shipped import read_experiment
+from pydantic import AfterValidator, Field
 
-if TYPE_CHECKING:
-    from pbdkit.model.experiment import Experiment
-    from pbdkit.model.reading import Settings
-    from pbdkit.plugin import Component
+from pbdkit.errors import ExperimentError, did_you_mean
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.reading import (
+    ALLOW,
+    EXPERIMENT,
+    OF_PROGRAM,
+    FileResolver,
+    Settings,
+    Source,
+    of_kind,
+    read_file,
+    read_text,
+    with_settings,
+)
+from pbdkit.model.shipped import read_experiment, shipped_names, shipped_text
+from pbdkit.model.validation import brief, fault
+from pbdkit.plugin import Component
+from pbdkit.plugin.registry import Registry
 
-    ComponentClasses = Iterable[type[Component]]
-    ExperimentLike = Experiment | Mapping[str, Any] | str | Path
-    """An experiment, or the dict, the file or the name of a shipped one of which it is made."""
+ComponentClasses = Iterable[type[Component]]
+ExperimentLike = Experiment | Mapping[str, Any] | str | Path
+"""An experiment, or the dict, the file or the name of a shipped one of which it is made."""
 
 
 def load_experiment(
@@ -51,9 +63,13 @@ def load_experiment(
         If a component is missing or fails.
     """
     source = read_experiment(name, allow_outside=allow_outside)
-    from pbdkit.model.experiment import Experiment
-    from pbdkit.model.reading import with_settings
+    return experiment_of_source(source, settings, components)
 
+
+def experiment_of_source(
+    source: Source, settings: Settings = (), components: ComponentClasses = ()
+) -> Experiment:
+    """Return the validated experiment of a source that was read, with settings applied."""
     return Experiment.build(with_settings(source, settings, Experiment.defaults()), components)
 
 
@@ -64,10 +80,6 @@ def as_experiment(
 
     Raises ExperimentError and PluginError.
     """
-    from pbdkit.model.experiment import Experiment
-    from pbdkit.model.reading import OF_PROGRAM, Source, with_settings
-    from pbdkit.plugin.registry import Registry
-
     if isinstance(given, Experiment):
         Registry(components)  # what is handed over is checked, needed or not
         given.refuse_unvalidated()
@@ -77,8 +89,7 @@ def as_experiment(
     if _is_dataset(given) or not isinstance(given, Mapping):
         raise ExperimentError(f"expected an experiment, {but_got(given)}")
     source = Source(data=dict(given), files=OF_PROGRAM)
-    source = with_settings(source, settings, Experiment.defaults())
-    return Experiment.build(source, components)
+    return experiment_of_source(source, settings, components)
 
 
 def but_got(given: Any) -> str:
@@ -99,3 +110,72 @@ def but_got(given: Any) -> str:
 
 def _is_dataset(given: Any) -> bool:
     return hasattr(given, "data_vars")
+
+
+def _an_experiment(value: Any) -> Any:
+    if not isinstance(value, (str, dict)):
+        raise fault(
+            "expected the name of a shipped experiment, a file in the folder of this one, or the "
+            "experiment itself, got "
+            f"{brief(value)}"
+        )
+    return value
+
+
+Base = Annotated[
+    Any, AfterValidator(_an_experiment), Field(json_schema_extra={"type": ["string", "object"]})
+]
+"""Type of a base experiment: a shipped name, a file, or the experiment itself.
+"""
+
+
+def base_source(path: Path, base: Any, source: Source) -> Source:
+    """Return the source of the base experiment of a sweep or fit.
+
+    Parameters
+    ----------
+    path
+        File of the sweep or fit.
+    base
+        Value of the field `experiment`.
+    source
+        Source of the sweep or fit.
+
+    Raises
+    ------
+    ExperimentError
+        If there is no such experiment, or the file cannot be read.
+    """
+    if isinstance(base, dict):
+        inner = {w[1:]: p for w, p in source.places.items() if w[:1] == ("experiment",)}
+        return Source(str(path), base, inner, source.files)
+    try:
+        return _read(path, base, source.files)
+    except _NoSuchExperimentError as error:
+        text = source.message(("experiment",), str(error))
+        raise ExperimentError(text, ("experiment",)) from None
+
+
+class _NoSuchExperimentError(ExperimentError):
+    """The field `experiment` does not refer to an experiment."""
+
+
+def _read(path: Path, name: str, files: FileResolver) -> Source:
+    """Read a file in the folder of another file, or a shipped experiment."""
+    accepted = "give a shipped name, or a file in the folder of that file or below it"
+    file = (files.folder or path.parent) / name
+    try:
+        is_file = files.folder is not None and file.is_file()
+        is_allowed = files.folder is None or files.holds(file)
+    except (OSError, ValueError):
+        raise _NoSuchExperimentError(f"{brief(name)} is not the name of a file") from None
+    if not is_allowed:
+        text = f"{brief(name)} lies outside the folder; {accepted}, or {ALLOW}"
+        raise _NoSuchExperimentError(text)
+    if is_file:
+        return of_kind(EXPERIMENT, read_file(file))
+    if name in (names := shipped_names()):
+        return read_text(shipped_text(name), name)
+    near = chain(path.parent.glob("*.yaml"), path.parent.glob("*.yml"))
+    hint = did_you_mean(name, [*(file.name for file in near), *names])
+    raise _NoSuchExperimentError(f"{brief(name)} is neither{hint} ({accepted})")

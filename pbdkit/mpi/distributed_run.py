@@ -410,8 +410,8 @@ class DistributedExecution(Execution):
 
     communicator: MPICommunicator
 
-    def __init__(self, communicator: Any) -> None:
-        super().__init__(MPICommunicator(communicator))
+    def __init__(self, communicator: MPICommunicator) -> None:
+        super().__init__(communicator)
 
     def scene(self, experiment: Experiment) -> Scene:
         """Return the part of the scene that this process needs."""

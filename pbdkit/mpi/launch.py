@@ -5,9 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
+from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError, refuse_without
-from pbdkit.execution import Execution
+
+if TYPE_CHECKING:
+    from pbdkit.execution import Execution
 
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
 """How many processes launchers of MPI programs say in the environment that there are."""
@@ -16,16 +20,17 @@ RANK = "PMIX_RANK"
 
 
 @contextmanager
-def launched() -> Iterator[Execution]:
-    """The processes that were started together, as by `mpiexec -n 4`, of which the first speaks;
-    and this one alone where it was not.
+def launched() -> Iterator[Communicator]:
+    """Yield the communicator of the processes that were started together, as by `mpiexec -n 4`.
+
+    The root alone prints in the block. A process that was started alone has the serial one.
 
     Raises ExperimentError where mpi4py is missing, finds no MPI library, or belongs to another
     launcher.
     """
     size = max(int(os.environ.get(name, 1)) for name in SIZES)
     if RANK not in os.environ and size == 1:
-        yield Execution()
+        yield SERIAL
         return
     refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
     try:
@@ -41,10 +46,23 @@ def launched() -> Iterator[Execution]:
                 f"{size} processes were started, and mpi4py finds each alone: it loads the MPI of "
                 "another launcher; start them by that one's mpiexec"
             )
-        yield Execution()
+        yield SERIAL
         return
+    from pbdkit.mpi.communicator import MPICommunicator
+
+    communicator = MPICommunicator(MPI.COMM_WORLD)
+    with communicator.root_speaks():
+        yield communicator
+
+
+def execution_of(communicator: Communicator) -> Execution:
+    """Return what carries out the runs of the processes of a communicator."""
+    if communicator is SERIAL:
+        from pbdkit.execution import Execution
+
+        return Execution()
+    from pbdkit.mpi.communicator import MPICommunicator
     from pbdkit.mpi.distributed_run import DistributedExecution
 
-    execution = DistributedExecution(MPI.COMM_WORLD)
-    with execution.communicator.root_speaks():
-        yield execution
+    assert isinstance(communicator, MPICommunicator)
+    return DistributedExecution(communicator)

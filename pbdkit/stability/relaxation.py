@@ -32,6 +32,7 @@ from pbdkit.linear.spectrum import (
     Complex,
     excess,
     has_symmetric_rows,
+    largest_stable_relaxation,
     modes,
     spectrum,
 )
@@ -116,7 +117,6 @@ def _best_for_real(m: float, M: float, w: float | None, b: float | None) -> Step
 def _best_for_complex(eigenvalues: Complex, w: float | None, b: float | None) -> StepWeights:
     """Search the optimum: over 1 - √b on a logarithmic scale, and over w below its bound for each
     b."""
-    from pbdkit.linear.spectrum import largest_stable_relaxation
 
     def weights_for(memory: float) -> StepWeights:
         if w is not None:

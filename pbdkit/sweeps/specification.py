@@ -22,8 +22,8 @@ from pbdkit.errors import ExperimentError, PluginError, did_you_mean
 from pbdkit.io.layout import SCHEMA_VERSION, reserved_names
 from pbdkit.io.members import PARAMETER, STATUS, TEXT
 from pbdkit.io.physical import IN_MM
-from pbdkit.model.base import Base, base_source
 from pbdkit.model.experiment import Experiment, Version
+from pbdkit.model.loading import Base, base_source
 from pbdkit.model.reading import SWEEP, Source, of_kind, plain, read_file, read_text, with_value
 from pbdkit.model.schema import DIALECT
 from pbdkit.model.shipped import shipped_names, shipped_text

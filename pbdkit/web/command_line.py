@@ -79,7 +79,7 @@ def report(
 ) -> None:
     """Write one page to share: the moving lattice, histories, curves, what was predicted, what
     broke, how to run it again; of a sweep its map and its members. It needs no network."""
-    from pbdkit.cli.options import refuse_output, refuse_unwritable
+    from pbdkit.cli.output import refuse_output, refuse_unwritable
     from pbdkit.io.open import reading
     from pbdkit.io.other_files import refuse_other_file
     from pbdkit.web.report import BUDGET, report as write

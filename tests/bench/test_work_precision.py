@@ -13,9 +13,9 @@ from pbdkit.bench.work_precision import (
     as_dict,
     engines,
     measure,
-    picture,
     resized,
     table,
+    work_precision_figure,
 )
 from pbdkit.scene.scene import build_scene
 
@@ -73,8 +73,8 @@ def test_without_sizes_it_runs_as_it_is(call, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["--sizes", "6,x"], 2, "'x' is no number of sites"),
-        (["--sizes", "1"], 2, "'1' is no number of sites"),
+        (["--sizes", "6,x"], 2, "'x' is not a number of sites"),
+        (["--sizes", "1"], 2, "'1' is not a number of sites"),
         (["--steps", "0"], 2, "--steps"),
         (["--plot", "b.txt"], 2, "a picture ends in .png, .svg, .pdf"),
         (["--plot", "nowhere/b.png"], 6, "there is no folder nowhere"),
@@ -201,7 +201,7 @@ def test_every_method_is_a_row_and_a_marker():
     rows = [measured(m, s, e) for m, e in zip(engines(), (0.0, 1e-7) * 3, strict=False)
             for s in (10, 20)]  # fmt: skip
     assert table(rows).row_count == len(rows)
-    panels = picture([*rows, measured(error=np.inf)], "a title").axes
+    panels = work_precision_figure([*rows, measured(error=np.inf)], "a title").axes
     drawn = np.concatenate([points.get_offsets() for ax in panels for points in ax.collections])
     assert len(drawn) == len(rows)
     assert drawn[:, 1].min() == FLOOR

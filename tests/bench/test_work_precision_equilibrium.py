@@ -15,9 +15,9 @@ from pbdkit.bench.work_precision import (
     followers_of,
     lines,
     measure,
-    picture,
     result_of,
     table,
+    work_precision_figure,
 )
 from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import build_scene
@@ -175,7 +175,7 @@ ROWS = [
 def test_every_row_is_in_the_table_and_every_measurement_in_the_picture():
     assert table(ROWS).row_count == len(ROWS)
     measured = [r for r in ROWS if not r.reason]
-    (ax,) = (a for a in picture(ROWS, "a title").axes if a.get_visible())
+    (ax,) = (a for a in work_precision_figure(ROWS, "a title").axes if a.get_visible())
     points = [one for one in ax.collections if len(one.get_offsets())]
     drawn = np.concatenate([one.get_offsets() for one in points])
     assert sorted(map(tuple, drawn)) == sorted((r.cpu_s, r.error) for r in measured)

@@ -15,6 +15,7 @@ from typing import Any
 
 from sheets import Running, moving, scene_of
 
+from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.mpi.distributed_run import DistributedExecution
 from pbdkit.mpi.driver import DividedStepper, Division
 from pbdkit.mpi.partition import MOST_STEPS, subdomains
@@ -181,7 +182,8 @@ def main() -> None:
     if comm.size == 1:
         found = memory(None)
     else:
-        found = {"speed": speed, "memory": memory, "weak": weak}[what](DistributedExecution(comm))
+        execution = DistributedExecution(MPICommunicator(comm))
+        found = {"speed": speed, "memory": memory, "weak": weak}[what](execution)
     (Path(folder) / str(comm.rank)).write_text(json.dumps(found))
 
 

@@ -16,7 +16,8 @@ from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.cli import program
-from pbdkit.cli.completion import SettingPaths, _Bash
+from pbdkit.cli.completion import _Bash
+from pbdkit.cli.setting_completion import SettingPaths
 from pbdkit.model.reading import with_setting
 from pbdkit.model.schema import experiment_schema
 from pbdkit.model.shipped import read_experiment, shipped_names

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import pbdkit
-from pbdkit.cli.options import refuse_output
+from pbdkit.cli.output import refuse_output
 
 Call = Callable[..., Any]
 OUT = Path("tensile.nc")

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from pbdkit.cli import options as module
-from pbdkit.cli.options import waiting
+from pbdkit import progress as module
+from pbdkit.progress import waiting
 
 
 class Terminal(io.StringIO):

@@ -20,7 +20,7 @@ from interpreted_kernels import interpreting
 from plugin_sources import listed
 
 import pbdkit
-from pbdkit.cli.plugins import INTERFACE_NAMES as OFFERED
+from pbdkit.cli.interface import INTERFACE_NAMES as OFFERED
 from pbdkit.model.reading import read_file
 from pbdkit.model.schema import experiment_schema
 from pbdkit.plugin import INTERFACES

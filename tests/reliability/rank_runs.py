@@ -25,6 +25,7 @@ from pbdkit.errors import PbdkitError
 from pbdkit.execution import Execution
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.model.experiment import Experiment
+from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.mpi.distributed_run import DistributedExecution
 from pbdkit.progress import Watch
 from pbdkit.simulation import record
@@ -89,7 +90,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", type=int)
     asked = parser.parse_args()
-    ranks = DistributedExecution(MPI.COMM_WORLD)
+    ranks = DistributedExecution(MPICommunicator(MPI.COMM_WORLD))
     with ranks.communicator.root_speaks():
         every = ranks.communicator.bcast(
             drawn(asked.trials, asked.seed) if ranks.communicator.is_root else None

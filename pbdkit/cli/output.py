@@ -1,0 +1,115 @@
+"""Output of commands: checks of paths before anything is computed, and writing of pictures."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator
+from contextlib import chdir, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pbdkit.errors import ExperimentError, StorageError, refuse_no_matplotlib
+from pbdkit.io.atomic_file import kind_of, write
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+FORMATS = (".png", ".svg", ".pdf")
+"""File name extensions of pictures."""
+
+
+@contextmanager
+def refusals_as(subject: str) -> Iterator[None]:
+    """Raise a StorageError that begins with `subject` for each OSError in the block."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{subject}: {error.strerror}") from None
+
+
+@contextmanager
+def folder_kept() -> Iterator[None]:
+    """Return to the current folder after the block: plugins may change it when they are imported.
+
+    Raises
+    ------
+    StorageError
+        If there is no current folder.
+    """
+    with refusals_as("the current folder"):
+        folder = Path.cwd()
+    with chdir(folder):
+        yield
+
+
+def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:
+    """Check that a file may be written at a path.
+
+    Parameters
+    ----------
+    force
+        Whether an existing file may be replaced.
+    experiment
+        Experiment file, which is never replaced.
+
+    Raises
+    ------
+    ExperimentError
+        If the name is not UTF-8, if the path is a folder or no regular file, if it is the
+        experiment under any name, or if a file exists and `force` is not set.
+    StorageError
+        If the file system returns an error.
+    """
+    try:  # in the bytes of the file system, whatever the locale
+        os.fsencode(path.absolute()).decode()
+    except UnicodeDecodeError:
+        shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
+        raise ExperimentError(
+            f"{shown}: the name is not UTF-8; name another file with -o"
+        ) from None
+    with refusals_as(f"{str(path)[:80]}..."):
+        kind, exists = kind_of(path), os.path.lexists(path)
+    if not exists:
+        return
+    if kind == "a folder":
+        raise ExperimentError(f"{path}: is a folder; name a file with -o")
+    if kind:
+        raise ExperimentError(
+            f"{path}: is {kind}, which is not replaced; remove it, or name another file with -o"
+        )
+    if experiment and experiment.exists() and path.samefile(experiment):
+        raise ExperimentError(f"{path}: is the experiment itself; name another file with -o")
+    if not force:
+        raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
+
+
+def refuse_unwritable(picture: Path | None, *files: Path | None) -> None:
+    """Raise ExperimentError or StorageError if a picture or another file cannot be written."""
+    if picture and picture.suffix not in FORMATS:
+        raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
+    if picture:
+        refuse_no_matplotlib()
+    for path in (picture, *files):
+        if path and path.is_dir():
+            raise ExperimentError(f"{path}: is a folder; name a file")
+        if path and not path.parent.is_dir():
+            raise StorageError(f"{path}: there is no folder {path.parent}")
+
+
+def save(picture: Path, figure: Figure, *, replace: bool, quiet: bool = False) -> None:
+    """Write a figure, and print its path unless `quiet`.
+
+    Raises
+    ------
+    WriteError
+        If the file system returns an error.
+    """
+    content = io.BytesIO()
+    figure.savefig(content, format=picture.suffix.removeprefix("."))
+    write(picture, content.getvalue(), replace=replace)
+    if not quiet:
+        click.echo(f"{picture} written")
