@@ -1,4 +1,4 @@
-"""Pantographic sheets for pbdkit: two families of fibres, joined where they cross by pivots."""
+"""Pantographic sheets for pbdkit: two families of fibres, connected by pivots where they cross."""
 
 from pbdkit.plugin import Component, hookimpl
 from pbdkit_pantograph.beams import PantographBeams
@@ -12,5 +12,5 @@ __all__ = ["Fibres", "Pantograph", "PantographBeams"]
 
 @hookimpl
 def pbdkit_components() -> list[type[Component]]:
-    """What this distribution offers."""
+    """Return the components of this distribution."""
     return [Fibres, Pantograph, PantographBeams]

@@ -1,4 +1,4 @@
-"""Pivots as two points that coincide, on fibres of springs that stay straight."""
+"""Pantographic sheet of springs: pivots are pairs of coincident points on elastic fibres."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from pbdkit_pantograph.fibres import ACROSS, ALONG, NEXT, roles_of
 
 
 class Pantograph(FollowerRule):
-    """A pivot is two points that coincide, one on each fibre; it moves to the average of the places
-    that the two fibres propose.
+    """A pivot is a pair of coincident points, one on each fibre; its target is the weighted mean of
+    the targets of both fibres.
 
-    The links of a fibre are springs of stiffness 1, and k_b = `bending` is that of the fibre
-    against being bent. A fibre proposes to its point, with D = x_k - x_j to the next points (1) and
-    those after them (2),
+    The links of a fibre are springs of stiffness 1, and k_b = `bending` is the bending stiffness of
+    a fibre. With D = x_k - x_j to the first (1) and second (2) points along it, the move of a fibre
+    is
 
         (Σ (D_1 - l D_1/|D_1|) + k_b (4 Σ D_1 - Σ D_2)) / (2 + 8 k_b)
 
-    which lowers ½ Σ (|D_1| - l)² + ½ k_b Σ |x_(i+1) - 2 x_i + x_(i-1)|². At the ends of fibres the
-    terms that are missing are left out, and a fibre weighs the less, the fewer there are. Pivots
-    turn freely unless `shear` k_s puts springs across the cells. The energy of all this never rises
-    with relaxation 1, and rotations are exact.
+    which decreases ½ Σ (|D_1| - l)² + ½ k_b Σ |x_(i+1) - 2 x_i + x_(i-1)|². At the ends of fibres
+    missing terms are omitted, and the weight of the fibre decreases with their number. Pivots
+    rotate freely unless `shear` k_s adds springs across the cells. The energy does not increase
+    with relaxation 1, and it is invariant under rotations.
     """
 
     type: Literal["pantograph"] = "pantograph"
@@ -41,34 +41,37 @@ class Pantograph(FollowerRule):
         0.01,
         ge=0.0,
         le=1e6,
-        description="Stiffness of fibres against bending, over that of their links.",
+        description="Bending stiffness of fibres relative to the stiffness of their links.",
         examples=[0.1],
     )
     shear: float = Field(
         0.0,
         ge=0.0,
         le=1e6,
-        description="Stiffness of springs across the cells, over that of the links.",
+        description="Stiffness of springs across cells relative to that of the links.",
         examples=[0.01],
     )
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """Stiffness and rest length of the spring, and 1 for the one of the eight points along the
-        fibres that it is: `next0` to `next3`, and `after0` to `after3` behind them."""
+        """Return stiffness and rest length of a spring, and indicators of the points along fibres.
+
+        `next0` to `next3` are 1 for the first point in that direction, `after0` to `after3` for the
+        second.
+        """
         roles = {s.rest: role for s, role in roles_of(setting.slots[slot.source])}
-        what, direction = roles.get(slot.rest, ("", 0))
-        stiffness = {ALONG: 1.0, ACROSS: self.shear}.get(what, 0.0)
+        relation, direction = roles.get(slot.rest, ("", 0))
+        stiffness = {ALONG: 1.0, ACROSS: self.shear}.get(relation, 0.0)
         return {
             "stiffness": stiffness,
             "rest": length(slot.rest),
-            **{f"next{n}": float((ALONG, n) == (what, direction)) for n in range(4)},
-            **{f"after{n}": float((NEXT, n) == (what, direction)) for n in range(4)},
+            **{f"next{n}": float((ALONG, n) == (relation, direction)) for n in range(4)},
+            **{f"after{n}": float((NEXT, n) == (relation, direction)) for n in range(4)},
         }
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
-        """(k e n, k) of the spring, e = |r + d| - |r|; then d and presence at each of the eight
-        points along the fibres."""
+        """Return (k e n, k) of the spring, e = |r + d| - |r|, n its direction; then d and presence
+        of each of the eight points along the fibres."""
         v = r + d
         distance = length(v)
         # |v|² - |r|² = d·(r + v): small elongations keep all their digits.
@@ -84,26 +87,26 @@ class Pantograph(FollowerRule):
 
     @staticmethod
     def apply(total: tuple[Any, ...], here: Here, p: Parameters) -> Vector:
-        """Σ forces / Σ stiffness; no move where there is neither."""
+        """Return Σ forces / Σ stiffness; zero without stiffness."""
         pull, stiffness = total[0], total[1]
-        one, one_stiffness = _bent(total[2:6], total[10:14])
-        other, other_stiffness = _bent(total[6:10], total[14:18])
-        stiffness = stiffness + p.bending * (one_stiffness + other_stiffness)
-        force = pull + p.bending * (one + other)
+        first, first_stiffness = _bending(total[2:6], total[10:14])
+        second, second_stiffness = _bending(total[6:10], total[14:18])
+        stiffness = stiffness + p.bending * (first_stiffness + second_stiffness)
+        force = pull + p.bending * (first + second)
         move: Vector = force / where(stiffness > 0.0, stiffness, 1.0)
         return move
 
 
-def _bent(next_points: Any, after: Any) -> tuple[Any, Any]:
-    """Force and stiffness of one fibre against bending, from (d, presence) of the points at its
-    both ends, next and next but one.
+def _bending(first_points: Any, second_points: Any) -> tuple[Any, Any]:
+    """Return bending force and stiffness of one fibre, from (d, presence) of its first and second
+    points in both directions.
 
-    Three points in a row that are all there resist; in differences of displacements, as rest
-    offsets along a fibre cancel. The stiffness is half the sum of the moduli of a row of the
-    quadratic form: with no less the energy might rise.
+    Each triple of consecutive points that are present contributes. Rest offsets along a fibre
+    cancel, so that differences of displacements suffice. The stiffness is half the sum of the
+    absolute values in a row of the quadratic form, the least for which the energy cannot increase.
     """
-    u, has_u, v, has_v = next_points
-    uu, has_uu, vv, has_vv = after
-    middle, one, other = has_u * has_v, has_u * has_uu, has_v * has_vv
-    force = 2.0 * middle * (u + v) + (one * (2.0 * u - uu) + other * (2.0 * v - vv))
-    return force, 4.0 * middle + 2.0 * (one + other)
+    u, has_u, v, has_v = first_points
+    uu, has_uu, vv, has_vv = second_points
+    middle, ahead, behind = has_u * has_v, has_u * has_uu, has_v * has_vv
+    force = 2.0 * middle * (u + v) + (ahead * (2.0 * u - uu) + behind * (2.0 * v - vv))
+    return force, 4.0 * middle + 2.0 * (ahead + behind)

@@ -173,7 +173,7 @@ def test_elastic_pivots_resist_the_angle_between_the_fibres_alone():
 
 
 def test_fibres_that_are_too_slender_are_refused():
-    with pytest.raises(pbdkit.ExperimentError, match=r"bending is less than 1e-10 of stretching"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"bending: is less than 1e-10 · stretching"):
         body(3, 3, 1, 0.0, rule={"type": "pantograph-beams", "bending": 1e-12})
 
 
