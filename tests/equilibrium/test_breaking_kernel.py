@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -49,8 +50,8 @@ def scene_of(**parts):
 
 
 @pytest.fixture(autouse=True)
-def _kernels(monkeypatch):
-    with interpreting():
+def _mostly_interpreted(request):
+    with nullcontext() if "compiled" in request.node.name else interpreting():
         yield
 
 
@@ -79,6 +80,16 @@ def test_the_kernel_breaks_and_softens_as_numpy_does(parts, monkeypatch):
         np.testing.assert_allclose(mine, others, rtol=0, atol=1e-10)
     assert own.method == certificate.method
     assert own.distance <= scene.experiment.solver.tolerance * 2.0
+
+
+def test_a_compiled_kernel_breaks_as_numpy_does(monkeypatch):
+    scene = scene_of(**SCENES["threshold, with frame bonds"])
+    expected, _ = equilibrium_state(scene)
+    settled = by_kernel(monkeypatch)
+    found, _ = equilibrium_state(scene)
+    assert len(settled) == 3
+    np.testing.assert_array_equal(found.broken_step, expected.broken_step)
+    np.testing.assert_allclose(found.u, expected.u, rtol=0, atol=1e-10)
 
 
 def test_an_increment_taken_up_again_comes_out_the_same_to_the_bit(monkeypatch):
