@@ -159,7 +159,7 @@ def test_fibres_run_at_45_degrees_where_the_lattice_stands_on_its_corner():
 
 def test_what_a_fibre_lacks_is_named():
     with pytest.raises(
-        pbdkit.ExperimentError, match=r"fibres need a neighbour at \(1\.414, 1\.414\): use a latt"
+        pbdkit.ExperimentError, match=r"fibres need a neighbour at \(1\.414, 1\.414\); use a latt"
     ):
         sheet(RULE, 1, neighbours={"type": "coordination", "shells": 1})
 
