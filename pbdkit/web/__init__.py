@@ -1,4 +1,4 @@
-"""Pages in a browser: reports of a dataset, and bodies that follow the mouse (`live`).
+"""Browser pages: reports of a dataset, and live bodies moved by the mouse.
 
 Python selects and packs the data, JavaScript draws them.
 """
@@ -34,7 +34,7 @@ def live(
     components: ComponentClasses = (),
     output: str | Path | None = None,
 ) -> LiveWidget:
-    """Return a widget for a notebook, in which the body of an experiment answers to the mouse.
+    """Return a widget for a notebook, in which the body of an experiment follows the mouse.
 
     Parameters
     ----------

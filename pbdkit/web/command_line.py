@@ -32,10 +32,10 @@ from pbdkit.cli.options import (
 def live(
     experiment: str, port: int, no_browser: bool, output: Path | None, settings: tuple[str, ...]
 ) -> None:
-    """Step an experiment in the browser: lead it with the mouse, turn its numbers, cut it, and save
-    what was done as an experiment.
+    """Step an experiment in the browser: lead it with the mouse, change its numbers, cut it, and
+    save the session as an experiment.
 
-    The page is served to this machine alone, under an address that nobody guesses. Ctrl-C ends it.
+    The page is served to this machine only, under a secret address. Ctrl-C ends it.
     """
     from pbdkit.api import load
     from pbdkit.errors import refuse_without
@@ -77,8 +77,8 @@ def live(
 def report(
     file: Path, output: Path | None, bench: Path | None, at: dict[str, str], force: bool
 ) -> None:
-    """Write one page to share: the moving lattice, histories, curves, what was predicted, what
-    broke, how to run it again; of a sweep its map and its members. It needs no network."""
+    """Write one page to share: the moving lattice, histories, curves, predictions, broken bonds,
+    and how to run it again; for a sweep its map and its members. It needs no network."""
     from pbdkit.cli.output import refuse_output, refuse_unwritable
     from pbdkit.io.open import reading
     from pbdkit.io.other_files import refuse_other_file

@@ -1,4 +1,4 @@
-"""One file of HTML with all that it needs: content, script, style.
+"""Self-contained HTML pages: content, script and style in one file.
 
 Arrays as text inside a page: little-endian, bytes of one place together, gzip, base64.
 """
@@ -24,14 +24,16 @@ EXPORT = re.compile(r"^export ((?:async )?(?:function\*?|class|const) (\w+))", r
 
 
 def source(name: str) -> str:
-    """The text of a file beside this one."""
+    """Return the text of a file in this package."""
     return files("pbdkit.web").joinpath(name).read_text("utf-8")
 
 
 def script(name: str, *, exports: bool = False) -> str:
-    """The module `name`.js with all that it imports as one that imports nothing: each is a function
-    of its own, called once, that returns what it exports. With `exports` the whole exports what
-    the module does."""
+    """Bundle the module `name`.js with all its imports into one without imports.
+
+    Each module becomes a function that is called once and returns its exports. With `exports` the
+    bundle exports the names of the module.
+    """
     texts: dict[str, str] = {}
 
     def take(name: str) -> None:
@@ -43,35 +45,35 @@ def script(name: str, *, exports: bool = False) -> str:
 
     take(name)
     modules = [_closed(name, text) for name, text in texts.items()]
-    given = EXPORT.findall(texts[name])
+    exported = EXPORT.findall(texts[name])
     if exports:
-        modules.append(f"export const {{ {', '.join(n for _, n in given)} }} = {name}_js;")
+        modules.append(f"export const {{ {', '.join(n for _, n in exported)} }} = {name}_js;")
     return "\n".join(modules)
 
 
-def _closed(name: str, text: str) -> str:
-    given = ", ".join(exported for _, exported in EXPORT.findall(text))
+def _closed(module: str, text: str) -> str:
+    names = ", ".join(name for _, name in EXPORT.findall(text))
     inner = EXPORT.sub(r"\1", IMPORT.sub(r"const \1 = \2_js;", text))
-    return f"const {name}_js = (() => {{\n{inner}\nreturn {{ {given} }};\n}})();"
+    return f"const {module}_js = (() => {{\n{inner}\nreturn {{ {names} }};\n}})();"
 
 
 def page(content: dict[str, Any]) -> str:
-    """The page; whatever the content holds is text in it, and no request leaves it."""
+    """Return the page as HTML; the content is data in it, and the page makes no request."""
     code = script("report")
     # In JSON, `<` can stand in texts alone; so nothing ends the element that holds it.
-    held = json.dumps(_finite(content), allow_nan=False).replace("<", "\\u003c")
+    data = json.dumps(_finite(content), allow_nan=False).replace("<", "\\u003c")
     digest = b64encode(sha256(code.encode()).digest()).decode()
     return Template(source("page.html")).substitute(
         title=escape(f"{content['title']}: report"),
         style=source("page.css"),
-        content=held,
+        content=data,
         script=code,
         hash=f"sha256-{digest}",
     )
 
 
 def _finite(value: Any) -> Any:
-    """The same with null for what is no number: JSON has none."""
+    """Replace numbers that are not finite by None, which JSON writes as null."""
     if isinstance(value, dict):
         return {str(key): _finite(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -83,11 +85,11 @@ def _finite(value: Any) -> Any:
 
 KINDS = {"f4": "<f4", "f8": "<f8", "i4": "<i4", "u1": "<u1"}
 LARGEST = 1e30
-"""What lies beyond is no number in a page: WebGL draws nothing there."""
+"""Largest number in a page: WebGL does not draw beyond it."""
 
 
 def packed(values: ArrayLike, kind: str) -> dict[str, Any]:
-    """The values as one of KINDS; `packed.js` reads them.
+    """Pack values as one of KINDS, for `packed.js` to read.
 
     First all lowest bytes of all numbers stand there, then the next ones: numbers that change
     slowly along the last dimension then take a tenth of the place.

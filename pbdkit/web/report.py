@@ -1,26 +1,8 @@
-"""What variables are called in pages, and in which units they are.
+"""Report of a dataset as one self-contained page of HTML: ``pbdkit.report`` and `pbdkit report`.
 
-What changes in time and belongs to no particle, as curves.
-
-What of a dataset a page holds: which recorded steps and which particles, within a budget.
-
-The bonds of a run as a page holds them, with what is known of how they broke.
-
-The moving lattice of a run as a page holds it: displacements, kinds, values, triangles.
-
-What was run, and how it is run again.
-
-How a run came to rest after its last event, beside what was known before its first step.
-
-All that the page of one run holds.
-
-Numbers that stand for whole members of a sweep: what its map can show.
-
-All that the page of a sweep holds: a map over its parameters, and the members below.
-
-What `pbdkit bench --json` measured, as a table in a page.
-
-A dataset as one page of HTML that needs no network: ``pbdkit.report`` and `pbdkit report`.
+The sections follow the content of the page: names and units, curves, thinning of steps and
+particles to a budget, bonds, the moving lattice, the experiment, how the body settled, the page of
+a run, numbers of sweep members, the page of a sweep, and benchmark tables.
 """
 
 from __future__ import annotations
@@ -68,29 +50,29 @@ if TYPE_CHECKING:
 
 
 def meaning_of(variable: xarray.DataArray) -> str:
-    """Its long name, or else its name."""
+    """Return the long name of a variable, or else its name."""
     return str(variable.attrs.get("long_name") or variable.name)
 
 
 def units_of(variable: xarray.DataArray) -> str:
-    """Its units in a page, mm and so on where it says its scale; nothing of plain numbers."""
+    """Return the units of a variable in a page, mm and so on where it has a scale; empty for
+    dimensionless numbers."""
     return signed(in_its_units(variable.attrs)[1])
 
 
 def factor_of(variable: xarray.DataArray) -> float:
-    """By what its values are multiplied to be in these."""
+    """Return the factor that converts values to the units of the page."""
     return in_its_units(variable.attrs)[0]
 
 
 MOST_POINTS, MOST_SERIES = 1200, 12
 AGAINST = {"nominal_stress": "nominal_strain", "load_resultant": "load_displacement"}
-"""What is drawn over something else than time as well."""
+"""Variables that are drawn over another variable as well as over time."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Lines over one axis: `x`, the `steps` of its points and the values of each series are
-    packed."""
+    """Lines over one axis: `x`, the `steps` of its points, and the packed values of each series."""
 
     title: str
     steps: dict[str, Any]
@@ -101,16 +83,16 @@ class Curve:
 
 
 def curves(dataset: xarray.Dataset, points: int = MOST_POINTS) -> list[dict[str, Any]]:
-    """Of every variable over time, or over every step, and a few small dimensions; and of the
-    pairs AGAINST; with so many points at most."""
+    """Return the curves of all variables over time, or over every step, with at most a few small
+    dimensions, and of the pairs AGAINST, with at most `points` points."""
     names = _names(dataset)
-    found = [_over_time(dataset, name, points) for name in names]
-    found += [_against(dataset, y, x, points) for y, x in AGAINST.items() if {x, y} <= {*names}]
-    return [asdict(curve) for curve in found]
+    lines = [_over_time(dataset, name, points) for name in names]
+    lines += [_against(dataset, y, x, points) for y, x in AGAINST.items() if {x, y} <= {*names}]
+    return [asdict(curve) for curve in lines]
 
 
 def fewer_points(dataset: xarray.Dataset) -> list[str]:
-    """A sentence where curves show fewer points than were recorded."""
+    """Return a note where curves show fewer points than were recorded."""
     longest = max((dataset.sizes.get(dim, 0) for dim in ("time", "step")), default=0)
     every = _every(longest, MOST_POINTS)
     return [] if every == 1 else [f"Curves show one point in {every} of up to {longest}."]
@@ -148,12 +130,12 @@ def _over_time(dataset: xarray.Dataset, name: str, points: int) -> Curve:
 
 
 def _lines(dataset: xarray.Dataset, name: str, along: str) -> Iterator[tuple[str, Array]]:
-    """The values of each place along the other dimensions, with what it is called."""
+    """Generate label and values for each index along the other dimensions."""
     variable = dataset[name].transpose(..., along)
-    others = [str(dim) for dim in variable.dims[:-1]]
+    dims = [str(dim) for dim in variable.dims[:-1]]
     values = factor_of(variable) * np.asarray(variable.values, float)
-    for place in product(*(range(variable.sizes[dim]) for dim in others)):
-        words = [_word(dataset, dim, n) for dim, n in zip(others, place, strict=True)]
+    for place in product(*(range(variable.sizes[dim]) for dim in dims)):
+        words = [_word(dataset, dim, n) for dim, n in zip(dims, place, strict=True)]
         yield ", ".join(words), values[place]
 
 
@@ -163,7 +145,8 @@ def _word(dataset: xarray.Dataset, dim: str, n: int) -> str:
 
 
 def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
-    """One over the other: of several pairs the one that goes farthest, as a chart has one axis."""
+    """Return one variable over another; of several pairs the one with the largest values, since a
+    chart has one axis."""
     pairs = list(zip(_lines(dataset, x, "time"), _lines(dataset, y, "time"), strict=True))
     (label, across), (_, up) = max(pairs, key=lambda pair: float(np.nanmax(np.abs(pair[1][1]))))
     rows = slice(None, None, _every(len(across), points))
@@ -180,47 +163,49 @@ def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
 
 Rows = NDArray[np.intp]
 FEWEST_STEPS = 60
-"""Of a run, as far as they are recorded."""
+"""Minimum number of steps of a run, as far as recorded."""
 MOST_PARTICLES = 50_000
-"""A browser moves so many well, with their bonds."""
+"""Maximum number of particles that a browser moves smoothly, with their bonds."""
 FEW_LEADERS = 200
-"""So many stay whatever else is left out: the motion is theirs."""
+"""Maximum number of leaders that are all shown, whatever is omitted, since they drive the
+motion."""
 
 
 @dataclass(frozen=True)
 class Thinning:
-    """The rows of the steps and of the particles that are shown; every `stride`-th particle along
-    each axis of the lattice, and all leaders if they are `led`; of `recorded` steps and `count`
-    particles."""
+    """Rows of the steps and particles that are shown: every `stride`-th particle along each axis of
+    the lattice, and all leaders if `with_leaders`; out of `recorded` steps and `count` particles.
+    """
 
     steps: Rows
     particles: Rows
     stride: int
-    led: bool
+    with_leaders: bool
     recorded: int
     count: int
 
     @property
     def is_thinner(self) -> bool:
-        """Whether a larger budget would show more."""
+        """Return whether a larger budget would show more."""
         return len(self.steps) < self.recorded or len(self.particles) < self.count
 
     def left_out(self) -> list[str]:
-        """What is not shown, a sentence each."""
-        said = []
+        """Return notes on the steps and particles that are not shown."""
+        sentences = []
         if len(self.steps) < self.recorded:
             every = int(self.steps[1] - self.steps[0]) if len(self.steps) > 1 else self.recorded
-            said.append(
+            sentences.append(
                 f"{len(self.steps)} of the {self.recorded} recorded steps are shown: one in "
                 f"{every}, and the last one."
             )
         if len(self.particles) < self.count:
-            said.append(
+            sentences.append(
                 f"{len(self.particles)} of the {self.count} particles are shown: one in "
-                f"{self.stride} along i and along j{', and all that lead' if self.led else ''}. "
-                "BondArrays are shown where both of their particles are."
+                f"{self.stride} along i and along j"
+                f"{', and all that lead' if self.with_leaders else ''}. "
+                "Bonds are shown where both of their particles are."
             )
-        return said
+        return sentences
 
 
 def thinned(
@@ -230,26 +215,26 @@ def thinned(
     budget: int,
     fewest: int = FEWEST_STEPS,
 ) -> Thinning:
-    """As many steps and particles as fit into `budget` bytes, where each particle takes `size`
-    bytes a step; steps are left out down to the `fewest`, then particles. `leaders` (particle,) are
-    kept where they are few."""
+    """Select as many steps and particles as fit into `budget` bytes, where each particle takes
+    `size` bytes a step; steps are omitted down to the `fewest`, then particles. `leaders`
+    (particle,) are included where they are few."""
     recorded, count = dataset.sizes.get("time", 1), dataset.sizes["particle"]
-    fitting = max(1, budget // (size * count))
-    every = math.ceil(recorded / max(fitting, min(recorded, fewest)))
+    affordable = max(1, budget // (size * count))
+    every = math.ceil(recorded / max(affordable, min(recorded, fewest)))
     steps = np.unique(np.append(np.arange(0, recorded, every), recorded - 1))
     stride = 1
-    kept = np.ones(count, np.bool_)
-    most = min(budget // (size * len(steps)), MOST_PARTICLES)
-    while kept.sum() > most and stride < 1000:
+    selection = np.ones(count, np.bool_)
+    limit = min(budget // (size * len(steps)), MOST_PARTICLES)
+    while selection.sum() > limit and stride < 1000:
         stride += 1
-        kept = _on_sublattice(dataset, stride)
-    led = bool(0 < leaders.sum() <= FEW_LEADERS)
-    rows = np.flatnonzero(kept | leaders if led else kept)
-    return Thinning(steps, rows, stride, led, recorded, count)
+        selection = _on_sublattice(dataset, stride)
+    with_leaders = bool(0 < leaders.sum() <= FEW_LEADERS)
+    rows = np.flatnonzero(selection | leaders if with_leaders else selection)
+    return Thinning(steps, rows, stride, with_leaders, recorded, count)
 
 
 def _on_sublattice(dataset: xarray.Dataset, stride: int) -> NDArray[np.bool_]:
-    """Which particles lie on every so-many-th line of the lattice, along i and along j."""
+    """Return which particles lie on every `stride`-th line of the lattice, along i and along j."""
     indices: list[NDArray[Any]] = [dataset[n].values for n in ("i", "j") if n in dataset.variables]
     if len(indices) < 2 or any(index.ndim != 1 for index in indices):
         return np.asarray(np.arange(dataset.sizes["particle"]) % stride**2 == 0)
@@ -257,16 +242,16 @@ def _on_sublattice(dataset: xarray.Dataset, stride: int) -> NDArray[np.bool_]:
 
 
 LISTED = 300
-"""So many broken bonds stand in the ledger of a page."""
+"""Maximum number of broken bonds in the table of a page."""
 STATES = ("intact", "broken", "cut", "broken from the start", "cannot break")
 
 
 @dataclass(frozen=True)
 class BondArrays:
     """Arrays along the bonds: `ends` the numbers of their particles, `rest` the rest offset, `step`
-    of breaking or -1, `strain` at breaking and `limit`, NaN where not known, `state` of STATES; and
-    what a model remembers of each at the end. `order` has the rows of the broken ones; `nearest` is
-    the one that is nearest to breaking."""
+    of breaking or -1, `strain` at breaking and `limit`, NaN where unknown, `state` an index of
+    STATES; and the final state variables of each. `order` holds the rows of the broken ones;
+    `nearest` is the one closest to breaking."""
 
     ends: Array
     rest: Array
@@ -282,16 +267,16 @@ class BondArrays:
 
     @property
     def spacing(self) -> float:
-        """The shortest rest length."""
+        """Return the shortest rest length."""
         return float(np.linalg.norm(self.rest, axis=1).min())
 
     @property
     def can_break(self) -> bool:
-        """Whether any has broken, or could have."""
+        """Return whether any bond broke, or could have broken."""
         return self.model not in ("none", "not known") or len(self.order) > 0
 
     def shown(self, particles: Rows) -> dict[str, Any]:
-        """Those between the particles shown, as rows of these."""
+        """Return the bonds between the particles shown, by rows of these."""
         rows = self._between(particles)
         return {
             "ends": packed(np.searchsorted(particles, self.ends[rows] - 1), "i4"),
@@ -305,7 +290,7 @@ class BondArrays:
         }
 
     def broken(self, particles: Rows) -> dict[str, Any]:
-        """Of these, how they broke."""
+        """Return how the bonds between these particles broke."""
         rows, place = self._between(particles), np.full(len(self.ends), -1)
         place[self.order] = np.arange(1, len(self.order) + 1)
         return {
@@ -317,11 +302,11 @@ class BondArrays:
         }
 
     def _between(self, particles: Rows) -> Rows:
-        shown = np.isin(self.ends - 1, particles, kind="table").all(axis=1)
-        return np.flatnonzero(shown)
+        both_ends = np.isin(self.ends - 1, particles, kind="table").all(axis=1)
+        return np.flatnonzero(both_ends)
 
     def ledger(self) -> dict[str, Any]:
-        """The bonds that broke, in their order; long ones are cut."""
+        """Return the table of broken bonds in the order of breaking; long tables are truncated."""
         listed = self.order[:LISTED]
         counts = np.bincount(self.state, minlength=len(STATES)).tolist()
         return {
@@ -339,56 +324,56 @@ class BondArrays:
 
 
 def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
-    """All that the dataset has; of one that has no table of bonds those of its scene, unless
-    neighbours are found anew. None where neither knows any. Lengths are in the units of the page.
+    """Return the bonds of a dataset or, where it has no table, of its scene, unless neighbours are
+    found anew; None where neither has any. Lengths are in the units of the page.
 
     Raises ExperimentError where dataset and scene do not go together.
     """
-    found = _in_lattice_units(dataset, scene)
-    return found and replace(found, rest=lattice_unit(dataset) * found.rest)
+    bonds = _in_lattice_units(dataset, scene)
+    return bonds and replace(bonds, rest=lattice_unit(dataset) * bonds.rest)
 
 
 def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
     if dataset.sizes.get("bond") == 0:  # of a body whose particles have no neighbours
         return None
     if scene is not None and "bond_ends" in dataset.variables:
-        return _explained(BondTable(dataset, scene), dataset)
+        return _from_bond_table(BondTable(dataset, scene), dataset)
     if "bond_ends" in dataset.variables and dataset["bond_ends"].ndim == 2:
-        return _told(dataset)
+        return _from_table(dataset)
     if scene is None or scene.experiment.neighbours.nearness():
         return None
-    found = describe_bonds(scene)
-    if not len(found):
+    table = describe_bonds(scene)
+    if not len(table):
         return None
     if scene.raster.count != dataset.sizes["particle"]:
         raise ExperimentError("its particles are not those of the experiment that it carries")
-    return _whole(found.ends, found.rest, found.shell)
+    return _whole(table.ends, table.rest, table.shell)
 
 
 def _whole(ends: Array, rest: Array, shell: Array) -> BondArrays:
-    """Bonds of which nobody knows whether they break."""
+    """Return bonds with unknown limits."""
     count = len(ends)
     unknown, never = np.full(count, np.nan), np.full(count, -1)
     state, order = np.zeros(count, np.int64), np.empty(0, np.intp)
     return BondArrays(ends, rest, shell, never, unknown, unknown, state, order)
 
 
-def _explained(known: BondTable, dataset: xarray.Dataset) -> BondArrays:
-    bonds = known.bonds
-    names = known.remembered(0) if len(bonds) else ()
+def _from_bond_table(table: BondTable, dataset: xarray.Dataset) -> BondArrays:
+    bonds = table.bonds
+    names = table.remembered(0) if len(bonds) else ()
     last = {n: dataset[n].isel(time=-1, missing_dims="ignore").values for n in names}
     return BondArrays(
-        bonds.ends, bonds.rest, bonds.shell, known.steps, known.strains_at_break,
-        np.where(known.spared, np.nan, known.limits), _states(known.steps, known.cut, known.spared),
-        known.order, known.model.type, last, known.nearest(),
+        bonds.ends, bonds.rest, bonds.shell, table.steps, table.strains_at_break,
+        np.where(table.spared, np.nan, table.limits), _states(table.steps, table.cut, table.spared),
+        table.order, table.model.type, last, table.nearest(),
     )  # fmt: skip
 
 
-def _told(dataset: xarray.Dataset) -> BondArrays | None:
-    """By the dataset alone."""
-    there = (dataset["bond_ends"].values > 0).all(axis=1)
-    if not there.all():  # of a sweep, in which other members have more
-        dataset = dataset.isel(bond=there)
+def _from_table(dataset: xarray.Dataset) -> BondArrays | None:
+    """Return the bonds from the dataset alone."""
+    complete = (dataset["bond_ends"].values > 0).all(axis=1)
+    if not complete.all():  # of a sweep, in which other members have more
+        dataset = dataset.isel(bond=complete)
     ends = dataset["bond_ends"].values
     if not len(ends) or "reference" not in dataset.variables:
         return None
@@ -400,34 +385,36 @@ def _told(dataset: xarray.Dataset) -> BondArrays | None:
 
 
 def broken_as(bonds: BondArrays, dataset: xarray.Dataset) -> BondArrays:
-    """The same bonds, broken as in a dataset that knows them all."""
-    known = dataset.variables.get("broken_step")
-    if known is None or known.shape != bonds.step.shape:
+    """Return the bonds with the breaking steps and strains of a dataset."""
+    broken_step = dataset.variables.get("broken_step")
+    if broken_step is None or broken_step.shape != bonds.step.shape:
         return bonds
-    step, beside = np.asarray(known.values), "broken_strain" in dataset
-    strain = dataset["broken_strain"].values if beside else np.full(len(step), np.nan)
+    step, has_strain = np.asarray(broken_step.values), "broken_strain" in dataset
+    strain = dataset["broken_strain"].values if has_strain else np.full(len(step), np.nan)
     spared = bonds.state == STATES.index("cannot break")
-    state = _states(step, (step > 0) & np.isnan(strain) & beside, spared)
+    state = _states(step, (step > 0) & np.isnan(strain) & has_strain, spared)
     order = breaking_order(step, strain)
     return replace(bonds, step=step, strain=strain, state=state, order=order)
 
 
 def _states(steps: Array, cut: Array, spared: Array) -> Array:
-    """Of STATES."""
+    """Return indices of STATES."""
     whole = np.where(spared, STATES.index("cannot break"), STATES.index("intact"))
-    gone = np.where(cut, STATES.index("cut"), STATES.index("broken"))
-    gone = np.where(steps == 0, STATES.index("broken from the start"), gone)
-    return np.where(steps < 0, whole, gone)
+    broken = np.where(cut, STATES.index("cut"), STATES.index("broken"))
+    broken = np.where(steps == 0, STATES.index("broken from the start"), broken)
+    return np.where(steps < 0, whole, broken)
 
 
 AT_ONCE = 2**28
-"""So many bytes of a variable are read at once; of larger ones a step at a time."""
+"""Maximum number of bytes of a variable that is read at once; larger ones are read a step at a
+time."""
 FAR = 20.0
-"""A body that leaves a box so many times its own is no longer followed: it has diverged."""
+"""Maximum ratio of the size of all positions to that of the body at rest; a larger one has diverged
+and is not followed."""
 
 
 def shown_variables(dataset: xarray.Dataset) -> list[str]:
-    """The names of what colours can show: a number, or a vector, of each particle."""
+    """Return the variables that colours can show: a number, or a vector, of each particle."""
     return [
         str(name)
         for name, variable in dataset.data_vars.items()
@@ -439,13 +426,13 @@ def shown_variables(dataset: xarray.Dataset) -> list[str]:
 
 
 def bytes_a_particle(dataset: xarray.Dataset) -> int:
-    """What each particle takes a step, before it is packed: displacement, kind and values."""
+    """Return the bytes of a particle in one step before packing: displacement, kind and values."""
     values = (2 if "axis" in dataset[n].dims else 1 for n in shown_variables(dataset))
     return 9 + 4 * sum(values)
 
 
 def read(variable: xarray.DataArray, steps: Rows) -> Iterator[Array]:
-    """The values at each of the steps, (particle, ...), in the units of the page."""
+    """Generate the values at each of the steps, (particle, ...), in the units of the page."""
     factor = factor_of(variable)
     if "time" not in variable.dims:
         yield in_units(variable.values, factor)
@@ -464,20 +451,20 @@ def in_units(values: Any, factor: float) -> Array:
 
 
 def resting(
-    dataset: xarray.Dataset, reference: Array, shown: Thinning, spacing: float
+    dataset: xarray.Dataset, reference: Array, thinning: Thinning, spacing: float
 ) -> dict[str, Any]:
-    """What does not move: names, reference, triangles.
+    """Return the static content: names, reference, triangles.
 
     `reference` (particle, axis) is where displacements are counted from, `spacing` the distance of
     neighbours there, both in the units of the page.
     """
-    rows, role = shown.particles, role_of(dataset)
+    rows, role = thinning.particles, role_of(dataset)
     labels = {n: dataset[n].values for n in ("number", "i", "j") if n in dataset.variables}
-    labels = {"number": np.arange(1, shown.count + 1)} | labels
+    labels = {"number": np.arange(1, thinning.count + 1)} | labels
     labels = {name: values[rows] for name, values in labels.items() if values.ndim == 1}
-    sites = [labels[n] // shown.stride for n in ("i", "j")] if {"i", "j"} <= {*labels} else []
+    sites = [labels[n] // thinning.stride for n in ("i", "j")] if {"i", "j"} <= {*labels} else []
     return {
-        "spacing": spacing * shown.stride,
+        "spacing": spacing * thinning.stride,
         "length": units_of(dataset["position"]),
         "reference": packed(reference[rows], "f8"),
         "labels": {name: packed(values, "i4") for name, values in labels.items()},
@@ -486,8 +473,8 @@ def resting(
 
 
 def _outline(dataset: xarray.Dataset, reference: Array, rows: Rows) -> dict[str, Any]:
-    """How far particles lie beyond the outline of the body, negative inside, where it cuts cells:
-    there fields end. In lattice units."""
+    """Return the signed distance of particles from the outline, negative inside, where it cuts
+    cells: fields end there. In lattice units."""
     if "inside" not in dataset.variables or dataset["inside"].ndim != 1:
         return {}
     if dataset["inside"].values.all() or (shape := shape_of(dataset)) is None:
@@ -495,41 +482,43 @@ def _outline(dataset: xarray.Dataset, reference: Array, rows: Rows) -> dict[str,
     return {"beyond": packed(distance_from(shape, reference[rows] / lattice_unit(dataset)), "f4")}
 
 
-def moving(dataset: xarray.Dataset, reference: Array, shown: Thinning) -> dict[str, Any]:
-    """What moves: arrays of the particles shown, with time as their last dimension; and of each
-    variable what all particles come to."""
+def moving(dataset: xarray.Dataset, reference: Array, thinning: Thinning) -> dict[str, Any]:
+    """Return the moving content: arrays of the particles shown, with time as their last dimension;
+    and statistics of each variable over all particles."""
     u, summary = _particles_over_time(
-        _displacements(dataset, reference, shown.steps), shown.particles
+        _displacements(dataset, reference, thinning.steps), thinning.particles
     )
     return {
-        "times": dataset["time"].values[shown.steps].tolist(),
-        "box": _box(reference, reference[shown.particles, :, None] + u),
+        "times": dataset["time"].values[thinning.steps].tolist(),
+        "box": _box(reference, reference[thinning.particles, :, None] + u),
         "u": packed(u, "f4"),
         "summary": summary,
-        "kind": packed(_kinds(dataset, shown), "u1"),
-        "variables": [_variable(dataset, name, shown) for name in shown_variables(dataset)],
+        "kind": packed(_kinds(dataset, thinning), "u1"),
+        "variables": [_variable(dataset, name, thinning) for name in shown_variables(dataset)],
     }
 
 
 def role_of(dataset: xarray.Dataset) -> Array:
-    """Body or frame, (particle,); all body where nobody says."""
+    """Return body or frame, (particle,); all body where roles are not recorded."""
     if "role" in dataset.variables:
         return np.asarray(dataset["role"].values)
     return np.full(dataset.sizes["particle"], OF_BODY)
 
 
 def _particles_over_time(each: Iterator[Array], rows: Rows) -> tuple[Array, dict[str, Any]]:
-    """The values of some rows, (particle, ..., time), and over time the mean, the largest and the
-    least of all; of vectors, of their lengths."""
-    shown, whole = [], []
+    """Return the values of some rows, (particle, ..., time), and over time the mean, maximum and
+    minimum over all, of lengths for vectors."""
+    selection, statistics = [], []
     for values in each:
-        shown.append(values[rows])
+        selection.append(values[rows])
         sizes = np.linalg.norm(values, axis=1) if values.ndim > 1 else values
-        known = sizes[np.isfinite(sizes)]
-        whole.append([known.mean(), known.max(), known.min()] if len(known) else [np.nan] * 3)
+        finite = sizes[np.isfinite(sizes)]
+        statistics.append(
+            [finite.mean(), finite.max(), finite.min()] if len(finite) else [np.nan] * 3
+        )
     names = "mean", "largest", "least"
-    summary = {n: packed(v, "f8") for n, v in zip(names, np.transpose(whole), strict=True)}
-    return np.stack(shown, axis=-1), summary
+    summary = {n: packed(v, "f8") for n, v in zip(names, np.transpose(statistics), strict=True)}
+    return np.stack(selection, axis=-1), summary
 
 
 def _displacements(dataset: xarray.Dataset, reference: Array, steps: Rows) -> Iterator[Array]:
@@ -538,9 +527,9 @@ def _displacements(dataset: xarray.Dataset, reference: Array, steps: Rows) -> It
     return (position - reference for position in read(dataset["position"], steps))
 
 
-def _variable(dataset: xarray.Dataset, name: str, shown: Thinning) -> dict[str, Any]:
+def _variable(dataset: xarray.Dataset, name: str, thinning: Thinning) -> dict[str, Any]:
     variable = dataset[name]
-    values, summary = _particles_over_time(read(variable, shown.steps), shown.particles)
+    values, summary = _particles_over_time(read(variable, thinning.steps), thinning.particles)
     return {
         "name": name,
         "meaning": meaning_of(variable),
@@ -551,17 +540,17 @@ def _variable(dataset: xarray.Dataset, name: str, shown: Thinning) -> dict[str, 
     }
 
 
-def _kinds(dataset: xarray.Dataset, shown: Thinning) -> Array:
+def _kinds(dataset: xarray.Dataset, thinning: Thinning) -> Array:
     if "kind" in dataset:
-        each = read(dataset["kind"], shown.steps)
-        return np.stack([kinds[shown.particles] for kinds in each], axis=-1)
-    kinds = np.where(role_of(dataset) == OF_BODY, FOLLOWER, FRAME)[shown.particles]
-    return np.repeat(kinds[:, None], len(shown.steps), axis=1)
+        each = read(dataset["kind"], thinning.steps)
+        return np.stack([kinds[thinning.particles] for kinds in each], axis=-1)
+    kinds = np.where(role_of(dataset) == OF_BODY, FOLLOWER, FRAME)[thinning.particles]
+    return np.repeat(kinds[:, None], len(thinning.steps), axis=1)
 
 
 def _box(reference: Array, places: Array) -> list[float]:
-    """Left, bottom, right, top of all that is shown at any step; of the body at rest where it
-    goes far beyond."""
+    """Return left, bottom, right, top of all positions shown; of the body at rest where they are
+    far outside."""
     low, high = np.nanmin(places, axis=(0, 2)), np.nanmax(places, axis=(0, 2))
     rest = np.nanmin(reference, axis=0), np.nanmax(reference, axis=0)
     if not (np.ptp([low, high], axis=0) < FAR * np.ptp(rest, axis=0).max()).all():
@@ -570,15 +559,15 @@ def _box(reference: Array, places: Array) -> list[float]:
 
 
 def spacing_of(reference: Array) -> float:
-    """How far neighbours are apart at rest, about, where no bonds say it."""
+    """Estimate the distance of neighbours at rest, where there are no bonds."""
     sides = np.ptp(reference, axis=0)
     count = len(reference)
     return float(max(math.sqrt(sides.prod() / count), sides.max() / count)) or 1.0
 
 
 def _triangles(reference: Array, sites: list[Array], body: NDArray[np.bool_]) -> Array:
-    """Rows of the triangles that fill the body at rest, (triangle, 3), by its `sites` if they are
-    known."""
+    """Return the rows of the triangles that fill the body at rest, (triangle, 3), by its `sites` if
+    they are known."""
     rows = np.flatnonzero(body & np.isfinite(reference).all(axis=1))
     if not sites:
         return np.asarray(rows[triangles_of(reference[rows])])
@@ -589,20 +578,22 @@ def _triangles(reference: Array, sites: list[Array], body: NDArray[np.bool_]) ->
 
 KeyPath = tuple[str | int, ...]
 MOST_TRIED = 150
-"""Of so many keys it is tried whether they can be left out."""
+"""Maximum number of keys for which omission is tried."""
 PARTS = ("lattice", "body", "neighbours", "rule", "frame", "fracture", "solver")
 
 
 def facts(dataset: xarray.Dataset) -> list[list[str]]:
-    """A name and a value each."""
-    said, parts = dataset.attrs, json_attribute(dataset, "experiment")
+    """Return names and values of the summary."""
+    attributes, parts = dataset.attrs, json_attribute(dataset, "experiment")
     times = dataset["time"].values
     sizes = {str(name): size for name, size in dataset.sizes.items()}
-    ended = ": ".join(filter(None, (str(said.get(n, "")) for n in ("status", "stop_reason"))))
+    outcome = ": ".join(
+        filter(None, (str(attributes.get(n, "")) for n in ("status", "stop_reason")))
+    )
     kinds = {name: _type(parts.get(name)) for name in PARTS}
-    found = {
-        "ended": ended,
-        "created": str(said.get("created", "")),
+    entries = {
+        "ended": outcome,
+        "created": str(attributes.get("created", "")),
         "by": made_by(dataset),
         **{name: kind for name, kind in kinds.items() if kind not in ("", "none")},
         "particles": f"{sizes.get('particle', 0)}",
@@ -610,13 +601,15 @@ def facts(dataset: xarray.Dataset) -> list[list[str]]:
         "steps": str(parts.get("steps", "")),
         "recorded": f"{len(times)} steps, {times[0]} to {times[-1]}",
     }
-    return [[name, value] for name, value in found.items() if value]
+    return [[name, value] for name, value in entries.items() if value]
 
 
 def made_by(dataset: xarray.Dataset) -> str:
-    """pbdkit and the plugins, with their versions."""
-    given = {"pbdkit": dataset.attrs.get("pbdkit_version", "")} | json_attribute(dataset, "plugins")
-    return ", ".join(f"{name} {version}".strip() for name, version in given.items())
+    """Return the versions of pbdkit and of plugins."""
+    versions = {"pbdkit": dataset.attrs.get("pbdkit_version", "")} | json_attribute(
+        dataset, "plugins"
+    )
+    return ", ".join(f"{name} {version}".strip() for name, version in versions.items())
 
 
 def _type(part: Any) -> str:
@@ -624,24 +617,24 @@ def _type(part: Any) -> str:
 
 
 def experiment_text(parts: dict[str, Any]) -> str:
-    """The experiment, or the sweep, as YAML; of an experiment without what is default, as far as
-    that can be told."""
+    """Return the experiment, or the sweep, as YAML; an experiment without defaults, as far as these
+    are known."""
     can_be_brief = "lattice" in parts and not retired_parts(parts)
     return yaml_text(_brief(parts) if can_be_brief else parts)
 
 
 def _brief(parts: dict[str, Any]) -> dict[str, Any]:
-    """Without every key that can be left out, so that the same experiment is built."""
-    left: list[KeyPath] = []
+    """Omit every key without which the same experiment is built."""
+    omitted: list[KeyPath] = []
     for path in list(_paths(parts))[:MOST_TRIED]:
-        inside = any(path[: len(gone)] == gone for gone in left)
-        if not inside and _same(_without(parts, [*left, path]), parts):
-            left.append(path)
-    return dict(_without(parts, left))
+        inside = any(path[: len(prefix)] == prefix for prefix in omitted)
+        if not inside and _same(_without(parts, [*omitted, path]), parts):
+            omitted.append(path)
+    return dict(_without(parts, omitted))
 
 
 def _paths(part: Any, path: KeyPath = ()) -> Iterator[KeyPath]:
-    """Of every key but types, those of the whole before those in it."""
+    """Generate the paths of all keys except types, outer before inner ones."""
     if isinstance(part, dict):
         yield from ((*path, key) for key in part if key not in ("version", "name", "type"))
     inner = part.items() if isinstance(part, dict) else enumerate(part)
@@ -650,48 +643,48 @@ def _paths(part: Any, path: KeyPath = ()) -> Iterator[KeyPath]:
             yield from _paths(value, (*path, key))
 
 
-def _without(part: Any, left: list[KeyPath], path: KeyPath = ()) -> Any:
+def _without(part: Any, omitted: list[KeyPath], path: KeyPath = ()) -> Any:
     if isinstance(part, dict):
-        kept = {k: v for k, v in part.items() if (*path, k) not in left}
-        return {key: _without(value, left, (*path, key)) for key, value in kept.items()}
+        remaining = {k: v for k, v in part.items() if (*path, k) not in omitted}
+        return {key: _without(value, omitted, (*path, key)) for key, value in remaining.items()}
     if isinstance(part, list):
-        return [_without(value, left, (*path, n)) for n, value in enumerate(part)]
+        return [_without(value, omitted, (*path, n)) for n, value in enumerate(part)]
     return part
 
 
 def _same(brief: dict[str, Any], parts: dict[str, Any]) -> bool:
     try:
-        found: dict[str, Any] = Experiment.build(Source("page", brief)).model_dump(
+        rebuilt: dict[str, Any] = Experiment.build(Source("page", brief)).model_dump(
             mode="json", by_alias=True
         )
     except PbdkitError:  # what is needed, or a part that is not installed here
         return False
-    return found == parts
+    return rebuilt == parts
 
 
 def title_of(dataset: xarray.Dataset) -> str:
-    """What the page is called."""
+    """Return the title of the page."""
     return str(dataset.attrs.get("title", ""))[:LONGEST] or "a result without a title"
 
 
 def file_name(title: str) -> str:
-    """A plain name for the files of an experiment."""
+    """Return a plain name for the files of an experiment."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", title).strip("-")[:60] or "experiment"
 
 
 LARGEST = 20_000
-"""Particles above which nothing is predicted for a page: it would take longer than the page."""
+"""Maximum number of particles for which the page predicts stability; beyond, that takes longer than
+the page."""
 FEWEST, MOST = 8, 800
-"""Moves that a decay is measured of, at least and at most."""
+"""Minimum and maximum number of moves from which a decay is measured."""
 FADED = 1e-11
-"""Moves smaller than this share of the largest one are of rounding."""
+"""Moves below this fraction of the largest one are rounding errors."""
 
 
 @dataclass(frozen=True)
 class SettlingMoves:
-    """The largest move a step of any follower, `move`, up to each of the `steps`; `free` is the
-    first of these rows after the last event: a leader that moves, begins or ends, a bond that
-    breaks."""
+    """The largest move per step of any follower, `move`, up to each of the `steps`; `free` is the
+    first row after the last event: a leader that moves, begins or ends, or a bond that breaks."""
 
     steps: Array
     move: Array
@@ -699,46 +692,47 @@ class SettlingMoves:
 
     @property
     def fitted(self) -> Rows:
-        """The rows that the decay is measured of: the second half of those after the last event
-        that are no rounding."""
+        """Return the rows from which the decay is measured: the second half of those after the last
+        event above rounding."""
         rows = np.arange(self.free, len(self.move))
         rows = rows[self.move[rows] > FADED * self.move.max(initial=0.0)]
         return np.asarray(rows[len(rows) // 2 :])
 
     @property
     def decay(self) -> float | None:
-        """By what the moves shrink a step, in the end."""
+        """Return the final factor of the moves per step."""
         rows = self.fitted
         if len(rows) < FEWEST:
             return None
         return float(np.exp(np.polyfit(self.steps[rows], np.log(self.move[rows]), 1)[0]))
 
     def steps_to(self, share: float) -> int | None:
-        """The steps from the last event until moves were smaller than a share of the first one."""
+        """Return the steps from the last event until moves fell below a fraction of the first
+        one."""
         free = self.move[self.free :]
         below = np.flatnonzero(free <= share * free[:1].max(initial=0.0))
         return int(self.steps[self.free + below[0]] - self.steps[self.free]) if len(below) else None
 
 
 def moves_of(dataset: xarray.Dataset) -> SettlingMoves | None:
-    """Between recorded steps that lie equally far apart, MOST at most; None where there are too
-    few of them, or no kinds."""
+    """Return the moves between equidistant recorded steps, at most MOST; None where there are too
+    few, or no kinds."""
     recorded = dataset.sizes["time"]
     steps = np.arange(0, recorded, -(-recorded // MOST))
     times = dataset["time"].values[steps]
-    apart = np.diff(times)
-    if len(apart) and apart[-1] != apart[0]:
-        steps, times, apart = steps[:-1], times[:-1], apart[:-1]
-    if len(times) < FEWEST or "kind" not in dataset or (apart != apart[0]).any():
+    intervals = np.diff(times)
+    if len(intervals) and intervals[-1] != intervals[0]:
+        steps, times, intervals = steps[:-1], times[:-1], intervals[:-1]
+    if len(times) < FEWEST or "kind" not in dataset or (intervals != intervals[0]).any():
         return None
     name = "u" if "u" in dataset else "position"
     move, event = [], 0
-    both = zip(read(dataset[name], steps), read(dataset["kind"], steps), strict=True)
-    for n, ((before, kinds_before), (now, kinds)) in enumerate(pairwise(both), 1):
-        lengths, leads = np.linalg.norm(now - before, axis=1), kinds == LEADER
-        move.append(float(lengths[~leads].max(initial=0.0)) / apart[0])
-        led = lengths[leads].max(initial=0.0) > FADED * max(move)
-        if led or not np.array_equal(kinds, kinds_before):
+    records = zip(read(dataset[name], steps), read(dataset["kind"], steps), strict=True)
+    for n, ((previous, previous_kinds), (current, kinds)) in enumerate(pairwise(records), 1):
+        lengths, leads = np.linalg.norm(current - previous, axis=1), kinds == LEADER
+        move.append(float(lengths[~leads].max(initial=0.0)) / intervals[0])
+        leader_move = lengths[leads].max(initial=0.0) > FADED * max(move)
+        if leader_move or not np.array_equal(kinds, previous_kinds):
             event = n
     if "broken_step" in dataset and dataset["broken_step"].size:
         last = int(dataset["broken_step"].max())
@@ -747,12 +741,12 @@ def moves_of(dataset: xarray.Dataset) -> SettlingMoves | None:
 
 
 def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
-    """Rows of what was predicted and what happened, sentences beside them, and the curve of the
-    moves; why there is none where it cannot be had cheaply."""
+    """Return the predicted and measured values, notes, and the curve of the moves; or the reason
+    why there is none."""
     if scene is None:
         return {"notes": ["Nothing is predicted: the experiment cannot be built here."]}
     if not scene.experiment.solver.makes_steps:
-        return _found(dataset)
+        return _certificate(dataset)
     if scene.raster.count > LARGEST:
         return {
             "notes": [
@@ -761,24 +755,29 @@ def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
             ]
         }
     analysis, moves = Analysis(tuned(scene)), moves_of(dataset)
-    rest = moves if moves and len(moves.move) - moves.free >= FEWEST else None
-    found: dict[str, Any] = {"rows": _rows(dataset, analysis, rest), "notes": _notes(analysis)}
-    if rest is None:
-        why = (
+    decaying = moves if moves and len(moves.move) - moves.free >= FEWEST else None
+    content: dict[str, Any] = {
+        "rows": _rows(dataset, analysis, decaying),
+        "notes": _notes(analysis),
+    }
+    if decaying is None:
+        reason = (
             "too few steps are recorded, or they are not equally far apart"
             if moves is None
             else "leaders move or bonds break until the end, or nearly"
         )
-        found["notes"].append(f"How the body came to rest is not measured: {why}.")
-    return found | ({"moves": _curve(analysis, moves)} if moves else {})
+        content["notes"].append(f"How the body came to rest is not measured: {reason}.")
+    return content | ({"moves": _curve(analysis, moves)} if moves else {})
 
 
-def _found(dataset: xarray.Dataset) -> dict[str, Any]:
-    """Of an equilibrium: what its certificate says."""
+def _certificate(dataset: xarray.Dataset) -> dict[str, Any]:
+    """Return the certificate of an equilibrium."""
     certificate = json_attribute(dataset, "certificate")
-    told = [[name.replace("_", " "), value] for name, value in certificate.items()]
-    note = "The solver makes no steps: it finds the equilibrium, and says how far from it the "
-    return {"certificate": told, "notes": [f"{note}last state can be at most."]}
+    entries = [[name.replace("_", " "), value] for name, value in certificate.items()]
+    note = (
+        "The solver makes no steps: it finds the equilibrium, with a bound on the distance to it."
+    )
+    return {"certificate": entries, "notes": [note]}
 
 
 def _rows(
@@ -824,8 +823,8 @@ def _notes(analysis: Analysis) -> list[str]:
 
 
 def _curve(analysis: Analysis, moves: SettlingMoves) -> dict[str, Any]:
-    """The logarithm of the moves, and the slope that was predicted through the middle of those
-    that the decay is measured of."""
+    """Return the logarithm of the moves, and a line with the predicted slope through the middle of
+    those from which the decay is measured."""
     with np.errstate(divide="ignore"):
         logs = np.log10(moves.move)
     logs[~np.isfinite(logs)] = np.nan
@@ -848,15 +847,14 @@ def _curve(analysis: Analysis, moves: SettlingMoves) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Origin:
-    """The scene of the experiment that a dataset carries, None where it cannot be built here, and
-    why it cannot."""
+    """The scene of a dataset's experiment, None where it cannot be built, and the reason."""
 
     scene: Scene | None
     fault: str = ""
 
 
 def origin_of(dataset: xarray.Dataset) -> Origin:
-    """Of a dataset: a page can be made without it, and then says what is missing."""
+    """Build the scene of a dataset, if possible: a page can be made without it."""
     try:
         return Origin(scene_of(dataset, "the lattice of a page"))
     except PbdkitError as error:
@@ -864,7 +862,8 @@ def origin_of(dataset: xarray.Dataset) -> Origin:
 
 
 class RunContent:
-    """What `report.js` shows of a run. Raises ExperimentError for a dataset without positions."""
+    """Content of the page of a run, for `report.js`. Raises ExperimentError for a dataset without
+    positions."""
 
     def __init__(self, dataset: xarray.Dataset) -> None:
         _refuse_no_motion(dataset)
@@ -885,22 +884,22 @@ class RunContent:
         }
 
     def within(self, budget: int) -> dict[str, Any]:
-        """All of it, where the moving lattice takes about `budget` bytes before it is packed."""
+        """Return the content, with a moving lattice of about `budget` bytes before packing."""
         dataset, reference, bonds = self._dataset, self._reference, self._bonds
-        shown = thinned(dataset, leaders_of(dataset), bytes_a_particle(dataset), budget)
+        thinning = thinned(dataset, leaders_of(dataset), bytes_a_particle(dataset), budget)
         spacing = bonds.spacing if bonds else spacing_of(reference)
         run = {
-            "lattice": resting(dataset, reference, shown, spacing)
-            | moving(dataset, reference, shown),
-            "bonds": bonds.shown(shown.particles) if bonds else None,
+            "lattice": resting(dataset, reference, thinning, spacing)
+            | moving(dataset, reference, thinning),
+            "bonds": bonds.shown(thinning.particles) if bonds else None,
             "curves": curves(dataset),
         }
-        left_out = [*shown.left_out(), *fewer_points(dataset), *self._notes]
-        return self._whole | {"run": run, "left_out": left_out, "thinned": shown.is_thinner}
+        left_out = [*thinning.left_out(), *fewer_points(dataset), *self._notes]
+        return self._whole | {"run": run, "left_out": left_out, "thinned": thinning.is_thinner}
 
 
 def _refuse_no_motion(dataset: xarray.Dataset) -> None:
-    """Raises ExperimentError unless there are positions of one run in the plane."""
+    """Raise ExperimentError unless there are positions of one run in the plane."""
     if "position" not in dataset:
         raise ExperimentError("has no positions: keep `position` to have them in a page")
     position = dataset["position"]
@@ -914,7 +913,7 @@ def _refuse_no_motion(dataset: xarray.Dataset) -> None:
 
 
 def _bonds(dataset: xarray.Dataset, origin: Origin) -> tuple[BondArrays | None, list[str]]:
-    """Those that are known, and sentences about what is not."""
+    """Return the known bonds, and notes on what is unknown."""
     notes = []
     if origin.fault:
         notes.append(f"The experiment cannot be built here: {origin.fault}")
@@ -924,11 +923,11 @@ def _bonds(dataset: xarray.Dataset, origin: Origin) -> tuple[BondArrays | None, 
     try:
         return bonds_of(dataset, origin.scene), notes
     except PbdkitError as error:
-        return bonds_of(dataset, None), [*notes, f"Of its bonds less is known: the file {error}"]
+        return bonds_of(dataset, None), [*notes, f"Limits of bonds are unknown: the file {error}"]
 
 
 def leaders_of(dataset: xarray.Dataset) -> NDArray[np.bool_]:
-    """Who leads at the first or at the last recorded step, (particle,)."""
+    """Return which particles lead at the first or at the last recorded step, (particle,)."""
     if "kind" not in dataset or "time" not in dataset["kind"].dims:
         return np.zeros(dataset.sizes["particle"], np.bool_)
     ends = dataset["kind"].isel(time=[0, -1]).values
@@ -936,8 +935,8 @@ def leaders_of(dataset: xarray.Dataset) -> NDArray[np.bool_]:
 
 
 def reference_of(dataset: xarray.Dataset, scene: Scene | None) -> NDArray[np.float64]:
-    """Where displacements are counted from, (particle, axis), in the units of the page: the
-    reference, or the first recorded step where nobody knows it."""
+    """Return the origin of displacements, (particle, axis), in the units of the page: the
+    reference, or the first recorded step where that is missing."""
     if "reference" in dataset.variables and dataset["reference"].ndim == 2:
         return in_units(dataset["reference"].values, factor_of(dataset["reference"]))
     if scene is not None and scene.raster.count == dataset.sizes["particle"]:
@@ -946,35 +945,38 @@ def reference_of(dataset: xarray.Dataset, scene: Scene | None) -> NDArray[np.flo
     return in_units(first.transpose("particle", "axis").values, factor_of(first))
 
 
-def _known(variable: xarray.DataArray) -> Array:
-    """With NaN where a member has nothing."""
+def _finite_values(variable: xarray.DataArray) -> Array:
+    """Return the values of members, with NaN in place of fill values."""
     values = np.asarray(variable.values, float)
-    known = np.where(values == variable.attrs.get(FILL, np.nan), np.nan, values)
-    return factor_of(variable) * known
+    finite = np.where(values == variable.attrs.get(FILL, np.nan), np.nan, values)
+    return factor_of(variable) * finite
 
 
 def numbers(dataset: xarray.Dataset, grid: list[str]) -> Iterator[dict[str, Any]]:
-    """One number a member each: of every variable that all members have, its last and its largest
-    value, over particles the mean and the largest."""
+    """Generate one number a member: for every variable common to all members its last and its
+    largest value, for particles the mean and the largest."""
     for name, variable in dataset.data_vars.items():
         if name in (STATUS, MESSAGE, "kind", "position") or not {*grid} <= {*variable.dims}:
             continue
         if variable.dtype.kind not in "biuf" or not variable.size:
             continue
         rest = [str(d) for d in variable.dims if d not in grid]
-        values = _known(variable.transpose(*grid, *rest))
+        values = _finite_values(variable.transpose(*grid, *rest))
         values = values.reshape(-1, *values.shape[len(grid) :])
         words = f"{meaning_of(variable)}{f' ({u})' if (u := units_of(variable)) else ''}"
         if name == "broken_step":
-            told = np.where(np.isnan(values).all(axis=1), np.nan, (values >= 0).sum(axis=1))
-            yield {"name": "broken bonds", "values": packed(told, "f8")}
+            numbers = np.where(np.isnan(values).all(axis=1), np.nan, (values >= 0).sum(axis=1))
+            yield {"name": "broken bonds", "values": packed(numbers, "f8")}
             continue
-        for how, told in _described(values, rest):
-            yield {"name": f"{words}: {how}" if how else words, "values": packed(told, "f8")}
+        for statistic, numbers in _statistics(values, rest):
+            yield {
+                "name": f"{words}: {statistic}" if statistic else words,
+                "values": packed(numbers, "f8"),
+            }
 
 
-def _described(values: Array, rest: list[str]) -> Iterator[tuple[str, Array]]:
-    """Numbers of (member, *rest) that stand for all, and what they are."""
+def _statistics(values: Array, rest: list[str]) -> Iterator[tuple[str, Array]]:
+    """Generate numbers that summarise (member, *rest), with their descriptions."""
     if "axis" in rest:
         values = np.linalg.norm(values, axis=1 + rest.index("axis"))
         rest = [dim for dim in rest if dim != "axis"]
@@ -986,12 +988,12 @@ def _described(values: Array, rest: list[str]) -> Iterator[tuple[str, Array]]:
         over, rest, values = "time", ["time", *rest], values[:, None]
     values = np.moveaxis(values, 1 + rest.index(over), 1)
     values = values.reshape(*values.shape[:2], -1)
-    several = values.shape[2] > 1
+    is_multiple = values.shape[2] > 1
     with np.errstate(all="ignore"):
         largest = _reduced(np.fmax, values)
         mean = np.nansum(values, axis=2) / np.isfinite(values).sum(axis=2)
-    yield ("largest at the end" if several else "at the end"), _last(largest)
-    if several:
+    yield ("largest at the end" if is_multiple else "at the end"), _last(largest)
+    if is_multiple:
         yield "mean at the end", _last(mean)
     if values.shape[1] > 1:
         yield "largest of all steps", _reduced(np.fmax, largest)
@@ -1002,34 +1004,34 @@ def _reduced(how: np.ufunc, values: Array) -> Array:
 
 
 def _last(values: Array) -> Array:
-    """The last number of each row, NaN where there is none."""
-    known = np.isfinite(values)
-    last = values.shape[1] - 1 - np.argmax(known[:, ::-1], axis=1)
+    """Return the last finite number of each row, NaN where there is none."""
+    finite = np.isfinite(values)
+    last = values.shape[1] - 1 - np.argmax(finite[:, ::-1], axis=1)
     return np.asarray(values[np.arange(len(values)), last])
 
 
 FEWEST_STEPS_OF_MEMBER, FEWEST_POINTS = 6, 50
-"""Of each member at least, as far as they are recorded."""
+"""Minimum number of steps and of points of each member, as far as recorded."""
 POINTS = 100_000
-"""Of the curves of all members together."""
+"""Maximum number of points in the curves of all members together."""
 
 
 class SweepContent:
-    """What `report.js` shows of a sweep."""
+    """Content of the page of a sweep, for `report.js`."""
 
     def __init__(self, dataset: xarray.Dataset) -> None:
         grid = [str(dim) for dim in dataset[STATUS].dims]
-        asked = json_attribute(dataset, "sweep")
+        specification = json_attribute(dataset, "sweep")
         title = title_of(dataset)
         places = product(*(range(dataset.sizes[dim]) for dim in grid))
         self._members = [dataset.isel(dict(zip(grid, place, strict=True))) for place in places]
-        self._scene = _scene(asked)
+        self._scene = _scene(specification)
         self._whole = {
             "what": "sweep",
             "title": title,
             "file": file_name(title),
             "facts": _facts(dataset),
-            "experiment": experiment_text(asked),
+            "experiment": experiment_text(specification),
             "grid": [{"name": dim, "labels": _labels(dataset, dim)} for dim in grid],
             "status": dataset[STATUS].values.ravel().tolist(),
             "message": dataset[MESSAGE].values.ravel().tolist(),
@@ -1037,41 +1039,41 @@ class SweepContent:
         }
 
     def within(self, budget: int) -> dict[str, Any]:
-        """All of it, where the moving lattices of all members together take about `budget` bytes
-        before they are packed."""
+        """Return the content, with moving lattices of all members of about `budget` bytes before
+        packing."""
         each = self._members
         points = max(FEWEST_POINTS, POINTS // len(each))
-        good = [str(member[STATUS].item()) in KEPT for member in each]
-        if "position" not in each[0] or not any(good):
+        successful = [str(member[STATUS].item()) in KEPT for member in each]
+        if "position" not in each[0] or not any(successful):
             note = "No lattices are shown: no member ended well, or `position` was not kept."
             plain = [{"curves": curves(member, points)} for member in each]
             return self._whole | {
                 "shared": {}, "members": plain, "left_out": [note], "thinned": False,
             }  # fmt: skip
-        first = each[good.index(True)]
+        first = each[successful.index(True)]
         size = bytes_a_particle(first) * len(each)
-        shown = thinned(first, leaders_of(first), size, budget, FEWEST_STEPS_OF_MEMBER)
+        thinning = thinned(first, leaders_of(first), size, budget, FEWEST_STEPS_OF_MEMBER)
         bodies = [
             _Body.of(member, self._scene) if g else None
-            for member, g in zip(each, good, strict=True)
+            for member, g in zip(each, successful, strict=True)
         ]
-        one = next(filter(None, bodies))
-        alike = all(body is None or one.is_like(body) for body in bodies)
+        first_body = next(filter(None, bodies))
+        same = all(body is None or first_body.is_like(body) for body in bodies)
         members = [
-            body and body.moving(member, shown, points, whole=not alike)
+            body and body.moving(member, thinning, points, whole=not same)
             for body, member in zip(bodies, each, strict=True)
         ]
         return self._whole | {
-            "shared": one.resting(first, shown) if alike else {},
+            "shared": first_body.resting(first, thinning) if same else {},
             "members": members,
-            "left_out": shown.left_out(),
-            "thinned": shown.is_thinner,
+            "left_out": thinning.left_out(),
+            "thinned": thinning.is_thinner,
         }
 
 
 @dataclass(frozen=True)
 class _Body:
-    """Of one member: where it is at rest, (particle, axis), and its bonds."""
+    """The reference of one member, (particle, axis), and its bonds."""
 
     reference: Array
     bonds: BondArrays | None
@@ -1086,33 +1088,35 @@ class _Body:
         return cls(reference, broken_as(bonds, member) if bonds else None)
 
     def is_like(self, other: _Body) -> bool:
-        """Whether they are the same at rest."""
+        """Return whether two members are the same at rest."""
         if self.bonds and other.bonds:
             same_bonds = np.array_equal(self.bonds.ends, other.bonds.ends)
         else:
             same_bonds = self.bonds is other.bonds
         return same_bonds and np.array_equal(self.reference, other.reference, equal_nan=True)
 
-    def resting(self, member: xarray.Dataset, shown: Thinning) -> dict[str, Any]:
-        """What does not move of it."""
-        here = self.reference[np.isfinite(self.reference).all(axis=1)]
-        spacing = self.bonds.spacing if self.bonds else spacing_of(here)
+    def resting(self, member: xarray.Dataset, thinning: Thinning) -> dict[str, Any]:
+        """Return the static content of the member."""
+        finite = self.reference[np.isfinite(self.reference).all(axis=1)]
+        spacing = self.bonds.spacing if self.bonds else spacing_of(finite)
         return {
-            "lattice": resting(member, self.reference, shown, spacing),
-            "bonds": self.bonds.shown(shown.particles) if self.bonds else None,
+            "lattice": resting(member, self.reference, thinning, spacing),
+            "bonds": self.bonds.shown(thinning.particles) if self.bonds else None,
         }
 
     def moving(
-        self, member: xarray.Dataset, shown: Thinning, points: int, *, whole: bool
+        self, member: xarray.Dataset, thinning: Thinning, points: int, *, whole: bool
     ) -> dict[str, Any]:
-        """What moves of it, or the `whole`."""
-        still = self.resting(member, shown) if whole else {"lattice": {}}
-        broken = self.bonds.broken(shown.particles) if self.bonds else None
-        last = member["position"].isel(time=shown.steps)
-        there = last.notnull().any(["particle", "axis"]).values  # others may have made more steps
-        moved = moving(member, self.reference, replace(shown, steps=shown.steps[there]))
-        return {"bonds": broken} | still | {
-            "lattice": still["lattice"] | moved,
+        """Return the moving content of the member, or the `whole` content."""
+        fixed = self.resting(member, thinning) if whole else {"lattice": {}}
+        broken = self.bonds.broken(thinning.particles) if self.bonds else None
+        last = member["position"].isel(time=thinning.steps)
+        recorded = (
+            last.notnull().any(["particle", "axis"]).values
+        )  # others may have made more steps
+        moved = moving(member, self.reference, replace(thinning, steps=thinning.steps[recorded]))
+        return {"bonds": broken} | fixed | {
+            "lattice": fixed["lattice"] | moved,
             "curves": curves(member, points),
         }  # fmt: skip
 
@@ -1120,19 +1124,26 @@ class _Body:
 def _facts(dataset: xarray.Dataset) -> list[list[str]]:
     status = dataset[STATUS].values.ravel()
     names, counts = np.unique(status, return_counts=True)
-    ended = ", ".join(f"{n} {name}" for name, n in zip(names, counts, strict=True))
+    outcome = ", ".join(f"{n} {name}" for name, n in zip(names, counts, strict=True))
     sizes = " × ".join(f"{size} {name}" for name, size in dataset[STATUS].sizes.items())
-    made = str(dataset.attrs.get("created", ""))
+    created = str(dataset.attrs.get("created", ""))
     members = f"{status.size}: {sizes}"
-    return [["members", members], ["ended", ended], ["created", made], ["by", made_by(dataset)]]
+    return [
+        ["members", members],
+        ["ended", outcome],
+        ["created", created],
+        ["by", made_by(dataset)],
+    ]
 
 
 def _labels(dataset: xarray.Dataset, dim: str) -> list[str]:
-    """What stands along a dimension of the grid; of cases, what is set in each."""
-    beside = [str(n) for n, c in dataset.coords.items() if c.dims == (dim,) and n != dim]
-    if dim == CASE and beside:
-        rows = zip(*(dataset[n].values.tolist() for n in beside), strict=True)
-        return [", ".join(f"{n} {_label(v)}" for n, v in zip(beside, r, strict=True)) for r in rows]
+    """Return the labels along a dimension of the grid; for cases, the values of each."""
+    coordinates = [str(n) for n, c in dataset.coords.items() if c.dims == (dim,) and n != dim]
+    if dim == CASE and coordinates:
+        rows = zip(*(dataset[n].values.tolist() for n in coordinates), strict=True)
+        return [
+            ", ".join(f"{n} {_label(v)}" for n, v in zip(coordinates, r, strict=True)) for r in rows
+        ]
     name = dim + TEXT if dim + TEXT in dataset.variables else dim
     if name not in dataset.variables:
         return [str(n) for n in range(dataset.sizes[dim])]
@@ -1143,16 +1154,18 @@ def _labels(dataset: xarray.Dataset, dim: str) -> list[str]:
 
 
 def _label(value: Any) -> str:
-    """A value in few words."""
+    """Return a short text of a value."""
     return f"{value:.6g}" if isinstance(value, float) else type_alone(str(value))
 
 
-def _scene(asked: dict[str, Any]) -> Scene | None:
-    """That of the experiment that is varied, None where the body is."""
+def _scene(specification: dict[str, Any]) -> Scene | None:
+    """Return the scene of the varied experiment, None where the body varies."""
     import xarray
 
-    experiment = asked.get("experiment", {})
-    varied = {path.split(".")[0] for key in ("vary", "together") for path in asked.get(key, {})}
+    experiment = specification.get("experiment", {})
+    varied = {
+        path.split(".")[0] for key in ("vary", "together") for path in specification.get(key, {})
+    }
     if varied & {"lattice", "body", "neighbours", "frame"}:
         return None
     carrier = xarray.Dataset(attrs={"experiment": json.dumps(experiment)})
@@ -1163,12 +1176,15 @@ def _scene(asked: dict[str, Any]) -> Scene | None:
 
 
 def speed(path: Path) -> dict[str, Any]:
-    """Headings with what they mean, and a row a method. Raises StorageError where the file cannot
-    be read, and ExperimentError where it holds something else."""
+    """Return headings with their meanings, and a row for each method. Raises StorageError where the
+    file cannot be read, and ExperimentError for other content."""
     try:
-        told = json.loads(path.read_text("utf-8"))
-        rows: list[dict[str, Any]] = [dict(row) for row in told["rows"]]
-        machine, experiment = dict(told["machine"]), f"{told['experiment']}, {told['steps']} steps"
+        content = json.loads(path.read_text("utf-8"))
+        rows: list[dict[str, Any]] = [dict(row) for row in content["rows"]]
+        machine, experiment = (
+            dict(content["machine"]),
+            f"{content['experiment']}, {content['steps']} steps",
+        )
     except OSError as error:
         raise StorageError(f"{path}: {error.strerror}") from None
     except (ValueError, TypeError, KeyError, RecursionError):
@@ -1193,12 +1209,13 @@ def _cell(row: dict[str, Any], name: str) -> str:
 
 
 BUDGET = 4_900_000
-"""Bytes of a page, at most."""
+"""Maximum size of a page in bytes."""
 FIRST, MOST_BYTES = 20_000_000, 80_000_000
-"""Bytes of the lattice before it is packed: in the first attempt, and what a browser still moves
-well. How much smaller they become depends on the motion, and is known only then."""
+"""Bytes of the lattice before packing in the first attempt, and the maximum that a browser moves
+smoothly. The ratio of compression depends on the motion, and is only known afterwards."""
 ATTEMPTS, SMALL = 4, 0.6
-"""A page that is thinned and smaller than that share of the budget is made again with more."""
+"""Maximum number of attempts; a thinned page below this fraction of the budget is repeated with a
+larger one."""
 
 
 def report(
@@ -1208,16 +1225,34 @@ def report(
     bench: str | Path | None = None,
     replace: bool = True,
 ) -> Path:
-    """Writes the page of a run or of a sweep, and returns its path. The page appears whole or not
-    at all, with `replace` in the place of an earlier one.
+    """Write the page of a run or of a sweep, and return its path.
 
-    The page has the moving lattice, the histories of particles and bonds, curves, what was
-    predicted, what broke, and how to run it again. It takes 5 MB at most: of more steps or
-    particles some are left out, and the page says which. `bench` is a file that
-    ``pbdkit bench --json`` wrote.
+    The page contains the moving lattice, the histories of particles and bonds, curves, predictions,
+    broken bonds, and how to run it again. It takes at most 5 MB: steps or particles are omitted as
+    necessary, which the page states.
 
-    Raises ExperimentError for a dataset without positions, and StorageError for files that cannot
-    be read or written.
+    Parameters
+    ----------
+    dataset : xarray.Dataset, str or path
+        A dataset, or a file that holds one.
+    path : str or path
+        The page. It appears complete or not at all.
+    bench : str or path, optional
+        A file written by ``pbdkit bench --json``.
+    replace : bool
+        Replace an existing page.
+
+    Returns
+    -------
+    Path
+        The path of the page.
+
+    Raises
+    ------
+    ExperimentError
+        For a dataset without positions.
+    StorageError
+        Where files cannot be read or written.
     """
     measured = speed(Path(bench)) if bench is not None else None
     with _reading(dataset) as read:
@@ -1227,16 +1262,16 @@ def report(
 
 
 def report_text(dataset: xarray.Dataset, measured: dict[str, Any] | None = None) -> str:
-    """The page, with the figures of `speed` where there are any."""
+    """Return the page as text, with the figures of `speed` if given."""
     content = (SweepContent if SWEEP in dataset.attrs else RunContent)(dataset)
     budget, best = FIRST, ""
     for _ in range(ATTEMPTS):
-        held = content.within(budget)
-        text = page(held | {"speed": measured})
+        data = content.within(budget)
+        text = page(data | {"speed": measured})
         fits = len(text) <= BUDGET
         if not best or (fits and len(text) > len(best)) or len(best) > BUDGET:
             best = text
-        enough = not held["thinned"] or len(text) > SMALL * BUDGET or budget == MOST_BYTES
+        enough = not data["thinned"] or len(text) > SMALL * BUDGET or budget == MOST_BYTES
         if fits and enough:
             break
         budget = min(int(0.9 * budget * BUDGET / len(text)), MOST_BYTES)

@@ -1,7 +1,4 @@
-"""What a page may ask of a session, checked as it comes in.
-
-Does what a page asks of a session.
-"""
+"""Requests of a page to a session: their validation and their execution."""
 
 from __future__ import annotations
 
@@ -15,65 +12,65 @@ from pbdkit.plugin.component import Strict
 from pbdkit.web.session import Session
 
 LONGEST = 4096
-"""Bytes of a command."""
+"""Maximum length of a command in bytes."""
 FARTHEST = 1e12
 """Largest coordinate, in lattice units: squares and differences of it are finite."""
 Step = Annotated[int, Field(ge=0, lt=2**31)]
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Place = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
-"""(x, y) on the page's plane."""
+"""Position (x, y) in the plane of the page."""
 
 
 class Play(Strict):
-    """Goes on stepping, or stops."""
+    """Continue stepping, or stop."""
 
     do: Literal["play"]
     on: bool
 
 
 class Advance(Strict):
-    """So many steps and no more."""
+    """Advance by a number of steps."""
 
     do: Literal["step"]
     count: Annotated[int, Field(ge=1, le=100_000)] = 1
 
 
 class Rewind(Strict):
-    """Back to about that step, or forward again."""
+    """Go to about that step, back or forward."""
 
     do: Literal["rewind"]
     step: Step
 
 
 class Speed(Strict):
-    """Steps a picture."""
+    """Set the number of steps per picture."""
 
     do: Literal["speed"]
     steps: Annotated[int, Field(ge=1, le=10_000)]
 
 
 class Grab(Strict):
-    """Takes hold of a particle shown, by its row: of its group where it leads."""
+    """Grab a visible particle by its row; a leader with its group."""
 
     do: Literal["grab"]
     row: Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Drag(Strict):
-    """Leads what is held so far from where it was grabbed."""
+    """Move the grabbed particle, relative to where it was grabbed."""
 
     do: Literal["drag"]
     by: Place
 
 
 class Release(Strict):
-    """Lets go of it."""
+    """Release the grabbed particle."""
 
     do: Literal["release"]
 
 
 class Turn(Strict):
-    """Another value of a number, by its name."""
+    """Change a number, by its name."""
 
     do: Literal["turn"]
     name: Annotated[str, Field(max_length=200)]
@@ -81,7 +78,7 @@ class Turn(Strict):
 
 
 class CutLine(Strict):
-    """Cuts along a line across the body as it stands."""
+    """Cut along a line across the deformed body."""
 
     do: Literal["cut"]
     from_: Place = Field(alias="from")
@@ -89,27 +86,27 @@ class CutLine(Strict):
 
 
 class CutBond(Strict):
-    """Cuts one bond, by its row."""
+    """Cut one bond, by its row."""
 
     do: Literal["cut-bond"]
     row: Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Colour(Strict):
-    """What particles are coloured by."""
+    """Select the variable of the particles' colours."""
 
     do: Literal["colour"]
     by: Literal["kind", "displacement", "last-step"]
 
 
 class Save(Strict):
-    """Writes what was done as an experiment."""
+    """Write the session as an experiment."""
 
     do: Literal["save"]
 
 
 class PictureReceived(Strict):
-    """The last picture has come; the next may."""
+    """Acknowledge the last picture; the next may be sent."""
 
     do: Literal["seen"]
 
@@ -121,14 +118,14 @@ Command = (
 _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="do")])
 
 
-def command_of(given: str | bytes | dict[str, Any]) -> Command:
-    """The command in a message. Raises ExperimentError for what is none."""
+def command_of(message: str | bytes | dict[str, Any]) -> Command:
+    """Parse the command of a message. Raises ExperimentError for anything else."""
     try:
-        if not isinstance(given, dict):
-            if len(given) > LONGEST:
+        if not isinstance(message, dict):
+            if len(message) > LONGEST:
                 raise ExperimentError(f"a command takes at most {LONGEST} bytes")
-            given = json.loads(given)
-        return _COMMANDS.validate_python(given)
+            message = json.loads(message)
+        return _COMMANDS.validate_python(message)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         where = ".".join(map(str, fault["loc"]))
@@ -137,8 +134,9 @@ def command_of(given: str | bytes | dict[str, Any]) -> Command:
         raise ExperimentError(f"no command: {printable(str(error))}"[:300]) from None
 
 
-def obey(session: Session, command: Command) -> None:
-    """Does it, between two steps. Raises PbdkitError, with nothing done, where that cannot be."""
+def execute(session: Session, command: Command) -> None:
+    """Execute a command between two steps. Raises PbdkitError, without any effect, where that is
+    impossible."""
     match command:
         case Play():
             session.running, session.owed = command.on, 0

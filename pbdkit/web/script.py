@@ -1,8 +1,7 @@
-"""The motion of a group that is led by hand: a path that is still being made.
+"""Script of a live session: groups led by hand, changed numbers and cuts, step by step, and its
+conversion to an experiment file.
 
-What was done by hand, step by step, in the words of an experiment file.
-
-Writes a script as an experiment file, and long ways of the hand beside it.
+Long paths of the hand are written to tables beside the file.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Motion, Path
 from pbdkit.model.reading import MAX_BYTES, MAX_NODES, yaml_text
 from pbdkit.plugin.fracture_model import Segment
-from pbdkit.web.view_frames import AdjustableNumber, numbers_of, placed
+from pbdkit.web.view_frames import AdjustableNumber, numbers_of, with_number
 
 Way = tuple[float, float]
 
 
 class Hand(Motion):
-    """Where the hand has led a group, knot by knot; between knots, and after the last, as `path`.
+    """Motion of a group led by hand, knot by knot; between knots, and after the last, as `path`.
 
     The knots grow while it is stepped, so that no engine is made anew for a move of the mouse.
     """
@@ -43,7 +42,7 @@ class Hand(Motion):
     _ways: list[Way] = PrivateAttr(default_factory=list)
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """That of the path which a file would say."""
+        """Return the offset of the path with these knots."""
         if not self._steps:
             return np.zeros(2)
         # The two lists themselves: a path of copies would cost as much as it is long.
@@ -51,36 +50,36 @@ class Hand(Motion):
         return Path.model_construct(**knots).offset(n, start)
 
     def knots(self) -> tuple[int, ...]:
-        """The last: what came before it is over."""
+        """Return the last knot; earlier ones are over."""
         return tuple(self._steps[-1:])
 
     def at(self, n: int) -> Way:
-        """The offset at the end of its n-th step, n ≥ 0."""
+        """Return the offset at the end of its n-th step, n ≥ 0."""
         x, y = self.offset(n, np.zeros((1, 2))) if n else (0.0, 0.0)
         return float(x), float(y)
 
     def lead(self, begin: int, end: int, way: Way) -> None:
-        """Goes on evenly, after its step `begin`, to `way` at its step `end`."""
+        """Move linearly, after its step `begin`, to `way` at its step `end`."""
         if begin and (not self._steps or self._steps[-1] < begin):
             self._add(begin, self.at(begin))
         self._add(end, way)
 
     def cut_back(self, n: int) -> None:
-        """Forgets what comes after its step n; every step until then stays to the bit."""
-        known = [(step, way) for step, way in self.path if step <= n]
-        if len(known) < len(self._steps):
-            begin = known[-1][0] if known else 0
-            known += [(step, self.at(step)) for step in range(begin + 1, n + 1)]
-        self._steps[:] = [step for step, _ in known]
-        self._ways[:] = [way for _, way in known]
+        """Remove what comes after its step n; all steps until then stay the same to the bit."""
+        knots = [(step, way) for step, way in self.path if step <= n]
+        if len(knots) < len(self._steps):
+            begin = knots[-1][0] if knots else 0
+            knots += [(step, self.at(step)) for step in range(begin + 1, n + 1)]
+        self._steps[:] = [step for step, _ in knots]
+        self._ways[:] = [way for _, way in knots]
 
     @property
     def path(self) -> list[tuple[int, Way]]:
-        """Its knots."""
+        """Return the knots of the path."""
         return list(zip(self._steps, self._ways, strict=True))
 
     def motion(self) -> dict[str, Any]:
-        """As an experiment file says it."""
+        """Return the motion as in an experiment file."""
         if not self._steps:
             return {"type": "hold"}
         ways = [list(way) for way in self._ways]
@@ -92,15 +91,15 @@ class Hand(Motion):
 
 
 NEVER = 2**62 - 1
-"""The last step of what is stepped until somebody has seen enough."""
+"""Last step of a session without end."""
 MADE = "-live"
-"""How the names of experiments end that were made by hand: their results lie beside the others."""
+"""Suffix of the names of saved sessions, whose results are separate files."""
 Parts = dict[str, Any]
 
 
 @dataclass
-class Led:
-    """A leader group: as the file says it, `of_file`, or one of the hand's, from a step on.
+class LeaderScript:
+    """A leader group: as in the file, `of_file`, or led by hand from a step on.
 
     `ended` is the last step for which it was let lead. A hand's group may stand in place of one
     that had not begun to lead, `instead_of`.
@@ -109,139 +108,151 @@ class Led:
     of_file: Parts
     hand: Hand | None = None
     ended: int | None = None
-    instead_of: Led | None = None
+    instead_of: LeaderScript | None = None
 
     @property
     def begins(self) -> int:
-        """The first step in which it leads."""
+        """Return the first step in which it leads."""
         return int(self.of_file.get("from", 1))
 
     def leads(self, step: int) -> bool:
-        """Whether it leads in that step."""
+        """Return whether it leads in a step."""
         ends = [end for end in (self.of_file.get("until"), self.ended) if end is not None]
         return self.begins <= step <= min(ends, default=step)
 
     def written(self, motion: bool) -> Parts:
-        """As an experiment file says it; without its `motion` a hand's group rests."""
-        ended = {} if self.ended is None else {"until": self.ended}
-        own = self.hand.motion() if self.hand and motion else {"type": "hold"}
-        return self.of_file | ({"motion": own} if self.hand else {}) | ended
+        """Return the group as in an experiment file; without its `motion` a group led by hand
+        rests."""
+        end = {} if self.ended is None else {"until": self.ended}
+        motion_part = self.hand.motion() if self.hand and motion else {"type": "hold"}
+        return self.of_file | ({"motion": motion_part} if self.hand else {}) | end
 
 
 @dataclass
 class Script:
-    """An experiment and all that was done to it: groups led by hand, numbers turned, cuts."""
+    """An experiment and all changes in a session: groups led by hand, changed numbers, cuts."""
 
     experiment: Experiment
     parts: Parts
     numbers: dict[str, AdjustableNumber]
-    groups: list[Led]
+    groups: list[LeaderScript]
     cuts: list[Parts] = field(default_factory=list)
 
     @classmethod
     def of(cls, experiment: Experiment) -> Script:
-        """Of an experiment whose relaxation and memory are numbers, to which nothing was done."""
+        """Return the script of an experiment with numbers for relaxation and memory, without
+        changes."""
         parts = parts_of(experiment)
-        groups = [Led(_said(group)) for group in parts.get("leaders", ())]
+        groups = [LeaderScript(_without_defaults(group)) for group in parts.get("leaders", ())]
         return cls(experiment, parts, numbers_of(experiment, parts), groups)
 
     def copy(self) -> Script:
-        """The same, for what is done to one of the two is not done to the other."""
+        """Return an independent copy."""
         numbers = {name: replace(n, turns=[*n.turns]) for name, n in self.numbers.items()}
         return replace(self, numbers=numbers, groups=deepcopy(self.groups), cuts=[*self.cuts])
 
-    def restore(self, kept: Script) -> None:
-        """Says what a copy says that is not needed any more."""
-        self.numbers, self.groups, self.cuts = kept.numbers, kept.groups, kept.cuts
+    def restore(self, snapshot: Script) -> None:
+        """Restore the changes of a copy, which is not used any more."""
+        self.numbers, self.groups, self.cuts = snapshot.numbers, snapshot.groups, snapshot.cuts
 
     def grab(self, group: int, step: int) -> int:
-        """Lets the hand lead a group after that step; returns the place of the group that it
-        leads."""
-        found = self.groups[group]
-        if found.hand is not None:
+        """Let the hand lead a group after a step; return the index of the group that it leads."""
+        original = self.groups[group]
+        if original.hand is not None:
             return group
-        kept = {key: of for key, of in found.of_file.items() if key not in ("motion", "until")}
-        led = Led(kept | {"from": step + 1}, Hand())
-        if found.begins == step + 1:
-            led.instead_of, self.groups[group] = found, led
+        selection = {
+            key: of for key, of in original.of_file.items() if key not in ("motion", "until")
+        }
+        led_group = LeaderScript(selection | {"from": step + 1}, Hand())
+        if original.begins == step + 1:
+            led_group.instead_of, self.groups[group] = original, led_group
             return group
-        found.ended = step
-        self.groups.append(led)
+        original.ended = step
+        self.groups.append(led_group)
         return len(self.groups) - 1
 
     def pick(self, particle: int, step: int) -> int:
-        """Lets the hand lead the particle of that number after that step."""
-        self.groups.append(Led({"select": {"numbers": [particle]}, "from": step + 1}, Hand()))
+        """Let the hand lead the particle of that number after a step."""
+        self.groups.append(
+            LeaderScript({"select": {"numbers": [particle]}, "from": step + 1}, Hand())
+        )
         return len(self.groups) - 1
 
     def let_go(self, group: int, step: int) -> None:
-        """Lets a group follow after that step."""
-        led = self.groups[group]
-        if led.begins > step:
+        """Let a group follow after a step."""
+        led_group = self.groups[group]
+        if led_group.begins > step:
             del self.groups[group]
         else:
-            led.ended = step
+            led_group.ended = step
 
     def turn(self, name: str, step: int, value: float) -> None:
-        """Another number after that step. Raises ExperimentError for one that cannot be."""
+        """Change a number after a step. Raises ExperimentError for an invalid one."""
         number = self.numbers.get(name)
         if number is None:
             raise ExperimentError(f"there is no number '{name}' that can be turned")
-        self.experiment.of_parts(placed(self.playing(step), number, number.turned(value)))
+        self.experiment.of_parts(with_number(self.playing(step), number, number.turned(value)))
         number.turn(step, value)
 
     def cut(self, segments: Sequence[Segment], step: int) -> None:
-        """Cuts at the beginning of the step after that one. Raises ExperimentError where the
-        experiment takes none."""
-        more: list[Parts] = [{"from": list(a), "to": list(b), "at": step + 1} for a, b in segments]
+        """Cut at the beginning of the next step. Raises ExperimentError where the experiment does
+        not support cuts."""
+        cuts: list[Parts] = [{"from": list(a), "to": list(b), "at": step + 1} for a, b in segments]
         playing = self.playing(step)
-        self.experiment.of_parts(playing | {"cuts": [*playing.get("cuts", ()), *more]})
-        self.cuts += more
+        self.experiment.of_parts(playing | {"cuts": [*playing.get("cuts", ()), *cuts]})
+        self.cuts += cuts
 
     def cut_back(self, step: int) -> None:
-        """Forgets all that was done after a step."""
+        """Remove all changes after a step."""
         for number in self.numbers.values():
             number.cut_back(step)
         self.cuts = [cut for cut in self.cuts if cut["at"] <= step]
-        groups = [led.instead_of if _comes_after(led, step) else led for led in self.groups]
-        self.groups = [led for led in groups if led]
-        for led in self.groups:
-            if led.ended is not None and led.ended >= step:
-                led.ended = None
-            if led.hand:
-                led.hand.cut_back(step - led.begins + 1)
+        groups = [
+            led_group.instead_of if _begins_after(led_group, step) else led_group
+            for led_group in self.groups
+        ]
+        self.groups = [led_group for led_group in groups if led_group]
+        for led_group in self.groups:
+            if led_group.ended is not None and led_group.ended >= step:
+                led_group.ended = None
+            if led_group.hand:
+                led_group.hand.cut_back(step - led_group.begins + 1)
 
     def next_turn(self, step: int) -> int:
-        """The first step after that one after which a number is another."""
+        """Return the first step after which a number changes again."""
         turns = (when for number in self.numbers.values() for when, _ in number.turns)
         return min((when for when in turns if when > step), default=NEVER)
 
     def playing(self, step: int) -> Parts:
-        """What is stepped after a step: its numbers as they are until the next turn, hands at rest,
-        and of the cuts that were made no more than tells that there are some."""
+        """Return the parts to be stepped after a step: numbers as they are until the next change,
+        hands at rest, and of past cuts only one, which keeps bonds breakable."""
         parts = dict(self.parts)
         for number in self.numbers.values():
             if number.turns:
-                parts = placed(parts, number, number.after(step))
+                parts = with_number(parts, number, number.after(step))
         cuts = [*parts.get("cuts", ()), *self.cuts]
         coming = [cut for cut in cuts if cut["at"] > step]
         parts["cuts"] = coming or cuts[-1:]
-        parts["leaders"] = [led.written(motion=False) for led in self.groups]
+        parts["leaders"] = [led_group.written(motion=False) for led_group in self.groups]
         parts.pop("record", None)
         parts.pop("diagnostics", None)
         return parts | {"steps": NEVER}
 
     def written(self, last: int) -> Parts:
-        """The whole as an experiment of `last` steps."""
+        """Return the session as an experiment of `last` steps."""
         parts = dict(self.parts)
         for number in self.numbers.values():
             if number.turns:
-                parts = placed(parts, number, number.written(last))
+                parts = with_number(parts, number, number.written(last))
         cuts = [cut for cut in (*parts.get("cuts", ()), *self.cuts) if cut["at"] <= last]
         name = parts["name"].removesuffix(MADE) + MADE
-        groups = [led.written(motion=True) for led in self.groups if not _comes_after(led, last)]
+        groups = [
+            led_group.written(motion=True)
+            for led_group in self.groups
+            if not _begins_after(led_group, last)
+        ]
         parts |= {"name": name, "steps": last, "leaders": groups}
-        parts = _where(parts, "cuts", cuts)
+        parts = _with_key(parts, "cuts", cuts)
         record = parts.get("record", {})
         if "at" in record:
             parts["record"] = record | {"at": [at for at in record["at"] if at <= last] or [0]}
@@ -250,8 +261,8 @@ class Script:
 
 
 def parts_of(experiment: Experiment) -> Parts:
-    """What an experiment that is stepped is made of, in lattice units, without an end to it; parts
-    that need not be said are left out."""
+    """Return the parts of an experiment to be stepped, in lattice units and without an end;
+    optional parts are omitted."""
     parts: Parts = json.loads(experiment.model_dump_json(by_alias=True))
     parts["solver"].pop("settle", None)
     whole = experiment.of_parts(parts)
@@ -266,38 +277,38 @@ def parts_of(experiment: Experiment) -> Parts:
     return parts
 
 
-def _said(group: Parts) -> Parts:
-    """Without what says nothing."""
+def _without_defaults(group: Parts) -> Parts:
+    """Omit the defaults of a leader group."""
     silent = {"from": 1, "until": None, "clamped": False}
     return {key: of for key, of in group.items() if key not in silent or of != silent[key]}
 
 
-def _comes_after(led: Led, step: int) -> bool:
-    return led.hand is not None and led.begins > step
+def _begins_after(group: LeaderScript, step: int) -> bool:
+    return group.hand is not None and group.begins > step
 
 
-def _where(parts: Parts, key: str, some: list[Any]) -> Parts:
-    """With what there is of it, without the key where there is nothing."""
+def _with_key(parts: Parts, key: str, values: list[Any]) -> Parts:
+    """Set a key, or omit it where there are no values."""
     rest = {name: part for name, part in parts.items() if name != key}
-    return rest | ({key: some} if some else {})
+    return rest | ({key: values} if values else {})
 
 
 INLINE = 500
-"""Knots of a way that are written into the experiment; those of longer ones take a table beside."""
+"""Maximum number of knots of a path in the experiment; longer ones are written to a table."""
 COMMENT = "# Made by hand with pbdkit live: `pbdkit run` repeats it bit for bit.\n"
 
 
 @dataclass(frozen=True)
 class Saved:
-    """Where it was written; `text` is the file where it needs no other, else None."""
+    """Path of the saved experiment; `text` is the file if it needs no other, else None."""
 
     path: FilePath
     text: str | None
 
 
-def saved(script: Script, step: int, output: FilePath | None) -> Saved:
-    """Writes what was done until a step. Where there is such a file already, or none is named, it
-    takes the next name that is free.
+def save_script(script: Script, step: int, output: FilePath | None) -> Saved:
+    """Write the session until a step, under the next free name where the file exists or none is
+    given.
 
     Raises ExperimentError where there is no step yet, or more than a file may hold; StorageError
     where it cannot be written.
@@ -318,7 +329,7 @@ def saved(script: Script, step: int, output: FilePath | None) -> Saved:
 
 
 def _free(path: FilePath, groups: int) -> FilePath:
-    """The first name of which there is neither a file nor a table of one of so many groups."""
+    """Return the first name for which neither the file nor a table of its groups exists."""
     names = (path if n == 1 else path.with_stem(f"{path.stem}-{n}") for n in count(1))
     return next(
         name
@@ -328,13 +339,13 @@ def _free(path: FilePath, groups: int) -> FilePath:
 
 
 def _table(path: FilePath, group: int) -> FilePath:
-    """Where the way of a group is, beside the experiment."""
+    """Return the path of the table of a group, beside the experiment."""
     return path.with_name(f"{path.stem}-{group}.csv")
 
 
 def _tables(parts: dict[str, Any], path: FilePath) -> dict[FilePath, str]:
-    """Puts the longest ways into tables beside the file, by their paths."""
-    found = {}
+    """Move the longest paths into tables beside the file, and return these by path."""
+    tables = {}
     for n, group in enumerate(parts["leaders"]):
         motion = group["motion"]
         if motion.get("type") == "path" and len(motion["steps"]) > INLINE:
@@ -344,13 +355,13 @@ def _tables(parts: dict[str, Any], path: FilePath) -> dict[FilePath, str]:
             lines = csv.writer(out, lineterminator="\n")
             lines.writerow(["step", "ux", "uy"])
             lines.writerows([step, repr(x), repr(y)] for step, (x, y) in rows)
-            found[table] = out.getvalue()
+            tables[table] = out.getvalue()
             group["motion"] = {"type": "table", "file": table.name}
-    return found
+    return tables
 
 
 def _nodes(parts: Any) -> int:
-    """About as many as the reader of files counts."""
+    """Return the approximate number of nodes that the reader of files counts."""
     if isinstance(parts, dict):
         return 1 + sum(1 + _nodes(part) for part in parts.values())
     return 1 + sum(map(_nodes, parts)) if isinstance(parts, list) else 1

@@ -1,11 +1,8 @@
-"""Who may see a session, and lead it: whoever knows its address, and no other page.
+"""Server of a live session: one page and a socket, on this machine only.
 
-A browser sends requests to this machine for any page that asks it to. Such a page knows no token;
-the browser says whose it is (Origin), and under which name it found the server (Host).
-
-Runs a session in a thread of its own, for all who look at it.
-
-Serves a session to pages on this machine: one page, and a socket.
+A browser sends requests to this machine on behalf of any page. Other pages do not have the token,
+and the browser adds their origin (Origin) and the name under which it reached the server (Host).
+The session runs in a thread of its own, shared by all viewers.
 """
 
 from __future__ import annotations
@@ -34,46 +31,46 @@ from websockets.http11 import Request, Response
 
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.web.page import script, source
-from pbdkit.web.requests import LONGEST, Command, PictureReceived, Rewind, command_of, obey
+from pbdkit.web.requests import LONGEST, Command, PictureReceived, Rewind, command_of, execute
 from pbdkit.web.session import Judge, Judgement, Message, Session, scenery, standing
 from pbdkit.web.view_frames import ViewFrame
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")
 Headers = Callable[[str], Sequence[str]]
-"""All values of the header of a name."""
+"""Function that returns all values of a header."""
 
 
 def new_token() -> str:
-    """Nobody guesses it."""
+    """Return a random token."""
     return secrets.token_urlsafe(32)
 
 
 @dataclass(frozen=True)
 class Access:
-    """To the server at a port."""
+    """Address of the server, and the check of requests to it."""
 
     port: int
     token: str = field(default_factory=new_token, repr=False)
 
     @property
     def address(self) -> str:
-        """What to open."""
+        """Return the URL of the page."""
         return f"http://{HOST}:{self.port}/?token={self.token}"
 
     def refusal(self, target: str, headers: Headers, *, is_socket: bool) -> str:
-        """Why a request is refused; empty where it is not. A socket says which page opens it; who
-        types an address comes from none."""
+        """Return the reason why a request is refused, or an empty text. A socket has the origin of
+        its page; an address typed by the user has none."""
         hosts, origins = headers("Host"), headers("Origin")
         if len(hosts) != 1 or hosts[0] not in self._hosts:
-            return "the server is asked under another name than its own"
+            return "the Host header does not name this server"
         if len(origins) > 1 or any(origin != f"http://{hosts[0]}" for origin in origins):
             return "the page is of another server"
         if is_socket and not origins:
-            return "it is not said which page asks"
-        given = parse_qs(urlsplit(target).query).get("token", [])
-        right = self.token.encode()
-        if len(given) != 1 or not secrets.compare_digest(given[0].encode(), right):
+            return "the Origin header is missing"
+        tokens = parse_qs(urlsplit(target).query).get("token", [])
+        expected = self.token.encode()
+        if len(tokens) != 1 or not secrets.compare_digest(tokens[0].encode(), expected):
             return "the token is missing or wrong; open the address that pbdkit has printed"
         return ""
 
@@ -83,25 +80,30 @@ class Access:
 
 
 SHORTEST_S = 1 / 60
-"""Between two pictures."""
+"""Minimum time in seconds between two pictures."""
 CLOSE_S = 1.0
 
 
 class Viewer(ABC):
-    """One page that looks on. Its methods are called from the session's thread, and do not wait."""
+    """One page that shows the session. Its methods are called from the session's thread, and do not
+    wait."""
 
-    ready = True
-    """Whether the last picture has come to it, so that the next may be sent."""
-    seen: ViewFrame | None = None
-    """The last that was sent."""
+    is_ready = True
+    """True once the last picture was acknowledged, so that the next may be sent."""
+    last_frame: ViewFrame | None = None
+    """The frame that was sent last."""
+
+    def awaits(self, picture: int) -> bool:
+        """Return whether a picture of this number can be sent and is new to the viewer."""
+        return self.is_ready and (self.last_frame is None or self.last_frame.picture != picture)
 
     @abstractmethod
     def tell(self, message: Message) -> None:
-        """What is to be known besides pictures."""
+        """Send a message other than a picture."""
 
     @abstractmethod
     def show(self, picture: bytes) -> None:
-        """The newest picture."""
+        """Send the newest picture."""
 
 
 What = Command | Judgement | Literal["join", "leave", "close"]
@@ -109,41 +111,41 @@ Asked = tuple[Viewer | None, What]
 
 
 class Conductor:
-    """Hands commands to a session, lets it step in between, and shows the newest picture to whoever
-    is ready for one: no picture ever waits for another."""
+    """Passes commands to a session, lets it step in between, and sends the newest picture to each
+    viewer that is ready: no picture waits for another."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        session.says = self._tell
+        session.notify = self._tell
         self._viewers: list[Viewer] = []
-        self._asked: queue.SimpleQueue[Asked] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Asked] = queue.SimpleQueue()
         self._standing: Message = {}
-        self._judge = Judge(lambda judgement: self._asked.put((None, judgement)))
+        self._judge = Judge(lambda judgement: self._queue.put((None, judgement)))
         self._judged: Any = None
         self._judgement: Message | None = None
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="session", daemon=True)
 
     def start(self) -> None:
-        """Begins; the body rests until somebody lets it go."""
+        """Start the thread; the body rests until a viewer starts it."""
         self._thread.start()
 
     def join(self, viewer: Viewer) -> None:
-        """One more looks on."""
-        self._asked.put((viewer, "join"))
+        """Add a viewer to the session."""
+        self._queue.put((viewer, "join"))
 
     def leave(self, viewer: Viewer) -> None:
-        """One looks on no more."""
-        self._asked.put((viewer, "leave"))
+        """Remove a viewer from the session."""
+        self._queue.put((viewer, "leave"))
 
     def ask(self, viewer: Viewer, command: Command) -> None:
-        """What a page asks for: done between two steps."""
-        self._asked.put((viewer, command))
+        """Queue a command of a page, to be executed between two steps."""
+        self._queue.put((viewer, command))
 
     def close(self) -> None:
         """End the session's thread after the steps that it is at, or, where these take longer than
         `CLOSE_S`, with the process."""
-        self._asked.put((None, "close"))
+        self._queue.put((None, "close"))
         self._judge.close()
         if self._thread.is_alive():
             self._thread.join(CLOSE_S)
@@ -152,7 +154,7 @@ class Conductor:
         due = 0.0
         while not self._closed:
             rests = self._session.next_steps == 0
-            for viewer, what in self._taken(None if rests else max(0.0, due - monotonic())):
+            for viewer, what in self._requests(None if rests else max(0.0, due - monotonic())):
                 self._do(viewer, what)
             steps = self._session.next_steps
             if steps and monotonic() >= due and not self._closed:
@@ -160,18 +162,18 @@ class Conductor:
                 self._try(None, lambda steps=steps: self._session.advance(steps))
             self._try(None, self._publish)
 
-    def _taken(self, seconds: float | None) -> Iterator[Asked]:
-        """All that was asked by now, waiting for so long until something is. Of some places to go
-        back to, one after the other, the last counts."""
-        found: list[Asked] = []
+    def _requests(self, seconds: float | None) -> Iterator[Asked]:
+        """Generate the queued requests, waiting for some time for the first. Of consecutive rewinds
+        only the last counts."""
+        requests: list[Asked] = []
         try:
-            found.append(self._asked.get(timeout=seconds))
+            requests.append(self._queue.get(timeout=seconds))
             while True:
-                found.append(self._asked.get_nowait())
+                requests.append(self._queue.get_nowait())
         except queue.Empty:
             pass
-        for n, (viewer, what) in enumerate(found):
-            later = found[n + 1][1] if n + 1 < len(found) else None
+        for n, (viewer, what) in enumerate(requests):
+            later = requests[n + 1][1] if n + 1 < len(requests) else None
             if not (isinstance(what, Rewind) and isinstance(later, Rewind)):
                 yield viewer, what
 
@@ -191,12 +193,12 @@ class Conductor:
             if not self._viewers:  # nobody is there to see it
                 self._try(None, self._session.rest)
         elif isinstance(what, PictureReceived) and viewer:
-            viewer.ready = True
+            viewer.is_ready = True
         elif not isinstance(what, str):
-            self._try(viewer, lambda: obey(self._session, what))
+            self._try(viewer, lambda: execute(self._session, what))
 
     def _try(self, viewer: Viewer | None, act: Any) -> None:
-        """Says what cannot be to whoever asked for it, or to all; what goes wrong here ends no
+        """Execute an action and report errors to the viewer, or to all; no error ends the
         session."""
         try:
             act()
@@ -219,30 +221,27 @@ class Conductor:
 
     def _publish(self) -> None:
         session = self._session
-        if (now := standing(session)) != self._standing:
-            self._standing = now
-            self._tell(now)
-        held = [number.after(session.step) for number in session.script.numbers.values()]
-        if held != self._judged:
-            self._judged = held
+        if (status := standing(session)) != self._standing:
+            self._standing = status
+            self._tell(status)
+        values = [number.after(session.step) for number in session.script.numbers.values()]
+        if values != self._judged:
+            self._judged = values
             self._judge.ask(session.plain())
-        ready = [
-            one for one in self._viewers
-            if one.ready and (one.seen is None or one.seen.made != session.pictures)
-        ]  # fmt: skip
-        frame = session.frame() if ready else None
-        for viewer in ready:
+        viewers = [viewer for viewer in self._viewers if viewer.awaits(session.pictures)]
+        frame = session.frame() if viewers else None
+        for viewer in viewers:
             assert frame
-            viewer.ready = False
-            picture, viewer.seen = frame.encoded(viewer.seen), frame
+            viewer.is_ready = False
+            picture, viewer.last_frame = frame.encoded(viewer.last_frame), frame
             viewer.show(picture)
 
 
 MOST_WAITING = 1000
-"""Messages to a page that takes none; then its line is cut."""
+"""Maximum number of messages to a page that does not read; then it is disconnected."""
 MOST_PAGES = 8
 SERVER_CLOSE_S = 0.5
-"""Seconds that pages have at the end to answer; then their lines are cut."""
+"""Time in seconds for pages to answer at the end; then they are disconnected."""
 POLICY = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; "
     "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -250,7 +249,7 @@ POLICY = (
 
 
 def _silent() -> logging.Logger:
-    """The library's notes on doubtful connections would stand between those of the program."""
+    """Return a logger that suppresses the library's notes on doubtful connections."""
     log = logging.getLogger("pbdkit.web")
     log.setLevel(logging.CRITICAL)
     return log
@@ -264,15 +263,15 @@ class SocketViewer(Viewer):
         self._waiting: asyncio.Queue[str | bytes | None] = asyncio.Queue(MOST_WAITING)
 
     def tell(self, message: Message) -> None:
-        """Puts it in line."""
+        """Queue a message to the page."""
         self._put(as_json(message))
 
     def show(self, picture: bytes) -> None:
-        """Puts it in line, where no other picture is."""
+        """Queue a picture; there is at most one."""
         self._put(picture)
 
     async def send(self, socket: ServerConnection) -> None:
-        """Hands on what comes, until the line is cut."""
+        """Send queued messages until the connection is closed."""
         with suppress(ConnectionClosed):  # whoever listens to the socket is told, too
             while (message := await self._waiting.get()) is not None:
                 await socket.send(message)
@@ -299,17 +298,17 @@ class SessionServer:
         self._transports: WeakSet[Any] = WeakSet()
         self.access = Access(port)
 
-    async def run(self, ready: Callable[[str], None], end: asyncio.Event) -> None:
-        """Serves until the end; `ready` is told the address. Raises ExperimentError where the port
-        is taken."""
+    async def run(self, on_ready: Callable[[str], None], end: asyncio.Event) -> None:
+        """Serve until the end; `on_ready` is called with the address. Raises ExperimentError where
+        the port is in use."""
         try:
             server = await self._started()
         except OSError as error:
             raise ExperimentError(
-                f"--port {self._port}: cannot be served at: {error.strerror}; take another, or none"
+                f"--port {self._port}: cannot be served at: {error.strerror}; choose another port, or omit --port"
             ) from None
         async with server:
-            ready(self.access.address)
+            on_ready(self.access.address)
             await end.wait()
             server.close()
             with suppress(TimeoutError):
@@ -338,7 +337,7 @@ class SessionServer:
         return Connection
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The page, a refusal, or nothing where the socket may open."""
+        """Return the page, a refusal, or None where the socket may open."""
         path, is_socket = urlsplit(request.path).path, "Upgrade" in request.headers
         refusal = self.access.refusal(
             request.path, request.headers.get_all, is_socket=is_socket or path == "/socket"
@@ -383,12 +382,12 @@ class SessionServer:
 
 
 def page(title: str, nonce: str) -> str:
-    """The page of a session; its script and style are those of the nonce."""
+    """Return the page of a session; its script and style carry the nonce."""
     return Template(source("live.html")).substitute(
         title=escape(title), nonce=nonce, style=source("live.css"), script=script("socket")
     )
 
 
 def as_json(message: Message) -> str:
-    """What a browser takes as JSON."""
+    """Serialise a message as JSON for a browser."""
     return json.dumps(message, allow_nan=False)

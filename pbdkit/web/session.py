@@ -1,14 +1,9 @@
-"""The verdict of the spectrum on the numbers as they are: stable, slow or diverging, and why.
+"""Live session: an experiment that is stepped while leaders are moved, numbers changed and bonds
+cut.
 
-Steps a script: by the engines of any run, with the scene as the script has it at each step.
-
-States that are kept, so that one can go back.
-
-Cuts as they are drawn, across the body as it stands, put back to where they are at rest.
-
-A body that is stepped, and what is done to it meanwhile.
-
-What a page has to know of a session besides pictures.
+Stability is judged in a separate thread, steps are made by the engines of any run, earlier states
+are kept so that the user can go back, and cuts are mapped from the deformed body to the body at
+rest.
 """
 
 from __future__ import annotations
@@ -41,30 +36,30 @@ from pbdkit.stepping.divergence import Guard
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state, unmoved_state
-from pbdkit.web.script import NEVER, Led, Saved, Script, Way, saved
+from pbdkit.web.script import NEVER, LeaderScript, Saved, Script, Way, save_script
 from pbdkit.web.view_frames import COLOURS, Camera, ViewFrame
 
 LARGEST = 4000
-"""Particles of which the spectrum is found in about a second."""
+"""Maximum number of particles for which the spectrum is computed in about a second."""
 SLOW = 2000
-"""Steps to a thousandth from which on a body is called slow."""
+"""Steps to a thousandth above which a body is called slow."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """In one word, "stable", "slow", "diverging" or "unknown", and why."""
+    """Verdict in one word, "stable", "slow", "diverging" or "unknown", with the reason."""
 
     word: str
     why: str
 
 
 def judged(experiment: Experiment) -> Judgement:
-    """Of the body as it starts, at rest unless the experiment says otherwise."""
+    """Judge the stability of the body in its initial state."""
     try:
         scene = build_scene(experiment)
         if scene.raster.count > LARGEST:
             size = f"the body has more than {LARGEST} particles"
-            return Judgement("unknown", f"{size}; `pbdkit check` tells of larger ones")
+            return Judgement("unknown", f"{size}; use `pbdkit check` for larger ones")
         analysis = Analysis(scene)
         return _worded(analysis)
     except Exception as error:  # whatever a plugin raises, the session goes on
@@ -74,8 +69,8 @@ def judged(experiment: Experiment) -> Judgement:
 def _worded(analysis: Analysis) -> Judgement:
     radius, stable = analysis.spectral_radius, analysis.stable
     if radius is None:
-        left = analysis.left_out
-        return Judgement("unknown", left[0] if left else "these steps have no spectrum")
+        reasons = analysis.left_out
+        return Judgement("unknown", reasons[0] if reasons else "these steps have no spectrum")
     if not stable:
         bound = analysis.largest_stable_relaxation
         remedy = f"; relaxation below {bound:.4g} is stable" if bound else ""
@@ -83,17 +78,17 @@ def _worded(analysis: Analysis) -> Judgement:
     steps = analysis.steps_to["1e-3"]
     if steps is None:
         return Judgement("slow", "a mode neither grows nor shrinks: nothing holds it")
-    fading = f"the slowest mode shrinks to a thousandth in {steps} steps"
+    decay = f"the slowest mode shrinks to a thousandth in {steps} steps"
     if steps <= SLOW:
-        return Judgement("stable", fading)
+        return Judgement("stable", decay)
     best = analysis.best_memory
-    own = analysis.scene.experiment.stepping.memory
-    remedy = f"; memory {best:.4g} is fastest" if best and not math.isclose(best, own) else ""
-    return Judgement("slow", fading + remedy)
+    memory = analysis.scene.experiment.stepping.memory
+    remedy = f"; memory {best:.4g} is fastest" if best and not math.isclose(best, memory) else ""
+    return Judgement("slow", decay + remedy)
 
 
 class Judge:
-    """Judges in a thread of its own, the newest experiment that it was given."""
+    """Judges the newest experiment in a thread of its own."""
 
     def __init__(self, tell: Callable[[Judgement], None]) -> None:
         self._tell, self._asked = tell, threading.Condition()
@@ -103,13 +98,13 @@ class Judge:
         self._thread.start()
 
     def ask(self, experiment: Experiment) -> None:
-        """Of this experiment, unless another is asked of before its turn."""
+        """Queue an experiment in place of one that still waits."""
         with self._asked:
             self._newest = experiment
             self._asked.notify()
 
     def close(self) -> None:
-        """Ends the thread once it has judged what it is at."""
+        """End the thread after the current judgement."""
         with self._asked:
             self._closed = True
             self._asked.notify()
@@ -126,12 +121,12 @@ class Judge:
 
 
 SMALL = 20_000
-"""Particles up to which numpy steps: kernels would be compiled anew for some turns of numbers, and
-each takes seconds."""
+"""Maximum number of particles that are stepped by numpy: kernels would be compiled again after some
+changes of numbers, which takes seconds each time."""
 
 
 class LiveStepper:
-    """The scene of a script from one change of it to the next, and the engine that steps it."""
+    """The scene of a script between two changes, and the engine that steps it."""
 
     def __init__(self, script: Script, scene: Scene) -> None:
         self.script, self.scene = script, scene
@@ -140,12 +135,12 @@ class LiveStepper:
         self._since, self._until = 0, -1
 
     def changed(self) -> None:
-        """The script says something else than before."""
+        """Invalidate the scene after a change of the script."""
         self._until = -1
 
     def set(self, state: State) -> State:
-        """Makes the scene that of the step after a state; returns the state as one of it. Raises
-        ExperimentError for what cannot be."""
+        """Build the scene of the step after a state, and return the state as one of it. Raises
+        ExperimentError where that is impossible."""
         if not self._since <= state.step < self._until:
             experiment = self.script.experiment.of_parts(self.script.playing(state.step))
             if experiment.parts_bonds != self.scene.has_fracture:
@@ -159,7 +154,7 @@ class LiveStepper:
         return fitted(state, self.scene)
 
     def advance(self, state: State, steps: int) -> State:
-        """The state so many steps on; it takes over the arrays of `state`."""
+        """Advance a state by a number of steps; the arrays of `state` are reused."""
         end = min(state.step + steps, NEVER)
         while state.step < end:
             state = self.set(state)
@@ -169,8 +164,9 @@ class LiveStepper:
 
 
 def stepped(experiment: Experiment) -> Scene:
-    """The scene of an experiment, to be stepped, with numbers for relaxation and memory. In place
-    of an equilibrium it takes the relaxation that leads there fastest, where that is soon known."""
+    """Build the scene of an experiment to be stepped, with numbers for relaxation and memory. For
+    an equilibrium solver it uses the relaxation that converges fastest, where that is quickly
+    computed."""
     scene = build_scene(experiment)
     if experiment.solver.makes_steps:
         return tuned(scene)
@@ -185,14 +181,16 @@ def stepped(experiment: Experiment) -> Scene:
     return build_scene(plain)
 
 
-def _led(scene: Scene, groups: Sequence[Led]) -> tuple[Leading, ...]:
-    """The scene's groups, with hands for the motions of those that are led by hand."""
-    found = []
-    for leading, led in zip(build_leading(scene.raster, scene.experiment), groups, strict=True):
-        motion = led.hand or leading.group.motion
+def _led(scene: Scene, groups: Sequence[LeaderScript]) -> tuple[Leading, ...]:
+    """Return the scene's groups, with the motions of the hand where they are led by hand."""
+    groups_of_scene = []
+    for leading, group_of_script in zip(
+        build_leading(scene.raster, scene.experiment), groups, strict=True
+    ):
+        motion = group_of_script.hand or leading.group.motion
         group = leading.group.model_copy(update={"motion": motion})
-        found.append(replace(leading, group=group))
-    return tuple(found)
+        groups_of_scene.append(replace(leading, group=group))
+    return tuple(groups_of_scene)
 
 
 def _chosen(scene: Scene) -> Choice:
@@ -202,7 +200,7 @@ def _chosen(scene: Scene) -> Choice:
 
 
 def fitted(state: State, scene: Scene) -> State:
-    """A state as one of a scene with more or fewer groups, or whose bonds can break by now."""
+    """Adapt a state to a scene with more or fewer groups, or whose bonds have become breakable."""
     missing = len(scene.leading) - len(state.starts)
     if missing:
         starts = (*state.starts, *(None,) * missing)[: len(scene.leading)]
@@ -215,13 +213,14 @@ def fitted(state: State, scene: Scene) -> State:
 
 
 ROOM = 256 * 2**20
-"""Bytes that kept states may take."""
+"""Maximum memory of kept states in bytes."""
 FEWEST, MOST = 4, 200
-"""Of states."""
+"""Minimum and maximum number of kept states."""
 
 
 class History:
-    """The start, and later states ever farther apart the more there are: never more than fit."""
+    """The initial state and later ones, with distances that grow with their number, so that they
+    fit into the memory."""
 
     def __init__(self, start: State) -> None:
         self._states = [start.copy()]
@@ -229,11 +228,11 @@ class History:
 
     @property
     def steps(self) -> list[int]:
-        """Those of which the state is kept."""
+        """Return the steps whose states are kept."""
         return [state.step for state in self._states]
 
     def keep(self, state: State) -> None:
-        """Notes a state, if it is far enough from the last."""
+        """Keep a state if it is far enough from the last one."""
         if state.step < self._states[-1].step + self._apart:
             return
         self._states.append(state.copy())
@@ -242,17 +241,17 @@ class History:
             self._thin()
 
     def copy(self) -> History:
-        """The same states, kept on their own."""
-        found = copy(self)
-        found._states = [*self._states]
-        return found
+        """Return an independent copy with the same states."""
+        history = copy(self)
+        history._states = [*self._states]
+        return history
 
     def before(self, step: int) -> State:
-        """A copy of the last state kept that is not after a step."""
+        """Return a copy of the last kept state not later than a step."""
         return self._states[max(0, bisect_right(self.steps, step) - 1)].copy()
 
     def cut_back(self, step: int) -> None:
-        """Forgets the states after a step."""
+        """Remove the states after a step."""
         self._states = [state for state in self._states if state.step <= step] or self._states[:1]
 
     def _fits(self) -> bool:
@@ -260,29 +259,30 @@ class History:
         return count <= FEWEST or (count <= MOST and sum(map(_size, self._states)) <= ROOM)
 
     def _thin(self) -> None:
-        kept = self._states[:1]
+        states = self._states[:1]
         for state in self._states[1:]:
-            if state.step >= kept[-1].step + self._apart:
-                kept.append(state)
-        self._states = kept
+            if state.step >= states[-1].step + self._apart:
+                states.append(state)
+        self._states = states
 
 
 def _size(state: State) -> int:
-    """Its bytes, about."""
-    more = (state.broken_step, state.broken_length, *state.bond_values, *state.particle_values)
-    return 2 * state.u.nbytes + sum(array.nbytes for array in more if array is not None)
+    """Return the approximate number of bytes of a state."""
+    arrays = (state.broken_step, state.broken_length, *state.bond_values, *state.particle_values)
+    return 2 * state.u.nbytes + sum(array.nbytes for array in arrays if array is not None)
 
 
 SAMPLES = 64
 NEAR = 0.25
-"""By so many spacings a line may be straightened."""
+"""Tolerance of straightening a line, in units of the spacing."""
 ALONG, WIDTH = 0.29, 1e-3
-"""Where a bond is cut, and how wide: bonds cross each other in the middle."""
+"""Position along a bond where it is cut, and width of the cut: bonds cross each other in the
+middle."""
 
 
 def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float) -> list[Segment]:
-    """A line across the body as straight segments at rest, each place moved back as the particle
-    next to it."""
+    """Map a line across the deformed body to straight segments at rest, each place by the
+    displacement of the nearest particle."""
     from scipy.spatial import cKDTree
 
     a, b = np.array(line[0]), np.array(line[1])
@@ -301,7 +301,7 @@ def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float)
 
 
 def across(ends: Floats) -> Segment:
-    """A short segment at rest that crosses a bond and, of those that cross it, no other."""
+    """Return a short segment at rest that crosses a bond and no other that crosses it."""
     (x, y), way = ends[0], ends[1] - ends[0]
     middle = np.array([x, y]) + ALONG * way
     aside = WIDTH * np.array([-way[1], way[0]])
@@ -310,33 +310,33 @@ def across(ends: Floats) -> Segment:
 
 
 def _straightened(places: Floats, tolerance: float) -> list[int]:
-    """The corners of a line that nowhere lies farther than that from these places."""
+    """Return the corners of a polyline within the tolerance of these places."""
     first, last = places[0], places[-1]
-    way, apart = last - first, places - first
+    way, offsets = last - first, places - first
     length = math.hypot(*way)
     if length == 0.0:
-        distance = np.hypot(*apart.T)
+        distance = np.hypot(*offsets.T)
     else:
-        share = np.clip(apart @ way / length**2, 0.0, 1.0)
-        distance = np.hypot(*(apart - share[:, None] * way).T)
+        share = np.clip(offsets @ way / length**2, 0.0, 1.0)
+        distance = np.hypot(*(offsets - share[:, None] * way).T)
     worst = int(np.argmax(distance))
     if len(places) < 3 or distance[worst] <= tolerance:
         return [0, len(places) - 1]
-    before = _straightened(places[: worst + 1], tolerance)
-    return before[:-1] + [worst + n for n in _straightened(places[worst:], tolerance)]
+    corners = _straightened(places[: worst + 1], tolerance)
+    return corners[:-1] + [worst + n for n in _straightened(places[worst:], tolerance)]
 
 
 LONGEST_S = 0.25
-"""A picture waits for so long at most, whatever the speed."""
+"""Maximum time in seconds between pictures, whatever the speed."""
 REPLAY_S = 0.5
-"""One goes back to a step that takes no longer than this from the last state kept before it."""
+"""Maximum time in seconds for replaying steps from a kept state."""
 
 
 @dataclass
 class GrabbedParticle:
-    """A particle that the mouse holds: the group that is led, None until it is moved, where that
-    was when it was grabbed, and how far the mouse has come since. `frees` tells that it follows
-    again once it is let go."""
+    """A particle held by the mouse: the group that is led, None until it is moved, its offset when
+    it was grabbed, and the displacement of the mouse since. With `frees` it follows again once it
+    is released."""
 
     row: int
     group: int | None = None
@@ -347,23 +347,23 @@ class GrabbedParticle:
 
 @dataclass
 class Session:
-    """Steps an experiment without end, and does what it is asked between two steps.
+    """Steps an experiment without end, and executes commands between two steps.
 
-    All of it goes into the script. Whoever goes back and does something forgets what came after.
-    `says` is told what is to be known besides pictures. Raises ExperimentError for an experiment
-    of which there is no scene.
+    All changes are recorded in the script; a change made after going back removes later ones.
+    Messages other than pictures are passed to `notify`. Raises ExperimentError for an experiment
+    whose scene cannot be built.
     """
 
     experiment: Experiment
     output: Path | None = None
-    says: Callable[[dict[str, Any]], None] = field(default=lambda message: None)
+    notify: Callable[[dict[str, Any]], None] = field(default=lambda message: None)
     running: bool = False
     owed: int = 0
     speed: int = 1
-    held: GrabbedParticle | None = None
+    grabbed: GrabbedParticle | None = None
     step_s: float = 0.0
     pictures: int = 0
-    """How many there could have been."""
+    """Number of the present picture."""
 
     def __post_init__(self) -> None:
         scene = stepped(self.experiment)
@@ -375,12 +375,12 @@ class Session:
 
     @property
     def step(self) -> int:
-        """The last that was made."""
+        """Return the last step that was made."""
         return self.state.step
 
     def advance(self, steps: int) -> None:
-        """So many steps, with what is held led evenly to where the mouse is. Where they cannot be
-        made all is as before, the body rests, and it is said why."""
+        """Advance by steps, with the grabbed group moved linearly to the mouse. Where a step fails,
+        the state is restored, the body rests, and an error is reported."""
         begin = self.step
         self._lead(begin, begin + steps)
         clock = perf_counter()
@@ -399,129 +399,133 @@ class Session:
         except FloatingPointError as error:
             self.running, self.owed = False, 0
             text = f"{error} left all bounds; go back, and take other numbers"
-            self.says({"is": "error", "text": text})
+            self.notify({"is": "error", "text": text})
 
     @property
     def next_steps(self) -> int:
-        """How many steps the next picture is away; 0 where the body rests."""
+        """Return the number of steps to the next picture; 0 where the body rests."""
         if not (self.running or self.owed):
             return 0
-        most = max(1, int(LONGEST_S / self.step_s)) if self.step_s else 1
-        return min(most, self.speed if self.running else self.owed)
+        limit = max(1, int(LONGEST_S / self.step_s)) if self.step_s else 1
+        return min(limit, self.speed if self.running else self.owed)
 
     def rewind(self, step: int) -> None:
-        """To that step, or to a state kept before it where it is a long way from there; the body
-        rests then."""
-        self.running, self.owed, self.held = False, 0, None
+        """Go to a step, or to a kept state before it if replaying would take long, and rest."""
+        self.running, self.owed, self.grabbed = False, 0, None
         step = min(step, self.end)
-        kept = self.history.before(step)
-        if (step - kept.step) * self.step_s > REPLAY_S:
-            step = kept.step
+        snapshot = self.history.before(step)
+        if (step - snapshot.step) * self.step_s > REPLAY_S:
+            step = snapshot.step
         self._replay(step)
 
     def grab(self, row: int) -> None:
-        """Takes hold of the particle of a row that is shown; nothing is done until it is moved."""
+        """Grab the particle of a visible row; it leads once it is moved."""
         if row >= len(self.camera.rows):
             raise ExperimentError(f"there is no particle {row}")
         self.release()
-        found = int(self.camera.rows[row])
-        if self.stage.scene.raster.table_kind[found] == FRAME:
+        row_in_table = int(self.camera.rows[row])
+        if self.stage.scene.raster.table_kind[row_in_table] == FRAME:
             raise ExperimentError("points of the frame follow others, and cannot be led")
-        self.held = GrabbedParticle(found)
+        self.grabbed = GrabbedParticle(row_in_table)
 
     def drag(self, by: Way) -> None:
-        """How far the mouse has come since the particle was grabbed."""
-        if self.held is None:
+        """Set the displacement of the mouse since the particle was grabbed."""
+        if self.grabbed is None:
             return
-        if self.held.group is None:
-            self._take(self.held)
-        self.held.by = by
+        if self.grabbed.group is None:
+            self._take(self.grabbed)
+        self.grabbed.by = by
 
     def release(self) -> None:
-        """Lets go: who led before stays there, others follow again."""
-        held, self.held = self.held, None
-        if held and held.group is not None and held.frees:
+        """Release the particle: a leader stays where it is, a follower follows again."""
+        grabbed, self.grabbed = self.grabbed, None
+        if grabbed and grabbed.group is not None and grabbed.frees:
             with self._editing():
-                self.script.let_go(held.group, self.step)
+                self.script.let_go(grabbed.group, self.step)
 
     def rest(self) -> None:
-        """Steps no more, and lets go of what is held."""
+        """Stop stepping, and release the grabbed particle."""
         self.running, self.owed = False, 0
         self.release()
 
     def turn(self, name: str, value: float) -> None:
-        """Another value of a number, from the next step on."""
+        """Change a number from the next step on."""
         with self._editing():
             self.script.turn(name, self.step, value)
 
     def cut(self, line: tuple[Way, Way]) -> None:
-        """Cuts along a line across the body as it stands, before the next step."""
+        """Cut along a line across the deformed body, before the next step."""
         camera = self.camera
         positions = camera.positions(self.state)
-        found = at_rest(line, positions, camera.reference, camera.spacing)
-        if not found:
+        segments = at_rest(line, positions, camera.reference, camera.spacing)
+        if not segments:
             raise ExperimentError("the cut lies beside the body; draw it across some bonds")
-        self._cut(found)
+        self._cut(segments)
 
     def cut_bond(self, row: int) -> None:
-        """Cuts a bond by its row."""
+        """Cut a bond by its row."""
         if row >= len(self.camera.bonds):
             raise ExperimentError(f"there is no bond {row}")
         ends = self.camera.reference[self.camera.bonds[row].astype(int)]
         self._cut([across(ends)])
 
     def save(self) -> Saved:
-        """Writes all that was done until now as an experiment, beside what is there already."""
-        found = saved(self.script, self.step, self.output)
-        self.says({"is": "saved", "path": str(found.path), "text": found.text, "steps": self.step})
-        return found
+        """Write the session until now as an experiment, beside existing files."""
+        result = save_script(self.script, self.step, self.output)
+        self.notify(
+            {"is": "saved", "path": str(result.path), "text": result.text, "steps": self.step}
+        )
+        return result
 
     def frame(self) -> ViewFrame:
-        """A picture of the body as it stands."""
+        """Return a picture of the present state."""
         return self.camera.frame(self.stage.scene, self.state, self.end, self.pictures, self.step_s)
 
     def plain(self) -> Experiment:
-        """The experiment with its numbers as they are now."""
+        """Return the experiment with its present numbers."""
         return self.script.experiment.of_parts(self.script.playing(self.step))
 
     def _cut(self, segments: list[Segment]) -> None:
         if self.stage.choice.engine == "compiled" and not self.stage.scene.has_fracture:
-            self.says({"is": "note", "text": "A kernel is made for cuts: some seconds."})
+            self.notify({"is": "note", "text": "A kernel is made for cuts: some seconds."})
         with self._editing():
             self.script.cut(segments, self.step)
 
-    def _take(self, held: GrabbedParticle) -> None:
-        step, self.held = self.step, None  # nothing is, where it cannot be led
+    def _take(self, grabbed: GrabbedParticle) -> None:
+        step, self.grabbed = self.step, None  # nothing is, where it cannot be led
         with self._editing():
             leading = self.stage.scene.leading
             groups = [
                 n
-                for n, of in enumerate(leading)
-                if of.group.leads(step + 1) and held.row in of.rows
+                for n, leaders in enumerate(leading)
+                if leaders.group.leads(step + 1) and grabbed.row in leaders.rows
             ]
             if groups:
-                held.group = self.script.grab(groups[0], step)
+                grabbed.group = self.script.grab(groups[0], step)
             else:
-                held.group, held.frees = self.script.pick(held.row + 1, step), True
-        self.held = held
-        hand = self.script.groups[held.group].hand
+                grabbed.group, grabbed.frees = self.script.pick(grabbed.row + 1, step), True
+        self.grabbed = grabbed
+        hand = self.script.groups[grabbed.group].hand
         assert hand
-        held.start = hand.at(step - self.script.groups[held.group].begins + 1)
+        grabbed.start = hand.at(step - self.script.groups[grabbed.group].begins + 1)
 
     def _lead(self, begin: int, end: int) -> None:
-        if self.held is None or self.held.group is None:
+        if self.grabbed is None or self.grabbed.group is None:
             return
-        led = self.script.groups[self.held.group]
-        target = self.held.start[0] + self.held.by[0], self.held.start[1] + self.held.by[1]
-        first = begin - led.begins + 1
-        if led.hand and led.hand.at(first) != target:
+        group = self.script.groups[self.grabbed.group]
+        target = (
+            self.grabbed.start[0] + self.grabbed.by[0],
+            self.grabbed.start[1] + self.grabbed.by[1],
+        )
+        first = begin - group.begins + 1
+        if group.hand and group.hand.at(first) != target:
             self._forget_later()
-            led.hand.lead(first, end - led.begins + 1, target)
+            group.hand.lead(first, end - group.begins + 1, target)
 
     @contextmanager
     def _editing(self) -> Iterator[None]:
-        """Lets something be done to the script after what came after this step is forgotten. Where
-        it cannot be done all is as before, what came after too."""
+        """Change the script in the block after removing what comes after this step. On an error
+        everything is restored."""
         script, history = self.script.copy(), self.history.copy()
         state, end = self.state, self.end
         try:
@@ -535,7 +539,7 @@ class Session:
             raise
 
     def _forget_later(self) -> None:
-        """What came after this step."""
+        """Remove what comes after this step."""
         if self.step < self.end:
             self.end = self.step
             self.script.cut_back(self.step)
@@ -543,17 +547,17 @@ class Session:
             self._changed()
 
     def _changed(self) -> None:
-        """The script says something else. Raises PbdkitError where it cannot."""
+        """Apply a change of the script. Raises PbdkitError where that is impossible."""
         self.stage.changed()
         self.state = self.stage.set(self.state)
 
     def _undo(self, step: int, text: str) -> None:
-        self.running, self.owed, self.held = False, 0, None
+        self.running, self.owed, self.grabbed = False, 0, None
         self.end = step
         self.script.cut_back(step)
         self.history.cut_back(step)
         self._replay(step)
-        self.says({"is": "error", "text": text})
+        self.notify({"is": "error", "text": text})
 
     def _replay(self, step: int) -> None:
         state = self.history.before(step)
@@ -565,7 +569,8 @@ Message = dict[str, Any]
 
 
 def scenery(session: Session) -> Message:
-    """What stays as it is: the body, its bonds (pairs of rows, 32 bits each), its numbers."""
+    """Return the static content of a session: the body, its bonds (pairs of rows, 32 bits each),
+    its numbers."""
     camera, scene = session.camera, session.stage.scene
     return {
         "is": "scene",
@@ -583,8 +588,8 @@ def scenery(session: Session) -> Message:
 
 
 def standing(session: Session) -> Message:
-    """What may change at any step, but for what pictures tell."""
-    choice, held = session.stage.choice, session.held
+    """Return the content of a session that may change at any step, except for pictures."""
+    choice, grabbed = session.stage.choice, session.grabbed
     threads = f" on {choice.threads} threads" if choice.threads > 1 else ""
     return {
         "is": "standing",
@@ -592,7 +597,7 @@ def standing(session: Session) -> Message:
         "speed": session.speed,
         "colour": session.camera.colour,
         "engine": choice.engine + threads,
-        "held": held is not None,
+        "held": grabbed is not None,
         "numbers": {
             name: number.at(session.step + 1) for name, number in session.script.numbers.items()
         },

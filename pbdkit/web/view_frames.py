@@ -1,7 +1,5 @@
-"""What is shown of a state: positions in single precision, thinned to what a canvas can show.
-
-The numbers of an experiment that can be turned while it is stepped, and their course.
-"""
+"""Frames of a live session: positions in single precision, thinned for a canvas, and the adjustable
+numbers of an experiment with their schedules."""
 
 from __future__ import annotations
 
@@ -28,46 +26,46 @@ from pbdkit.stepping.state import State
 
 MOST_POINTS = 50_000
 MOST_LEADERS = 2000
-"""Of a group; of larger ones some are shown."""
+"""Maximum number of leaders of a group that are shown."""
 MOST_BONDS = 500_000
 COLOURS = {"kind": "kind", "displacement": "displacement", "last-step": "way of the last step"}
-"""What particles can be coloured by, with what it is called."""
+"""Variables that can colour particles, with their names."""
 HEAD = struct.Struct("<IIIIIIIIdd")
 VALUES, KINDS, BROKEN = 1, 2, 4
-"""What a frame holds besides positions."""
+"""Flags for the optional content of a frame."""
 
 
 @dataclass(frozen=True)
 class ViewFrame:
     """A state as it is shown: positions (particle, 2), a value of each (None: coloured by kind),
-    its kind, and which bonds are broken. `kinds` and `broken` are the same objects as long as
-    nothing in them changes. `end` is the last step that was made, `made` counts the pictures that
-    there could have been until then, and `step_s` is what a step takes."""
+    its kind, and which bonds are broken. `kinds` and `broken` are the same objects until they
+    change. `end` is the last step that was made, `picture` the number of the picture, and `step_s`
+    the time of a step in seconds."""
 
     step: int
     end: int
-    made: int
+    picture: int
     step_s: float
     positions: NDArray[np.float32]
     values: NDArray[np.float32] | None
     kinds: Bytes
     broken: Bytes
 
-    def encoded(self, before: ViewFrame | None) -> bytes:
-        """The bytes for whoever has seen the frame before: what they know is left out."""
+    def encoded(self, previous: ViewFrame | None) -> bytes:
+        """Encode the frame for a viewer of the previous one: unchanged parts are omitted."""
         parts: list[NDArray[Any]] = [self.positions]
         holds = 0
-        for bit, part, known in (
+        for bit, part, previous_part in (
             (VALUES, self.values, None),
-            (KINDS, self.kinds, before and before.kinds),
-            (BROKEN, self.broken, before and before.broken),
+            (KINDS, self.kinds, previous and previous.kinds),
+            (BROKEN, self.broken, previous and previous.broken),
         ):
-            if part is not None and part is not known:
+            if part is not None and part is not previous_part:
                 holds |= bit
                 parts.append(part)
         low, high = _range(self.values)
         nanoseconds = min(int(1e9 * self.step_s), 2**32 - 1)
-        steps = self.step % 2**32, self.end % 2**32, self.made % 2**32, nanoseconds
+        steps = self.step % 2**32, self.end % 2**32, self.picture % 2**32, nanoseconds
         sizes = len(self.positions), len(self.broken), 0
         head = HEAD.pack(holds, *steps, *sizes, low, high)
         return b"".join([head, *(part.tobytes() for part in parts)])
@@ -95,7 +93,7 @@ class Camera:
 
     @cached_property
     def bonds(self) -> NDArray[np.uint32]:
-        """(bond, end): the rows of their ends; none where particles or bonds are left out."""
+        """Rows of the ends of bonds, (bond, end); none where particles or bonds are omitted."""
         table = self._scene.bonds.ends if self._shows_bonds else np.zeros((0, 2))
         return table.astype(np.uint32) if len(table) <= MOST_BONDS else np.zeros((0, 2), np.uint32)
 
@@ -104,27 +102,29 @@ class Camera:
         return self.every == 1 and not self._scene.experiment.neighbours.nearness()
 
     def positions(self, state: State) -> NDArray[np.float64]:
-        """(particle, axis) of those that are shown."""
+        """Return the positions of the visible particles, (particle, axis)."""
         u = state.u.reshape(len(state.u), -1)[:, self._place]
         return np.asarray(self.reference + u.T, np.float64)
 
-    def frame(self, scene: Scene, state: State, end: int, made: int, step_s: float) -> ViewFrame:
-        """A picture of a state of a scene of that body; of what else it tells, see Frame."""
+    def frame(
+        self, scene: Scene, state: State, end: int, pictures: int, step_s: float
+    ) -> ViewFrame:
+        """Return the frame of a state."""
         with np.errstate(over="ignore"):  # of what diverges
             positions = self.positions(state).astype(np.float32)
             values = self._values(state)
         kinds, broken = self._kinds_of(scene, state.step), self._broken_of(state)
-        return ViewFrame(state.step, end, made, step_s, positions, values, kinds, broken)
+        return ViewFrame(state.step, end, pictures, step_s, positions, values, kinds, broken)
 
     def _values(self, state: State) -> NDArray[np.float32] | None:
         if self.colour == "kind":
             return None
         u = state.u if self.colour == "displacement" else state.u - state.previous
-        own = u.reshape(len(u), -1)[:, self._place]
-        return np.asarray(np.sqrt((own.astype(np.float64) ** 2).sum(axis=0)), np.float32)
+        displacements = u.reshape(len(u), -1)[:, self._place]
+        return np.asarray(np.sqrt((displacements.astype(np.float64) ** 2).sum(axis=0)), np.float32)
 
     def _kinds_of(self, scene: Scene, step: int) -> Bytes:
-        leading = [led.rows for led in scene.leading if led.group.leads(step + 1)]
+        leading = [group.rows for group in scene.leading if group.group.leads(step + 1)]
         same = len(leading) == len(self._leading) and all(map(is_, leading, self._leading))
         if not (same and len(self._kinds)):
             self._leading = leading
@@ -144,14 +144,14 @@ class Camera:
 
 
 def _thinned(scene: Scene, every: int) -> NDArray[np.intp]:
-    """The rows of each n-th particle along both axes, of the last, and of leaders if they are not
-    too many."""
+    """Return the rows of each n-th particle along both axes, of the last, and of leaders unless
+    they are many."""
     raster = scene.raster
     site = raster.site_table()
-    shown = ((site % every == 0) | (site == site.max(axis=0))).all(axis=1)
+    selection = ((site % every == 0) | (site == site.max(axis=0))).all(axis=1)
     for leading in scene.leading:
-        shown[leading.rows[:: max(1, len(leading.rows) // MOST_LEADERS)]] = True
-    return np.flatnonzero(shown)
+        selection[leading.rows[:: max(1, len(leading.rows) // MOST_LEADERS)]] = True
+    return np.flatnonzero(selection)
 
 
 def _range(values: NDArray[np.float32] | None) -> tuple[float, float]:
@@ -164,35 +164,36 @@ def _range(values: NDArray[np.float32] | None) -> tuple[float, float]:
 
 PARTS = ("rule", "fracture", "solver")
 SOLVER = {"relaxation": 1.0, "memory": 0.0}
-"""Of the solver, with what they are where nothing is said."""
+"""Adjustable numbers of the solver, with their defaults."""
 MORE, LITTLE = 1 + 2**-10, 2**-10
-"""By so much a number is turned to see whether it can be."""
+"""Test factor, and test value instead of zero, by which a number is recognised as adjustable."""
 SPANS = {"solver.relaxation": (0.01, 2.0), "solver.memory": (0.0, 1.0)}
-"""What sliders of these go over."""
+"""Ranges of the sliders of these numbers."""
 
 
 @dataclass
 class AdjustableNumber:
-    """One number by its place in the file, e.g. ``fracture.thresholds.0``.
+    """One number by its path in the file, e.g. ``fracture.thresholds.0``.
 
-    `given` is what the experiment says, a number or a course; `turns` are the steps after which it
+    `initial` is the number or schedule of the experiment; `turns` are the steps after which it
     was turned, each with the value from then on; `bounds` what it has to lie between, and `span`
     what a slider goes over.
     """
 
     name: str
-    given: float | dict[str, Any]
+    initial: float | dict[str, Any]
     bounds: tuple[float, float]
     turns: list[tuple[int, float]] = field(default_factory=list)
 
     @property
     def where(self) -> tuple[str | int, ...]:
-        """The keys on the way to it."""
+        """Return the keys of the path."""
         return tuple(int(key) if key.isdecimal() else key for key in self.name.split("."))
 
     @property
     def span(self) -> tuple[float, float]:
-        """From about nothing to twice what it was, within its bounds."""
+        """Return the range of the slider: from zero to twice the initial value, within the
+        bounds."""
         value = self.at(0)
         low, high = SPANS.get(self.name, (min(2 * value, 0.0), max(2 * value, 0.0)))
         if low == high:
@@ -202,35 +203,35 @@ class AdjustableNumber:
         return max(low, min(inner[0], value)), min(high, max(inner[1], value))
 
     def after(self, step: int) -> float | dict[str, Any]:
-        """What holds from the next step on until it is turned: a number or a course."""
-        known = [value for when, value in self.turns if when <= step]
-        return known[-1] if known else self.given
+        """Return the value from the next step on: a number or a schedule."""
+        values = [value for when, value in self.turns if when <= step]
+        return values[-1] if values else self.initial
 
     def at(self, step: int) -> float:
-        """What it is at the end of a step."""
-        found = self.after(step - 1)
-        return NumberCourse.model_validate(found).at(step) if isinstance(found, dict) else found
+        """Return the value at the end of a step."""
+        value = self.after(step - 1)
+        return NumberCourse.model_validate(value).at(step) if isinstance(value, dict) else value
 
     def turn(self, step: int, value: float) -> None:
-        """From the step after that one on it is another."""
+        """Change the value after a step."""
         if self.turns and self.turns[-1][0] == step:
             self.turns.pop()
         self.turns.append((step, value))
 
     def turned(self, value: float) -> dict[str, Any]:
-        """As an experiment says that it comes to this value. One whose parts draw numbers from it
-        before the first step refuses that."""
+        """Return a schedule that reaches a value. Experiments whose components use the number
+        before the first step reject it."""
         return {"steps": [0, 1], "values": [self.at(0), value]}
 
     def cut_back(self, step: int) -> None:
-        """Forgets what was turned after that step, or then and for later ones."""
+        """Remove changes at and after a step."""
         self.turns = [turn for turn in self.turns if turn[0] < step]
 
     def written(self, last: int) -> float | dict[str, Any]:
-        """As an experiment file says it, that ends with step `last`."""
+        """Return the schedule for an experiment file with `last` steps."""
         turns = [turn for turn in self.turns if turn[0] < last]
         if not turns:
-            return self.given
+            return self.initial
         first = turns[0][0]
         knots = self._begun(first)
         for step, value in turns:
@@ -241,11 +242,12 @@ class AdjustableNumber:
         return {"steps": list(steps), "values": list(values)}
 
     def _begun(self, until: int) -> list[tuple[int, float]]:
-        """The knots of what was given, up to a step. A stretch that ends before its knot is told
-        step by step: the line to another knot would differ in its last digits."""
-        if not isinstance(self.given, dict):
-            return [(until, self.given)]
-        course = NumberCourse.model_validate(self.given)
+        """Return the knots of the initial schedule, up to a step. An interval that ends before its
+        knot is written step by step: interpolation to another knot would differ in the last digits.
+        """
+        if not isinstance(self.initial, dict):
+            return [(until, self.initial)]
+        course = NumberCourse.model_validate(self.initial)
         pairs = zip(course.steps, course.values, strict=True)
         knots = [(step, float(value)) for step, value in pairs if step <= until]
         begin = knots[-1][0] + 1 if knots else until
@@ -255,33 +257,35 @@ class AdjustableNumber:
 
 
 def numbers_of(experiment: Experiment, parts: dict[str, Any]) -> dict[str, AdjustableNumber]:
-    """All that may change in time of an experiment with these parts, by name."""
-    found = {}
+    """Return all numbers that may change in time, by name."""
+    numbers = {}
     for name, value in _candidates(parts):
         number = AdjustableNumber(name, value, _bounds(experiment, name))
         with suppress(PbdkitError):
-            experiment.of_parts(placed(parts, number, number.turned(number.at(0) * MORE or LITTLE)))
-            found[name] = number
-    return found
+            experiment.of_parts(
+                with_number(parts, number, number.turned(number.at(0) * MORE or LITTLE))
+            )
+            numbers[name] = number
+    return numbers
 
 
-def placed(parts: dict[str, Any], number: AdjustableNumber, value: Any) -> dict[str, Any]:
-    """The parts with another value there; what is not on the way to it is shared."""
+def with_number(parts: dict[str, Any], number: AdjustableNumber, value: Any) -> dict[str, Any]:
+    """Return the parts with another value; unaffected parts are shared."""
     *parents, last = number.where
     parts = dict(parts)
-    within: Any = parts
+    container: Any = parts
     for key in parents:
-        inner = copy(within[key] if isinstance(key, int) else within.get(key, {}))
-        within[key] = inner
-        within = inner
-    within[last] = value
+        inner = copy(container[key] if isinstance(key, int) else container.get(key, {}))
+        container[key] = inner
+        container = inner
+    container[last] = value
     return parts
 
 
 def _candidates(parts: dict[str, Any]) -> Iterator[tuple[str, float | dict[str, Any]]]:
     for part in PARTS:
-        own = parts.get(part, {})
-        for name, value in ((SOLVER | own) if part == "solver" else own).items():
+        fields = parts.get(part, {})
+        for name, value in ((SOLVER | fields) if part == "solver" else fields).items():
             entries = value if isinstance(value, list) else [value]
             for n, entry in enumerate(entries):
                 if isinstance(entry, float) or (isinstance(entry, dict) and "steps" in entry):
@@ -290,7 +294,7 @@ def _candidates(parts: dict[str, Any]) -> Iterator[tuple[str, float | dict[str, 
 
 
 def _bounds(experiment: Experiment, name: str) -> tuple[float, float]:
-    """As the model declares them; infinite where it does not."""
+    """Return the bounds declared by the model, or infinite ones."""
     part, key, *_ = name.split(".")
     fields = type(getattr(experiment, part)).model_fields.items()
     metadata = [m for n, f in fields if key in (n, f.alias) for m in f.metadata]

@@ -1,4 +1,4 @@
-"""The live view in a notebook: messages of a widget in place of a socket."""
+"""Widget with the live view for notebooks: messages of the widget in place of a socket."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pbdkit.web.session import Message, Session
 
 
 class _Cells(Viewer):
-    """All cells that show one widget."""
+    """The notebook cells that show one widget."""
 
     def __init__(self, widget: anywidget.AnyWidget) -> None:
         self._widget = widget
@@ -27,13 +27,13 @@ class _Cells(Viewer):
 
 
 class LiveWidget(anywidget.AnyWidget):
-    """A session in a notebook. `session` is what was done, ``close()`` ends it."""
+    """Live session in a notebook. `session` is the session, ``close()`` ends it."""
 
     _esm = script("notebook", exports=True) + "\nexport default { render };\n"
     _css = source("live.css")
 
-    def __init__(self, session: Session, **more: Any) -> None:
-        super().__init__(**more)
+    def __init__(self, session: Session, **traits: Any) -> None:
+        super().__init__(**traits)
         self.session = session
         self._conductor = Conductor(session)
         self._cells = _Cells(self)
@@ -41,12 +41,12 @@ class LiveWidget(anywidget.AnyWidget):
         self._conductor.start()
 
     def close(self) -> None:
-        """Ends the session."""
+        """End the session of the widget."""
         self._conductor.close()
         super().close()
 
     def _hear(self, widget: Any, message: Any, buffers: Any) -> None:
-        """A cell that joins begins anew: it knows nothing yet."""
+        """Execute the message of a cell; a new cell joins as a new viewer."""
         if message == {"do": "join"}:
             self._conductor.leave(self._cells)
             self._cells = _Cells(self)

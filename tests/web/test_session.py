@@ -28,7 +28,7 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation
 from pbdkit.web import script as saving, session as history, session as stage
 from pbdkit.web.command_line import live
-from pbdkit.web.requests import FARTHEST, LONGEST, command_of, obey
+from pbdkit.web.requests import FARTHEST, LONGEST, command_of, execute
 from pbdkit.web.server import Access, Conductor, SessionServer, SocketViewer
 from pbdkit.web.session import Session, judged, scenery, standing
 from pbdkit.web.widget import LiveWidget
@@ -42,11 +42,11 @@ CHANGED = {
 def session_of(name, tmp_path, settings=(), **more):
     said = []
     loaded = pbdkit.load(name, settings=settings)
-    return Session(loaded, tmp_path / "made.yaml", says=said.append, **more), said
+    return Session(loaded, tmp_path / "made.yaml", notify=said.append, **more), said
 
 
 def do(session, **command):
-    obey(session, command_of(json.dumps(command)))
+    execute(session, command_of(json.dumps(command)))
 
 
 def run_of(path):
@@ -316,7 +316,7 @@ def test_leaders_that_cannot_go_there_stay_and_it_is_said(tmp_path):
 def test_what_cannot_be_is_refused_with_nothing_done(command, told, tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     with pytest.raises(pbdkit.ExperimentError, match=re.escape(told)):
-        obey(session, command_of(json.dumps(command)))
+        execute(session, command_of(json.dumps(command)))
     session.advance(1)
     fresh, _ = session_of("paper/a", tmp_path)
     assert session.script.written(1) == fresh.script.written(1)
