@@ -305,7 +305,8 @@ class SessionServer:
             server = await self._started()
         except OSError as error:
             raise ExperimentError(
-                f"--port {self._port}: cannot be served at: {error.strerror}; choose another port, or omit --port"
+                f"--port {self._port}: cannot be served at: {error.strerror}; choose another port, "
+                "or omit --port"
             ) from None
         async with server:
             on_ready(self.access.address)
