@@ -132,7 +132,7 @@ def _places(scene: Scene) -> list[Here]:
     """Return the middle of the body and, for rules that depend on the place, its corners."""
     if not scene.experiment.rule.uses_reference:
         return [NOWHERE]
-    lower, upper = scene.raster.body_box
+    lower, upper = scene.raster.body_box()
     local = [scene.middle, *map(vector, product(*zip(lower, upper, strict=True)))]
     origin = vector(scene.experiment.lattice.origin)
     return [

@@ -408,8 +408,11 @@ def missing_segments(
     ]
 
 
-def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
-    """Return the lattice context from which a rule may derive constants."""
-    lower, upper = (end.each(add, raster.lattice.origin) for end in raster.body_box)
+def setting_of(
+    raster: Raster, neighbourhood: Neighbourhood, box: tuple[Vector[float], Vector[float]]
+) -> Setting:
+    """Return the lattice context from which a rule may derive constants; `box` is that of the
+    body."""
+    lower, upper = (end.each(add, raster.lattice.origin) for end in box)
     cell, slots = raster.cell, neighbourhood.slots
     return Setting(cell, slots, lower, upper, neighbourhood.tiling)

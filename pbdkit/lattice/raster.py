@@ -331,9 +331,8 @@ class Raster:
         processes."""
         return hull(box for part in self.communicator.allgather(list(boxes)) for box in part)
 
-    @cached_property
     def body_box(self) -> tuple[Vector[float], Vector[float]]:
-        """Corners (lower, upper) of the body, from site (0, 0) of the lattice."""
+        """Return the corners (lower, upper) of the body, from site (0, 0) of the lattice."""
         ends = (self.ends_of_rows(s) for s in range(self.shape[0]))
         at = [positions(self.cell, s, *cells) for s, cells in enumerate(ends)]
         lower, upper = self.hull_of_all(

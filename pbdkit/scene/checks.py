@@ -16,7 +16,7 @@ from pbdkit.lattice.neighbourhood import Neighbourhood, flatness
 from pbdkit.lattice.raster import FOLLOWER, LeftOut, Raster, cells_of_sites, positions
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Newton, Oscillation, Rotation
-from pbdkit.plugin import Lattice, MixesCells
+from pbdkit.plugin import Lattice, MixesCells, Vector
 from pbdkit.plugin.fields import ByRegion
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import signed_distance
@@ -98,7 +98,9 @@ def narrow_voids(lattice: Lattice, left_out: LeftOut) -> Iterator[str]:
         )
 
 
-def locking(experiment: Experiment, raster: Raster) -> Iterator[str]:
+def locking(
+    experiment: Experiment, raster: Raster, box: tuple[Vector[float], Vector[float]]
+) -> Iterator[str]:
     """Generate a warning about cells that lock in bending.
 
     A material that hardly extends along the diagonals of the lattice is stiff in shear and under
@@ -112,7 +114,7 @@ def locking(experiment: Experiment, raster: Raster) -> Iterator[str]:
     if vectors[0, 0] * vectors[1, 0] > -0.25:  # the compliant mode is not of that kind
         return
     sides = [math.hypot(*vector) for vector in raster.cell.vectors]
-    ends = zip(*raster.body_box, sides, strict=True)
+    ends = zip(*box, sides, strict=True)
     across = max(1.0, min((high - low) / side for low, high, side in ends))
     error = LOCKING_FACTOR * float(c.shear / values[0]) / across
     if error > MAX_LOCKING:
@@ -175,7 +177,7 @@ def never_near(
     driven: list[Leading | Barrier] = [*barriers, *leading]
     if any(isinstance(part.group.motion, Newton | Rotation) for part in driven):
         return
-    box = np.array(raster.body_box) + raster.lattice.origin if barriers else np.zeros((2, 2))
+    box = np.array(raster.body_box()) + raster.lattice.origin if barriers else np.zeros((2, 2))
     offsets = [offset for group in leading for offset in _offsets(group, steps)]
     largest = max((np.abs(offset).max(initial=0.0) for offset in offsets), default=0.0)
     reach = 2.0 * largest + float(np.hypot(*(box[1] - box[0])))

@@ -367,13 +367,14 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     neighbours = experiment.neighbours
     neighbourhood, layers = ground.neighbourhood, ground.layers
     raster, cells = ground.raster()
+    box = raster.body_box()
     warnings = [*ground.warnings, *lattice_warnings(experiment, neighbourhood, raster, layers)]
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
-    warnings += [*angles_in_radians(experiment), *locking(experiment, raster)]
+    warnings += [*angles_in_radians(experiment), *locking(experiment, raster, box)]
     warnings += narrow_voids(experiment.lattice, ground.left_out)
     warnings += missing_segments(raster, neighbourhood, _segments(experiment))
-    setting = setting_of(raster, neighbourhood)
+    setting = setting_of(raster, neighbourhood, box)
     constants = scene_constants(experiment, setting)
     constants = with_fields(constants, experiment, raster, neighbourhood, setting)
     if neighbours.nearness() and any(constants.weights.values()):
@@ -393,7 +394,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     if not loads:
         warnings += never_near(raster, barriers, leading, experiment.steps)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
-    lower, upper = raster.body_box
+    lower, upper = box
     facts = loads, setting, (lower + upper) / 2
     operations = build_operations(raster, experiment)
     return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers, operations))
