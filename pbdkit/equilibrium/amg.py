@@ -21,15 +21,15 @@ MOST_GRIDS = 20
 STRONG = 0.01
 """Relative size from which on a bond connects."""
 ROUNDS, MARGIN, BAND = 12, 1.1, 5.0
-"""Turns to find the largest eigenvalue, what it is multiplied with, and by how much smaller those
-are that relaxation does not look at."""
+"""Number of power iterations for the largest eigenvalue, factor on the result, and ratio below it
+up to which eigenvalues are not relaxed."""
 SINGULAR = 1e-9
 
 
 @dataclass(frozen=True)
 class _Level:
-    """`prolongs` takes a grid's values to this one's; `own` are the inverses of the blocks on the
-    diagonal, `largest` the largest eigenvalue of the matrix times them."""
+    """One grid: `prolongs` maps values of the next grid to this one, `own` holds the inverses of
+    the diagonal blocks, `largest` is the largest eigenvalue of the matrix times these."""
 
     matrix: Any
     own: Any
@@ -38,7 +38,7 @@ class _Level:
     restricts: Any
 
     def relaxed(self, b: Floats, x: Floats | None = None) -> Floats:
-        """Two steps of Chebyshev's iteration for the upper part of the spectrum."""
+        """Return x after two steps of Chebyshev's iteration for the upper part of the spectrum."""
         high, low = self.largest, self.largest / BAND
         middle, half = (high + low) / 2, (high - low) / 2
         share = half / middle
@@ -51,9 +51,10 @@ class _Level:
 
 
 class SparseGrids:
-    """Approximates A⁻¹ r by a V-cycle in single precision. Of the matrix there are `axes` unknowns
-    a particle, one after the other; `places` (particle, axis of space) says where particles lie,
-    `led` where the leaders do, `held` which unknowns stand alone, and are not interpolated to."""
+    """Approximation of A⁻¹ r by one V-cycle in single precision. The matrix has `axes` unknowns for
+    each particle, stored next to each other; `places` and `led` (particle, axis of space) are the
+    positions of particles and leaders; `held` marks the unknowns that stand alone and are not
+    interpolated."""
 
     def __init__(
         self, matrix: Any, axes: int, places: Floats, led: Floats, held: Mask | None = None
@@ -68,9 +69,11 @@ class SparseGrids:
                 continue
             if held is not None:
                 hats, held = _free(hats, held)
-            own = _own_inverses(A, axes)
+            block_inverses = _own_inverses(A, axes)
             restricts = hats.T.tocsr()
-            self._levels.append(_Level(A, own, MARGIN * _largest(A, own), hats, restricts))
+            self._levels.append(
+                _Level(A, block_inverses, MARGIN * _largest(A, block_inverses), hats, restricts)
+            )
             A, places = (restricts @ (A @ hats)).tocsr(), points * spacing + origin
             if held is not None:
                 A = A + _chosen(held)
@@ -79,12 +82,12 @@ class SparseGrids:
         )
 
     def __call__(self, r: Floats) -> Floats:
-        """One cycle from zero; r is scaled, for it may be tiny in single precision."""
+        """Return one cycle from zero; r is scaled, since it may be tiny in single precision."""
         scale = float(np.abs(r).max(initial=0.0))
         if not 0.0 < scale < np.inf:
             return r.copy()
-        found = self._cycled(0, (r * (1.0 / scale)).astype(np.float32))
-        return np.asarray(found.astype(float) * scale)
+        x = self._cycled(0, (r * (1.0 / scale)).astype(np.float32))
+        return np.asarray(x.astype(float) * scale)
 
     def _cycled(self, depth: int, b: Floats) -> Floats:
         if depth == len(self._levels):
@@ -96,21 +99,21 @@ class SparseGrids:
 
 
 def _spacing(places: Floats) -> Floats:
-    """How far apart rows of particles lie along each axis."""
-    found = []
+    """Return the distance between rows of particles along each axis."""
+    spacings = []
     for along in places.T:
-        apart = np.diff(np.unique(along.round(9)))
-        found.append(float(apart.min(initial=np.inf)))
-    spacing = np.array(found)
+        gaps = np.diff(np.unique(along.round(9)))
+        spacings.append(float(gaps.min(initial=np.inf)))
+    spacing = np.array(spacings)
     return np.where(
         np.isfinite(spacing), spacing, spacing.min(initial=1.0, where=np.isfinite(spacing))
     )
 
 
 def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
-    """(unknown, unknown of the next grid) the hats, and the points that they are around; `at` and
-    `led` in units of the next grid. Around points to which a leader is nearer than any particle
-    there is none."""
+    """Return the hats, (unknown, unknown of the next grid), and the points at which they are
+    centred. `at` and `led` are in units of the next grid. A point to which a leader is nearer than
+    any particle has no hat."""
     from scipy.sparse import csr_array, eye_array, kron
 
     low = np.floor(np.minimum(at.min(axis=0), led.min(axis=0, initial=0.0))).astype(int) - 1
@@ -118,16 +121,16 @@ def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
         (np.ceil(np.maximum(at.max(axis=0), led.max(axis=0, initial=0.0))) - low + 2).astype(int)
     )
     near, near_led = (_nearest(points, low, shape) for points in (at, led))
-    kept = near <= near_led
+    is_particle_nearer = near <= near_led
     rows, points, values = [], [], []
     cell = np.floor(at)
     for corner in product((0, 1), repeat=at.shape[1]):
         weight = np.abs(1.0 - np.array(corner) - (at - cell)).prod(axis=1)
         point = np.ravel_multi_index(tuple((cell + corner - low).astype(int).T), shape)
-        some = np.flatnonzero((weight > 1e-9) & kept[point])
-        rows.append(some)
-        points.append(point[some])
-        values.append(weight[some])
+        entries = np.flatnonzero((weight > 1e-9) & is_particle_nearer[point])
+        rows.append(entries)
+        points.append(point[entries])
+        values.append(weight[entries])
     row, point, value = (np.concatenate(part) for part in (rows, points, values))
     count, piece = _pieces(A, axes, row, point, len(at))
     around = np.zeros(count, np.intp)
@@ -138,56 +141,62 @@ def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
 
 
 def _free(hats: Any, held: Mask) -> tuple[Any, Mask]:
-    """The hats of what is free, and which unknowns of the next grid are held: those to which one
-    that is held is nearer than any other."""
-    led, free = (_chosen(some) @ hats for some in (held, ~held))
-    below = (led.max(axis=0).toarray() > free.max(axis=0).toarray()).ravel()
-    return (free @ _chosen(~below)).tocsr(), below
+    """Return the hats of free unknowns, and a mask of the held unknowns of the next grid: those to
+    which a held unknown is nearer than any other."""
+    led_weights, free_weights = (_chosen(some) @ hats for some in (held, ~held))
+    below = (led_weights.max(axis=0).toarray() > free_weights.max(axis=0).toarray()).ravel()
+    return (free_weights @ _chosen(~below)).tocsr(), below
 
 
-def _chosen(some: Mask) -> Any:
-    """1 on the diagonal of some."""
+def _chosen(mask: Mask) -> Any:
+    """Return a diagonal matrix with 1 where the mask is true."""
     from scipy.sparse import diags_array
 
-    return diags_array(some.astype(np.float32), format="csr")
+    return diags_array(mask.astype(np.float32), format="csr")
 
 
 def _nearest(at: Floats, low: Indices, shape: tuple[int, ...]) -> Floats:
-    """How far each point of the next grid is from the nearest of some places, as far as these lie
-    in a cell beside it."""
-    found = np.full(int(np.prod(shape)), np.inf)
+    """Return the distance of each point of the next grid from the nearest place in an adjacent
+    cell."""
+    distances = np.full(int(np.prod(shape)), np.inf)
     cell = np.floor(at)
     for corner in product((0, 1), repeat=at.shape[1]):
         point = np.ravel_multi_index(tuple((cell + corner - low).astype(int).T), shape)
-        np.minimum.at(found, point, np.linalg.norm(at - cell - corner, axis=1))
-    return found
+        np.minimum.at(distances, point, np.linalg.norm(at - cell - corner, axis=1))
+    return distances
 
 
 def _pieces(A: Any, axes: int, row: Indices, point: Indices, count: int) -> tuple[int, Indices]:
-    """(count, piece) of the entries of hats: those around one point whose particles are bonded to
-    each other are one piece."""
+    """Return the number of pieces and the piece of each entry of hats. Entries around one point
+    whose particles are bonded to each other form one piece."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import connected_components
 
     a, b = _bonds(A, axes)
     order = np.argsort(row, kind="stable")
     first = np.searchsorted(row[order], np.arange(count + 1))
-    most = int(np.diff(first).max(initial=0))
-    slots = np.full((count, most), -1, np.intp)
+    width = int(np.diff(first).max(initial=0))
+    slots = np.full((count, width), -1, np.intp)
     slots[row[order], np.arange(len(row)) - first[row[order]]] = order
     pairs = []
-    for m, n in product(range(most), repeat=2):
-        one, other = slots[a, m], slots[b, n]
-        same = (one >= 0) & (other >= 0) & (point[one] == point[other])
-        pairs.append(np.stack([one[same], other[same]]))
-    one, other = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(len(one), np.int8), (one, other)), (len(row),) * 2)
+    for m, n in product(range(width), repeat=2):
+        first_entries, second_entries = slots[a, m], slots[b, n]
+        same = (
+            (first_entries >= 0)
+            & (second_entries >= 0)
+            & (point[first_entries] == point[second_entries])
+        )
+        pairs.append(np.stack([first_entries[same], second_entries[same]]))
+    first_entries, second_entries = np.concatenate(pairs, axis=1)
+    graph = coo_array(
+        (np.ones(len(first_entries), np.int8), (first_entries, second_entries)), (len(row),) * 2
+    )
     number, label = connected_components(csr_array(graph), directed=False)
     return int(number), label
 
 
 def _bonds(A: Any, axes: int) -> tuple[Indices, Indices]:
-    """The pairs of particles that pull at each other, one way or the other."""
+    """Return the pairs of particles that are coupled in at least one direction."""
     entries = A.tocoo()
     diagonal = np.abs(A.diagonal()).reshape(-1, axes).max(axis=1)
     a, b = entries.row // axes, entries.col // axes
@@ -196,7 +205,7 @@ def _bonds(A: Any, axes: int) -> tuple[Indices, Indices]:
 
 
 def _own_inverses(A: Any, axes: int) -> Any:
-    """The inverses of the blocks on the diagonal, as a matrix."""
+    """Return the inverses of the diagonal blocks as a matrix."""
     from scipy.sparse import bsr_array
 
     count = A.shape[0] // axes
@@ -209,11 +218,11 @@ def _own_inverses(A: Any, axes: int) -> Any:
     return bsr_array((inverse, np.arange(count), np.arange(count + 1)), A.shape).tocsr()
 
 
-def _largest(A: Any, own: Any) -> float:
-    """About the largest eigenvalue of D⁻¹ A."""
+def _largest(A: Any, block_inverses: Any) -> float:
+    """Estimate the largest eigenvalue of D⁻¹ A by power iteration."""
     x, size = np.random.default_rng(0).normal(size=A.shape[0]).astype(np.float32), 1.0
     for _ in range(ROUNDS):
-        x = own @ (A @ x)
+        x = block_inverses @ (A @ x)
         size = float(np.linalg.norm(x))
         x /= size
     return size

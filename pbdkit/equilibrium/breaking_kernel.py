@@ -1,13 +1,14 @@
-"""Equilibria of linear rules whose bonds break, in one compiled call an increment or several.
+"""Equilibria of linear rules with breaking bonds, in one compiled call for an increment or several.
+The kernel moves the body to equilibrium, updates and breaks bonds, and repeats both.
 
-The kernel settles the body, renews and breaks bonds, and settles again. The matrix is a band,
-A c = r with A = 1 - (step operator), one unknown a follower and axis; or, where all axes move alike
-and each by itself, one a follower, for all axes at a time: `wide` is the number of unknowns of a
-follower. Row i of a band holds A[i, i - half] to A[i, i + half]. Factors are L with ones on the
-diagonal and U, without exchanges, in its place. A row depends on those before it alone: where bonds
-have changed, only rows from the first of them on are assembled and factorised anew, from the moves
-that a nudge of each neighbour by 1 makes at rest, which is exact for linear rules. The general path
-needs 25 times as long (docs/decisions/0010).
+The matrix is a band, A c = r with A = 1 - (step operator), with one unknown for each follower and
+axis; or, if all axes move alike and independently, one for each follower, with all axes as right
+sides: `wide` is the number of unknowns of a follower. Row i of a band holds A[i, i - half] to A[i,
+i + half]. Factors are L with ones on the diagonal and U, without exchanges, in its place. A row
+depends on earlier rows only: if bonds have changed, only rows from the first of them on are
+assembled and factorised again, from the moves caused by a displacement of each neighbour by 1 at
+rest, which is exact for linear rules. The general path takes 25 times as long
+(docs/decisions/0010).
 """
 
 from __future__ import annotations
@@ -46,19 +47,20 @@ from pbdkit.stepping.numba_engine.sweeps import write_bond_pass, write_general
 from pbdkit.stepping.state import State, unmoved_state
 
 SAME = 1e-12
-"""By so much entries may differ that are alike but for rounding; they are shares of a move."""
+"""Relative difference of entries that counts as rounding, as a share of a move."""
 SAFETY = 3.0
-"""What the estimated spread is multiplied with."""
+"""Safety factor of the estimated spread."""
 
 
 def rows_of(work: Any, count: int, reach: int, wide: int) -> Any:
-    """The band of `count` followers, each coupled to those up to `reach` before and after it."""
+    """Return the band of `count` followers, each coupled to those up to `reach` before and after
+    it."""
     width = 2 * ((reach + 1) * wide - 1) + 1
     return work[: count * wide * width].reshape(count * wide, width)
 
 
 def are_alike(blocks: Any) -> Any:
-    """Whether all blocks (follower, neighbour, axis, axis) are multiples of 1."""
+    """Return whether all blocks (follower, neighbour, axis, axis) are multiples of the identity."""
     count, slots, axes, _ = blocks.shape
     for e in range(count):
         for k in range(slots):
@@ -71,8 +73,8 @@ def are_alike(blocks: Any) -> Any:
 
 
 def assemble(band: Any, blocks: Any, pattern: Any, first: int, wide: int) -> None:
-    """Writes the rows of A from follower `first` on. Who does not move at all has a row of zeros,
-    and stays: its diagonal becomes 1."""
+    """Assemble the rows of A from follower `first` on. A follower that does not move has a row of
+    zeros, of which the diagonal becomes 1."""
     first_entry, slot, column, weight = pattern
     half, inner = band.shape[1] // 2, wide if wide > 1 else 1
     for e in range(first, len(blocks)):
@@ -88,16 +90,16 @@ def assemble(band: Any, blocks: Any, pattern: Any, first: int, wide: int) -> Non
                         value += blocks[e, slot[n], a, c] * weight[n, c, b]
                     band[e * wide + a, away + b - a] -= value
         for i in range(e * wide, (e + 1) * wide):
-            most = 0.0
+            largest_entry = 0.0
             for m in range(band.shape[1]):
-                most = max(most, abs(band[i, m]))
-            if most == 0.0:
+                largest_entry = max(largest_entry, abs(band[i, m]))
+            if largest_entry == 0.0:
                 band[i, half] = 1.0
 
 
 def factor(band: Any, first: int, diagonal: Any, inverse: Any) -> None:
-    """Replaces the rows of A from `first` on by those of its factors; notes what stood on its
-    diagonal, and the inverse of each pivot."""
+    """Factorise the rows of A from `first` on, in place; store the diagonal of A and the inverse of
+    each pivot."""
     half = band.shape[1] // 2
     for i in range(first, len(band)):
         row = band[i]
@@ -107,14 +109,14 @@ def factor(band: Any, first: int, diagonal: Any, inverse: Any) -> None:
             if row[at] != 0.0:
                 share = row[at] * inverse[k]
                 row[at] = share
-                here, above = row[at + 1 : at + 1 + half], band[k, half + 1 :]
+                lower, upper = row[at + 1 : at + 1 + half], band[k, half + 1 :]
                 for m in range(half):
-                    here[m] -= share * above[m]
+                    lower[m] -= share * upper[m]
         inverse[i] = 1.0 / row[half]
 
 
 def solve(band: Any, inverse: Any, x: Any) -> None:
-    """Replaces the right sides (unknown, side) by the solutions."""
+    """Replace right sides (unknown, side) by solutions."""
     half, sides = band.shape[1] // 2, x.shape[1]
     for i in range(len(band)):
         for k in range(max(0, i - half), i):
@@ -131,9 +133,9 @@ def solve(band: Any, inverse: Any, x: Any) -> None:
 def refactor(
     work: Any, blocks: Any, pattern: Any, factors: Any, known: Any, first: int, alike: bool
 ) -> None:
-    """Factors anew from follower `first` on. `known` are the unknowns a follower has, how far A⁻¹
-    takes random signs, with a margin, the largest diagonal entry, and the reach of the band;
-    `alike` whether frame points follow with all axes alike."""
+    """Update the factors from follower `first` on. `known` holds the number of unknowns of a
+    follower, the norm of A⁻¹ for random signs times a safety factor, the largest diagonal entry,
+    and the reach of the band; `alike` is true if all axes of frame points follow alike."""
     diagonal, inverse, signs = factors
     count, axes = blocks.shape[0], blocks.shape[2]
     wide = 1 if alike and are_alike(blocks) else axes
@@ -152,7 +154,7 @@ def refactor(
 
 
 def correct(work: Any, factors: Any, known: Any, r: Any, c: Any) -> None:
-    """c (follower, axis) with A c = r."""
+    """Solve A c = r for c, (follower, axis)."""
     count, axes = r.shape
     wide = 1 if known[0] == 1.0 else axes
     for e in range(count):
@@ -163,34 +165,38 @@ def correct(work: Any, factors: Any, known: Any, r: Any, c: Any) -> None:
 
 
 def largest(table: Any) -> Any:
-    """The largest size in a table; not a number where one is none."""
-    most = 0.0
+    """Return the largest magnitude in a table; nan if one is nan."""
+    magnitude = 0.0
     for n in range(table.shape[0]):
         for m in range(table.shape[1]):
-            if not abs(table[n, m]) <= most:
-                most = abs(table[n, m])
-    return most
+            if not abs(table[n, m]) <= magnitude:
+                magnitude = abs(table[n, m])
+    return magnitude
 
 
 def norm(table: Any) -> Any:
-    """The root of the sum of squares."""
-    found = 0.0
+    """Return the root of the sum of squares."""
+    squares = 0.0
     for n in range(table.shape[0]):
         for m in range(table.shape[1]):
-            found += table[n, m] * table[n, m]
-    return math.sqrt(found)
+            squares += table[n, m] * table[n, m]
+    return math.sqrt(squares)
 
 
 SETTLING_S, PARTICLE_S = 6e-3, 1e-5
-"""What a settling takes by numpy, about, and what it takes more a particle."""
+"""Estimated time of one equilibrium by numpy, and additional time for each particle, in seconds."""
 LITTLE_BY_LITTLE, AT_ONCE = 20, 2
-"""Settlings an increment where bonds change little by little, and where they only break."""
+"""Estimated number of equilibria in an increment if bonds change gradually, and if they only
+break."""
 
 
 def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
-    """For a scene whose rule is linear; None where compiling would take longer than numpy, where
-    nothing compiles, or where the solver's method is not direct. Decided by the experiment alone,
-    so that what is resumed goes on as it began."""
+    """Return the kernel of a scene with a linear rule.
+
+    Returns None if compiling would take longer than numpy, if nothing can be compiled, or if the
+    method of the solver is not direct. The result depends on the experiment alone, so that a
+    resumed run continues by the same method.
+    """
     solver = scene.experiment.solver.equilibrium
     direct = solver.method == "lu" or (
         solver.method == "auto" and scene.raster.count <= LARGEST_ANEW
@@ -199,26 +205,34 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
         return None
 
     try:
-        found = Settler(scene, tolerance, watch)
+        settler = Settler(scene, tolerance, watch)
     except PluginError:
         return None
-    return found if found.is_small else None
+    return settler if settler.is_small else None
 
 
 def _is_plain(scene: Scene) -> bool:
-    """Whether the kernel knows all that such a scene has: loads, cuts, fields, courses, leaders
-    along one axis and cells that begin to soften in turn it does not."""
-    asked, constants = scene.experiment, scene.constants
-    more = any((asked.cuts, asked.loads, asked.courses, constants.by_bond, constants.by_particle))
+    """Return whether the kernel supports all features of the scene: not loads, cuts, fields,
+    time-dependent parameters, leaders along one axis, and cells that soften one after the other."""
+    experiment, constants = scene.experiment, scene.constants
+    varies = any(
+        (
+            experiment.cuts,
+            experiment.loads,
+            experiment.courses,
+            constants.by_bond,
+            constants.by_particle,
+        )
+    )
     mixed = scene.cells is not None and bool(scene.cells.mixed)
     guided = any(leading.group.axes for leading in scene.leading)
     flat = scene.axes == 2 and scene.inner is None
-    in_turn = isinstance(asked.fracture, SoftensCells)
-    return scene.has_fracture and flat and not (more or mixed or guided or in_turn)
+    in_turn = isinstance(experiment.fracture, SoftensCells)
+    return scene.has_fracture and flat and not (varies or mixed or guided or in_turn)
 
 
 def _seconds(scene: Scene) -> float:
-    """What numpy would take."""
+    """Estimate the time by numpy in seconds."""
     renews = isinstance(scene.experiment.fracture, RenewsBonds)
     settlings = scene.experiment.solver.equilibrium.increments * (
         LITTLE_BY_LITTLE if renews else AT_ONCE
@@ -231,9 +245,9 @@ Entry = tuple[Indices, Indices, Indices, Floats]
 
 @dataclass(frozen=True)
 class Pattern:
-    """`place` is the flat place of each follower. Follower e is moved by the entries from
-    `first[e]` to `first[e + 1]`: through a `slot` (that after the last: by itself), by the follower
-    `column`, times a `weight` (entry, axis, axis). `reach` is how far a column lies from e."""
+    """Couplings of the followers. `place` is the flat place of each follower. The entries from
+    `first[e]` to `first[e + 1]` belong to follower e: it moves by a `slot` (the last: by itself),
+    with the follower `column`, times a `weight` (entry, axis, axis)."""
 
     place: Indices
     first: Indices
@@ -243,7 +257,7 @@ class Pattern:
 
     @property
     def reach(self) -> int:
-        """The half width of the band."""
+        """Largest distance of a column from its row, the half width of the band."""
         row = np.repeat(np.arange(len(self.place)), np.diff(self.first))
         return int(np.abs(row - self.column).max(initial=0))
 
@@ -255,11 +269,12 @@ class Pattern:
 
 
 def pattern_at(scene: Scene, step: int) -> Pattern:
-    """With the roles of a step; followers row by row or column by column, what lies nearer."""
+    """Return the couplings with the roles of a step, with followers ordered row by row or column by
+    column, whichever has the smaller reach."""
     rows = np.flatnonzero(kinds_at(scene.raster, scene.leading, step) == FOLLOWER)
     places, (x, y) = scene.raster.place_of(rows), scene.raster.reference(rows).round(6).T
-    found = (_pattern(scene, places[np.lexsort(keys)]) for keys in ((x, y), (y, x)))
-    return min(found, key=lambda pattern: pattern.reach)
+    patterns = (_pattern(scene, places[np.lexsort(keys)]) for keys in ((x, y), (y, x)))
+    return min(patterns, key=lambda pattern: pattern.reach)
 
 
 def _pattern(scene: Scene, place: Indices) -> Pattern:
@@ -273,55 +288,58 @@ def _pattern(scene: Scene, place: Indices) -> Pattern:
 
 
 def _entries(scene: Scene, place: Indices) -> Iterator[Entry]:
-    """(follower, slot, column, weight) of some entries at a time."""
-    size, one = scene.raster.kind.size, np.eye(scene.axes)
+    """Generate entries (follower, slot, column, weight), several at a time."""
+    size, identity = scene.raster.kind.size, np.eye(scene.axes)
     column_at = np.full(size, -1)
     every = column_at[place] = np.arange(len(place))
 
-    def entries(rows: Indices, slot: int, there: Indices, weight: Floats) -> Entry:
-        free = column_at[there] >= 0
+    def entries(rows: Indices, slot: int, neighbours: Indices, weight: Floats) -> Entry:
+        free = column_at[neighbours] >= 0
         slots = np.full(np.count_nonzero(free), slot)
-        return rows[free], slots, column_at[there[free]], weight[free]
+        return rows[free], slots, column_at[neighbours[free]], weight[free]
 
-    for s, own in by_sublattice(scene, place):
-        ones = np.broadcast_to(one, (len(own), *one.shape))
+    for s, members in by_sublattice(scene, place):
+        ones = np.broadcast_to(identity, (len(members), *identity.shape))
         count = len(scene.neighbourhood.slots[s])
-        yield entries(every[own], count, place[own], ones)
+        yield entries(every[members], count, place[members], ones)
         for k, slot in enumerate(scene.neighbourhood.slots[s]):
-            there = place[own] + slot_step(scene.raster.shape, slot)
-            yield entries(every[own], k, there, ones)
-            for some, body, weight in _followed(scene, there):
-                yield entries(every[own][some], k, body, weight)
+            neighbours = place[members] + slot_step(scene.raster.shape, slot)
+            yield entries(every[members], k, neighbours, ones)
+            for rows, body, weight in _followed(scene, neighbours):
+                yield entries(every[members][rows], k, body, weight)
 
 
-def _followed(scene: Scene, there: Indices) -> Iterator[tuple[Indices, Indices, Floats]]:
-    """Which of some places are frame points, with a body place each that they follow and its
-    weight: the first of each, then the second, and so on."""
+def _followed(scene: Scene, places: Indices) -> Iterator[tuple[Indices, Indices, Floats]]:
+    """Generate the places that are frame points, by their numbers, with a body place that each
+    follows and its weight: the first of each, then the second, and so on."""
     if (frame := scene.frame) is None:
         return
     point_at = np.full(scene.raster.kind.size, -1)
     point_at[frame.place] = np.arange(len(frame.place))
-    some = np.flatnonzero(point_at[there] >= 0)
+    numbers = np.flatnonzero(point_at[places] >= 0)
     first, last = (
-        np.searchsorted(frame.map.point, point_at[there[some]], side) for side in ("left", "right")
+        np.searchsorted(frame.map.point, point_at[places[numbers]], side)
+        for side in ("left", "right")
     )
     matrices = frame_matrices(frame.map.weight, scene.axes)
     for e in range(int((last - first).max(initial=0))):
         has = first + e < last
         entry = (first + e)[has]
-        yield some[has], frame.body_place[entry], matrices[entry]
+        yield numbers[has], frame.body_place[entry], matrices[entry]
 
 
 GOES_ON, SETTLED, FAILED = 0, 1, 2
-"""What became of a call: bonds may still change, no bond changes any more, or the band does not
-serve; then followers stand where they were before the last settling."""
+"""Result of a call: bonds may change further, no bond changes any more, or the band does not serve;
+then followers are where they were before the last equilibrium."""
 ROWS = "int64(0)", "int64(kind.shape[1])"
 
 
 def write_settling(plan: Plan) -> tuple[str, list[str]]:
-    """The source of a module with ``run(given, step, tolerance, slack, most)``, which settles at
-    most so often, to within the length `tolerance`, and leaves out changes of bonds within the
-    share `slack`; it returns how often bonds have changed, and what became of it."""
+    """Return the source of a module with ``run(given, step, tolerance, slack, most)``.
+
+    It makes at most `most` equilibria, within the length `tolerance`, and ignores changes of bonds
+    within the share `slack`; it returns the number of changes of bonds and the result.
+    """
     (level,) = plan.levels
     general = write_general(plan, level, None)
     follow = Function(plan.shared, "follow_body")
@@ -330,20 +348,20 @@ def write_settling(plan: Plan) -> tuple[str, list[str]]:
         frame.emit_for(LatticeWriter(plan, follow, Passes(None, [])), "flat_u")
     moves, derive = _write_moves(plan, follow, general), _write_derivative(plan, general)
     judge, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
-    known, settle = _write_known(plan, derive), _write_settle(plan, follow, moves)
+    update, settle = _write_known(plan, derive), _write_settle(plan, follow, moves)
     run = Function(plan.shared, "run", "given", "step", "tolerance", "slack", "most")
     run.add(0, "for n in range(most):", f"    {mark.call()}")
-    run.add(1, f"if not {known.call()} or not {settle.call('tolerance')}:")
+    run.add(1, f"if not {update.call()} or not {settle.call('tolerance')}:")
     run.add(2, f"return n, {FAILED}")
     run.add(1, judge.call(*ROWS, "0", "kind.shape[2]"), f"if not {changed.call('slack')}:")
     run.add(2, f"return n, {SETTLED}")
     run.add(0, f"return most, {GOES_ON}")
-    functions = [general, moves, derive, judge, mark, changed, known, settle]
+    functions = [general, moves, derive, judge, mark, changed, update, settle]
     return write_module(plan, [follow, *functions] if follow.lines else functions, run)
 
 
 def _write_moves(plan: Plan, follow: Function, general: Function) -> Function:
-    """The function that writes r (follower, axis), the moves, with the frame in line."""
+    """Write the function that computes r (follower, axis), the moves, after updating the frame."""
     out = Function(plan.shared, "find_moves")
     out.add(0, *[follow.call()] * bool(follow.lines), "for n in range(len(body)):")
     out.add(1, general.call("body[n, 0]", "body[n, 1]", "body[n, 2]", *ROWS))
@@ -353,8 +371,8 @@ def _write_moves(plan: Plan, follow: Function, general: Function) -> Function:
 
 
 def _write_derivative(plan: Plan, general: Function) -> Function:
-    """The function that writes what each neighbour of a follower, and it itself, does to its move;
-    `u` are planes at rest."""
+    """Write the function that computes the derivative of each follower's move with respect to each
+    neighbour and itself; `u` are planes at rest."""
     axes, planes = len(plan.axes), plan.each("u_@")
     out = Function(plan.shared, "derive", "e", *planes)
     out.add(0, "spot, s, i = place[e], sublattice[e], runs[e, 0]")
@@ -371,13 +389,13 @@ def _write_derivative(plan: Plan, general: Function) -> Function:
 
 
 def _bonds(plan: Plan, pattern: str) -> list[str]:
-    """The pattern for each number that is remembered of bonds."""
+    """Return the pattern for each number that bonds remember."""
     return [pattern.replace("#", str(n)) for n in range(plan.bonds)]
 
 
 def _write_mark(plan: Plan) -> Function:
-    """The function that marks followers whose bonds, or those of the cells around them, are not as
-    they were known; then they are."""
+    """Write the function that marks followers whose bonds, or those of the cells around them, have
+    changed since the last call."""
     out = Function(plan.shared, "mark")
     differs = _bonds(plan, " or flat_bond#[home] != flat_known#[home]")
     out.add(0, "cells = broken.size // len(ends)", "for n in range(len(ends)):")
@@ -397,7 +415,7 @@ def _write_mark(plan: Plan) -> Function:
 
 
 def _write_changed(plan: Plan) -> Function:
-    """The function that tells whether bonds broke or changed; else they are as they were known."""
+    """Write the function that returns whether bonds broke or changed; if not, it restores them."""
     out = Function(plan.shared, "changed", "slack")
     numbers = [n for n in plan.levels[-1].seen.bond if n.home is Home.BOND]
     changing = [str(n) for n, number in enumerate(numbers) if number.changes]
@@ -414,7 +432,7 @@ def _write_changed(plan: Plan) -> Function:
 
 
 def _write_known(plan: Plan, derive: Function) -> Function:
-    """The function that brings the factors up to date; it tells whether they serve."""
+    """Write the function that updates the factors, and returns whether they serve."""
     out = Function(plan.shared, "know")
     out.add(0, "since = place.size", "for e in range(place.size):", "    if stale[e]:")
     out.add(2, derive.call("e", *plan.each("still_@")), "stale[e], since = 0, min(since, e)")
@@ -426,7 +444,8 @@ def _write_known(plan: Plan, derive: Function) -> Function:
 
 
 def _write_settle(plan: Plan, follow: Function, moves: Function) -> Function:
-    """The function that moves the followers to where they rest, and tells whether it did."""
+    """Write the function that moves the followers to equilibrium, and returns whether it
+    succeeded."""
     out = Function(plan.shared, "settle", "tolerance")
     at = plan.each("flat_u_@[place[e]]")
     out.add(0, "factors, before = (diagonal, inverse, randoms), 0.0", "for e in range(place.size):")
@@ -454,16 +473,16 @@ def _write_settle(plan: Plan, follow: Function, moves: Function) -> Function:
 FUNCTIONS = (refactor, correct, largest, norm)
 MOST_CORRECTIONS = 8
 LARGEST_BAND = 10_000_000
-"""Numbers in a band: 80 MB."""
+"""Largest number of entries of a band: 80 MB."""
 OPERATIONS_A_CALL = 100_000_000
-"""In calls of so many, some tenths of a second, interruptions are heard."""
+"""Number of operations in a call, some tenths of a second, between two checks for interruption."""
 
 
 class Settler:
-    """For linear rules, with all that the band needs. What it holds is decided by the bonds as
-    they are, to the bit: it remembers nothing else from one increment to the next.
+    """Kernel for a linear rule, with its band. Its data depend on the bonds alone, to the last bit;
+    nothing else is stored between two increments.
 
-    Raises PluginError for parts that do not compile.
+    Raises PluginError for parts that cannot be compiled.
     """
 
     def __init__(self, scene: Scene, tolerance: float, watch: Watch) -> None:
@@ -501,43 +520,45 @@ class Settler:
         return bool(self._of_roles["band"].size <= LARGEST_BAND)
 
     def settle(self, state: State, moment: float, most: int) -> tuple[bool, int]:
-        """Goes on, in place, from an equilibrium to that of a moment, until no bond changes any
-        more, `most` times at most. Returns whether that is so, and how often bonds have changed;
-        where the band does not serve the state is as the last settling left it.
+        """Move a state, in place, from an equilibrium to that of a moment, until no bond changes
+        any more, at most `most` times.
+
+        Returns whether that is so, and the number of changes of bonds; if the band does not serve,
+        the state is that of the last equilibrium.
 
         Raises ExperimentError for contradicting leaders, and StoppedError.
         """
-        led, state.starts = prescribe(self._scene, state, moment)
-        place(state.u, led)
+        placed, state.starts = prescribe(self._scene, state, moment)
+        place(state.u, placed)
         self._take_roles(math.ceil(moment), state)
         changes, became = 0, GOES_ON
         while became == GOES_ON and changes < most:
             self._watch.begin("settling and breaking")
             a_call = max(1, min(most - changes, OPERATIONS_A_CALL // self._work))
             with blaming(self._scene.experiment.rule, f"at step {moment:.6g}"):
-                more, became = self._run(*self._given(state, moment, a_call))
-            changes += more
+                breaks, became = self._run(*self._given(state, moment, a_call))
+            changes += breaks
         state.step = math.floor(moment)
         state.previous[...] = state.u
         return became == SETTLED, changes
 
     def _take_roles(self, step: int, state: State) -> None:
-        """Makes ready for the roles of a step, where they are others."""
+        """Prepare the arrays for the roles of a step, if they have changed."""
         roles = tuple(leading.group.leads(step) for leading in self._scene.leading)
         if self._of_roles and roles == self._roles:
             return
         pattern = pattern_at(self._scene, step)
         reach, axes, count = pattern.reach, self._scene.axes, len(pattern.place)
-        most = count * axes * (2 * ((reach + 1) * axes - 1) + 1)
-        self._work = 1 + most * (reach + 1) * axes
-        self._roles, self._of_roles = roles, self._arrays_of(pattern, most)
+        size = count * axes * (2 * ((reach + 1) * axes - 1) + 1)
+        self._work = 1 + size * (reach + 1) * axes
+        self._roles, self._of_roles = roles, self._arrays_of(pattern, size)
         # Unlike any bond's, so that all rows are found anew.
-        known = {"known_broken": np.full_like(state.broken_step, -2)}
-        known |= {f"known{n}": value.copy() for n, value in enumerate(state.bond_values)}
-        self._of_roles |= known
+        stale = {"known_broken": np.full_like(state.broken_step, -2)}
+        stale |= {f"known{n}": value.copy() for n, value in enumerate(state.bond_values)}
+        self._of_roles |= stale
 
-    def _arrays_of(self, pattern: Pattern, most: int) -> Arrays:
-        """By name what the kernel holds as long as the roles stay."""
+    def _arrays_of(self, pattern: Pattern, size: int) -> Arrays:
+        """Return by name the arrays of the kernel that are constant as long as the roles are."""
         raster, axes, count = self._scene.raster, self._scene.axes, len(pattern.place)
         s, *cells = np.unravel_index(pattern.place, raster.shape)
         alone = np.stack([cells[0], cells[0] + 1, cells[1], cells[1] + 1], axis=1)
@@ -561,7 +582,7 @@ class Settler:
             "alike": np.array([pattern.alike]),
             "stale": np.ones(count, np.uint8),
             "blocks": np.zeros((count, slots, axes, axes)),
-            "band": np.empty(most),
+            "band": np.empty(size),
             "diagonal": np.zeros(count * axes),
             "inverse": np.zeros(count * axes),
             "randoms": signs,
@@ -572,11 +593,11 @@ class Settler:
         }
 
     def _named(self, state: State) -> Arrays:
-        """The arrays of the kernel by name."""
+        """Return the arrays of the kernel by name."""
         nobody = np.zeros_like(state.u)
         return self._constant | state_arrays(self._plan, state.u, nobody, state) | self._of_roles
 
     def _given(self, state: State, moment: float, most: int) -> tuple[Any, ...]:
         arrays = self._named(state)
-        given = tuple(arrays[name] for name in self._names)
-        return given, math.ceil(moment), self._tolerance, self._share, most
+        values = tuple(arrays[name] for name in self._names)
+        return values, math.ceil(moment), self._tolerance, self._share, most

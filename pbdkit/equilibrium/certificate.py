@@ -1,4 +1,4 @@
-"""A posteriori error bound of an equilibrium, and when a run of steps looks for one."""
+"""A posteriori error bound of an equilibrium, and detection of the steady state of a run."""
 
 from __future__ import annotations
 
@@ -40,16 +40,19 @@ WAYS = {
     "nothing to solve": "nobody follows",
 }
 CORRECTION = "correction, "
-"""Before the name of a way: it bounds only what a correction that was solved for leaves."""
+"""Prefix of a kind of bound that applies only to the error that a computed correction leaves."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """`residual` is the largest move of the rule at the state; `distance` bounds how far any
-    follower is from equilibrium, both lengths; `share` is the distance as a share of the largest
-    prescribed displacement; `iterations` counts linearisations and `inner_iterations` those of the
-    linear solvers; `bound` says how the distance was obtained; `linearised` whether the rule is not
-    linear, so that it holds to first order, with a factor of 2."""
+    """Bound on the error of an equilibrium.
+
+    `residual` is the largest move of the rule at the state, and `distance` a bound on the distance
+    of any follower from equilibrium, both lengths; `share` is the distance relative to the largest
+    prescribed displacement; `iterations` is the number of linearisations, `inner_iterations` that
+    of iterations of the linear solvers; `bound` is the kind of the bound; `linearised` is true if
+    the rule is not linear, so that the bound is of first order, with a factor of 2.
+    """
 
     method: str
     iterations: int
@@ -61,7 +64,7 @@ class Certificate:
     linearised: bool
 
     def as_dict(self) -> dict[str, Any]:
-        """The same as plain values, for JSON."""
+        """Return the certificate as plain values, for JSON."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -87,7 +90,7 @@ UNKNOWN = Certificate(
 
 
 class UnconvergedError(Exception):
-    """The best state found is no equilibrium; its certificate comes along."""
+    """The best state found is not an equilibrium; the error contains its certificate."""
 
     def __init__(self, reason: str, certificate: Certificate = UNKNOWN) -> None:
         super().__init__(reason)
@@ -95,21 +98,21 @@ class UnconvergedError(Exception):
 
 
 class RoundingError(UnconvergedError):
-    """A state is as near to an equilibrium as rounding allows, and the tolerance is less."""
+    """A state is as near to an equilibrium as rounding permits, but not within the tolerance."""
 
 
 def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
-    """The largest prescribed displacement: of the leaders, or of the start; where nothing is
-    prescribed but rest the largest that loads make, and without any the lattice's spacing."""
+    """Return the largest prescribed displacement of leaders or of the start. If there is none, the
+    largest displacement caused by loads; without loads, the shortest bond."""
     ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
     prescribed = rows.communicator.largest(max([rows.max_norm(start.u), *ways]))
     return prescribed or _way_under_loads(scene, start, rows) or spacing_of(scene)
 
 
 def _way_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
-    """The largest displacement that loads make when they change, linearised at rest; 0 where
-    nothing holds the body against them. Obstacles may stop all of it: then the largest move that
-    loads would make without them."""
+    """Return the largest displacement that changes of the loads cause, linearised at rest; 0 if
+    nothing holds the body against them. Obstacles can prevent all of it: then the largest move of
+    the loads without obstacles."""
     steps, moves, ways = scene.experiment.steps, Moves(scene), [0.0]
     rest = replace(rest, u=np.zeros(rest.u.shape))
     moments = {*scene.loads.changes(steps), *bends_of(scene)} if scene.loads else ()
@@ -120,38 +123,38 @@ def _way_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
         with suppress(ExperimentError, StuckError), one_thread():
             system = linearised(scene, rest, steps, "auto", Watch(), rows=rows)
             for push in pushes:
-                found = solved(system, push, spacing_of(scene), rows)
-                ways.append(rows.max_norm(found))
+                solution = solved(system, push, spacing_of(scene), rows)
+                ways.append(rows.max_norm(solution))
     return max(ways)
 
 
 def spacing_of(scene: Scene) -> float:
-    """The length of the shortest bond."""
+    """Return the length of the shortest bond."""
     return min(min(lengths) for lengths in scene.neighbourhood.shells())
 
 
 def broken_bonds(state: State) -> int:
-    """How many bonds are broken."""
+    """Return the number of broken bonds."""
     return 0 if state.broken_step is None else int(np.count_nonzero(state.broken_step >= 0))
 
 
 LINEAR = 1e-9
-"""A correction that leaves less than this share of the moves came from the right linearisation."""
+"""Ratio of the remaining moves to the corrected ones below which the rule counts as linear."""
 FIRST_ORDER = 2.0
-"""What a bound is multiplied with that holds to first order only."""
+"""Safety factor of bounds of first order."""
 ACCURACY = 1e-8
-"""How well linear systems are solved; the bound takes in what that leaves."""
+"""Relative accuracy of linear systems; the bound includes the remaining error."""
 
 CONTRACTION = 0.1
-"""The share of the moves that a correction may leave for its linearisation to be trusted: further
-ones, each that much smaller, then lie within a ninth of the first."""
+"""Largest ratio of moves after and before a correction for which the linearisation is valid:
+further corrections, each smaller by this ratio, then amount to a ninth of the first."""
 BENT = "the rule bends too much between there and equilibrium for a bound"
 
 
 @dataclass(frozen=True)
 class PredictedEquilibrium:
-    """`u` is the equilibrium ahead as far as it is known, and the certificate says how far at most
-    any follower is from it; `obstacle` why there is no distance, where it is infinite."""
+    """Predicted equilibrium `u` with the certificate of its error; `obstacle` is the reason of an
+    infinite distance."""
 
     u: Floats
     certificate: Certificate
@@ -159,19 +162,31 @@ class PredictedEquilibrium:
 
 
 class ErrorBound:
-    """The outlook from states of a scene with the roles of its last step.
+    """Prediction of the equilibrium from states of a scene with the roles of its last step.
 
-    The correction c, A c = move, leads from u to the equilibrium, and what it fails to do is seen
-    in the moves where it leads:
+    The correction c, A c = move, leads from u to the equilibrium; its error follows from the moves
+    at u + c:
 
-        distance ≤ max |c| + (bound on |A⁻¹|) · |move(u + c)|,
+    distance ≤ max
 
-    for rules that are not linear with A linearised at u, the second term to first order, doubled,
-    and only where the correction leaves a tenth of the moves at most.
+    c
 
-    An outlook follows from the state alone, so that a run that is gone on with has those of the
-    uninterrupted one. Between two of them only factors are kept: iterative solvers remember what
-    they have solved before.
+    + (bound on
+
+    A⁻¹
+
+    ) ·
+
+    move(u + c)
+
+    .
+
+    For rules that are not linear, A is linearised at u, the second term is of first order and
+    doubled, and the correction has to reduce the moves to a tenth.
+
+    A prediction depends on the state alone, so that a resumed run has those of the uninterrupted
+    one. Only factors are stored between two predictions, since iterative solvers depend on earlier
+    solutions.
     """
 
     def __init__(self, scene: Scene, scale: float, watch: Watch) -> None:
@@ -181,22 +196,22 @@ class ErrorBound:
         self._broken = 0
 
     def from_(self, state: State) -> PredictedEquilibrium:
-        """The outlook from the end of a step, which is left as it is.
+        """Predict the equilibrium from the end of a step; the state is not changed.
 
-        The distance is infinite where no bound is known: for what is pushed on for ever, and for
-        parts that nothing holds under rules that are not linear.
+        The distance is infinite if no bound is known: for bodies that are pushed on without end,
+        and for parts that nothing holds under rules that are not linear.
         """
         with one_thread():
             return self._from(state)
 
     def _from(self, state: State) -> PredictedEquilibrium:
         u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
-        here = replace(state, u=u, previous=previous)
+        start = replace(state, u=u, previous=previous)
         if not self._scene.barriers:
-            at_rest = self._system_at_rest(here)
-            if self._is_linear(here, at_rest):
-                return self._outlook(here, at_rest)
-        return self._outlook(here, self._linearised(here, u), anew=True)
+            at_rest = self._system_at_rest(start)
+            if self._is_linear(start, at_rest):
+                return self._outlook(start, at_rest)
+        return self._outlook(start, self._linearised(start, u), anew=True)
 
     def _system_at_rest(self, here: State) -> System:
         system, broken = self._at_rest, broken_bonds(here)
@@ -210,19 +225,21 @@ class ErrorBound:
         return linearised(self._scene, at, steps, "auto", self._watch)
 
     def _outlook(self, here: State, known: System, *, anew: bool = False) -> PredictedEquilibrium:
-        """By the system of the scene at rest, or by one that was linearised `anew` at the state."""
+        """Predict by the system at rest, or by one linearised `anew` at the state."""
         moves = self._moves.at(here, self._scene.experiment.steps)
         ahead, distance = here.u.copy(), math.inf
         correction, obstacle = self._correction(here, known, moves, anew)
         if correction is not None:
             ahead += correction
-            left = self._moves.at(replace(here, u=ahead), self._scene.experiment.steps)
-            bound = known.distance(left, self._moves.rounding(ahead)) * (
+            remainder = self._moves.at(replace(here, u=ahead), self._scene.experiment.steps)
+            bound = known.distance(remainder, self._moves.rounding(ahead)) * (
                 FIRST_ORDER if anew else 1.0
             )
             distance = float(np.sqrt((correction**2).sum(axis=0)).max(initial=0.0)) + bound
-            most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + self._moves.rounding(ahead)
-            if anew and not np.abs(left).max(initial=0.0) <= most:
+            limit = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + self._moves.rounding(
+                ahead
+            )
+            if anew and not np.abs(remainder).max(initial=0.0) <= limit:
                 distance, obstacle = math.inf, BENT
         distance = math.inf if math.isnan(distance) else distance
         certificate = Certificate(
@@ -240,7 +257,7 @@ class ErrorBound:
     def _correction(
         self, here: State, known: System, moves: Floats, anew: bool
     ) -> tuple[Floats | None, str]:
-        """None, and why, where there is no equilibrium, or none that is known."""
+        """Return the correction; None, with the reason, if no equilibrium is known."""
         try:
             if anew:
                 known.refuse_moving_floats(moves, self._moves.rounding(here.u))
@@ -250,53 +267,57 @@ class ErrorBound:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"
 
     def _is_linear(self, here: State, known: System) -> bool:
-        """Whether followers put elsewhere, at random and as far as the body has come, move by what
-        the linearisation at rest says."""
+        """Return whether random displacements, of the size of those of the body, cause the moves of
+        the linearisation at rest."""
         size = float(np.abs(here.u).max()) or spacing_of(self._scene)
-        put, steps = random_displacements(self._scene, size), self._scene.experiment.steps
-        moves, moved = (self._moves.at(replace(here, u=u), steps) for u in (here.u, here.u + put))
-        return known.mismatch(put, moves, moved) <= LINEAR
+        probe, steps = random_displacements(self._scene, size), self._scene.experiment.steps
+        moves, moved = (self._moves.at(replace(here, u=u), steps) for u in (here.u, here.u + probe))
+        return known.mismatch(probe, moves, moved) <= LINEAR
 
 
 FINEST, COARSEST = 256, 4
-"""Looks lie apart by between these parts of the steps since the first: what comes late comes late
-by a 256th, or by a step."""
+"""Divisors of the number of steps since the first check that bound the number of steps to the next
+one."""
 OVERDUE = 4
-"""Where steps are short but shrink no more (rounding, or a body that swings), a bound is made each
-time the steps since the first look are this many times more."""
+"""Ratio of the numbers of steps since the first check at which a bound is computed although steps
+do not shrink (rounding, or a vibrating body)."""
 NEVER = 2**62
 
 
 @dataclass
 class Pace:
-    """When to look, from what the looks before have found.
+    """Schedule of the checks for a steady state.
 
-    Where the modes of a symmetric step shrink by ρ and less, the sizes of its steps fall at a rate
-    of at least -ln ρ, and fall ever more slowly. What is extrapolated from two looks,
+    If the modes of a symmetric step decay by ρ or faster, the sizes of its steps decay at a rate of
+    at least -ln ρ, which decreases. The extrapolation from two checks,
 
-        distance ≈ ρ / (1 - ρ) · |last step|,  ρ from the ratio of two steps,
+    distance ≈ ρ / (1 - ρ) ·
 
-    comes out too small, so that one looks too early rather than too late, and it is sharp in the
-    end, when one mode is left. It only says when a bound is worth its cost.
+    last step
+
+    , ρ from the ratio of two steps,
+
+    is too small, so that a check is early rather than late; it is exact once a single mode is left.
+    It only determines when a bound is worth its cost.
     """
 
     next_look: int
-    """The step at which to look next."""
+    """Step of the next check."""
     tolerance: float
     begin: int
-    """The step before the first look."""
+    """Step before the first check."""
     rate: float = 0.0
-    """Of the decay, a step; 0 while none is seen."""
+    """Rate of decay in each step; 0 if there is none."""
     seen: tuple[int, float] | None = None
-    """The last look: its step, and the size of the step made there."""
+    """Step of the last check, and size of that step."""
     bounded: tuple[int, float] | None = None
-    """The last bound: its step, and the distance."""
+    """Step of the last bound, and its distance."""
     overdue: int | None = None
-    """The steps since the first look after which a bound is made all the same."""
+    """Number of steps since the first check after which a bound is computed in any case."""
 
     def is_near(self, step: int, longest: float, size: float) -> bool:
-        """Whether the distance is worth a bound. `longest` is the longest way that a particle made
-        in this step, `size` a norm of all ways."""
+        """Return whether a bound is worth its cost, for a step with a longest displacement
+        `longest` and a norm `size` of all displacements."""
         if self.seen:
             self.rate = _rate(self.seen, (step, size))
         self.seen = (step, size)
@@ -313,48 +334,47 @@ class Pace:
         return False
 
     def note_distance(self, step: int, distance: float) -> None:
-        """What the bound came to, where the run goes on."""
-        here = (step, distance)
-        rate = (_rate(self.bounded, here) if self.bounded else 0.0) or self.rate
+        """Schedule the next check after a bound that is not small enough."""
+        entry = (step, distance)
+        rate = (_rate(self.bounded, entry) if self.bounded else 0.0) or self.rate
         wanted = self.tolerance if distance > self.tolerance else distance / 2
-        self.bounded, self.overdue = here, OVERDUE * (step - self.begin)
+        self.bounded, self.overdue = entry, OVERDUE * (step - self.begin)
         self._wait(step, _steps_until(distance, wanted, rate))
 
     def _wait(self, step: int, steps: float) -> None:
         elapsed = step - self.begin
-        least, most = max(1, elapsed // FINEST), max(1, elapsed // COARSEST)
-        self.next_look = step + math.ceil(min(max(least, steps), most))
+        shortest, longest = max(1, elapsed // FINEST), max(1, elapsed // COARSEST)
+        self.next_look = step + math.ceil(min(max(shortest, steps), longest))
 
 
 def _rate(earlier: tuple[int, float], later: tuple[int, float]) -> float:
-    """The rate of decay a step between two values, 0 where they do not fall."""
-    (begin, before), (end, after) = earlier, later
-    if not after < before or not math.isfinite(before):
+    """Return the rate of decay in each step between two values, 0 if they do not decrease."""
+    (begin, earlier_value), (end, later_value) = earlier, later
+    if not later_value < earlier_value or not math.isfinite(earlier_value):
         return 0.0
-    return math.log(before / after) / (end - begin) if after > 0.0 else math.inf
+    return math.log(earlier_value / later_value) / (end - begin) if later_value > 0.0 else math.inf
 
 
 def _distance(length: float, rate: float) -> float:
-    """ρ / (1 - ρ) · length for ρ = exp(-rate)."""
+    """Return ρ / (1 - ρ) · length for ρ = exp(-rate)."""
     if length == 0.0:
         return 0.0
     return length / math.expm1(min(rate, 500.0)) if rate > 0.0 else math.inf
 
 
 def _steps_until(value: float, wanted: float, rate: float) -> float:
-    """The steps in which a value that falls at a rate comes to what is wanted."""
+    """Return the number of steps in which a decaying value reaches another."""
     if value <= wanted:
         return 0.0
     return math.log(value / wanted) / rate if rate > 0.0 and math.isfinite(value) else math.inf
 
 
 class SteadyStateMonitor:
-    """Looks at the states of a run that is to end once it has settled: roles no longer change,
-    leaders rest, no follower can be farther from equilibrium than the tolerance, and no bond is so
-    near to breaking that it might on the way there.
+    """Detection of the steady state of a run: roles are constant, leaders rest, no follower is
+    farther from equilibrium than the tolerance, and no bond can break on the way there.
 
-    Where the step looks back, a body may swing through its equilibrium: what memory and frames
-    with lag can carry it on counts as distance.
+    If the step depends on the state before it, a body may vibrate about its equilibrium: the
+    displacement that memory and lagging frames may still cause is added to the distance.
     """
 
     def __init__(self, scene: Scene, settle: Settle, start: State, watch: Watch) -> None:
@@ -369,20 +389,23 @@ class SteadyStateMonitor:
         self._carrying = _carrying(scene)
         unended = "leaders do not come to rest before its end"
         self.obstacle = "steps are too few" if ends else unended
-        """Why the run has not settled, as found at the last look."""
+        """Reason for which the last check found no steady state."""
 
     def look(self, state: State) -> Certificate | None:
-        """At the end of that step: the certificate where the run has settled. Raises StoppedError
-        where the watch says so. Neither changes the pace: another look finds the same."""
-        before, found = replace(self.pace), None
+        """Return the certificate if the end of a step is a steady state.
+
+        Raises StoppedError if the user interrupts. In both cases the schedule is unchanged, so that
+        another check has the same result.
+        """
+        pace, certificate = replace(self.pace), None
         try:
-            found = self._look(state)
+            certificate = self._look(state)
         except StoppedError:
-            self.pace = before
+            self.pace = pace
             raise
-        if found:
-            self.pace = before
-        return found
+        if certificate:
+            self.pace = pace
+        return certificate
 
     def _look(self, state: State) -> Certificate | None:
         with np.errstate(all="ignore"):
@@ -413,7 +436,15 @@ class SteadyStateMonitor:
 
 
 def _carrying(scene: Scene) -> float:
-    """How many times the last step a body may be carried on: |b| / (1 - |b|) by memory b, which
-    makes each step b times the last, and once by a frame that lags."""
+    """Return the ratio to the last step of the displacement that may follow:
+
+    b
+
+    / (1 -
+
+    b
+
+    ) for memory b, by which each step is b times the last, plus 1 for a frame with lag.
+    """
     memory = abs(scene.experiment.stepping.memory)
     return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + scene.lag

@@ -1,16 +1,15 @@
 """Compiled loops over the rows of grids: coarsening, fields of iterations, relaxation.
 
-A grid has a `code` by (row, place), the number of the stencil in `own` or -1 where nobody is free,
-and a `kind`, 0 outside, 1 free, 2 led. `halved` tells along which axes the next grid has half the
-places: its place n lies at 2n - 1, or at n.
+A grid has a `code` by (row, place), the number of the stencil in `own` or -1 where no particle is
+free, and a `kind`, 0 outside, 1 free, 2 leader. `halved` are the axes along which the next grid has
+half the places: its place n lies at 2n - 1, or at n. Fields are planes (axis, row, place), zero
+where no particle is free; the outermost ring is never free.
 
-Fields are planes (axis, row, place), zero where nobody is free; the outermost ring is never free. A
-row has runs of places that share the stencil `same`, from `begin` to `end`, and single places, the
-lone, with stencils of their own, `own[which]`. A stencil is 3 × 3 places of 4 numbers, xx, xy, yx,
-yy, row after row.
-
-Rows are relaxed in two colours, even and odd, the places of a row from the same state; sums are
-made row by row, so that the result does not depend on how many rows are done at a time.
+A row has runs of places that share the stencil `same`, from `begin` to `end`, and single places,
+the lone ones, with separate stencils, `own[which]`. A stencil is 3 × 3 places of 4 numbers, xx, xy,
+yx, yy, row after row. Rows are relaxed in two colours, even and odd, the places of a row from the
+same state; sums are made row by row, so that the result does not depend on the number of rows
+processed at a time.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ KEPT = globals().get("KEPT", False)
 
 @njit(cache=KEPT)
 def runs(code, first, begin, end, lone, place, which):
-    """Fills the lists of a grid; returns how many runs and lone places there are. Lists without
-    room are not filled."""
+    """Fill the lists of a grid; return the numbers of runs and lone places. Lists that are too
+    short are not filled."""
     r = s = 0
     for i in range(code.shape[0]):
         first[i], lone[i] = r, s
@@ -51,28 +50,28 @@ def runs(code, first, begin, end, lone, place, which):
 
 @njit(cache=KEPT)
 def coarse_kinds(kind, halved, out):
-    """0 outside, 1 free, 2 led, of the next grid: a place outside on which free ones hang is free,
-    unless led ones are nearer."""
+    """Compute the kinds of the next grid. A place outside to which free ones are interpolated is
+    free, unless leaders are nearer."""
     a1, b1 = halved
     for n in range(1, out.shape[0] - 1):
         for m in range(1, out.shape[1] - 1):
             i, j = (2 * n - 1 if a1 else n), (2 * m - 1 if b1 else m)
-            here = kind[i, j] if i < kind.shape[0] and j < kind.shape[1] else 0
+            place_kind = kind[i, j] if i < kind.shape[0] and j < kind.shape[1] else 0
             for ring in (1, 2):
-                if here:
+                if place_kind:
                     break
                 for a in range(max(-a1, -i), min(a1, kind.shape[0] - 1 - i) + 1):
                     for b in range(max(-b1, -j), min(b1, kind.shape[1] - 1 - j) + 1):
                         near = kind[i + a, j + b]
-                        if abs(a) + abs(b) == ring and near and here != 1:
-                            here = near
-            out[n, m] = here
+                        if abs(a) + abs(b) == ring and near and place_kind != 1:
+                            place_kind = near
+            out[n, m] = place_kind
 
 
 @njit(cache=KEPT)
 def coarse_codes(code, kind, halved, out):
-    """Of the next grid: -1 where nobody is free, 0 where all stencils around are the one of most,
-    so that this one's is too; others are numbered from 1. Returns the last number."""
+    """Compute the codes of the next grid, and return the last number: -1 where no particle is free,
+    0 where all stencils around are the most frequent one; others are numbered from 1."""
     count = 0
     a1, b1 = halved
     for n in range(out.shape[0]):
@@ -95,16 +94,16 @@ def coarse_codes(code, kind, halved, out):
 
 @njit(cache=KEPT)
 def beside(q, half):
-    """The places of the next grid between which a place lies that is q away from one of them, and
-    the share of the first: numbers of a stencil, -1, 0 or 1."""
+    """Return the two places of the next grid between which the place at distance q lies, and the
+    weight of the first, as numbers of a stencil, -1, 0 or 1."""
     if not half:
         return q, q, 1.0
     return (q - 1) // 2 if q % 2 else q // 2, (q + 1) // 2, 0.5 if q % 2 else 1.0
 
 
 @njit(cache=KEPT)
-def galerkin(code, own, coarse, halved, out):
-    """out[k] = the stencil of Pᵀ K P at the place of the next grid that is numbered k."""
+def galerkin(code, stencils, coarse, halved, out):
+    """Compute out[k], the stencil of Pᵀ K P at the place of the next grid with the number k."""
     a1, b1 = halved
     for n in range(1, coarse.shape[0] - 1):
         for m in range(1, coarse.shape[1] - 1):
@@ -128,58 +127,58 @@ def galerkin(code, own, coarse, halved, out):
                                 w = hangs * wa * wb
                                 if w > 0.0:
                                     for e in range(4):
-                                        out[k, 3 * ta + tb + 4, e] += w * own[code[i, j], s, e]
+                                        out[k, 3 * ta + tb + 4, e] += w * stencils[code[i, j], s, e]
 
 
 @njit(cache=KEPT)
-def asymmetry(code, own):
-    """The largest entry of K - Kᵀ. Of places with the stencil of most one pair a direction is
-    enough."""
-    worst, seen, unseen = 0.0, np.zeros(9, np.bool_), 9
+def asymmetry(code, stencils):
+    """Return the largest entry of K - Kᵀ. For the most frequent stencil one pair in each direction
+    suffices."""
+    worst, is_checked, unchecked = 0.0, np.zeros(9, np.bool_), 9
     for i in range(1, code.shape[0] - 1):
         for j in range(1, code.shape[1] - 1):
-            here = code[i, j]
-            if here < 0 or (here == 0 and not unseen):
+            number = code[i, j]
+            if number < 0 or (number == 0 and not unchecked):
                 continue
             for s in range(9):
-                there = code[i + s // 3 - 1, j + s % 3 - 1]
-                if there < 0 or (here == 0 and (there > 0 or seen[s])):
+                neighbour = code[i + s // 3 - 1, j + s % 3 - 1]
+                if neighbour < 0 or (number == 0 and (neighbour > 0 or is_checked[s])):
                     continue
-                if here == 0:
-                    seen[s] = True
-                    unseen -= 1
-                one, other = own[here, s], own[there, 8 - s]
+                if number == 0:
+                    is_checked[s] = True
+                    unchecked -= 1
+                entry, opposite = stencils[number, s], stencils[neighbour, 8 - s]
                 for e in range(4):
-                    worst = max(worst, abs(one[e] - other[(0, 2, 1, 3)[e]]))
+                    worst = max(worst, abs(entry[e] - opposite[(0, 2, 1, 3)[e]]))
     return worst
 
 
 @njit(cache=KEPT)
-def symmetrise(code, own):
-    """(K + Kᵀ) / 2, where places have stencils of their own."""
+def symmetrise(code, stencils):
+    """Replace K by (K + Kᵀ) / 2 where stencils are separate."""
     for i in range(1, code.shape[0] - 1):
         for j in range(1, code.shape[1] - 1):
             for s in range(5):
-                here, there = code[i, j], code[i + s // 3 - 1, j + s % 3 - 1]
-                if here < 0 or there < 0:
+                number, neighbour = code[i, j], code[i + s // 3 - 1, j + s % 3 - 1]
+                if number < 0 or neighbour < 0:
                     continue
                 for e in range(4):
                     t = (0, 2, 1, 3)[e]
-                    mean = (own[here, s, e] + own[there, 8 - s, t]) / 2
-                    own[here, s, e] = own[there, 8 - s, t] = mean
+                    mean = (stencils[number, s, e] + stencils[neighbour, 8 - s, t]) / 2
+                    stencils[number, s, e] = stencils[neighbour, 8 - s, t] = mean
 
 
 @njit(cache=KEPT)
-def balance(code, own, factor):
-    """Factors of rows, from place to place, with which as much of K as can be is symmetric, from
-    those that are known, 0 where none is. Returns how many places have none, and how many had."""
-    before = 0
+def balance(code, stencils, factor):
+    """Propagate row factors that make K as symmetric as possible, from the factors that are not 0.
+    Return the number of places without a factor, after and before."""
+    initial = 0
     for i in range(code.shape[0]):
         for j in range(code.shape[1]):
-            before += code[i, j] > 0 and factor[i, j] == 0.0
-    found, left = 1, before
-    while left and found:
-        found = 0
+            initial += code[i, j] > 0 and factor[i, j] == 0.0
+    progress, missing = 1, initial
+    while missing and progress:
+        progress = 0
         for i in range(1, code.shape[0] - 1):
             for j in range(1, code.shape[1] - 1):
                 if code[i, j] <= 0 or factor[i, j] != 0.0:
@@ -189,32 +188,34 @@ def balance(code, own, factor):
                     a, b = i + s // 3 - 1, j + s % 3 - 1
                     if s != 4 and code[a, b] >= 0 and factor[a, b] > 0.0:
                         for e in range(4):
-                            mine = own[code[i, j], s, e]
-                            both += mine * factor[a, b] * own[code[a, b], 8 - s, (0, 2, 1, 3)[e]]
+                            mine = stencils[code[i, j], s, e]
+                            both += (
+                                mine * factor[a, b] * stencils[code[a, b], 8 - s, (0, 2, 1, 3)[e]]
+                            )
                             square += mine * mine
                 if square > 0.0 and both > 0.0:
                     factor[i, j] = both / square
-                    found += 1
-        left -= found
-    return left, before
+                    progress += 1
+        missing -= progress
+    return missing, initial
 
 
 def run_coarsening():
-    """Calls each of these once, so that all are compiled."""
+    """Call each function once, so that all are compiled."""
     code = np.zeros((8, 8), np.int32)
     code[0] = code[-1] = code[:, 0] = code[:, -1] = -1
     code[2, 2] = 1
-    kind, own, halved = (code >= 0).astype(np.int8), np.ones((2, 9, 4)), (1, 1)
+    kind, stencils, halved = (code >= 0).astype(np.int8), np.ones((2, 9, 4)), (1, 1)
     lists = np.zeros(9, np.int64), np.zeros(7, np.int32), np.zeros(7, np.int32)
     lists += np.zeros(9, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
     runs(code, *lists)
     coarse_kind, coarse_code = np.zeros((6, 6), np.int8), np.zeros((6, 6), np.int32)
     coarse_kinds(kind, halved, coarse_kind)
     count = coarse_codes(code, coarse_kind, halved, coarse_code)
-    galerkin(code, own, coarse_code, halved, np.zeros((count + 1, 9, 4)))
-    asymmetry(code, own)
-    symmetrise(code, own)
-    balance(code, own, np.zeros((8, 8)))
+    galerkin(code, stencils, coarse_code, halved, np.zeros((count + 1, 9, 4)))
+    asymmetry(code, stencils)
+    symmetrise(code, stencils)
+    balance(code, stencils, np.zeros((8, 8)))
 
 
 FAST = {"error_model": "numpy", "nogil": True, "cache": KEPT, "fastmath": True}
@@ -222,26 +223,31 @@ FAST = {"error_model": "numpy", "nogil": True, "cache": KEPT, "fastmath": True}
 
 @njit(**FAST)
 def descend(a, p, q, x, r, share, out, sums):
-    """x += a p, r -= a q; out = share · r in its precision; sums, by row, = r · r and the largest
-    |a p|."""
+    """Compute x += a p, r -= a q and out = share · r in its precision; sums, by row, are r · r and
+    the largest
+
+    a p
+
+    .
+    """
     sums[:] = 0.0
     for v in range(2):
         for i in range(x.shape[1]):
             xs, rs, ps, qs, os = x[v, i], r[v, i], p[v, i], q[v, i], out[v, i]
-            part = most = 0.0
+            part = longest = 0.0
             for j in range(xs.size):
                 xs[j] += a * ps[j]
                 rs[j] -= a * qs[j]
                 os[j] = share * rs[j]
                 part += rs[j] * rs[j]
-                most = max(most, abs(ps[j]))
+                longest = max(longest, abs(ps[j]))
             sums[0, i] += part
-            sums[1, i] = max(sums[1, i], abs(a) * most)
+            sums[1, i] = max(sums[1, i], abs(a) * longest)
 
 
 @njit(**FAST)
 def turn(share, z, beta, p):
-    """p = share · z + beta p."""
+    """Compute p = share · z + beta p."""
     for v in range(2):
         for i in range(p.shape[1]):
             zs, ps = z[v, i], p[v, i]
@@ -251,20 +257,20 @@ def turn(share, z, beta, p):
 
 @njit(**FAST)
 def dot(a, b, sums):
-    """sums, by row, = a · b."""
+    """Compute sums, by row, of a · b."""
     sums[:] = 0.0
     for v in range(2):
         for i in range(a.shape[1]):
-            one, other = a[v, i], b[v, i]
+            first, second = a[v, i], b[v, i]
             part = 0.0
-            for j in range(one.size):
-                part += one[j] * other[j]
+            for j in range(first.size):
+                part += first[j] * second[j]
             sums[i] += part
 
 
 @njit(**FAST)
 def prolong(first, begin, end, lone, place, coarse, halved, x):
-    """x += P coarse at the free places of a grid: its runs and lone places by row."""
+    """Compute x += P coarse at the free places of a grid, given its runs and lone places by row."""
     half, width = x.dtype.type(0.5), coarse.shape[2]
     line, row = np.zeros(width + 1, x.dtype), np.zeros(2 * width + 2, x.dtype)
     for i in range(first.size - 1):
@@ -273,9 +279,9 @@ def prolong(first, begin, end, lone, place, coarse, halved, x):
         for v in range(2):
             low = (i + 1) // 2 if halved[0] else i
             high = i // 2 + 1 if halved[0] else i
-            one, other = coarse[v, low], coarse[v, high]
+            lower, upper = coarse[v, low], coarse[v, high]
             for n in range(width):
-                line[n] = half * (one[n] + other[n])
+                line[n] = half * (lower[n] + upper[n])
             if halved[1]:
                 for n in range(width):
                     row[2 * n] = half * (line[n] + line[n + 1])
@@ -294,8 +300,8 @@ def prolong(first, begin, end, lone, place, coarse, halved, x):
 
 @njit(**FAST)
 def differences(still, moved, place, number, share, axis, out):
-    """share · (still - moved) at flat places, into place `number` of each one's stencil, as what
-    moves along an axis do. Returns the largest."""
+    """Write share · (still - moved) at flat places into place `number` of each one's stencil, as
+    the derivative with respect to an axis. Return the largest value."""
     largest = 0.0
     for n in range(place.size):
         for v in range(2):
@@ -307,7 +313,7 @@ def differences(still, moved, place, number, share, axis, out):
 
 @njit(**FAST)
 def clear_noise(stencils, noise):
-    """Zero where all four numbers of a place of a stencil are as small."""
+    """Set the four numbers of a place of a stencil to zero if all are at most `noise`."""
     for n in range(stencils.shape[0]):
         for s in range(stencils.shape[1]):
             c = stencils[n, s]
@@ -316,7 +322,7 @@ def clear_noise(stencils, noise):
 
 
 def run_fields():
-    """Calls each of these once, so that all are compiled."""
+    """Call each function once, so that all are compiled."""
     r, z = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32)
     descend(0.0, r, r, r.copy(), r.copy(), 1.0, z, np.zeros((2, 8)))
     turn(1.0, z, 0.0, r)
@@ -325,29 +331,30 @@ def run_fields():
     differences(r.reshape(2, -1), r.reshape(2, -1), np.zeros(1, int), np.zeros(1, int), 1.0, 0,
                 np.zeros((1, 9, 2, 2)))  # fmt: skip
     clear_noise(np.zeros((1, 9, 2, 2)), 0.0)
-    rows, some = np.zeros(9, np.int64), np.zeros(1, np.int32)
-    prolong(rows, some, some, rows, some, np.zeros((2, 6, 6), np.float32), (1, 1), z)
+    rows, lists = np.zeros(9, np.int64), np.zeros(1, np.int32)
+    prolong(rows, lists, lists, rows, lists, np.zeros((2, 6, 6), np.float32), (1, 1), z)
 
 
 Grid = namedtuple("Grid", "first begin end lone place which same own inverse own_inverse")
-"""Of each row its `first` run and `lone` place, with the ends of the last row at the end; the
-stencils, and the inverses of their middles."""
+"""Grid as an argument of kernels: for each row the `first` run and the first `lone` place, with the
+total numbers at the end; the stencils, and the inverses of their diagonal blocks."""
 
 
 @njit(**FAST)
 def around(x, i, lo, hi):
-    """The rows before, at and after a run, x and y, from one place before it to one after."""
+    """Return the rows before, at and after a run, x and y, from one place before it to one
+    after."""
     lo, hi = lo - 1, hi + 1
-    before, after = (
+    previous, following = (
         (x[0, i - 1, lo:hi], x[1, i - 1, lo:hi]),
         (x[0, i + 1, lo:hi], x[1, i + 1, lo:hi]),
     )
-    return before[0], before[1], x[0, i, lo:hi], x[1, i, lo:hi], after[0], after[1]
+    return previous[0], previous[1], x[0, i, lo:hi], x[1, i, lo:hi], following[0], following[1]
 
 
 @njit(**FAST)
 def of_row(c, x, y, j):
-    """What three places of a row do to the one in their middle, by 12 numbers."""
+    """Return the product of three places of a row with 12 numbers of a stencil."""
     x0, y0, x1, y1, x2, y2 = x[j], y[j], x[j + 1], y[j + 1], x[j + 2], y[j + 2]
     kx = (c[0] * x0 + c[1] * y0) + (c[4] * x1 + c[5] * y1) + (c[8] * x2 + c[9] * y2)
     ky = (c[2] * x0 + c[3] * y0) + (c[6] * x1 + c[7] * y1) + (c[10] * x2 + c[11] * y2)
@@ -356,7 +363,7 @@ def of_row(c, x, y, j):
 
 @njit(**FAST)
 def of_run(c, rows, j):
-    """K x at place j of a run."""
+    """Return K x at place j of a run."""
     ax, ay = of_row(c[0], rows[0], rows[1], j)
     bx, by = of_row(c[1], rows[2], rows[3], j)
     cx, cy = of_row(c[2], rows[4], rows[5], j)
@@ -365,7 +372,7 @@ def of_run(c, rows, j):
 
 @njit(**FAST)
 def of_lone(grid, e, x, i):
-    """K x at a place with a stencil of its own."""
+    """Return K x at a place with a separate stencil."""
     j, k = grid.place[e], grid.which[e]
     kx = ky = x[0, 0, 0] * 0
     for a in range(3):
@@ -378,7 +385,7 @@ def of_lone(grid, e, x, i):
 
 @njit(**FAST)
 def product(grid, x, out, sums):
-    """out = K x; sums, by row, = x · K x."""
+    """Compute out = K x; sums, by row, are x · K x."""
     for i in range(grid.first.size - 1):
         part = 0.0
         for e in range(grid.first[i], grid.first[i + 1]):
@@ -398,7 +405,7 @@ def product(grid, x, out, sums):
 
 @njit(**FAST)
 def residual(grid, i, b, x, out):
-    """out = b - K x of a row, (axis, place)."""
+    """Compute out = b - K x of a row, (axis, place)."""
     for e in range(grid.first[i], grid.first[i + 1]):
         lo, hi = grid.begin[e], grid.end[e]
         rows, bx, by = around(x, i, lo, hi), b[0, i, lo:hi], b[1, i, lo:hi]
@@ -414,7 +421,7 @@ def residual(grid, i, b, x, out):
 
 @njit(**FAST)
 def solve_own(grid, i, r, weight, x):
-    """x += weight · D⁻¹ r at the places of a row, D the middles of the stencils."""
+    """Compute x += weight · D⁻¹ r at the places of a row, with the diagonal blocks D."""
     d = grid.inverse
     for e in range(grid.first[i], grid.first[i + 1]):
         lo, hi = grid.begin[e], grid.end[e]
@@ -430,7 +437,7 @@ def solve_own(grid, i, r, weight, x):
 
 @njit(**FAST)
 def clear(x, i):
-    """A row of zeros."""
+    """Set a row to zero."""
     for v in range(2):
         for j in range(x.shape[2]):
             x[v, i, j] = 0
@@ -438,8 +445,8 @@ def clear(x, i):
 
 @njit(**FAST)
 def relax(grid, b, x, row, weight, start, upwards):
-    """x += weight · D⁻¹ (b - K x) on even rows, then on odd ones; `upwards` the other way round.
-    `start`: from x = 0, whatever it holds. `row` is room for one."""
+    """Relax x += weight · D⁻¹ (b - K x) on even rows, then on odd ones; `upwards` in the opposite
+    order. `start`: from x = 0, whatever x contains. `row` is a buffer for one row."""
     rows = grid.first.size - 1
     for i in range(1 if upwards else 0, rows + 1, 2):
         # Row i, and the row before it, for which both beside it are now done.
@@ -461,8 +468,8 @@ def relax(grid, b, x, row, weight, start, upwards):
 
 @njit(**FAST)
 def restrict(grid, b, x, halved, code, out):
-    """out = Pᵀ (b - K x) at the free places of the next grid, those of a `code` of at least 0.
-    `halved` tells along which axes it has half the places: its place n lies at 2n - 1, or at n."""
+    """Compute out = Pᵀ (b - K x) at the free places of the next grid, those with a `code` of at
+    least 0."""
     half, width, across = x.dtype.type(0.5), code.shape[1], x.shape[2]
     odd, even = np.zeros((2, across), x.dtype), np.zeros((2, across), x.dtype)
     sums = np.zeros((2, 2 * width + 2), x.dtype)
@@ -490,7 +497,8 @@ def restrict(grid, b, x, halved, code, out):
 
 @njit(**FAST)
 def whole_residual(grid, i, b, x, out):
-    """The residual of a row, zero where nobody is free, and of a row that is not there."""
+    """Compute the residual of a row, zero where no particle is free and for a row outside the
+    grid."""
     for v in range(2):
         for j in range(out.shape[1]):
             out[v, j] = 0
@@ -500,7 +508,7 @@ def whole_residual(grid, i, b, x, out):
 
 @njit(**FAST)
 def add_rows(sums, row, share, anew):
-    """sums (+)= share · row, both axes."""
+    """Compute sums (+)= share · row for both axes."""
     for v in range(2):
         to, of = sums[v], row[v]
         if anew:
@@ -512,8 +520,8 @@ def add_rows(sums, row, share, anew):
 
 
 @njit(**FAST)
-def scaled(grid, same, own, moves, out):
-    """out = S moves at free places, S by stencil as 4 numbers."""
+def scaled(grid, same, table, moves, out):
+    """Compute out = S moves at free places, with S by stencil as 4 numbers."""
     for i in range(grid.first.size - 1):
         for e in range(grid.first[i], grid.first[i + 1]):
             lo, hi = grid.begin[e], grid.end[e]
@@ -521,21 +529,21 @@ def scaled(grid, same, own, moves, out):
                 u, v = moves[0, i, j], moves[1, i, j]
                 out[0, i, j], out[1, i, j] = same[0] * u + same[1] * v, same[2] * u + same[3] * v
         for e in range(grid.lone[i], grid.lone[i + 1]):
-            j, c = grid.place[e], own[grid.which[e]]
+            j, c = grid.place[e], table[grid.which[e]]
             u, v = moves[0, i, j], moves[1, i, j]
             out[0, i, j], out[1, i, j] = c[0] * u + c[1] * v, c[2] * u + c[3] * v
 
 
 def run():
-    """Calls each of these once, so that all are compiled."""
+    """Call each function once, so that all are compiled."""
     run_coarsening()
     run_fields()
     lists = np.zeros(9, np.int64), np.zeros(7, np.int32), np.zeros(7, np.int32)
     lists += np.zeros(9, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
-    grids, own = [], np.ones((2, 9, 4))
+    grids, stencils = [], np.ones((2, 9, 4))
     for real in (np.float32, np.float64):
         same, middle = ((real(1.0),) * 12,) * 3, (real(1.0),) * 4
-        grids.append(Grid(*lists, same, own.astype(real), middle, np.ones((2, 4), real)))
+        grids.append(Grid(*lists, same, stencils.astype(real), middle, np.ones((2, 4), real)))
     rough, exact = grids
     r, z, half = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32), np.float32(0.5)
     product(exact, r, r.copy(), np.zeros(8))

@@ -18,17 +18,20 @@ from pbdkit.equilibrium.multigrid import Grids
 from pbdkit.equilibrium.stencil_matrix import kernels
 from pbdkit.equilibrium.system import ALL, Rows
 
-MOST = 400
-"""Turns of an iteration."""
+MAX_ITERATIONS = 400
+"""Maximum number of iterations."""
 ALIKE = 1e-13
-"""The share of what others add by which a field differs from them at least."""
+"""Relative size below which the component of a field outside the span of the others counts as
+zero."""
 SLOWEST = 0.9
-"""The slowest fall of the jumps that is extrapolated."""
+"""Slowest rate of decay of the jumps that is extrapolated."""
 
 
 def best_of(krylov: LatticeKrylov, near: Sequence[Floats], b: Floats) -> Floats | float:
-    """The x among combinations of some fields that leaves nothing of K x = b along any of them, and
-    least energy where K is symmetric (Galerkin); b is overwritten with what it leaves. 0 of none.
+    """Return the Galerkin solution of K x = b in the span of some fields, 0 if there is none.
+
+    The residual is orthogonal to the fields; where K is symmetric the energy is minimal. b is
+    overwritten with the residual.
     """
     if not near:
         return 0.0
@@ -46,15 +49,16 @@ def best_of(krylov: LatticeKrylov, near: Sequence[Floats], b: Floats) -> Floats 
     return x
 
 
-class Found(ABC):
-    """An iteration's x with K x ≈ b; `jumps` are the largest ways made in each turn."""
+class KrylovResult(ABC):
+    """Result of an iteration: x with K x ≈ b, and the largest displacement of each iteration,
+    `jumps`."""
 
     x: Floats
     jumps: list[float]
 
     @property
     def ahead(self) -> float:
-        """About how far x still is from the solution, extrapolated from the last jumps."""
+        """Estimated distance of x from the solution, extrapolated from the last jumps."""
         if len(self.jumps) < 3:
             return math.inf
         a, b, c = self.jumps[-3:]
@@ -63,30 +67,31 @@ class Found(ABC):
 
 
 @dataclass
-class Descent(Found):
-    """By conjugate gradients: `steps` and `turns` are their numbers α and β, `left` is rᵀ B r of
-    what is left, B the cycle."""
+class Descent(KrylovResult):
+    """Result of conjugate gradients: `steps` and `turns` are the numbers α and β,
+    `residual_energy` is rᵀ B r
+    of the residual, with the cycle B."""
 
     x: Floats
-    left: float = math.inf
+    residual_energy: float = math.inf
     jumps: list[float] = field(default_factory=list)
     steps: list[float] = field(default_factory=list)
     turns: list[float] = field(default_factory=list)
     indefinite: bool = False
-    """Whether a way was met that does not lead uphill."""
+    """Whether a direction of negative curvature was met."""
 
     def smallest(self) -> float:
-        """The smallest eigenvalue of B K that the iteration has seen (Lanczos)."""
+        """Return the smallest eigenvalue of B K in the Krylov space (Lanczos)."""
         a, b = np.array(self.steps), np.array(self.turns)
         diagonal = 1.0 / a
         diagonal[1:] += b[1:] / a[:-1]
-        beside = np.sqrt(b[1:]) / a[:-1]
-        T = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        off_diagonal = np.sqrt(b[1:]) / a[:-1]
+        T = np.diag(diagonal) + np.diag(off_diagonal, 1) + np.diag(off_diagonal, -1)
         return float(np.linalg.eigvalsh(T)[0])
 
 
 class LatticeKrylov(ABC):
-    """Solves K x = b by the grids of K, or that of a coarser one."""
+    """Solver of K x = b by the grids of K, or by a coarser one of them."""
 
     name: str
 
@@ -97,87 +102,97 @@ class LatticeKrylov(ABC):
         self._sums = np.empty(len(self._grid.code))
 
     def dot(self, a: Floats, b: Floats) -> float:
-        """a · b."""
+        """Return the scalar product a · b."""
         kernels().dot(a, b, self._sums)
         return self._rows.total(self._sums)
 
     def product(self, x: Floats, out: Floats | None = None) -> Floats:
-        """K x."""
-        found = self._grid.field(np.float64) if out is None else out
-        kernels().product(self.matrix, x, found, self._sums)
-        return found
+        """Return the product K x."""
+        product = self._grid.field(np.float64) if out is None else out
+        kernels().product(self.matrix, x, product, self._sums)
+        return product
 
     def energy(self, x: Floats, out: Floats) -> float:
-        """x · K x; out = K x."""
+        """Return x · K x, and write K x into `out`."""
         self.product(x, out)
         return self._rows.total(self._sums)
 
     @abstractmethod
-    def solve(self, b: Floats, done: Callable[[Any], bool], most: int = MOST) -> Found:
-        """Iterates until `done`, or as far as it gets. b is overwritten with what is left of it."""
+    def solve(
+        self, b: Floats, is_done: Callable[[Any], bool], max_iterations: int = MAX_ITERATIONS
+    ) -> KrylovResult:
+        """Iterate until `is_done` is true or no progress is made; b is overwritten with the
+        residual."""
 
 
 class ConjugateGradients(LatticeKrylov):
-    """For a symmetric positive K."""
+    """Conjugate gradients, for a symmetric positive definite K."""
 
     name = "conjugate-gradients"
 
-    def solve(self, b: Floats, done: Callable[[Descent], bool], most: int = MOST) -> Descent:
-        """A cycle a turn."""
+    def solve(
+        self, b: Floats, is_done: Callable[[Descent], bool], max_iterations: int = MAX_ITERATIONS
+    ) -> Descent:
+        """Solve with one cycle in each iteration."""
         kernel, grid = kernels(), self._grid
-        found, r = Descent(grid.field(np.float64)), b
+        descent, r = Descent(grid.field(np.float64)), b
         p, q, rounded = grid.field(np.float64), grid.field(np.float64), grid.field(np.float32)
         size, sums = math.sqrt(self.dot(r, r)), np.empty((2, r.shape[1]))
         if not 0.0 < size < math.inf:
-            found.left = 0.0 if size == 0.0 else math.inf
-            return found
+            descent.residual_energy = 0.0 if size == 0.0 else math.inf
+            return descent
         np.multiply(r, 1.0 / size, out=rounded, casting="same_kind")
         while True:
             z = self._grids.cycle(rounded, self._depth)
-            before, found.left = found.left, size * self.dot(r, z)
-            if len(found.steps) >= most or (found.steps and done(found)):
-                return found
-            turned = found.left / before if found.steps else 0.0
+            previous, descent.residual_energy = descent.residual_energy, size * self.dot(r, z)
+            if len(descent.steps) >= max_iterations or (descent.steps and is_done(descent)):
+                return descent
+            turned = descent.residual_energy / previous if descent.steps else 0.0
             kernel.turn(size, z, turned, p)
             bent = self.energy(p, q)
             if not 0.0 < bent < math.inf:
-                found.indefinite = bent <= 0.0
-                return found
-            step = found.left / bent
-            kernel.descend(step, p, q, found.x, r, 1.0 / size, rounded, sums)
+                descent.indefinite = bent <= 0.0
+                return descent
+            step = descent.residual_energy / bent
+            kernel.descend(step, p, q, descent.x, r, 1.0 / size, rounded, sums)
             squares, jumps = self._rows.whole(sums)
-            found.steps.append(step)
-            found.turns.append(turned)
-            found.jumps.append(float(jumps.max()))
+            descent.steps.append(step)
+            descent.turns.append(turned)
+            descent.jumps.append(float(jumps.max()))
             if not squares.any():
-                found.left = 0.0
-                return found
+                descent.residual_energy = 0.0
+                return descent
 
 
 @dataclass
-class Stabilised(Found):
-    """By the stabilised iteration of biconjugate gradients. Its jumps waver."""
+class Stabilised(KrylovResult):
+    """Result of the stabilised biconjugate gradient iteration, whose jumps are not monotonic."""
 
     x: Floats
     jumps: list[float] = field(default_factory=list)
 
     @property
     def ahead(self) -> float:
-        """The larger of the last two jumps."""
+        """Larger of the last two jumps."""
         return max(self.jumps[-2:]) if len(self.jumps) > 1 else math.inf
 
 
 class BiconjugateGradients(LatticeKrylov):
-    """For a K that is not symmetric (van der Vorst's BiCGStab)."""
+    """Stabilised biconjugate gradients (van der Vorst), for a K that is not symmetric."""
 
     name = "bicgstab"
 
-    def solve(self, b: Floats, done: Callable[[Found], bool], most: int = MOST) -> Stabilised:
-        """Two cycles a turn."""
-        r, found = b, Stabilised(self._grid.field(np.float64))
+    def solve(
+        self,
+        b: Floats,
+        is_done: Callable[[KrylovResult], bool],
+        max_iterations: int = MAX_ITERATIONS,
+    ) -> Stabilised:
+        """Solve with two cycles in each iteration."""
+        r, iteration = b, Stabilised(self._grid.field(np.float64))
         shadow, p, q, t = r.copy(), r.copy(), np.zeros_like(r), np.zeros_like(r)
         rho = self.dot(shadow, r)
-        while rho and math.isfinite(rho) and len(found.jumps) < most:
+        while rho and math.isfinite(rho) and len(iteration.jumps) < max_iterations:
             p_smooth = self._smoothed(p)
             self.product(p_smooth, q)
             step = rho / self.dot(shadow, q)
@@ -187,19 +202,19 @@ class BiconjugateGradients(LatticeKrylov):
             square = self.dot(t, t)
             weight = self.dot(t, r) / square if square else 0.0
             way = step * p_smooth + weight * r_smooth
-            found.x += way
+            iteration.x += way
             r -= weight * t
-            found.jumps.append(self._rows.max_norm(way))
-            if done(found) or not weight:
+            iteration.jumps.append(self._rows.max_norm(way))
+            if is_done(iteration) or not weight:
                 break
-            before, rho = rho, self.dot(shadow, r)
+            previous, rho = rho, self.dot(shadow, r)
             p -= weight * q
-            p *= rho / before * step / weight
+            p *= rho / previous * step / weight
             p += r
-        return found
+        return iteration
 
     def _smoothed(self, r: Floats) -> Floats:
-        """B r; r is scaled, for it may be tiny in single precision."""
+        """Return B r; r is scaled, since it may be tiny in single precision."""
         size = math.sqrt(self.dot(r, r)) or 1.0
         rounded = np.multiply(r, 1.0 / size).astype(np.float32)
         return size * self._grids.cycle(rounded, self._depth).astype(np.float64)

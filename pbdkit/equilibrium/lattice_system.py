@@ -23,7 +23,7 @@ from pbdkit.equilibrium.krylov import (
     BiconjugateGradients,
     ConjugateGradients,
     Descent,
-    Found,
+    KrylovResult,
     LatticeKrylov,
     best_of,
 )
@@ -64,28 +64,28 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 ENOUGH = 8
-"""Iterations that tell how far a place gives way."""
+"""Number of iterations from which the compliance of a place is estimated."""
 
 
 def compliance(grids: Multigrid | PartedGrids) -> float:
-    """How far a place gives way to a unit load at most: as on the coarsest grid, and on each finer
-    one by so much more as on the first of them."""
+    """Estimate the largest displacement of a place under a unit load. The increase from the
+    coarsest grid to the next is assumed for each finer grid."""
     coarse, last = grids.whole, len(grids) - 1
-    axis, place, found = coarse.softest
+    axis, place, displacement = coarse.softest
     if last == 0:
-        return found
+        return displacement
     depth = len(coarse) - 2
     grid, (i, j) = coarse.grid(depth), coarse.finer_place(depth + 1, place)
     b = grid.field(np.float64)
     if i >= b.shape[1] or j >= b.shape[2] or grid.code[i, j] < 0:
-        return found * (last + 1)
+        return displacement * (last + 1)
     b[axis, i, j] = 1.0
     x = ConjugateGradients(coarse, depth).solve(b, lambda d: len(d.steps) >= ENOUGH).x
-    return found + max(0.0, float(x[axis, i, j]) - found) * last
+    return displacement + max(0.0, float(x[axis, i, j]) - displacement) * last
 
 
 def field_of(matrix: StencilMatrix, planes: Floats) -> Floats:
-    """What planes are there."""
+    """Return planes of the scene as a field of the grid."""
     if matrix.at is None:
         return planes.reshape(2, *matrix.code.shape)
     out = np.zeros((2, *matrix.code.shape))
@@ -94,12 +94,12 @@ def field_of(matrix: StencilMatrix, planes: Floats) -> Floats:
 
 
 def free_field_of(matrix: StencilMatrix, planes: Floats) -> Floats:
-    """The same of who is free alone."""
+    """Return planes of the scene as a field that is zero except at free places."""
     return np.where(matrix.code >= 0, field_of(matrix, planes), 0.0)
 
 
 def planes_of(matrix: StencilMatrix, field: Floats, shape: tuple[int, ...]) -> Floats:
-    """What a field is on the scene's raster, of a shape."""
+    """Return a field of the grid as planes of the scene, which have the given shape."""
     if matrix.at is None:
         return field.reshape(shape)
     planes = np.zeros(shape)
@@ -108,26 +108,26 @@ def planes_of(matrix: StencilMatrix, field: Floats, shape: tuple[int, ...]) -> F
 
 
 MOST_TURNS, TURN = 32, 3
-"""Of inverse iteration on a coarser grid, and iterations in each turn."""
+"""Maximum number of inverse iterations on a coarser grid, and of inner iterations in each."""
 
 
 @dataclass(frozen=True)
 class SlowMode:
-    """A mode of the steps, planes, and its slowness 1 / (1 - λ), λ its eigenvalue."""
+    """Mode of the steps as planes, and its slowness 1 / (1 - λ) with the eigenvalue λ."""
 
     planes: Floats
     slowness: float
 
     def improved(self, system: System, accuracy: float) -> SlowMode:
-        """After a turn, solved to an accuracy relative to where it leads."""
+        """Return the mode after one inverse iteration, with an accuracy relative to the result."""
         force = self.planes / np.abs(self.planes).max()
-        found = system.solve(force, accuracy * self.slowness)
-        return SlowMode(found, float((found * found).sum() / (found * force).sum()))
+        planes = system.solve(force, accuracy * self.slowness)
+        return SlowMode(planes, float((planes * planes).sum() / (planes * force).sum()))
 
 
 def softest(grids: Multigrid, krylov: type[LatticeKrylov]) -> tuple[Floats, float]:
-    """Of K⁻¹ about the largest eigenvalue and its field on the finest grid, up to some factor: by
-    inverse iteration on ever finer grids, but for the two finest."""
+    """Estimate the largest eigenvalue of K⁻¹ and its mode on the finest grid, up to a factor, by
+    inverse iteration from the coarsest to the third-finest grid."""
     mode, softness = grids.softest_field(), 1.0
     for depth in range(len(grids) - 1, 0, -1):
         solver, finer = krylov(grids, depth), grids.grid().unknowns / grids.grid(depth).unknowns
@@ -140,18 +140,21 @@ def softest(grids: Multigrid, krylov: type[LatticeKrylov]) -> tuple[Floats, floa
 
 
 LOOKS_AHEAD = 2
-"""Iterations that a bound takes."""
+"""Number of iterations for a bound."""
 SAFETY = 2.0
-"""By what λ is divided."""
+"""Divisor of the estimated eigenvalue λ."""
 NEAR = 0.01
-"""The share of the first jump at which an iteration has found most of an error."""
+"""Ratio to the first jump at which an iteration has removed most of an error."""
 TURNS = 6
-"""Of inverse iteration."""
+"""Number of inverse iterations."""
 
 
 class LatticeSystem(System):
-    """The system by multigrid; `has_leaders` says whether rows of the matrix have what leaders do
-    to followers too. Raises FloatingError where leaders do not hold all of the body."""
+    """Linear system solved by multigrid on stencils; `has_leaders` is true if rows of the matrix
+    contain the coupling of followers to leaders too.
+
+    Raises FloatingError if leaders do not hold all of the body.
+    """
 
     def __init__(
         self,
@@ -170,58 +173,58 @@ class LatticeSystem(System):
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
         self._solver: LatticeKrylov = kind(self._grids, rows=rows)
         self.may_be_stable = not self._symmetric or self._grids.is_definite()
-        """Not where coarse ways already lead downhill."""
+        """False if directions of negative curvature exist on the coarse grids."""
         self._smallest = 1.0
         self._spread: float | None = None
         self._iterations = 0
 
     @property
     def methods(self) -> str:
-        """Multigrid and an iteration around it."""
+        """Multigrid and the iteration that it preconditions."""
         return f"multigrid, {self._solver.name}"
 
     @property
     def how(self) -> str:
-        """By energy where there is one."""
+        """Kind of the bound: by energy for a symmetric matrix, else by the iteration."""
         return "energy" if self._symmetric else "iteration"
 
     @property
     def iterations(self) -> int:
-        """Of all solutions and bounds together."""
+        """Number of iterations of all solutions and bounds."""
         return self._iterations
 
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Until the jumps of the iteration say that no more than the tolerance is left. Nothing is
-        owed: all is held."""
+        """Iterate until the estimated distance is within the tolerance. `owed` is not used, since
+        the whole body is held."""
         self._watch.begin("solving")
-        found = self._found(self._pull(moves), lambda d: d.ahead <= tolerance)
-        if found.jumps and not found.ahead <= tolerance:
+        iteration = self._iterate(self._pull(moves), lambda d: d.ahead <= tolerance)
+        if iteration.jumps and not iteration.ahead <= tolerance:
             raise StuckError
-        return self._planes(found.x)
+        return self._planes(iteration.x)
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """From the combination of those `near` that is best."""
-        begun = [free_field_of(self._matrix, v) for v in near]
-        return self._planes(self._to_share(self._pull(moves), share, begun))
+        """Solve from the best combination of the fields `near`."""
+        fields = [free_field_of(self._matrix, v) for v in near]
+        return self._planes(self._to_share(self._pull(moves), share, fields))
 
     def pushed_by(self, led: Floats) -> Floats | None:
-        """-S⁻¹ K led."""
+        """Return -S⁻¹ K led."""
         if not self._has_leaders:
             return None
         pull, out = (
             self._solver.product(field_of(self._matrix, led)),
             self._grids.grid().field(np.float64),
         )
-        own = inverses(-self._matrix.scale.reshape(-1, 2, 2)).reshape(-1, 4)
-        inverse = np.ascontiguousarray(own)  # kernels are compiled for such alone
+        negative_inverse = inverses(-self._matrix.scale.reshape(-1, 2, 2)).reshape(-1, 4)
+        inverse = np.ascontiguousarray(negative_inverse)  # kernels are compiled for such alone
         kernels().scaled(self._solver.matrix, tuple(inverse[0].tolist()), inverse, pull, out)
         return self._planes(out)
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """A⁻¹ = K⁻¹ S, and Sᵀ K⁻ᵀ its transpose: by the same grids where K is symmetric, else by
-        those of its transpose."""
+        """Solve with the transpose of A⁻¹ = K⁻¹ S, which is Sᵀ K⁻ᵀ: by the same grids for a
+        symmetric K, else by the grids of the transpose."""
         b, out = free_field_of(self._matrix, weights), self._grids.grid().field(np.float64)
         solver = self if self._symmetric else self._transposed
         x = solver._to_share(b, share, ())
@@ -234,21 +237,21 @@ class LatticeSystem(System):
         return LatticeSystem(transposed(self._matrix), False, self._shape, self._watch)
 
     def _to_share(self, b: Floats, share: float, near: Sequence[Floats]) -> Floats:
-        """x with K x = b to a share of its largest number."""
+        """Solve K x = b with an error relative to the largest number of x."""
         self._watch.begin("solving")
         start = best_of(self._solver, near, b)
 
-        def is_near(d: Found) -> bool:
+        def is_near(d: KrylovResult) -> bool:
             return d.ahead <= share * self._rows.max_norm(start + d.x)
 
-        found = self._found(b, is_near)
-        if found.jumps and not is_near(found):
+        iteration = self._iterate(b, is_near)
+        if iteration.jumps and not is_near(iteration):
             raise StuckError
-        return np.asarray(start + found.x)
+        return np.asarray(start + iteration.x)
 
     def slowest(self) -> SlowMode:
-        """Roughly the mode of the steps that fades most slowly, by the coarser grids; of a lattice
-        that this process has whole."""
+        """Estimate the slowest mode of the steps on the coarser grids, for a lattice within one
+        process."""
         mode, softness = softest(self._grids.whole, type(self._solver))
         return SlowMode(
             self._planes(mode),
@@ -256,76 +259,82 @@ class LatticeSystem(System):
         )
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
-        """Of forces."""
+        """Return the relative mismatch of forces."""
         solver, pull = self._solver, self._solver.product(field_of(self._matrix, c))
-        left = self._pull(after) - self._pull(before) + pull
-        return math.sqrt(solver.dot(left, left) / solver.dot(pull, pull))
+        difference = self._pull(after) - self._pull(before) + pull
+        return math.sqrt(solver.dot(difference, difference) / solver.dot(pull, pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """The error that some turns find, and the bound on what they leave; rounding counts as
-        random."""
-        found, way = self._tracked(self._pull(moves))
+        """Return the error that some iterations remove, plus the bound on the remaining error;
+        rounding counts as random."""
+        remainder, length = self._tracked(self._pull(moves))
         if self._spread is None:
             self._spread = self._spread_of_rounding()
-        return way + found + rounding * self._spread
+        return remainder + length + rounding * self._spread
 
     def _tracked(self, r: Floats) -> tuple[float, float]:
-        """How far x with K x = r may still be from what some turns find, and how far that is."""
+        """Return the bound on the error of x after some iterations on K x = r, and the size of
+        x."""
         if self._symmetric:
-            found: Found = self._found(r, lambda d: len(d.jumps) >= LOOKS_AHEAD)
-            assert isinstance(found, Descent)
-            left = self._farthest(found.left)
+            iteration: KrylovResult = self._iterate(r, lambda d: len(d.jumps) >= LOOKS_AHEAD)
+            assert isinstance(iteration, Descent)
+            remainder = self._farthest(iteration.residual_energy)
         else:
-            found = self._found(r, lambda d: d.ahead <= NEAR * d.jumps[0])
-            left = SAFETY * found.ahead if found.jumps else 0.0
-            if not math.isfinite(left):
+            iteration = self._iterate(r, lambda d: d.ahead <= NEAR * d.jumps[0])
+            remainder = SAFETY * iteration.ahead if iteration.jumps else 0.0
+            if not math.isfinite(remainder):
                 raise StuckError
-        return left, math.sqrt(self._rows.max_norm((found.x * found.x).sum(axis=0)))
+        return remainder, math.sqrt(self._rows.max_norm((iteration.x * iteration.x).sum(axis=0)))
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """All is held."""
+        """Do nothing: the whole body is held."""
 
     def is_stable(self) -> bool:
-        """Conjugate gradients see a negative eigenvalue, from the load and from a random one. Where
-        the matrix is not symmetric, those nearest to 0 are looked at."""
+        """Return whether conjugate gradients meet no negative eigenvalue, from the load and from a
+        random right side. For a matrix that is not symmetric, the sign of the eigenvalues nearest
+        to 0 is checked."""
         v = self._rows.random(self._shape)
         if self._symmetric:
             try:
-                self._found(self._pull(v), lambda d: d.jumps[-1] <= NEAR * d.jumps[0])
+                self._iterate(self._pull(v), lambda d: d.jumps[-1] <= NEAR * d.jumps[0])
             except IndefiniteError:
                 return False
             return True
-        before = v
+        previous = v
         for _ in range(TURNS):
-            found = self._found(self._pull(v), lambda d: d.ahead <= NEAR * d.jumps[0])
-            before, v = (
+            iteration = self._iterate(self._pull(v), lambda d: d.ahead <= NEAR * d.jumps[0])
+            previous, v = (
                 v,
-                self._planes(found.x / (self._rows.max_norm(found.x) or 1.0)),
+                self._planes(iteration.x / (self._rows.max_norm(iteration.x) or 1.0)),
             )
-        return self._solver.dot(*(field_of(self._matrix, each) for each in (v, before))) > 0.0
+        return self._solver.dot(*(field_of(self._matrix, each) for each in (v, previous))) > 0.0
 
-    def _found(self, r: Floats, done: Callable[[Any], bool]) -> Found:
-        found: Found = self._solver.solve(r, done)
-        self._iterations += len(found.jumps)
-        if isinstance(found, Descent):
-            if found.indefinite or found.left < 0.0 or any(turn < 0.0 for turn in found.turns):
+    def _iterate(self, r: Floats, is_done: Callable[[Any], bool]) -> KrylovResult:
+        iteration: KrylovResult = self._solver.solve(r, is_done)
+        self._iterations += len(iteration.jumps)
+        if isinstance(iteration, Descent):
+            if (
+                iteration.indefinite
+                or iteration.residual_energy < 0.0
+                or any(turn < 0.0 for turn in iteration.turns)
+            ):
                 raise IndefiniteError
-            if not math.isfinite(found.left):
+            if not math.isfinite(iteration.residual_energy):
                 raise StuckError
-            if len(found.steps) > 1:
-                self._smallest = min(self._smallest, found.smallest())
+            if len(iteration.steps) > 1:
+                self._smallest = min(self._smallest, iteration.smallest())
             if self._smallest <= 0.0:
                 raise IndefiniteError
-        return found
+        return iteration
 
-    def _farthest(self, left: float) -> float:
-        """How far any place moves by what has this rᵀ B r."""
-        if min(left, self._compliance) < 0.0:
+    def _farthest(self, energy: float) -> float:
+        """Bound the displacement of any place for a residual with this rᵀ B r."""
+        if min(energy, self._compliance) < 0.0:
             raise IndefiniteError
-        return math.sqrt(SAFETY / self._smallest * self._compliance * left)
+        return math.sqrt(SAFETY / self._smallest * self._compliance * energy)
 
     def _spread_of_rounding(self) -> float:
-        """How far rounding of moves by up to 1 takes a place."""
+        """Bound the displacement that rounding of moves by up to 1 causes."""
         r = self._pull(np.sign(self._rows.random(self._shape)))
         if self._symmetric:
             return self._farthest(self._solver.dot(r, self._grids.cycle(r.astype(np.float32))))
@@ -336,19 +345,19 @@ class LatticeSystem(System):
         return compliance(self._grids)
 
     def _pull(self, moves: Floats) -> Floats:
-        """What K c equals, on the grid."""
+        """Return K c for a correction c with these moves, as a field."""
         out, scale = self._grids.grid().field(np.float64), self._matrix.scale
         same = tuple(scale[0].tolist())
         kernels().scaled(self._solver.matrix, same, scale, field_of(self._matrix, moves), out)
         return out
 
     def _planes(self, field: Floats) -> Floats:
-        """On the scene's raster."""
+        """Return a field as planes of the scene."""
         return planes_of(self._matrix, field, self._shape)
 
 
 FAITHFUL = 1e-3
-"""The share of what all moves at once are by which stencils from differences may be off."""
+"""Largest relative mismatch of stencils from differences with moves."""
 
 
 def lattice_system(
@@ -359,24 +368,28 @@ def lattice_system(
     moves: Moves | None = None,
     rows: Rows = ALL,
 ) -> LatticeSystem | None:
-    """The system of a scene, by the moves of its followers where these are compiled and the state
-    is not at rest; None where it has no such form, or leaders do not hold the body. A scene of
-    which each process has some `rows` has it at rest, without such moves."""
+    """Return the linear system of a scene on stencils; None if it has no such form, or leaders do
+    not hold the body.
+
+    Compiled `moves` serve for differences at a state that is not at rest. With `rows` of one of
+    several processes the system is that at rest.
+    """
     if moves and moves.is_compiled and state.u.any():
         matrix = differenced_matrix(scene, state, step, moves)
-        alike = DIFFERENCED
+        rtol = DIFFERENCED
     else:
-        matrix, alike, moves = stencil_matrix(scene, state, step, rows), EXACT, None
+        matrix, rtol, moves = stencil_matrix(scene, state, step, rows), EXACT, None
     if matrix is None:
         return None
     matrix = matrix.within(rows.known)
-    held = held_components(scene, step, rows)
-    if leads_one_way(matrix, rows) or not is_held(matrix, held, rows):
+    components = held_components(scene, step, rows)
+    if leads_one_way(matrix, rows) or not is_held(matrix, components, rows):
         return None
-    known = balanced(constrained(matrix, held), alike, rows)
+    matrix, is_symmetric = balanced(constrained(matrix, components), rtol, rows)
     try:
         # What frame points show of leaders is not among the stencils.
-        system = LatticeSystem(*known, state.u.shape, watch, not (moves or scene.frame), rows)
+        has_leaders = not (moves or scene.frame)
+        system = LatticeSystem(matrix, is_symmetric, state.u.shape, watch, has_leaders, rows)
     except FloatingError:
         return None
     if not system.may_be_stable:
@@ -384,8 +397,8 @@ def lattice_system(
             raise IndefiniteError
         return None
     if moves:
-        put = random_displacements(scene, NUDGE * scene.neighbourhood.nudge_unit)
-        there = replace(state, u=state.u + put)
-        if not system.mismatch(put, moves.at(state, step), moves.at(there, step)) <= FAITHFUL:
+        probe = random_displacements(scene, NUDGE * scene.neighbourhood.nudge_unit)
+        displaced = replace(state, u=state.u + probe)
+        if not system.mismatch(probe, moves.at(state, step), moves.at(displaced, step)) <= FAITHFUL:
             return None
     return system

@@ -1,12 +1,12 @@
-"""Solvers of linear systems of particles with known coordinates: an inverse, factors, an iteration.
+"""Direct and iterative solvers of linear systems of particles with known coordinates.
 
 Small matrices are inverted. Narrow ones are factorised as bands by LAPACK, with particles in rows
-across the shorter side of the body. Others are factorised by SuperLU, in an order that fills in
-little: nested dissection (A. George, Nested dissection of a regular finite element mesh, SIAM J.
-Numer. Anal. 10, 1973), where a strip that no coupling crosses parts the body in two, both halves
-are parted in the same way, and the strip is eliminated last. SuperLU has no such order of its own.
-Large ones are solved by iteration, with multigrid (amg.py) as preconditioner. Measurements stand in
-docs/decisions/0010.
+across the shorter side of the body. Others are factorised by SuperLU, in an order with little
+fill-in: nested dissection (A. George, Nested dissection of a regular finite element mesh, SIAM J.
+Numer. Anal. 10, 1973), where a strip that no coupling crosses divides the body in two, both halves
+are divided in the same way, and the strip is eliminated last. SuperLU itself does not offer this
+order. Large systems are solved by iteration, with multigrid (amg.py) as preconditioner.
+docs/decisions/0010 contains measurements.
 """
 
 from __future__ import annotations
@@ -31,33 +31,34 @@ Preconditioner = Callable[[Floats], Floats]
 MAX_ITERATIONS = 400
 """Maximum number of Krylov iterations with a preconditioner."""
 MIN_RESIDUAL = 1e-14
-"""Smallest relative residual that is asked of an iteration."""
+"""Smallest relative residual of iterations."""
 LARGEST_LU = 30_000
 """Unknowns up to which `auto` takes an LU factorisation."""
 LARGEST_COUPLED_LU = 200_000
-"""The same where the axes move each other."""
+"""Unknowns up to which `auto` takes an LU factorisation if the axes are coupled."""
 WIDEST_BAND = 120
 """Largest half-bandwidth that is factorised as a band: beyond, factors of a body as long as wide
 take more memory than sparse ones, and soon more time."""
 PIVOT_THRESHOLD = 0.1
-"""Diagonal entries that are this share of the largest of their columns serve as pivots."""
+"""Ratio to the largest entry of its column from which a diagonal entry is a pivot."""
 PATTERN_ASYMMETRY = 1.2
 """Largest ratio of the entries of a matrix and its transpose together to those of the matrix for
 its pattern to count as nearly symmetric."""
 SYMMETRY_RTOL = 1e-12
 """Relative difference up to which a matrix counts as symmetric."""
 FEWEST, LEAF = 1000, 40
-"""Places from which dissection pays (measured), and so few that they are parted no further."""
+"""Number of places from which dissection pays (measured), and number up to which a part is not
+divided."""
 TINY = 1e-300
 WIDEST = 0.25
-"""The share of all places that the first strip may take for dissection to be worth its while."""
+"""Largest fraction of all places in the first strip of a dissection."""
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Where the unknowns lie, `axes` of each particle next to each other: the places of particles
-    and of leaders, (particle, axis of space); which unknowns are `held`, each alone in its row and
-    column (None: none)."""
+    """Coordinates of the unknowns, `axes` of each particle next to each other: positions of
+    particles and of leaders, (particle, axis of space), and a mask of the `held` unknowns, each
+    alone in its row and column (None if there are none)."""
 
     axes: int
     places: Floats
@@ -65,27 +66,27 @@ class Coordinates:
     held: NDArray[np.bool_] | None = None
 
     def grids(self, matrix: Any) -> Preconditioner:
-        """Multigrid for a matrix of these unknowns."""
+        """Return the multigrid preconditioner of a matrix."""
         return SparseGrids(matrix, self.axes, self.places, self.led, self.held)
 
 
 class LinearSolver(ABC):
-    """Solves A x = b for one matrix, with an unknown a row."""
+    """Solver of A x = b for one matrix, with one row for each unknown."""
 
     name: str
     iterations = 0
 
     @abstractmethod
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method gets."""
+        """Solve for x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method allows."""
 
     @abstractmethod
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """The same of Aᵀ x = b."""
+        """Solve Aᵀ x = b in the same way."""
 
 
 class Dense(LinearSolver):
-    """The inverse itself, for small matrices."""
+    """Inverse of a small matrix."""
 
     name = "lu"
 
@@ -93,16 +94,16 @@ class Dense(LinearSolver):
         self.inverse = np.linalg.inv(matrix)
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """By a product."""
+        """Multiply by the inverse."""
         return self.inverse @ b
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By a product."""
+        """Multiply by the transpose of the inverse."""
         return self.inverse.T @ b
 
 
 class BandLU(LinearSolver):
-    """LAPACK's LU factors of a band matrix, with unknowns in an order of their own."""
+    """LAPACK's LU factors of a band matrix, with the unknowns reordered."""
 
     name = "lu"
 
@@ -121,11 +122,11 @@ class BandLU(LinearSolver):
             raise np.linalg.LinAlgError(f"the pivot of unknown {info} is zero")
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """By the factors."""
+        """Solve by the factors."""
         return self._by_factors(b, 0)
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By the same factors."""
+        """Solve by the transposed factors."""
         return self._by_factors(b, 1)
 
     def _by_factors(self, b: Floats, trans: int) -> Floats:
@@ -151,8 +152,8 @@ def band_order(matrix: Any, coordinates: Coordinates) -> tuple[Indices, int]:
 
 
 class SparseLU(LinearSolver):
-    """SuperLU. Where the pattern is nearly symmetric, in an order that fills in little: by nested
-    dissection where it is known where the many unknowns lie, else by minimum degree."""
+    """SuperLU factors. A nearly symmetric pattern is reordered to reduce fill-in: by nested
+    dissection if the coordinates of many unknowns are known, else by minimum degree."""
 
     name = "lu"
 
@@ -180,11 +181,11 @@ class SparseLU(LinearSolver):
             raise np.linalg.LinAlgError(str(error)) from None
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """By the factors."""
+        """Solve by the factors."""
         return self._by_factors(b, "N")
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By the same factors."""
+        """Solve by the transposed factors."""
         return self._by_factors(b, "T")
 
     def _by_factors(self, b: Floats, how: str) -> Floats:
@@ -196,7 +197,7 @@ class SparseLU(LinearSolver):
 
 
 class PreconditionedKrylov(LinearSolver):
-    """Conjugate gradients for symmetric matrices, GMRES for others; `grids` makes the multigrid
+    """Conjugate gradients for symmetric matrices, GMRES for others; `grids` returns the multigrid
     preconditioner of a matrix, None for none."""
 
     def __init__(
@@ -214,7 +215,8 @@ class PreconditionedKrylov(LinearSolver):
         self._most = MAX_ITERATIONS + (0 if grids else 20 * math.isqrt(matrix.shape[0]))
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Until it is accurate enough, or most iterations are made."""
+        """Iterate until the residual is small enough, or the maximum number of iterations is
+        reached."""
         from scipy.sparse.linalg import LinearOperator, cg, gmres
 
         accuracy, whole = max(accuracy, MIN_RESIDUAL), float(np.linalg.norm(b))
@@ -226,7 +228,7 @@ class PreconditionedKrylov(LinearSolver):
             self._watch.look(math.log(left) / math.log(accuracy) if 0.0 < left < 1.0 else 0.0)
 
         def told(r: Floats) -> Floats:
-            """Conjugate gradients precondition the residual of every iteration."""
+            """Precondition the residual of an iteration of conjugate gradients."""
             tell(float(np.linalg.norm(r)) / whole)
             return self._cycle(r)
 
@@ -243,7 +245,7 @@ class PreconditionedKrylov(LinearSolver):
         return np.asarray(x)
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By grids of the transpose, where that is another matrix."""
+        """Solve with the preconditioner of the transpose, unless the matrix is symmetric."""
         return (self if self._symmetric else self._transposed).solve(b, accuracy)
 
     @cached_property
@@ -281,18 +283,18 @@ def linear_solver(
 
 
 def dense(matrix: Any) -> Floats:
-    """The matrix as an array."""
+    """Return the matrix as an array."""
     return matrix if isinstance(matrix, np.ndarray) else np.asarray(matrix.toarray())
 
 
 def is_symmetric(matrix: Any) -> bool:
-    """Whether a matrix equals its transpose, up to rounding."""
+    """Return whether a matrix equals its transpose, up to rounding."""
     difference = abs(matrix - matrix.T)
     return bool(difference.max() <= SYMMETRY_RTOL * max(1.0, abs(matrix).max()))
 
 
 def is_nearly_symmetric(matrix: Any) -> bool:
-    """Whether a sparse matrix has most entries where its transpose has them."""
+    """Return whether a sparse matrix has most entries where its transpose has entries."""
     from scipy.sparse import csr_array
 
     ones = csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), matrix.shape)
@@ -300,9 +302,9 @@ def is_nearly_symmetric(matrix: Any) -> bool:
 
 
 def dissected(matrix: Any, places: Floats) -> Indices | None:
-    """The unknowns of a sparse matrix, in the order of elimination; `places` (unknown, axis) says
-    where they lie, those of one place next to each other. None where couplings reach too far, or
-    where there are few places."""
+    """Return the unknowns of a sparse matrix in the order of nested dissection. `places` (unknown,
+    axis) are their positions, with those of one place next to each other. None if couplings extend
+    too far, or if there are few places."""
     fresh = np.ones(len(places), bool)
     fresh[1:] = (places[1:] != places[:-1]).any(axis=1)
     sites, every = places[fresh], np.arange(np.count_nonzero(fresh))
@@ -318,16 +320,17 @@ def dissected(matrix: Any, places: Floats) -> Indices | None:
 
 
 def _reach(matrix: Any, places: Floats) -> Floats:
-    """How far couplings reach along each axis; a hair more, for rounding, and never nothing."""
+    """Return the range of the couplings along each axis, with a margin for rounding; it is
+    positive."""
     row, column = matrix.tocoo().coords
-    found = [float(np.abs(x[row] - x[column]).max(initial=0.0)) for x in places.T.copy()]
-    return 1.001 * np.array(found) + 1e-9 * np.ptp(places) + TINY
+    distances = [float(np.abs(x[row] - x[column]).max(initial=0.0)) for x in places.T.copy()]
+    return 1.001 * np.array(distances) + 1e-9 * np.ptp(places) + TINY
 
 
-def _dissect(places: Floats, some: Indices, reach: Floats, order: list[Indices]) -> None:
-    halves = _halves(places, some, reach) if len(some) > LEAF else None
+def _dissect(places: Floats, members: Indices, reach: Floats, order: list[Indices]) -> None:
+    halves = _halves(places, members, reach) if len(members) > LEAF else None
     if halves is None:
-        order.append(some)
+        order.append(members)
         return
     below, above, strip = halves
     _dissect(places, below, reach, order)
@@ -336,16 +339,16 @@ def _dissect(places: Floats, some: Indices, reach: Floats, order: list[Indices])
 
 
 def _halves(
-    places: Floats, some: Indices, reach: Floats
+    places: Floats, members: Indices, reach: Floats
 ) -> tuple[Indices, Indices, Indices] | None:
-    """Those below a strip across the longer side, those above it, and the strip; None where it
-    leaves nobody on one side."""
-    here = places[some]
-    sides = np.ptp(here, axis=0)
+    """Return the members below and above a strip across the longer side, and those in the strip;
+    None if one side is empty."""
+    positions = places[members]
+    sides = np.ptp(positions, axis=0)
     axis = int(sides[1] / reach[1] > sides[0] / reach[0])
-    along, width = here[:, axis], reach[axis]
+    along, width = positions[:, axis], reach[axis]
     middle = np.partition(along, len(along) // 2)[len(along) // 2] - width / 2
     below, above = along <= middle, along > middle + width
     if not (below.any() and above.any()):
         return None
-    return some[below], some[above], some[~(below | above)]
+    return members[below], members[above], members[~(below | above)]

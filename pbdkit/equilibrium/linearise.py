@@ -45,11 +45,11 @@ def linearised(
     moves: Moves | None = None,
     rows: Rows = ALL,
 ) -> System:
-    """The system of a scene at a state with the roles of a moment's step, by one of the solver's
-    methods; `moves`, where known, serve it.
+    """Return the linear system of a scene at a state with the roles of a moment's step, by a method
+    of the solver; `moves` are reused if they exist.
 
-    Of a scene of which each process has some rows there is the one on stencils alone. Raises
-    ExperimentError where there is no unique solution, or none on stencils.
+    A scene distributed among processes has a system on stencils only. Raises ExperimentError if
+    there is no unique solution, or none on stencils.
     """
     if rows.strip:
         return _shared(scene, state, math.ceil(moment), watch, rows)
@@ -71,15 +71,15 @@ def linearised(
 
 
 def mismatch_at_rest(scene: Scene, moves: Moves, size: float, method: str, watch: Watch) -> float:
-    """How far from linear the moves are of followers put elsewhere, at random and as far as a size:
-    as by System.mismatch, of the linearisation at rest."""
+    """Return the nonlinearity of the moves at random displacements of a size, as System.mismatch of
+    the linearisation at rest."""
     start, steps = initial_state(scene), scene.experiment.steps
     rest = replace(start, u=np.zeros_like(start.u))
     with one_thread():
         system = linearised(scene, rest, steps, method, watch)
-        put = random_displacements(scene, size)
-        made = [moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
-        return system.mismatch(put, *made)
+        probe = random_displacements(scene, size)
+        moves_of_both = [moves.at(replace(rest, u=u), steps) for u in (rest.u, probe.copy())]
+        return system.mismatch(probe, *moves_of_both)
 
 
 def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> System:
@@ -92,8 +92,8 @@ def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> 
 
 
 class _Replaceable(System):
-    """A system until it gets stuck, then another; but for a body that is not stable where it is
-    put, which is better put elsewhere."""
+    """System that is replaced by another once its iteration makes no progress, except if the body
+    is unstable at a state that is not at rest."""
 
     def __init__(self, system: System, otherwise: Callable[[], System], *, at_rest: bool) -> None:
         self._system, self._otherwise, self._past = system, otherwise, 0
@@ -102,35 +102,35 @@ class _Replaceable(System):
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """By the first that can."""
+        """Solve by the first system that can."""
         return self._first_able(lambda system: system.solve(moves, tolerance, owed, rounding))
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """By the first that can."""
+        """Solve by the first system that can."""
         return self._first_able(lambda system: system.answer(moves, share, near))
 
     def pushed_by(self, led: Floats) -> Floats | None:
-        """By the present one."""
+        """Return the result of the current system."""
         return self._system.pushed_by(led)
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """By the first that can."""
+        """Solve by the first system that can."""
         return self._first_able(lambda system: system.solve_transposed(weights, share))
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
-        """By the present one."""
+        """Return the result of the current system."""
         return self._system.mismatch(c, before, after)
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """By the first that can."""
+        """Return the bound of the first system that has one."""
         return self._first_able(lambda system: system.distance(moves, rounding))
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """By the present one."""
+        """Check by the current system."""
         self._system.refuse_moving_floats(moves, rounding)
 
     def is_stable(self) -> bool:
-        """By the present one."""
+        """Return the result of the current system."""
         return self._system.is_stable()
 
     def _first_able(self, does: Callable[[System], T]) -> T:
@@ -145,25 +145,25 @@ class _Replaceable(System):
 
     @property
     def methods(self) -> str:
-        """Of the present one."""
+        """Methods of the current system."""
         return self._system.methods
 
     @property
     def is_stuck(self) -> bool:
-        """Of the present one."""
+        """State of the current system."""
         return self._system.is_stuck
 
     @property
     def how(self) -> str:
-        """Of the present one."""
+        """Kind of the bound of the current system."""
         return self._system.how
 
     @property
     def amplification(self) -> float:
-        """Of the present one."""
+        """Amplification of the current system."""
         return self._system.amplification
 
     @property
     def iterations(self) -> int:
-        """Of both."""
+        """Number of iterations of both systems."""
         return self._past + self._system.iterations

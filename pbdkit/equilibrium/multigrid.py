@@ -32,19 +32,19 @@ from pbdkit.equilibrium.stencil_matrix import (
 from pbdkit.equilibrium.system import Rows, Strip, coarser_size, outside
 
 PRECISION = np.float32
-"""Of cycles."""
+"""Floating-point type of cycles."""
 WEIGHT = 0.8
-"""Of a relaxation; below 1, since the places of a row do not know of each other."""
+"""Relaxation factor, below 1 because the places of a row are relaxed at once."""
 STIFFER = 3.0
-"""So many times stiffer, a direction is made coarser alone."""
+"""Ratio of stiffness above which only the stiffer direction is coarsened."""
 NARROW = 5
-"""Places across, with the ring around, at which a grid is not made narrower."""
+"""Number of places across, with the ring around, at which a grid is not narrowed any more."""
 EVERY = slice(None)
 
 
 class StencilGrid:
-    """One grid: its `code` and `kind` as of StencilMatrix, its `stencils`, and what kernels are
-    given of them in a precision. Corrections do not reach `held` components."""
+    """One grid: its `code` and `kind` as in StencilMatrix, its `stencils`, and the lists of its
+    rows for kernels. Corrections leave `held` components unchanged."""
 
     def __init__(
         self,
@@ -65,22 +65,25 @@ class StencilGrid:
         self.unknowns = 2 * (int((end - begin).sum()) + lone_count)
 
     def given(self, precision: type[np.floating[Any]]) -> Any:
-        """The grid as kernels take it."""
+        """Return the grid as the argument of kernels, in a precision."""
         middle = self._inverses
         same = tuple(tuple(map(precision, row)) for row in self.stencils[0].reshape(3, 12))
-        own, inverse = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
-        return kernels().Grid(*self.lists, same, own, tuple(map(precision, middle[0])), inverse)
+        stencils, inverse = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
+        return kernels().Grid(
+            *self.lists, same, stencils, tuple(map(precision, middle[0])), inverse
+        )
 
     @cached_property
     def _inverses(self) -> Floats:
         return inverses(self.stencils[:, OWN].reshape(-1, 2, 2)).reshape(-1, 4)
 
     def field(self, precision: type[np.floating[Any]]) -> Floats:
-        """Room for one number an axis and place."""
+        """Return zeros, one number for each axis and place."""
         return np.zeros((2, *self.code.shape), precision)
 
     def halved(self, rows: int) -> tuple[int, int]:
-        """Along which axes the next grid has half the places, of a lattice of so many rows."""
+        """Return the axes along which the next grid has half the places, for a lattice of `rows`
+        rows."""
         along = [np.abs(_stiffness(self.stencils[0], axis)) for axis in range(2)]
         columns = self.code.shape[1]
         if rows <= NARROW or columns <= NARROW:
@@ -90,7 +93,7 @@ class StencilGrid:
         return int(along[0] > along[1]), int(along[1] > along[0])
 
     def coarser(self, halved: tuple[int, int], known: slice = EVERY) -> StencilGrid:
-        """The next grid, as far as it is known: some of its rows."""
+        """Return the next grid, or the `known` rows of it."""
         shape = [
             coarser_size(n) if half else n for n, half in zip(self.code.shape, halved, strict=True)
         ]
@@ -106,38 +109,39 @@ class StencilGrid:
         stencils[0] = _coarse_stencil(self.stencils[:1], halved)
         if self.held is None:
             return StencilGrid(code, kind, stencils)
-        held = coarser_held(self.kind, self.held, halved, kind)
-        code, stencils, _ = with_held(code, stencils, held)
-        return StencilGrid(code, kind, stencils, held)
+        coarse_held = coarser_held(self.kind, self.held, halved, kind)
+        code, stencils, _ = with_held(code, stencils, coarse_held)
+        return StencilGrid(code, kind, stencils, coarse_held)
 
     def add_coarser(self, coarse: Floats, halved: tuple[int, int], x: Floats) -> None:
-        """x += P coarse."""
+        """Add P coarse to x."""
         kernels().prolong(*self.lists[:5], coarse, halved, x)
         if self.held is not None:
             x[self.held] = 0.0
 
     def is_definite_alone(self) -> bool:
-        """Whether the matrix is positive at each place by itself, where it is symmetric."""
+        """Return whether the diagonal block of every place is positive definite, for a symmetric
+        matrix."""
         a, b, c, d = self.stencils[:, OWN].T
         return bool(((a > 0.0) & (a * d > b * c)).all())
 
     def matrix(self) -> tuple[tuple[NDArray[np.intp], ...], Floats]:
-        """Where the unknowns are, and the matrix, dense."""
+        """Return the places of the unknowns and the dense matrix."""
         at = np.nonzero(self.code >= 0)
         number = np.full(self.code.shape, -1)
         number[at] = np.arange(len(at[0]))
         K = np.zeros((len(at[0]), 2, len(at[0]), 2))
         blocks = self.stencils[self.code[at]].reshape(-1, 9, 2, 2)
         for s in range(9):
-            there = number[at[0] + s // 3 - 1, at[1] + s % 3 - 1]
-            some = np.flatnonzero(there >= 0)
-            K[some, :, there[some], :] += blocks[some, s]
+            neighbours = number[at[0] + s // 3 - 1, at[1] + s % 3 - 1]
+            present = np.flatnonzero(neighbours >= 0)
+            K[present, :, neighbours[present], :] += blocks[present, s]
         return at, K.reshape(2 * len(at[0]), -1)
 
 
 class GridLevel:
-    """A grid with room for what a cycle does there, in single precision; `halved` tells along which
-    axes the next one has half the places."""
+    """One grid with the arrays of a cycle, in single precision; `halved` are the axes along which
+    the next one has half the places."""
 
     def __init__(self, grid: StencilGrid, halved: tuple[int, int] = (0, 0)) -> None:
         self.grid, self.given, self.halved = grid, grid.given(PRECISION), halved
@@ -145,71 +149,71 @@ class GridLevel:
         self._row = np.zeros((2, grid.code.shape[1]), PRECISION)
 
     def down(self, b: Floats, below: GridLevel) -> None:
-        """Relaxes K x = b from zero; what is left goes to the next grid."""
+        """Relax K x = b from zero, and restrict the residual to the next grid."""
         kernel, x = kernels(), self.x
         kernel.relax(self.given, b, x, self._row, PRECISION(WEIGHT), True, False)
         kernel.restrict(self.given, b, x, self.halved, below.grid.code, below.b)
 
     def up(self, b: Floats, coarse: Floats) -> None:
-        """Adds what the next grid has found, and relaxes."""
+        """Add the correction of the next grid, and relax."""
         self.grid.add_coarser(coarse, self.halved, self.x)
         kernels().relax(self.given, b, self.x, self._row, PRECISION(WEIGHT), False, True)
 
 
 class Grids(ABC):
-    """A grid and ever coarser ones: ``cycle(r)`` approximates K⁻¹ r, in single precision."""
+    """Hierarchy of grids: ``cycle(r)`` approximates K⁻¹ r in single precision."""
 
     @abstractmethod
     def __len__(self) -> int:
-        """How many grids there are."""
+        """Return the number of grids."""
 
     @abstractmethod
     def grid(self, depth: int = 0) -> StencilGrid:
-        """The finest, or one so much coarser."""
+        """Return the grid at a depth, 0 for the finest."""
 
     @abstractmethod
     def cycle(self, r: Floats, depth: int = 0) -> Floats:
-        """One V-cycle from zero. What it gives out is valid until the next."""
+        """Return one V-cycle from zero. The array is overwritten by the next cycle."""
 
     @abstractmethod
     def is_definite(self) -> bool:
-        """Whether a symmetric matrix is positive, as the coarsest grid and each place by itself
-        tell."""
+        """Return whether a symmetric matrix is positive definite, judged by the coarsest grid and
+        by each diagonal block."""
 
 
 def _stiffness(stencil: Floats, axis: int) -> float:
-    """What a wave along an axis meets."""
+    """Return the stiffness against a wave along an axis."""
     c = np.moveaxis(stencil.reshape(3, 3, 2, 2), axis, 0)
     sides: Floats = c[0].sum(axis=0) + c[2].sum(axis=0)
     return float(np.trace(sides))
 
 
 def _coarse_stencil(stencils: Floats, halved: tuple[int, int]) -> Floats:
-    """What one stencil everywhere makes of itself."""
+    """Return the coarse stencil of a uniform stencil."""
     coarse = np.full((7, 7), -1, np.int32)
     coarse[3, 3] = 1
-    found: Floats = np.zeros((2, *stencils.shape[1:]))
-    kernels().galerkin(np.zeros((12, 12), np.int32), stencils, coarse, halved, found)
-    return np.asarray(found[1])
+    stencil: Floats = np.zeros((2, *stencils.shape[1:]))
+    kernels().galerkin(np.zeros((12, 12), np.int32), stencils, coarse, halved, stencil)
+    return np.asarray(stencil[1])
 
 
 COARSEST = 200
-"""Unknowns below which a grid is solved with its inverse."""
+"""Number of unknowns below which a grid is solved by its inverse."""
 TURNS = 30
-"""Of the inverse iteration on the coarsest grid."""
+"""Number of inverse iterations on the coarsest grid."""
 SINGULAR = 1e-12
-"""One part of what the inverse of the coarsest grid may magnify; a body that is not held gives way
-without end."""
+"""Reciprocal of the largest condition number of the coarsest grid; a body that is not held exceeds
+it."""
 
 
 class FloatingError(Exception):
-    """Something of the body is not held."""
+    """Leaders leave a motion of the body free."""
 
 
 class Multigrid(Grids):
-    """All of a grid and ever coarser ones, in this process.
+    """Hierarchy of grids in one process.
 
-    Raises FloatingError where leaders leave a motion of the body free.
+    Raises FloatingError if leaders leave a motion of the body free.
     """
 
     def __init__(self, grid: StencilGrid) -> None:
@@ -229,25 +233,26 @@ class Multigrid(Grids):
         self._inverse, self._gives_way = inverse.astype(PRECISION), inverse.diagonal()
 
     def is_definite(self) -> bool:
-        """Whether a symmetric matrix is positive, as the coarsest grid and each place by itself
-        tell: one that is not there is not on the finest either."""
+        """Return whether a symmetric matrix is positive definite, judged by the coarsest grid and
+        by each diagonal block. A matrix that is not definite there is not definite on the finest
+        grid."""
         K = (self._coarsest + self._coarsest.T) / 2.0
         return self.grid().is_definite_alone() and bool(np.linalg.eigvalsh(K)[0] > 0.0)
 
     def __len__(self) -> int:
-        """With the coarsest."""
+        """Return the number of grids, including the coarsest."""
         return len(self._levels)
 
     def grid(self, depth: int = 0) -> StencilGrid:
-        """The finest, or one so much coarser."""
+        """Return the grid at a depth, 0 for the finest."""
         return self._levels[depth].grid
 
     def cycle(self, r: Floats, depth: int = 0) -> Floats:
-        """On all grids from there on."""
+        """Return one V-cycle from the grid at a depth on."""
         level = self._levels[depth]
         if depth == len(self._levels) - 1:
-            found = self._inverse @ r[:, self._at[0], self._at[1]].T.ravel()
-            level.x[:, self._at[0], self._at[1]] = found.reshape(-1, 2).T
+            x = self._inverse @ r[:, self._at[0], self._at[1]].T.ravel()
+            level.x[:, self._at[0], self._at[1]] = x.reshape(-1, 2).T
             return level.x
         below = self._levels[depth + 1]
         level.down(r, below)
@@ -256,49 +261,51 @@ class Multigrid(Grids):
 
     @property
     def whole(self) -> Multigrid:
-        """All of them."""
+        """The hierarchy itself."""
         return self
 
     @property
     def softest(self) -> tuple[int, tuple[int, int], float]:
-        """Of the coarsest grid the axis and place that gives way most to a unit load, and how
-        far."""
+        """Return axis, place and displacement of the most compliant unknown of the coarsest grid
+        under a unit load."""
         n = int(self._gives_way.argmax())
         i, j = (int(index[n // 2]) for index in self._at)
         return n % 2, (i, j), float(self._gives_way[n])
 
     def softest_field(self) -> Floats:
-        """On the coarsest grid: what gives way most to forces like itself."""
+        """Return the softest mode of the coarsest grid, by inverse iteration."""
         mode = np.random.default_rng(0).random(len(self._inverse))
         for _ in range(TURNS):
             mode = self._inverse @ (mode / np.abs(mode).max())
-        found = self._levels[-1].grid.field(PRECISION)
-        found[:, self._at[0], self._at[1]] = mode.reshape(-1, 2).T
-        return found
+        field = self._levels[-1].grid.field(PRECISION)
+        field[:, self._at[0], self._at[1]] = mode.reshape(-1, 2).T
+        return field
 
     def finer_field(self, depth: int, field: Floats) -> Floats:
-        """A field of a grid on the one before it."""
+        """Return a field of one grid, interpolated to the next finer one."""
         above = self._levels[depth - 1]
-        found = above.grid.field(PRECISION)
+        fine = above.grid.field(PRECISION)
         coarse = field.astype(PRECISION, copy=False)
-        above.grid.add_coarser(coarse, above.halved, found)
-        return found
+        above.grid.add_coarser(coarse, above.halved, fine)
+        return fine
 
     def finer_place(self, depth: int, place: tuple[int, int]) -> tuple[int, int]:
-        """Where a place of a grid lies on the one before it."""
+        """Return the place of the next finer grid at which a place of one grid lies."""
         halved = self._levels[depth - 1].halved
         i, j = (2 * n - 1 if half else n for n, half in zip(place, halved, strict=True))
         return i, j
 
 
 SMALL = 100 * COARSEST
-"""Unknowns of a grid that is not worth sharing: more than four times those of the coarsest, so that
-all processes have two grids at least where any is parted."""
+"""Number of unknowns below which a grid is not distributed: more than four times that of the
+coarsest, so that all processes have two grids at least."""
 
 
 class PartedGrids(Grids):
-    """Of a grid that each process has a strip of. Raises FloatingError where leaders leave a motion
-    of the body free."""
+    """Hierarchy of grids of which each process has a strip.
+
+    Raises FloatingError if leaders leave a motion of the body free.
+    """
 
     def __init__(self, grid: StencilGrid, rows: Rows, strip: Strip) -> None:
         self._rows = rows
@@ -310,63 +317,65 @@ class PartedGrids(Grids):
             self._strips.append(strip)
             self._levels.append(GridLevel(level.grid.coarser(level.halved, strip.known)))
         self.whole = Multigrid(self._joined())
-        """The grids that all processes have."""
+        """Grids that every process has as a whole."""
 
     def _unknowns(self) -> int:
-        own, code = self._strips[-1].own, self._levels[-1].grid.code
-        return 2 * int(self._rows.communicator.sum(int(np.count_nonzero(code[own] >= 0))))
+        rows, code = self._strips[-1].own, self._levels[-1].grid.code
+        return 2 * int(self._rows.communicator.sum(int(np.count_nonzero(code[rows] >= 0))))
 
     def _joined(self) -> StencilGrid:
-        """The coarsest of the parted grids, with the rows of all."""
-        grid, own = self._levels[-1].grid, self._strips[-1].own
-        code = grid.code[own]
+        """Gather the coarsest of the distributed grids."""
+        grid, rows = self._levels[-1].grid, self._strips[-1].own
+        code = grid.code[rows]
         used, number = np.unique(code, return_inverse=True)
-        some = used > 0
-        stencils = self._rows.communicator.allgather(grid.stencils[used[some]])
-        before = sum(map(len, stencils[: self._rows.communicator.rank]))
-        renumbered = np.where(some, before + np.cumsum(some), used).astype(code.dtype)
-        held = None if grid.held is None else self._together(grid.held[:, own], 1)
+        is_irregular = used > 0
+        stencils = self._rows.communicator.allgather(grid.stencils[used[is_irregular]])
+        offset = sum(map(len, stencils[: self._rows.communicator.rank]))
+        renumbered = np.where(is_irregular, offset + np.cumsum(is_irregular), used).astype(
+            code.dtype
+        )
+        joined_held = None if grid.held is None else self._together(grid.held[:, rows], 1)
         return StencilGrid(
             self._together(renumbered[number].reshape(code.shape), 0),
-            self._together(grid.kind[own], 0),
+            self._together(grid.kind[rows], 0),
             np.concatenate([grid.stencils[:1], *stencils]),
-            held,
+            joined_held,
         )
 
-    def _together(self, own: Array, axis: int) -> Array:
-        return np.concatenate(self._rows.communicator.allgather(own), axis)
+    def _together(self, values: Array, axis: int) -> Array:
+        return np.concatenate(self._rows.communicator.allgather(values), axis)
 
     def __len__(self) -> int:
-        """With those that all have."""
+        """Return the number of grids, including those that every process has."""
         return len(self._levels) - 1 + len(self.whole)
 
     def grid(self, depth: int = 0) -> StencilGrid:
-        """A parted one."""
+        """Return a distributed grid."""
         return self._levels[depth].grid
 
     def is_definite(self) -> bool:
-        """In all processes."""
+        """Return whether the matrix is definite in all processes."""
         alone = self._levels[0].grid.is_definite_alone()
         return not self._rows.communicator.any(not alone) and self.whole.is_definite()
 
     def cycle(self, r: Floats, depth: int = 0) -> Floats:
-        """From the finest grid; renews the halo of r. What comes out is right in own rows and in
-        the one before and after them."""
+        """Return one V-cycle from the finest grid; the halo of r is updated. The result is valid in
+        the own rows and in the rows adjacent to them."""
         assert depth == 0
         self._rows.exchange_halo(r)
-        given = [r, *(level.b for level in self._levels[1:])]
-        for b, (level, below) in zip(given, pairwise(self._levels), strict=False):
+        right_sides = [r, *(level.b for level in self._levels[1:])]
+        for b, (level, below) in zip(right_sides, pairwise(self._levels), strict=False):
             level.down(b, below)
         strip = self._strips[-1]
-        found = self.whole.cycle(self._together(given[-1][:, strip.own], 1))
-        low, rows = strip.low, given[-1].shape[1]
-        x = np.ascontiguousarray(found[:, low : low + rows])
-        for level, b in zip(self._levels[-2::-1], given[-2::-1], strict=True):
+        coarse = self.whole.cycle(self._together(right_sides[-1][:, strip.own], 1))
+        low, rows = strip.low, right_sides[-1].shape[1]
+        x = np.ascontiguousarray(coarse[:, low : low + rows])
+        for level, b in zip(self._levels[-2::-1], right_sides[-2::-1], strict=True):
             level.up(b, x)
             x = level.x
         return x
 
 
 def grids_of(grid: StencilGrid, rows: Rows) -> Multigrid | PartedGrids:
-    """Those of the finest."""
+    """Return the hierarchy of grids with `grid` as the finest."""
     return PartedGrids(grid, rows, rows.strip) if rows.strip else Multigrid(grid)

@@ -1,8 +1,8 @@
 """Search for the equilibrium of given roles, bonds and obstacles.
 
-Linear rules need one linearisation, at rest. Others are followed from the equilibrium before by
-Newton's iteration, bodies whose bonds have just broken by pseudo-transient continuation, and bodies
-before obstacles by an active set of held particles.
+Linear rules need one linearisation, at rest. Other rules are followed from the previous equilibrium
+by Newton's iteration, bodies whose bonds have just broken by pseudo-transient continuation, and
+bodies in contact with obstacles by an active set of constrained particles.
 """
 
 from __future__ import annotations
@@ -43,39 +43,38 @@ from pbdkit.stepping.state import State
 
 MOST_CORRECTIONS = 12
 LOOSEST = 0.1
-"""No tolerance from here on is proposed."""
+"""Largest tolerance that messages propose."""
 CONTRACTION = 0.5
-"""What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
-iteration leads there (Deuflhard)."""
+"""Largest ratio of a correction to the last one. Below it there is one equilibrium nearby, to which
+Newton's iteration converges (Deuflhard)."""
 SERVES, NEAR = 0.02, 1e-3
-"""What share of an error a correction may leave for its linearisation to serve once more; how
-accurately corrections are solved for at least, as a share of themselves."""
+"""Largest ratio of errors for which a linearisation is used again, and largest relative error of
+corrections."""
 NOT_LINEAR = "the rule declares itself linear, and does not move as its linearisation says"
 NUDGE, SHARE = 1e-6, 0.25
-"""By so much, in lattice spacings, leaders are moved to see what their way does to others; the
-share of the tolerance that linear systems have."""
+"""Displacement of leaders, in lattice spacings, for derivatives with respect to the load, and
+fraction of the tolerance that linear systems may use."""
 UNSTABLE = "what is found is not stable"
 ROUNDING = "rounding alone allows no better"
 FIRM = 1e5
-"""Distance over rounding up to which a body counts as firm: farther, it may be about to give way,
-so that a shorter way could help."""
+"""Ratio of distance to rounding up to which a body counts as firm. Beyond it the body may be near a
+limit point, so that a smaller increment could converge."""
 MOST_IMPLICIT_STEPS = 200
 LEAP = 0.2
-"""The longest move of an implicit step, in lattice spacings."""
+"""Longest move of an implicit step, in lattice spacings."""
 LEAST_DAMPING, FASTEST, FALL, SLOWEST = 1e-10, 0.05, 0.5, 2.0
-"""The least damping, relative to the stiffness of a particle among others at rest. Between implicit
-steps it falls by this share of what the moves do, and no faster than this; it rises with them, up
-to twofold."""
+"""Smallest damping, relative to the stiffness of a particle among others at rest; smallest ratio of
+two dampings; factor on the ratio of the moves; largest ratio of two dampings."""
 NEXT_TO_NOTHING, MUCH = 1e-6, 100.0
-"""The stiffness, as a damping, below which motions are left out of a certificate. It is tried once
-the moves are so many times what softer ones would allow."""
+"""Stiffness, as a damping, below which motions are excluded from a certificate, and ratio of the
+moves to those that softer motions allow from which this is tried."""
 
 
 @dataclass(frozen=True)
 class Finder:
-    """Looks for equilibria of a scene, to within a length, by one of the solver's methods, shares
-    being of the length `scale`; `compiles` is of the moves; `rows` are those of the scene;
-    `at_rest` the last system there, and `rest` of what it is the system."""
+    """Search for equilibria of a scene within a length, by a method of the solver. Relative numbers
+    refer to the length `scale`; `compiles` is that of the moves; `rows` are those of the scene;
+    `at_rest` is the last system at rest, and `rest` the data on which it depends."""
 
     scene: Scene
     tolerance: float
@@ -89,13 +88,13 @@ class Finder:
 
     @cached_property
     def moves(self) -> Moves:
-        """Of the scene's followers."""
+        """Evaluation of the moves of the scene."""
         return Moves(self.scene, compiles=self.compiles)
 
     @cached_property
     def linear(self) -> bool:
-        """Whether the rule is, and there is no obstacle: it says so, or followers put elsewhere, at
-        random and as far as the load goes, move by what the linearisation at rest says."""
+        """Whether the rule is linear and there are no obstacles. A rule that does not declare
+        itself linear is tested at random displacements of the size of the load."""
         scene = self.scene
         if scene.barriers:
             return False
@@ -105,27 +104,32 @@ class Finder:
         return off <= LINEAR
 
     def at(self, moment: float) -> Finder:
-        """The same with the numbers of a moment."""
-        now = self.scene.at(moment)
-        return self if now is self.scene else replace(self, scene=now)
+        """Return the finder with the parameters of a moment."""
+        scene = self.scene.at(moment)
+        return self if scene is self.scene else replace(self, scene=scene)
 
     def find(self, state: State, moment: float) -> Certificate:
-        """Moves the followers of `state`, in place, to where they rest with the roles, loads and
-        numbers of a moment, by the linearisation at rest, exact for linear rules. Raises
-        ExperimentError where a part has no equilibrium, UnconvergedError and StoppedError."""
+        """Move the followers of `state`, in place, to the equilibrium with the roles, loads and
+        parameters of a moment, by the linearisation at rest, which is exact for linear rules.
+
+        Raises ExperimentError if a part has no equilibrium, UnconvergedError and StoppedError.
+        """
         with one_thread():
             return _Linear(self.at(moment), state, moment).run()
 
     def relax(self, state: State, moment: float) -> Certificate:
-        """The same for rules that are not linear, from a state in which bonds have just broken, by
-        implicit steps: to where steps lead that are small enough. Raises UnconvergedError."""
+        """Move the followers by implicit steps, for rules that are not linear and a state in which
+        bonds have just broken: to the equilibrium that sufficiently small steps approach.
+
+        Raises UnconvergedError.
+        """
         with one_thread():
             return _Relaxing(self.at(moment), state, moment).run()
 
     def follow(self, state: State, moment: float, before: State) -> Certificate:
-        """The same for rules that are not linear, from the equilibrium `before` all went on a
-        little: by Newton's iteration, as long as each correction is much smaller than the last,
-        so that no other equilibrium is nearer. What is found is stable."""
+        """Move the followers by Newton's iteration, for rules that are not linear and a small
+        change of the load since the equilibrium `before`. Each correction has to be much smaller
+        than the last, so that no other equilibrium is nearer; the result is stable."""
         with one_thread():
             try:
                 return _Newton(self.at(moment), state, moment, before).run()
@@ -135,8 +139,8 @@ class Finder:
 
 @dataclass(frozen=True)
 class Rest:
-    """What a system at rest depends on, so that a later search takes it up again: the scene with
-    its numbers, which groups lead, the bonds, and by which methods it was to be solved."""
+    """Data on which a system at rest depends, so that a later search uses it again: the scene with
+    its parameters, the leading groups, the bonds, and the methods of the solver."""
 
     scene: Scene
     leads: tuple[bool, ...]
@@ -145,14 +149,14 @@ class Rest:
 
     @classmethod
     def of(cls, finder: Finder, state: State, moment: float, methods: str) -> Rest:
-        """That of a state with the roles of a moment's step."""
+        """Return the data of a state with the roles of a moment's step."""
         leads = tuple(led.group.leads(math.ceil(moment)) for led in finder.scene.leading)
         broken = () if state.broken_step is None else (state.broken_step >= 0,)
         bonds = (*broken, *(value.copy() for value in state.bond_values))
         return cls(finder.scene, leads, bonds, methods)
 
     def serves(self, other: Rest) -> bool:
-        """Whether both have the same system."""
+        """Return whether both have the same system."""
         same = self.scene is other.scene and (self.leads, self.methods) == (
             other.leads,
             other.methods,
@@ -161,7 +165,7 @@ class Rest:
 
 
 class Search(ABC):
-    """Goes from a state, in place, to an equilibrium, with the roles of a moment's step."""
+    """Search from a state, in place, for an equilibrium with the roles of a moment's step."""
 
     _linear = False
 
@@ -171,11 +175,11 @@ class Search(ABC):
         self._system = self._linearised(at, what)
         self._left = self._moves()
         self._known: tuple[float, Floats | None, System | None] = math.inf, None, None
-        """The last distance, of which moves, by which system."""
+        """The last distance, with the moves and the system to which it belongs."""
 
     @abstractmethod
     def run(self) -> Certificate:
-        """To the equilibrium."""
+        """Move the state to the equilibrium, and return its certificate."""
 
     def _certified(self) -> Certificate:
         certificate = self._certificate(self._distance())
@@ -187,15 +191,15 @@ class Search(ABC):
         return certificate
 
     def _floor(self) -> float:
-        """The distance that rounding of the moves alone makes."""
+        """Return the distance caused by rounding of the moves alone."""
         with suppress(StuckError):
             nothing = np.zeros_like(self._left)
-            found = self._system.distance(nothing, self._rounding())
-            return found * (1.0 if self._linear else FIRST_ORDER)
+            distance = self._system.distance(nothing, self._rounding())
+            return distance * (1.0 if self._linear else FIRST_ORDER)
         return 0.0
 
     def _is_rounding(self, share: float) -> bool:
-        """Whether rounding by that share is what keeps the tolerance from being reached."""
+        """Return whether rounding, as a relative distance, prevents the tolerance."""
         finite = math.isfinite(self._finder.rows.max_norm(self._left))
         return (
             finite
@@ -247,26 +251,28 @@ class Search(ABC):
             return self._finder.moves.at(self._state, self._moment)
 
     def _distance(self) -> float:
-        known, of, by = self._known
+        distance, of, by = self._known
         if of is not self._left or by is not self._system:
-            known = self._system.distance(self._left, self._rounding())
-            self._known = known, self._left, self._system
-        return math.inf if math.isnan(known) else known * (1.0 if self._linear else FIRST_ORDER)
+            distance = self._system.distance(self._left, self._rounding())
+            self._known = distance, self._left, self._system
+        return (
+            math.inf if math.isnan(distance) else distance * (1.0 if self._linear else FIRST_ORDER)
+        )
 
     @property
     def _wanted(self) -> float:
-        """How near a linear system must be solved: what the certificate adds has room besides."""
+        """Accuracy of linear systems, which leaves room for the other terms of the certificate."""
         return SHARE * self._finder.tolerance
 
     def _rounding(self) -> float:
-        finder, own = self._finder, self._state.u[..., self._finder.rows.own, :]
+        finder, u = self._finder, self._state.u[..., self._finder.rows.own, :]
         return self._system.amplification * finder.rows.communicator.largest(
-            finder.moves.rounding(own)
+            finder.moves.rounding(u)
         )
 
 
 def _reachable(share: float) -> str:
-    """A tolerance with room for a bound of so much, in words; a remedy where there is none."""
+    """Return a remedy: a tolerance that can be reached with such a bound, if there is one."""
     tolerance = 10.0 ** math.ceil(math.log10(share / SHARE)) if 0.0 < share < math.inf else 1.0
     if tolerance < LOOSEST:
         return f"; take solver.tolerance: {tolerance:.0e}"
@@ -274,7 +280,7 @@ def _reachable(share: float) -> str:
 
 
 class _Linear(Search):
-    """By one linearisation."""
+    """Search by one linearisation."""
 
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
         at_rest = replace(state, u=np.zeros_like(state.u))
@@ -284,17 +290,17 @@ class _Linear(Search):
         self._owed: State | None = state.copy()
 
     def _linearised(self, at: State, what: str) -> System:
-        """Factorised once for as long as roles, numbers and bonds stay."""
-        known = self._finder.at_rest
-        if known and self._finder.rest:
-            here = Rest.of(self._finder, at, self._moment, known[0].methods)
-            if self._finder.rest[0].serves(here):
-                self._linearisations, self._inner = 1, -known[0].iterations
-                return known[0]
+        """Return the system, which is factorised once for the same roles, parameters and bonds."""
+        system = self._finder.at_rest
+        if system and self._finder.rest:
+            rest = Rest.of(self._finder, at, self._moment, system[0].methods)
+            if self._finder.rest[0].serves(rest):
+                self._linearisations, self._inner = 1, -system[0].iterations
+                return system[0]
         return super()._linearised(at, what)
 
     def run(self) -> Certificate:
-        """Corrects until the tolerance is reached."""
+        """Correct until the tolerance is reached."""
         self._linear = True
         start = self._left, self._state.u, self._state.previous
         if self._finder.rows.communicator.any(any(planes.any() for planes in start)):
@@ -303,31 +309,34 @@ class _Linear(Search):
 
     def _correct(self) -> None:
         for n in range(MOST_CORRECTIONS):
-            moves, before = self._left, self._finder.rows.norm(self._left)
+            moves, previous = self._left, self._finder.rows.norm(self._left)
             correction = self._system.solve(moves, self._wanted, self._owed, self._rounding())
             self._shift(correction)
             self._owed = None
-            after = self._finder.rows.norm(self._left)
+            norm = self._finder.rows.norm(self._left)
             floor = self._rounding() * math.sqrt(self._finder.rows.size(self._left))
-            if n == 0 and before > 1e3 * floor:
+            if n == 0 and previous > 1e3 * floor:
                 off = self._system.mismatch(correction, moves, self._left)
-                if not off <= LINEAR + floor / before:
+                if not off <= LINEAR + floor / previous:
                     raise UnconvergedError(NOT_LINEAR, self._certificate(self._distance()))
-            if not after <= 0.5 * before or self._distance() <= self._finder.tolerance:
+            if not norm <= 0.5 * previous or self._distance() <= self._finder.tolerance:
                 return
 
 
 class _Newton(Search):
-    """By linearisations at each state it comes to, from an equilibrium nearby."""
+    """Newton's iteration from an equilibrium nearby."""
 
     def __init__(self, finder: Finder, state: State, moment: float, before: State) -> None:
         super().__init__(finder, state, moment, before, "following the load")
         self._before, self._led = before, state.u - before.u
         self._way = float(np.abs(self._led).max())
-        """How far leaders went on, or others under loads that did."""
+        """Change of the displacements of leaders, or, under loads, of followers."""
 
     def run(self) -> Certificate:
-        """Raises UnconvergedError where corrections do not shrink, or lead to nothing stable."""
+        """Correct until the tolerance is reached.
+
+        Raises UnconvergedError if corrections do not shrink or the result is not stable.
+        """
         self._go_ahead()
         self._correct()
         certificate = self._certified()
@@ -336,13 +345,13 @@ class _Newton(Search):
         return certificate
 
     def _go_ahead(self) -> None:
-        """As far as the equilibrium before says, leaders their whole way: by what moves a small
-        part of it makes."""
+        """Predict the equilibrium at the end of the increment from the previous one, by the moves
+        for a small part of the increment."""
         nudge = NUDGE * self._finder.scene.neighbourhood.nudge_unit
         moves, part = self._finder.moves, min(1.0, nudge / self._way) if self._way else 1.0
-        here = moves.at(self._before, self._moment)
+        moves_before = moves.at(self._before, self._moment)
         nudged = replace(self._before, u=self._before.u + part * self._led)
-        pull = here + (moves.at(nudged, self._moment) - here) / part
+        pull = moves_before + (moves.at(nudged, self._moment) - moves_before) / part
         wanted = max(self._wanted, NEAR * self._way)
         correction = self._system.solve(pull, wanted, None, self._rounding() / part)
         if self._finder.scene.loads:
@@ -362,8 +371,8 @@ class _Newton(Search):
             share = min(NEAR, (far / farther) ** 2) if farther else NEAR
             wanted = max(self._wanted, share * far)
             correction = self._system.solve(self._left, wanted, None, self._rounding())
-            before, size = size, float(np.abs(correction).max(initial=0.0))
-            if not size <= CONTRACTION * min(before, self._way or math.inf):
+            previous, size = size, float(np.abs(correction).max(initial=0.0))
+            if not size <= CONTRACTION * min(previous, self._way or math.inf):
                 if size <= self._floor():
                     return  # of rounding
                 reason = "corrections do not become smaller"
@@ -374,9 +383,9 @@ class _Newton(Search):
 
 class _Relaxing(Search):
     """Pseudo-transient continuation (Kelley and Keyes, 1998): implicit steps, (A + damping) c =
-    move, with a damping that falls with the moves.
+    move, with a damping that decreases with the moves.
 
-    Parts that hang by one bond, or that nothing holds, stay where implicit steps have them.
+    Parts that hang by one bond, or that nothing holds, stay where implicit steps move them.
     """
 
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
@@ -391,18 +400,21 @@ class _Relaxing(Search):
         return MatrixSystem(finder.scene, at, method, finder.watch, step, self._damping)
 
     def run(self) -> Certificate:
-        """Raises UnconvergedError where moves do not die away, or do so where nothing is stable."""
+        """Make implicit steps until the tolerance is reached.
+
+        Raises UnconvergedError if moves do not decay or the result is not stable.
+        """
         leap, size = LEAP * spacing_of(self._finder.scene), self._finder.rows.norm(self._left)
         for _ in range(MOST_IMPLICIT_STEPS):
             if self._is_near():
                 break
             correction = self._system.solve(self._left, self._wanted, None, self._rounding())
-            most = float(np.abs(correction).max(initial=0.0))
-            if not math.isfinite(most):
+            longest = float(np.abs(correction).max(initial=0.0))
+            if not math.isfinite(longest):
                 break
-            self._shift(correction * min(1.0, leap / most if most else 1.0))
-            before, size = size, self._finder.rows.norm(self._left)
-            share = size / before if before and most <= leap else 1.0
+            self._shift(correction * min(1.0, leap / longest if longest else 1.0))
+            previous, size = size, self._finder.rows.norm(self._left)
+            share = size / previous if previous and longest <= leap else 1.0
             share = max(FASTEST, FALL * share) if share < 1.0 else min(SLOWEST, share)
             self._damping = min(1.0, max(LEAST_DAMPING, self._damping * share))
             self._system = self._linearised(self._state, "relaxing what broke")
@@ -412,9 +424,9 @@ class _Relaxing(Search):
         return certificate
 
     def _is_near(self) -> bool:
-        """Whether the tolerance is reached but for motions that cost next to nothing."""
-        most, tolerance = self._finder.rows.max_norm(self._left), self._finder.tolerance
-        if most > MUCH * NEXT_TO_NOTHING * tolerance:
+        """Return whether the tolerance is reached except for motions of hardly any stiffness."""
+        longest, tolerance = self._finder.rows.max_norm(self._left), self._finder.tolerance
+        if longest > MUCH * NEXT_TO_NOTHING * tolerance:
             return False
         self._damping = NEXT_TO_NOTHING
         self._system = self._linearised(self._state, "relaxing what broke")
@@ -422,17 +434,17 @@ class _Relaxing(Search):
 
 
 MOST_SETS = 60
-"""So often who is held by obstacles may change."""
+"""Maximum number of changes of the active set."""
 LEAST_PART = 2.0**-6
-"""Smallest part of a correction that is tried where the whole takes particles off obstacles that
-hold them."""
+"""Smallest fraction of a correction that is tried if the whole removes particles from obstacles
+that hold them."""
 
 
 def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:
-    """Moves the followers of `state`, in place, to an equilibrium nearby that is stable, with
-    obstacles where they are at a moment.
+    """Move the followers of `state`, in place, to a stable equilibrium nearby, with obstacles at a
+    moment.
 
-    Raises ExperimentError where there is no unique one, UnconvergedError and StoppedError.
+    Raises ExperimentError if there is no unique equilibrium, UnconvergedError and StoppedError.
     """
     with one_thread():
         try:
@@ -442,26 +454,32 @@ def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:
 
 
 class _ContactSearch(Search):
-    """By linearisations at each state it comes to, with those held who would enter an obstacle,
-    until nobody else would. What nothing holds yet is led on by weak springs."""
+    """Newton's iteration with an active set: particles that would enter an obstacle are
+    constrained, until no other would. Parts that nothing holds yet are moved by weak springs."""
 
     def run(self) -> Certificate:
-        """Raises UnconvergedError where who is held goes on changing, where corrections do not
-        become smaller once it stays, or where what they lead to is not stable."""
-        held, size, went_loose = None, math.inf, False
+        """Correct until the active set and the state converge.
+
+        Raises UnconvergedError if the active set goes on changing, corrections do not shrink once
+        it is constant, or the result is not stable.
+        """
+        contacts, size, went_loose = None, math.inf, False
         system = self._newest()
         for _ in range(MOST_SETS):
             loose = system.is_loose(self._left, self._rounding())
             if not loose and not self._finder.tolerance < self._distance() < math.inf:
                 break
-            same, held = held is not None and np.array_equal(held, system.held), system.held
+            same, contacts = (
+                contacts is not None and np.array_equal(contacts, system.held),
+                system.held,
+            )
             if loose:
                 went_loose = True
                 correction = system.solve_loose(self._left, spacing_of(self._finder.scene))
             else:
                 correction = system.solve(self._left, self._wanted, None, self._rounding())
-            before, size = size, float(np.abs(correction).max(initial=0.0))
-            if same and not loose and not size <= CONTRACTION * before:
+            previous, size = size, float(np.abs(correction).max(initial=0.0))
+            if same and not loose and not size <= CONTRACTION * previous:
                 break
             self._go(correction)
             part, system = 1.0, self._newest()

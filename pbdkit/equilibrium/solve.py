@@ -1,7 +1,7 @@
 """Load stepping: from the initial state of a scene to the equilibrium of its last step.
 
-The load is cut into increments where bonds can break or rules are not linear; in each the body
-settles, bonds that are too long break, and it settles again until nothing changes.
+The load is divided into increments if bonds can break or rules are not linear. In each the body is
+moved to equilibrium, and bonds that are too long break, until nothing changes.
 """
 
 from __future__ import annotations
@@ -44,62 +44,66 @@ def finder_of(
     compiles: bool = True,
     rows: Rows = ALL,
 ) -> Finder:
-    """What finds the equilibrium that a scene asks for, from its initial state. Whoever asks for
-    many that differ by numbers compiles none of their moves."""
-    asked, scale = scene.experiment.solver.equilibrium, scale_of(scene, start, rows)
-    length = asked.tolerance * scale
-    return Finder(scene, length, scale, asked.method, watch or Watch(), compiles, rows)
+    """Return the search for equilibria of a scene, from its initial state. `compiles` is false if
+    many scenes with different parameters follow, whose moves are not worth compiling."""
+    settings, scale = scene.experiment.solver.equilibrium, scale_of(scene, start, rows)
+    length = settings.tolerance * scale
+    return Finder(scene, length, scale, settings.method, watch or Watch(), compiles, rows)
 
 
 SAMPLES = 16
-"""Parts of an interval in which the way of a leader counts as straight."""
+"""Number of parts of an interval in which the path of a leader counts as straight."""
 
 
 def events(scene: Scene) -> list[int]:
-    """The moments, from 0 on, between which each leader moves by one formula, all keep their roles
-    and bonds that are not torn, and loads and numbers change evenly: the ends of steps, up to the
-    last of the load."""
+    """Return the ends of steps, from 0 to the last change of the load, between which each leader
+    moves by one formula, all roles and uncut bonds are constant, and loads and parameters change
+    linearly."""
     steps, last = scene.experiment.steps, last_event(scene)
-    found = {0, last, *bends_of(scene), *(cut.at - 1 for cut in scene.experiment.cuts)}
+    steps_of_events = {0, last, *bends_of(scene), *(cut.at - 1 for cut in scene.experiment.cuts)}
     for change in scene.loads.changes(steps) if scene.loads else ():
-        found |= {change - 1, change}
+        steps_of_events |= {change - 1, change}
     for leading in scene.driven:
         group = leading.group
         end = group.last(steps)
         knots = (group.from_ - 1 + n for n in group.motion.knots())
-        found |= {group.from_ - 1, end, *(knot for knot in knots if knot <= end)}
-    return sorted(moment for moment in found if 0 <= moment <= last)
+        steps_of_events |= {group.from_ - 1, end, *(knot for knot in knots if knot <= end)}
+    return sorted(moment for moment in steps_of_events if 0 <= moment <= last)
 
 
 def moments(scene: Scene, count: int) -> list[float]:
-    """The ends of about `count` increments, equal parts of the way that the leaders go, as many of
-    what loads and numbers do, and every event. An increment is some whole steps, or a step some
-    whole increments; where nobody moves there is one."""
+    """Return the ends of about `count` increments of equal lengths of the path of leaders, as many
+    of the changes of loads and parameters, and all events. An increment is several whole steps, or
+    a step several whole increments; an interval without motion is one increment."""
     ends = events(scene)
     intervals = list(pairwise(ends)) or [(0, ends[-1])]
-    shares, found = _in_parts(count, [_way(scene, *i) for i in intervals]), list[float]()
+    shares, ends_of_increments = (
+        _in_parts(count, [_way(scene, *i) for i in intervals]),
+        list[float](),
+    )
     ways = [course.way for course in scene.experiment.courses.values()]
     for way in [*ways, *([scene.loads.way] if scene.loads else [])]:
         shares = list(map(max, shares, _in_parts(count, [way(*i) for i in intervals])))
     for (begin, end), parts in zip(intervals, shares, strict=True):
         a_step = round(parts / (end - begin))
         if a_step > 0:
-            found += [begin + (n + 1) / a_step for n in range(a_step * (end - begin))]
+            ends_of_increments += [begin + (n + 1) / a_step for n in range(a_step * (end - begin))]
         else:
             marks = np.linspace(begin, end, max(1, round(parts)) + 1).round().astype(int)
-            found += np.unique(marks)[1:].tolist()
-    return found
+            ends_of_increments += np.unique(marks)[1:].tolist()
+    return ends_of_increments
 
 
 def _in_parts(count: int, ways: list[float]) -> list[float]:
-    """So many increments over intervals of these ways; one each where there is no way at all."""
+    """Return the number of increments for each interval, in proportion to its path; one each if
+    there is no path at all."""
     whole = sum(ways)
     return [count * way / whole if whole > 0.0 else 1.0 for way in ways]
 
 
 def _way(scene: Scene, begin: int, end: int) -> float:
-    """How far the leader that goes farthest goes between two events."""
-    most = 0.0
+    """Return the longest path of a leader between two events."""
+    longest = 0.0
     for leading in scene.driven:
         group = leading.group
         if not (group.from_ - 1 <= begin and group.leads(end)):
@@ -107,48 +111,49 @@ def _way(scene: Scene, begin: int, end: int) -> float:
         times = np.linspace(begin, end, SAMPLES + 1) - group.from_ + 1
         at = [leading.offset(n) for n in times.tolist()]
         ways = sum(np.hypot.reduce(abs(b - a), axis=1) for a, b in pairwise(at))
-        most = max(most, float(np.max(ways)))
-    return most if math.isfinite(most) else 0.0
+        longest = max(longest, float(np.max(ways)))
+    return longest if math.isfinite(longest) else 0.0
 
 
 def spacings(scene: Scene) -> int:
-    """By how many lattice spacings the obstacle that goes farthest goes, at least 1."""
+    """Return the longest path of an obstacle in lattice spacings, at least 1."""
     ways = [way_of(barrier, scene.experiment.steps) for barrier in scene.barriers]
     return max(1, math.ceil(max(ways, default=0.0) / spacing_of(scene)))
 
 
 def changes(scene: Scene, steps: int) -> list[int]:
-    """The steps after which roles or loads change, within so many."""
-    found = {step - 1 for step in scene.loads.changes(steps)} if scene.loads else set()
+    """Return the steps after which roles or loads change, within the first `steps`."""
+    steps_of_changes = {step - 1 for step in scene.loads.changes(steps)} if scene.loads else set()
     for leading in scene.leading:
-        found |= {leading.group.from_ - 1, leading.group.last(steps)}
-    return sorted(step for step in found if 0 < step < steps)
+        steps_of_changes |= {leading.group.from_ - 1, leading.group.last(steps)}
+    return sorted(step for step in steps_of_changes if 0 < step < steps)
 
 
 VALUES_A_CALL = 200_000_000
-"""An engine makes so many values' steps a call, some tenths of a second."""
+"""Number of values times steps in a call of an engine, which takes some tenths of a second."""
 GROWING = 1e-6
-"""A mode grows where steps multiply it by so much more than 1."""
+"""Excess over 1 of an eigenvalue from which a mode counts as growing."""
 RECORD_LAST = "; or record that of the last step alone, `record: {{at: [{}]}}`"
 MOST_SETTLINGS = 2000
-"""So often bonds may change in an increment, one after the other or little by little."""
+"""Maximum number of changes of bonds in an increment."""
 TINY, SMALLEST = 1e-9, 2.0**-12
-"""The last part of a way is taken with what is left of it; no part is smaller than the other share
-of its increment."""
+"""Relative remainder of a path that is joined to its last part, and smallest part relative to the
+increment."""
 REMEDY = (
     "To follow what comes after it take solver: {type: stepping, relaxation: auto, memory: auto} "
     "from there; record: {increments: true} keeps the equilibria within steps"
 )
-"""What is to be done about a body that came apart."""
+"""Remedy for a body that came apart."""
 MOST_ROUNDS, STEPS_A_ROUND = 40, 50
-"""Of steps, where an equilibrium cannot be followed."""
+"""Maximum number of rounds of steps, and steps in each, if an equilibrium cannot be followed."""
 
 
 class Reached(NamedTuple):
-    """A moment on the way to the last equilibrium, and whether `state` is an equilibrium there.
+    """Moment on the path to the last equilibrium, and whether `state` is an equilibrium there.
 
-    The moment and the state that the increments work on decide all that follows. `state` is that
-    one or, under linear rules without fracture, a copy of it that has settled."""
+    The moment and the working state determine everything that follows. `state` is the working state
+    or, for linear rules without fracture, a copy of it at equilibrium.
+    """
 
     moment: float
     state: State
@@ -161,7 +166,8 @@ Way = Generator[Reached, None, Certificate]
 
 
 class SeparatedError(Exception):
-    """Bonds broke, and what remains has no equilibrium; the state is the last that had one."""
+    """Bonds broke, and the remaining body has no equilibrium; the state is the last one that
+    had."""
 
 
 def increments(
@@ -172,19 +178,20 @@ def increments(
     finder: Finder | None = None,
     stops: Sequence[int] = (),
 ) -> Way:
-    """Takes a scene, in place, from its initial state, or from one on the way, as it was at the
-    moment `since`, to the equilibrium of its last step. Yields what is reached on the way; the
-    `stops` are steps before the last one whose equilibria are among it.
+    """Move a scene, in place, from its initial state, or from one at the moment `since`, to the
+    equilibrium of its last step, and yield the states on the way. `stops` are steps before the last
+    one whose equilibria are included.
 
-    The body settles before each change of roles or loads: late leaders start, and parts that
-    nothing holds remain, where slow loading has them; what loads push on for ever until then goes
-    as far as steps take it. Where bonds can break, and for rules that
-    are not linear, leaders and loads come in increments, within steps too: settle, break what is
-    too long, settle again until nothing breaks.
-    Raises ExperimentError where there is no equilibrium, UnconvergedError, SeparatedError, and
-    StoppedError where the watch says so: then the state is the last that had been reached.
+    The body is at equilibrium before each change of roles or loads: leaders that start late, and
+    parts that nothing holds, are where slow loading moves them; parts that loads push on without
+    end move as far as steps take them. If bonds can break, and for rules that are not linear,
+    leaders and loads move in increments, within steps too: the body is moved to equilibrium, bonds
+    that are too long break, and both are repeated until no bond breaks.
+
+    Raises ExperimentError if there is no equilibrium, UnconvergedError, SeparatedError, and
+    StoppedError on interruption: then the state is the last one reached.
     """
-    asked, steps = scene.experiment.solver.equilibrium, scene.experiment.steps
+    settings, steps = scene.experiment.solver.equilibrium, scene.experiment.steps
     for n, driven in enumerate(scene.driven):
         if driven.group.leads(steps) and driven.group.motion.rests_after() is None:
             count = len(scene.leading)
@@ -197,7 +204,7 @@ def increments(
     if finder is None:
         finder = finder_of(scene, initial_state(scene) if since or state.step else state, watch)
     if scene.has_fracture or not finder.linear:
-        count = asked.increments if scene.experiment.fracture.can_break else spacings(scene)
+        count = settings.increments if scene.experiment.fracture.can_break else spacings(scene)
         return (yield from _load(scene, state, finder, moments(scene, count), since, stops))
     return (yield from _of_linear(scene, state, finder, [s for s in stops if s > since]))
 
@@ -205,7 +212,7 @@ def increments(
 def settle(
     scene: Scene, state: State, watch: Watch | None = None, finder: Finder | None = None
 ) -> Certificate:
-    """The same in one go, by a finder where one is at hand."""
+    """Move a state to the last equilibrium in one call, by a finder if one exists."""
     way = increments(scene, state, watch or Watch(), finder=finder)
     while True:
         try:
@@ -227,15 +234,15 @@ def settle_at_step(scene: Scene, state: State, watch: Watch | None = None) -> Ce
 
 
 def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
-    """The equilibrium of a scene as a state of its own."""
+    """Return the equilibrium of a scene as a new state."""
     state = initial_state(scene)
     certificate = settle(scene, state)
     return state, certificate
 
 
 def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int]) -> Way:
-    """The equilibria of some steps and of the last one; the state goes on by those after which
-    roles or loads change."""
+    """Compute the equilibria of some steps and of the last one; the state itself moves through
+    those after which roles or loads change."""
     steps, settled, last = scene.experiment.steps, None, last_event(scene)
     for stop in [*stops, steps]:
         for change in changes(scene, stop):
@@ -244,12 +251,12 @@ def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int])
             if settled and settled.step == change:
                 vars(state).update(vars(settled.copy()))
                 continue
-            before = state.copy()
+            start = state.copy()
             try:
                 with _at_step(change):
                     _settle_at(scene, state, finder, change)
             except NoEquilibriumError:
-                vars(state).update(vars(before))
+                vars(state).update(vars(start))
                 if not _steps_shrink(scene, change):
                     raise
                 yield from _step_to(change, state, scene, finder)
@@ -271,7 +278,8 @@ def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int])
 
 
 def _steps_shrink(scene: Scene, step: int) -> bool:
-    """Whether no mode grows by the steps with the roles of one, as far as its spectrum is known."""
+    """Return whether no mode grows in steps with the roles of a step, as far as the spectrum is
+    known."""
     if excess(scene) or scene.experiment.neighbours.nearness():
         return True
     operator = step_operator(scene.at(step), step=step)
@@ -282,8 +290,8 @@ def _steps_shrink(scene: Scene, step: int) -> bool:
 
 
 def _step_to(last: int, state: State, scene: Scene, finder: Finder) -> Iterator[Reached]:
-    """Steps, in calls short enough for interruptions to be heard: where nothing holds a part that
-    is pushed on, how far it goes counts."""
+    """Make steps, in calls short enough for interruptions: the displacement of parts that are
+    pushed on without end depends on the number of steps."""
     watch, first, engine = finder.watch, state.step, chosen_engine(scene)
     watch.begin("stepping while loads push on what nothing holds")
     a_call = max(1, int(VALUES_A_CALL / state.u.size))
@@ -306,13 +314,13 @@ def _at_step(step: int, remedy: str = "") -> Iterator[None]:
 
 
 def _settle_at(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
-    before = state.u.copy(), state.starts
-    led, state.starts = prescribe(scene, state, moment)
-    place(state.u, led)
+    start = state.u.copy(), state.starts
+    placed, state.starts = prescribe(scene, state, moment)
+    place(state.u, placed)
     try:
         certificate = finder.find(state, moment)
     except StoppedError:
-        state.u[...], state.starts = before
+        state.u[...], state.starts = start
         raise
     state.step = math.floor(moment)
     state.previous[...] = state.u
@@ -327,7 +335,7 @@ def _load(
     since: float,
     stops: Sequence[int],
 ) -> Way:
-    """In increments up to the last motion or change of roles or loads, breaking bonds on the
+    """Move in increments to the last motion or change of roles or loads, and break bonds on the
     way."""
     certificate: Certificate | None = None
     last = every[-1]
@@ -341,28 +349,28 @@ def _load(
     farthest = size_of(scene) + finder.scale
     for moment in planned:
         finder.watch.load = f"step {moment:.6g} of {last:g}, "
-        before = state.copy()
+        start = state.copy()
         step = math.floor(since) + 1
         try:
-            most = MOST_SETTLINGS
+            max_changes = MOST_SETTLINGS
             if since == step - 1 and cut_bonds(scene, state.broken_step, step) and since > 0:
                 # What gives way to a cut does so under the load at which it is made.
-                _settle_bonds_at(scene, state, finder, since, since, most, step)
-            settled, changes = quick.settle(state, moment, most) if quick else (False, 0)
+                _settle_bonds_at(scene, state, finder, since, since, max_changes, step)
+            settled, changes = quick.settle(state, moment, max_changes) if quick else (False, 0)
             if not settled or moment == last:  # which is certified
-                left = max(1, most - changes)
-                certificate = _settle_bonds_at(scene, state, finder, since, moment, left)
+                remaining = max(1, max_changes - changes)
+                certificate = _settle_bonds_at(scene, state, finder, since, moment, remaining)
             _refuse_thrown_off(scene, state, farthest)
         except StoppedError:
-            vars(state).update(vars(before))
+            vars(state).update(vars(start))
             raise
         except (NoEquilibriumError, UnconvergedError) as error:
             failed = state.copy()
             if _is_worth_keeping(failed, moment, finder, error):
                 raise
-            vars(state).update(vars(before))
+            vars(state).update(vars(start))
             if _torn(failed):
-                text = _parting(scene, before, failed, (since, moment), error)
+                text = _parting(scene, start, failed, (since, moment), error)
                 raise SeparatedError(text) from None
             raise
         since = moment
@@ -378,26 +386,26 @@ def _load(
 
 
 def _torn(state: State) -> int:
-    """The number of bonds broken or cut since the start."""
+    """Return the number of bonds broken or cut since the start."""
     return 0 if state.broken_step is None else int(np.count_nonzero(state.broken_step > 0))
 
 
 def _refuse_thrown_off(scene: Scene, state: State, farthest: float) -> None:
-    """Raises NoEquilibriumError where bonds broke and a particle has gone farther than the size of
-    the body and all prescribed displacements together: nothing holds it there."""
-    if _torn(state) and not (most := most_of(state)) <= farthest:
+    """Raise NoEquilibriumError if bonds broke and a particle has moved farther than the size of the
+    body and all prescribed displacements together: nothing holds it."""
+    if _torn(state) and not (longest := most_of(state)) <= farthest:
         number = Guard(farthest, 0, 0, None).worst(scene, state)
         raise NoEquilibriumError(
-            f"particle {number} would be displaced by {most:.6g}, farther than the body is long: "
-            "hardly anything holds it"
+            f"particle {number} would be displaced by {longest:.6g}, farther than the body is "
+            "long: hardly anything holds it"
         )
 
 
 def _is_worth_keeping(
     state: State, moment: float, finder: Finder, error: NoEquilibriumError | UnconvergedError
 ) -> bool:
-    """Whether the state at a moment, where an increment has failed, is an equilibrium but for the
-    tolerance: it has a certificate, and no bond breaks or changes in it."""
+    """Return whether the state of a failed increment is an equilibrium except for the tolerance: it
+    has a certificate, and no bond breaks or changes in it."""
     if not (isinstance(error, UnconvergedError) and finder.linear and moment == int(moment)):
         return False
     if not math.isfinite(error.certificate.distance):
@@ -410,7 +418,8 @@ def _is_worth_keeping(
 def _parting(
     scene: Scene, before: State, failed: State, between: tuple[float, float], error: Exception
 ) -> str:
-    """The message of a body that came apart between two moments: where, why, and the remedy."""
+    """Return the message for a body that came apart between two moments: position, cause and
+    remedy."""
     since, moment = between
     assert before.broken_step is not None
     assert failed.broken_step is not None
@@ -426,8 +435,8 @@ def _parting(
         first = f"the bond between particles {a} and {b}{plural} broke, and "
     flat = before.u.reshape(len(before.u), -1)
     step = max(1, math.ceil(since))
-    led = [flat[:, each.place] for each in scene.leading if each.group.leads(step)]
-    way = max((float(np.abs(u).max(initial=0.0)) for u in led), default=0.0)
+    leader_displacements = [flat[:, each.place] for each in scene.leading if each.group.leads(step)]
+    way = max((float(np.abs(u).max(initial=0.0)) for u in leader_displacements), default=0.0)
     leads = f", leaders displaced by up to {way:.6g}" if way else ""
     cause = str(error).partition("; ")[0]
     return (
@@ -445,8 +454,8 @@ def _settle_bonds_at(
     most: int,
     step: int = 0,
 ) -> Certificate:
-    """Until no bond changes any more, `most` times at most; what breaks does so in a `step`, by
-    default that of the moment."""
+    """Move to equilibrium until no bond changes any more, at most `most` times. Bonds break in a
+    `step`, by default that of the moment."""
     fracturing = Fracturing.of(scene.at(moment))
     for _ in range(most):
         if finder.linear:
@@ -463,22 +472,22 @@ def _settle_bonds_at(
 
 
 def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: float) -> Certificate:
-    """From the equilibrium of a moment to that of a later one, in parts as large as keep to one
-    way; where none is small enough, since the body snaps, by steps. Where bonds broke, by implicit
-    steps at once."""
-    here, part = since, moment - since
+    """Move from the equilibrium of a moment to that of a later one, in parts that are small enough
+    to follow one path. If none is (the body snaps), make steps; if bonds broke, make implicit steps
+    at once."""
+    reached, part = since, moment - since
     while True:
-        target = moment if here + part > moment - TINY * part else here + part
-        before = state.copy()
-        led, state.starts = prescribe(scene, state, target)
-        place(state.u, led)
+        target = moment if reached + part > moment - TINY * part else reached + part
+        start = state.copy()
+        placed, state.starts = prescribe(scene, state, target)
+        place(state.u, placed)
         try:
-            certificate = _nearby(finder, state, target, before)
+            certificate = _nearby(finder, state, target, start)
         except (NoEquilibriumError, UnconvergedError) as error:
-            torn = _torn(before) and not scene.barriers
+            torn = _torn(start) and not scene.barriers
             if isinstance(error, RoundingError) and not torn:
                 raise  # smaller parts come no nearer
-            vars(state).update(vars(before))
+            vars(state).update(vars(start))
             if torn:
                 return _relaxed(scene, state, finder, moment)
             if isinstance(error, NoEquilibriumError):
@@ -487,19 +496,19 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
             if part > (moment - since) * SMALLEST:
                 continue
             certificate = _stepped(scene, state, finder, target, error)
-        here = target
+        reached = target
         state.step = math.floor(target)
         state.previous[...] = state.u
-        if here >= moment:
+        if reached >= moment:
             return certificate
-        part = min(2.0 * part, moment - here)
+        part = min(2.0 * part, moment - reached)
 
 
 def _relaxed(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
-    """As steps would go on from a state in which bonds have broken, with leaders where they are at
-    a moment."""
-    led, state.starts = prescribe(scene, state, moment)
-    place(state.u, led)
+    """Make implicit steps from a state in which bonds have broken, with leaders at their positions
+    of a moment."""
+    placed, state.starts = prescribe(scene, state, moment)
+    place(state.u, placed)
     certificate = finder.relax(state, moment)
     state.step = math.floor(moment)
     state.previous[...] = state.u
@@ -515,19 +524,21 @@ def _nearby(finder: Finder, state: State, moment: float, before: State) -> Certi
 def _stepped(
     scene: Scene, state: State, finder: Finder, moment: float, failed: UnconvergedError
 ) -> Certificate:
-    """As stepping goes on with leaders where they are at a moment, until an equilibrium is near.
-    Raises UnconvergedError where none comes near that is stable."""
-    led, state.starts = prescribe(scene, state, moment)
-    place(state.u, led)
+    """Make steps with leaders at their positions of a moment, until an equilibrium is near.
+
+    Raises UnconvergedError if no stable one is reached.
+    """
+    placed, state.starts = prescribe(scene, state, moment)
+    place(state.u, placed)
     for _ in range(MOST_ROUNDS):
         for _ in range(STEPS_A_ROUND):
             state.u += finder.at(moment).moves.at(state, moment)
         if not np.isfinite(state.u).all():
             break
-        found = state.copy()
+        candidate = state.copy()
         with suppress(UnconvergedError):
-            certificate = _nearby(finder, found, moment, found.copy())
-            vars(state).update(vars(found))
+            certificate = _nearby(finder, candidate, moment, candidate.copy())
+            vars(state).update(vars(candidate))
             return certificate
     raise UnconvergedError(
         f"at step {moment:.6g} the load leads no further: several equilibria meet there, as where "
@@ -537,15 +548,15 @@ def _stepped(
 
 
 def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int) -> bool:
-    """Whether bonds break or change in the settled state; changes within the tolerance are left
-    out, so that the certificate speaks of the bonds as they are."""
-    before = [value.copy() for value in state.bond_values]
+    """Return whether bonds break or change at the equilibrium. Changes within the tolerance are
+    discarded, so that the certificate applies to the bonds as they are."""
+    values_before = [value.copy() for value in state.bond_values]
     broken = broken_bonds(state)
     fracturing.break_bonds(state.u, state, step, in_turn=True)
     if broken_bonds(state) > broken:
         return True
     tolerance = scene.experiment.solver.equilibrium.tolerance
-    pairs = list(zip(before, state.bond_values, strict=True))
+    pairs = list(zip(values_before, state.bond_values, strict=True))
     if any((abs(b - a) > tolerance * np.maximum(1.0, abs(a))).any() for a, b in pairs):
         return True
     for old, new in pairs:

@@ -1,8 +1,8 @@
-"""The linear system of an equilibrium as a sparse matrix, in its diagonal blocks.
+"""Linear system of an equilibrium as a sparse matrix, in its diagonal blocks.
 
-Where x and y do not move each other there are two blocks, often equal; where one moves the other
-only (mixed coordinates), it is solved first. Within a block, what leaders hold is solved together,
-and each part of the body that nothing holds by itself: its matrix is singular.
+If x and y do not move each other there are two blocks, often equal; if only one moves the other
+(mixed coordinates), it is solved first. Within a block, all particles that leaders hold are solved
+together, and each part of the body that nothing holds by itself: its matrix is singular.
 """
 
 from __future__ import annotations
@@ -36,42 +36,43 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 SAFETY = 3.0
-"""What an estimate that may come out too small is multiplied with."""
+"""Safety factor of estimates that can be too small."""
 ACCURACY = 1e-9
-"""Of solutions, relative; corrections are corrected where more is wanted."""
+"""Relative accuracy of solutions; a second correction improves it if necessary."""
 ROUGH = 1e-3
-"""The relative accuracy of solutions that only serve a bound."""
+"""Relative accuracy of solutions that only serve a bound."""
 TURNS = 20
-"""Of inverse iteration."""
+"""Number of inverse iterations."""
 SOFT = 1e10
-"""Where A⁻¹ takes numbers of up to 1 farther, the part may be one that nothing holds."""
+"""Norm of A⁻¹ from which a part may be one that nothing holds."""
 TOO_SOFT = 1e13
-"""Where it takes them farther beside the modes that cost nothing, these cannot be told from soft
-ones in double precision."""
+"""Norm of A⁻¹, without the rigid modes, from which these cannot be distinguished from soft modes in
+double precision."""
 NOTHING = 64.0 * float(np.finfo(float).eps)
-"""What rounding leaves of A y and of the push on a mode y that costs nothing, relative to the terms
-that cancel."""
+"""Rounding error of A y and of the push on a rigid mode y, relative to the terms that cancel."""
 RANDOM_SHARE = 0.1
-"""The share that any one mode has in random numbers, over the root of how many they are, at
-least."""
+"""Smallest component of a vector of random numbers along one mode, times the root of their
+number."""
 SHIFT, MODES, MOST_MODES = 1e-13, 6, 96
-"""A large singular matrix is shifted by so much, relative to its largest entry, to find its kernel
-among so many modes; among up to so many more where all of them belong to it."""
+"""Shift of a large singular matrix, relative to its largest entry; number of modes among which its
+kernel is searched, and maximum of that number."""
 LARGEST_FALLBACK = 400_000
-"""Unknowns up to which an LU factorisation takes over where an iteration gets stuck."""
+"""Number of unknowns up to which an LU factorisation replaces an iteration that makes no
+progress."""
 
 
 class DriftingError(Exception):
-    """A part that nothing holds is pushed on for ever."""
+    """A part that nothing holds is pushed on without end."""
 
 
 class TooSoftError(DriftingError):
-    """Double precision does not tell whether a part is held softly or not at all."""
+    """In double precision a softly held part cannot be distinguished from one that nothing
+    holds."""
 
 
 class Subsystem(ABC):
-    """A x = r for the unknowns of a part, by a solver for them and, after them, for what borders
-    A; without one only rest is an equilibrium."""
+    """Linear system A x = r of a part, with a solver for its unknowns and for the borders of A.
+    Without a solver only rest is an equilibrium."""
 
     def __init__(
         self, size: int, solver: LinearSolver | None, watch: Watch, borders: int = 0
@@ -79,42 +80,50 @@ class Subsystem(ABC):
         self._size, self._solver, self._watch, self._borders = size, solver, watch, borders
 
     is_stuck = False
-    """Whether an iteration has got nowhere, and there is no other choice."""
+    """Whether an iteration makes no progress and there is no alternative."""
 
     @abstractmethod
     def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """The x to which steps from x = 0 converge; `owed` is what invariants have to gain,
-        `rounding` how far r may be off. Raises DriftingError where there is none."""
+        """Solve for the x to which steps from x = 0 converge; `owed` is the change of the
+        invariants, `rounding` the error of r.
+
+        Raises DriftingError if there is no such x.
+        """
 
     @abstractmethod
     def solve_transposed(self, weights: Floats) -> Floats:
-        """λ with λ · r = weights · x for the x of every r that has one, nothing being owed."""
+        """Return λ with λ · r = weights · x for the solution x of every r that has one."""
 
     @property
     def name(self) -> str:
-        """The method."""
+        """Name of the method."""
         return self._solver.name if self._solver else "lu"
 
     @property
     def iterations(self) -> int:
-        """Of the linear solver."""
+        """Number of iterations of the linear solver."""
         return self._solver.iterations if self._solver else 0
 
     def farthest(self, r: Floats, rounding: float) -> float:
-        """max |A⁻¹ r|, and what rounding of r by so much may add to it."""
+        """Return max
+
+        A⁻¹ r
+
+        plus the effect of rounding of r.
+        """
         if self._solver is None:
             return math.inf if r.any() or rounding else 0.0
-        found = float(np.abs(self._inverted(r)).max(initial=0.0))
-        return found + (self._spread * rounding if rounding else 0.0)
+        distance = float(np.abs(self._inverted(r)).max(initial=0.0))
+        return distance + (self._spread * rounding if rounding else 0.0)
 
     @property
     def how(self) -> str:
-        """How the bound is obtained."""
+        """Kind of the bound."""
         return "inverse" if isinstance(self._solver, Dense) else "solution"
 
     def is_stable(self) -> bool:
-        """Whether no eigenvalue is negative: of small matrices none at all, of others none of those
-        nearest to 0, through which they pass as the load goes on."""
+        """Return whether no eigenvalue is negative. All eigenvalues of small matrices are computed,
+        of others those nearest to 0, through which they pass with the load."""
         if self._solver is None or self._borders:
             return True
         if isinstance(self._solver, Dense):
@@ -123,29 +132,28 @@ class Subsystem(ABC):
         v: Floats = np.random.default_rng(0).normal(size=self._size)
         for _ in range(TURNS):
             w = self._inverted(v / np.linalg.norm(v))
-            v, before = w, v
-        return bool(v @ before > 0.0)
+            v, previous = w, v
+        return bool(v @ previous > 0.0)
 
     def _inverted(self, r: Floats, accuracy: float = ROUGH) -> Floats:
-        """A⁻¹ r, roughly."""
+        """Return A⁻¹ r with a low accuracy."""
         assert self._solver is not None
         b = np.append(r, np.zeros(self._borders))
         return self._solver.solve(b, accuracy)[: self._size]
 
     @property
     def is_soft(self) -> bool:
-        """Whether some motion that costs something costs so little that others may that cost
-        nothing as it seems."""
+        """Whether some mode is so soft that others may be rigid within rounding."""
         return not self._spread < SOFT
 
     @cached_property
     def _spread(self) -> float:
-        """That of all unknowns."""
+        """Norm of A⁻¹ for all unknowns."""
         return self.spread_of(np.ones(self._size, bool))
 
     def spread_of(self, some: Mask) -> float:
-        """How far A⁻¹ takes numbers of up to 1 in some unknowns: the largest row sum of |A⁻¹| where
-        the inverse is at hand; else some times as far as it takes random ones, as rounding is."""
+        """Return the maximum norm of A⁻¹ for right sides in some unknowns: from the inverse if it
+        is available, else estimated from random signs, which rounding resembles."""
         if self._solver is None:
             return math.inf if some.any() else 0.0
         if isinstance(self._solver, Dense):
@@ -159,7 +167,10 @@ class Subsystem(ABC):
 
 
 class ConstrainedSubsystem(Subsystem):
-    """A part whose matrix has an inverse. Raises LinAlgError where some motion costs nothing."""
+    """Linear system of a part with a regular matrix.
+
+    Raises LinAlgError if some motion has no stiffness.
+    """
 
     def __init__(
         self,
@@ -183,20 +194,21 @@ class ConstrainedSubsystem(Subsystem):
             raise np.linalg.LinAlgError("singular")
 
     def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """By this method; nothing is owed, for what is held has no invariants."""
+        """Solve by the method; `owed` is not used, since a held part has no invariants."""
         if not r.any():
             return np.zeros_like(r)
         self._watch.begin("solving")
         return self._solved(r, ACCURACY, 100 * ACCURACY)
 
     def solve_transposed(self, weights: Floats) -> Floats:
-        """By the same method."""
+        """Solve the transposed system by the same method."""
         return self._solved(weights, ACCURACY, 100 * ACCURACY, transposed=True)
 
     def _solved(
         self, b: Floats, accuracy: float, most: float, *, transposed: bool = False
     ) -> Floats:
-        """By factors where the iteration leaves more than `most` of b and there is that choice."""
+        """Solve, by factors if the iteration leaves a residual of more than `most` and the method
+        may be replaced."""
         matrix = self._matrix.T if transposed else self._matrix
         for _ in range(2):
             assert self._solver is not None
@@ -204,8 +216,8 @@ class ConstrainedSubsystem(Subsystem):
             x = solve(b, accuracy)
             if not isinstance(self._solver, PreconditionedKrylov):
                 break
-            left = float(np.linalg.norm(b - matrix @ x))
-            self._is_short = not left <= most * float(np.linalg.norm(b))
+            residual = float(np.linalg.norm(b - matrix @ x))
+            self._is_short = not residual <= most * float(np.linalg.norm(b))
             if not (self._is_short and self._has_choice):
                 self.is_stuck |= self._is_short
                 break
@@ -214,58 +226,67 @@ class ConstrainedSubsystem(Subsystem):
         return x
 
     def _inverted(self, r: Floats, accuracy: float = ROUGH) -> Floats:
-        """Not finite where an iteration gets stuck: what it has found then bounds nothing."""
+        """Return A⁻¹ r with a low accuracy; infinite if an iteration makes no progress, since its
+        result bounds nothing."""
         x = self._solved(r, accuracy, 2.0 * accuracy)
         return np.full_like(x, math.inf) if self._is_short else x
 
     def farthest(self, r: Floats, rounding: float) -> float:
-        """Of what an iteration leaves, some times as far as it leads if it goes on, and as far as
-        what that leaves may lead."""
+        """Return max
+
+        A⁻¹ r
+
+        plus the effect of rounding. The remaining error of an iteration is estimated by solving for
+        its residual.
+        """
         x = self._inverted(r)
-        found = float(np.abs(x).max(initial=0.0))
-        if isinstance(self._solver, PreconditionedKrylov) and math.isfinite(found):
-            left = r - self._matrix @ x
-            ahead = self._inverted(left)
-            found += SAFETY * float(np.abs(ahead).max(initial=0.0))
-            if math.isfinite(found):
-                rounding += float(np.abs(left - self._matrix @ ahead).max(initial=0.0))
-        return found + (self._spread * rounding if rounding else 0.0)
+        distance = float(np.abs(x).max(initial=0.0))
+        if isinstance(self._solver, PreconditionedKrylov) and math.isfinite(distance):
+            residual = r - self._matrix @ x
+            ahead = self._inverted(residual)
+            distance += SAFETY * float(np.abs(ahead).max(initial=0.0))
+            if math.isfinite(distance):
+                rounding += float(np.abs(residual - self._matrix @ ahead).max(initial=0.0))
+        return distance + (self._spread * rounding if rounding else 0.0)
 
 
 class SingularSubsystem(Subsystem):
-    """A part with modes that no step changes: what their invariants Yᵀ u, Yᵀ A = 0, were, they
-    remain. `before` is the share of A that looks back a step: it has a share in the invariants,
-    K = Yᵀ (1 + before). Solves A x + Y μ = r, K x = k; without a solver where modes grow, or where
-    other modes cost hardly more than nothing."""
+    """Linear system of a part with modes that no step changes: their invariants Yᵀ u, Yᵀ A = 0, are
+    constant.
+
+    `before` is the part of A that multiplies the state before the last one, which contributes to
+    the invariants, K = Yᵀ (1 + before). The system is A x + Y μ = r, K x = k; it has no solver if
+    modes grow or other modes have hardly any stiffness.
+    """
 
     def __init__(self, matrix: Any, before: Any, watch: Watch) -> None:
         self._matrix, self._left = matrix, _left_kernel(matrix)
-        left = self._left
-        rows = left.T + (left.T @ before if before is not None else 0.0)
-        size, modes = left.shape
+        kernel = self._left
+        rows = kernel.T + (kernel.T @ before if before is not None else 0.0)
+        size, modes = kernel.shape
         solver: LinearSolver | None = None
         with suppress(np.linalg.LinAlgError):
             if size <= DENSE:
                 corner = np.zeros((modes, modes))
-                solver = Dense(np.block([[dense(matrix), left], [rows, corner]]))
+                solver = Dense(np.block([[dense(matrix), kernel], [rows, corner]]))
             else:
                 from scipy.sparse import block_array
 
-                bordered = block_array([[matrix, left], [np.asarray(rows), None]], format="csr")
+                bordered = block_array([[matrix, kernel], [np.asarray(rows), None]], format="csr")
                 solver = SparseLU(bordered, False)
         super().__init__(size, solver, watch, modes)
         if solver is not None and not self._spread < TOO_SOFT:
             self._solver = None
 
     def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """By this method."""
+        """Solve by the method."""
         if self._solver is None:
             if r.any():
                 raise TooSoftError
             return np.zeros_like(r)
         push = self._left @ (self._left.T @ r)
-        kept = np.zeros(self._borders) if owed is None else self._left.T @ owed
-        x = self._solver.solve(np.concatenate([r - push, kept]), ACCURACY)[: self._size]
+        invariants = np.zeros(self._borders) if owed is None else self._left.T @ owed
+        x = self._solver.solve(np.concatenate([r - push, invariants]), ACCURACY)[: self._size]
         terms = abs(self._matrix) @ np.abs(x) + np.abs(r)
         large = NOTHING * float(terms.max(initial=0.0)) + 8.0 * rounding
         if not np.abs(push).max(initial=0.0) <= large:
@@ -273,17 +294,18 @@ class SingularSubsystem(Subsystem):
         return x
 
     def solve_transposed(self, weights: Floats) -> Floats:
-        """By the same method; nothing that pushes the part on for ever has a share."""
+        """Solve the transposed system; loads that push the part on without end have no effect."""
         if self._solver is None:
             return np.zeros_like(weights)
         b = np.append(weights, np.zeros(self._borders))
-        found = self._solver.solve_transposed(b, ACCURACY)[: self._size]
-        return np.asarray(found - self._left @ (self._left.T @ found))
+        solution = self._solver.solve_transposed(b, ACCURACY)[: self._size]
+        return np.asarray(solution - self._left @ (self._left.T @ solution))
 
 
 def _left_kernel(matrix: Any) -> Floats:
-    """(unknown, mode): an orthonormal basis of all y with yᵀ A = 0 to rounding; of large matrices
-    by inverse iteration: whatever is not in the kernel shrinks by SHIFT / λ a turn."""
+    """Return an orthonormal basis, (unknown, mode), of all y with yᵀ A = 0 within rounding. Large
+    matrices need inverse iteration, in which vectors outside the kernel shrink by SHIFT / λ each
+    time."""
     size = matrix.shape[0]
     largest = float(abs(matrix).max()) if size else 0.0
     if not largest > 0.0:
@@ -291,9 +313,9 @@ def _left_kernel(matrix: Any) -> Floats:
     # A = 1 - (step operator): the terms that cancel are of size 1, however little they leave.
     nothing = NOTHING * max(1.0, float(abs(matrix).sum(axis=1).max()))
     if size <= DENSE:
-        left, values, _ = np.linalg.svd(dense(matrix))
-        found: Floats = left[:, values <= nothing]
-        return found
+        vectors, values, _ = np.linalg.svd(dense(matrix))
+        kernel: Floats = vectors[:, values <= nothing]
+        return kernel
     from scipy.sparse import eye_array
 
     shift = SHIFT * largest
@@ -304,16 +326,16 @@ def _left_kernel(matrix: Any) -> Floats:
         for _ in range(4):
             basis = np.linalg.qr(shifted.solve_transposed(basis, 0.0))[0]
         _, values, turned = np.linalg.svd(matrix.T @ basis, full_matrices=False)
-        some = values <= nothing
-        if not some.all() or count >= min(MOST_MODES, size):
-            return np.asarray(basis @ turned[some].T)
+        is_kernel = values <= nothing
+        if not is_kernel.all() or count >= min(MOST_MODES, size):
+            return np.asarray(basis @ turned[is_kernel].T)
         count = min(4 * count, MOST_MODES, size)
 
 
 @dataclass
 class DiagonalBlock:
-    """The unknowns of one axis, or of both where they move each other, with their parts: who
-    belongs to each. `into` is what the axis solved before adds to the moves."""
+    """Unknowns of one axis, or of both if they move each other, divided into parts. `into` is the
+    coupling to the axis solved before."""
 
     axes: list[int]
     parts: list[tuple[Indices, Subsystem]]
@@ -332,7 +354,7 @@ SOFT_MESSAGE = (
 
 
 class MatrixSystem(System):
-    """The system by one of the solver's methods, direct or iterative; with `damping` that of an
+    """Linear system by a method of the solver, direct or iterative; with `damping`, that of an
     implicit step, (A + damping) c = move."""
 
     def __init__(
@@ -366,18 +388,19 @@ class MatrixSystem(System):
 
     @property
     def amplification(self) -> float:
-        """By the largest entry of the diagonal."""
+        """Largest diagonal entry."""
         return self._amplification
 
     @property
     def methods(self) -> str:
-        """The names of the methods used."""
+        """Names of the methods used."""
         names = {part.name for block in self._blocks for _, part in block.parts}
         return ", ".join(sorted(names)) or "nothing to solve"
 
     @property
     def how(self) -> str:
-        """By the solution; its rounding by the inverse itself where that is at hand."""
+        """Kind of the bound: by the solution; that of its rounding by the inverse itself if it is
+        available."""
         if self._damping:
             return "damped"
         ways = {part.how for block in self._blocks for _, part in block.parts}
@@ -385,111 +408,111 @@ class MatrixSystem(System):
 
     @property
     def iterations(self) -> int:
-        """Of all linear solvers together."""
+        """Number of iterations of all linear solvers."""
         parts = {id(part): part for block in self._blocks for _, part in block.parts}
         return sum(part.iterations for part in parts.values())
 
     def _table(self, planes: Floats) -> Floats:
-        """(follower, axis) of planes."""
+        """Return planes as a table, (follower, axis)."""
         return planes.reshape(len(planes), -1)[:, self._place].T
 
     def _planes(self, table: Floats) -> Floats:
-        """Planes of (follower, axis)."""
+        """Return a table, (follower, axis), as planes."""
         planes = np.zeros(self._shape)
         planes.reshape(len(planes), -1)[:, self._place] = table.T
         return planes
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """Looks at each part by itself."""
+        """Check each part by itself."""
         table = self._table(moves)
         for block in self._blocks:
-            for unknowns, part in block.parts:
-                r = table[:, block.axes].ravel()[unknowns]
+            for members, part in block.parts:
+                r = table[:, block.axes].ravel()[members]
                 if (
                     isinstance(part, SingularSubsystem)
                     and np.abs(r).max(initial=0.0) > 8 * rounding
                 ):
                     raise NoEquilibriumError(
                         "there is no unique equilibrium: leaders do not hold a part of "
-                        f"{self._named(block, unknowns)}; let one hold it, or take solver: "
+                        f"{self._named(block, members)}; let one hold it, or take solver: "
                         "{type: stepping}",
                         ("leaders",),
                     )
 
     @property
     def is_stuck(self) -> bool:
-        """Subsystem by part."""
+        """Whether the iteration of any part makes no progress."""
         return any(part.is_stuck for block in self._blocks for _, part in block.parts)
 
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """DiagonalBlock by block, part by part."""
+        """Solve block by block, and part by part."""
         back = None if owed is None else self._owed(owed)
         return self._planes(self._solved(self._table(moves), back, rounding))
 
     def _solved(self, moves: Floats, owed: Floats | None, rounding: float) -> Floats:
-        found = np.zeros_like(moves)
+        solution = np.zeros_like(moves)
         for block in self._blocks:
             r = moves[:, block.axes].ravel()
             if block.into is not None:
-                r = r + block.into @ found[:, 1 - block.axes[0]]
+                r = r + block.into @ solution[:, 1 - block.axes[0]]
             back = None if owed is None else owed[:, block.axes].ravel()
             x = np.zeros_like(r)
-            for some, part in block.parts:
+            for members, part in block.parts:
                 try:
-                    own = None if back is None else back[some]
-                    x[some] = part.solve(r[some], own, rounding)
+                    part_owed = None if back is None else back[members]
+                    x[members] = part.solve(r[members], part_owed, rounding)
                 except DriftingError as error:
                     soft = isinstance(error, TooSoftError) or (
-                        part.is_soft and self._is_fixed(block.axes, some)
+                        part.is_soft and self._is_fixed(block.axes, members)
                     )
                     text = SOFT_MESSAGE if soft else DRIFTS
-                    named = self._named(block, some)
+                    named = self._named(block, members)
                     raise NoEquilibriumError(text.format(named), ("leaders",)) from None
-            found[:, block.axes] = x.reshape(-1, len(block.axes))
-        return found
+            solution[:, block.axes] = x.reshape(-1, len(block.axes))
+        return solution
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """By `solve`, which knows no tolerance."""
+        """Solve by `solve`, which does not use a tolerance."""
         return self.solve(moves, 0.0, rounding=PUSH * float(np.abs(moves).max(initial=0.0)))
 
     def pushed_by(self, led: Floats) -> None:
-        """Unknown."""
+        """Return None: leaders are not part of the matrix."""
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """The last block first."""
+        """Solve the transposed blocks in reverse order."""
         table = self._table(weights)
-        found = np.zeros_like(table)
+        solution = np.zeros_like(table)
         for block in reversed(self._blocks):
             b = table[:, block.axes].ravel()
             x = np.zeros_like(b)
-            for some, part in block.parts:
-                x[some] = part.solve_transposed(b[some])
-            found[:, block.axes] = x.reshape(-1, len(block.axes))
+            for members, part in block.parts:
+                x[members] = part.solve_transposed(b[members])
+            solution[:, block.axes] = x.reshape(-1, len(block.axes))
             if block.into is not None:
                 table[:, 1 - block.axes[0]] += block.into.T @ x
-        found[self._guided] = 0.0
-        return self._planes(found)
+        solution[self._guided] = 0.0
+        return self._planes(solution)
 
     def _owed(self, state: State) -> Floats | None:
-        """What followers have yet to get, (follower, axis), where the step looks back:
-        before · (u(t-1) - u(t)), None elsewhere."""
+        """Return the displacements that followers have yet to receive, (follower, axis), if the
+        step depends on the state before: before · (u(t-1) - u(t)); else None."""
         if not self._operator.couplings_previous.parts:
             return None
         u, previous = self._table(state.u), self._table(state.previous)
         return self._operator.couplings_previous.times((previous - u).astype(float))
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
-        """By the operator."""
+        """Return the mismatch with the step operator."""
         table = self._table(c)
         with np.errstate(all="ignore"):
             pull = table - self._both.times(table)
-            left = pull + self._table(after) - self._table(before)
-            return float(np.linalg.norm(left) / np.linalg.norm(pull))
+            difference = pull + self._table(after) - self._table(before)
+            return float(np.linalg.norm(difference) / np.linalg.norm(pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Solves once more for what is left of the moves, and adds what rounding may make of it."""
+        """Solve once more for the remaining moves, and add the effect of rounding."""
         table, bounds = self._table(moves), np.zeros(2)
         for block in self._blocks:
             r = table[:, block.axes].ravel()
@@ -497,14 +520,14 @@ class MatrixSystem(System):
             if block.into is not None:
                 unsure += abs(block.into).sum(axis=1) * bounds[1 - block.axes[0]]
             far = (
-                part.farthest(r[some], float(unsure[some].max(initial=0.0)))
-                for some, part in block.parts
+                part.farthest(r[members], float(unsure[members].max(initial=0.0)))
+                for members, part in block.parts
             )
             bounds[block.axes] = max(far, default=0.0)
         return math.hypot(*bounds)
 
     def is_stable(self) -> bool:
-        """Subsystem by part."""
+        """Return whether all parts are stable."""
         return all(part.is_stable() for block in self._blocks for _, part in block.parts)
 
     def _named(self, block: DiagonalBlock, unknowns: Indices) -> str:
@@ -512,11 +535,12 @@ class MatrixSystem(System):
         return f"{len(numbers)} particles (with number {numbers[0]})"
 
     def _following(self, first: int) -> DiagonalBlock:
-        """The block of the other axis; it shares the solvers of the first where both are alike."""
-        other, led = 1 - first, self._operator.couplings_leader
+        """Return the block of the other axis; it uses the solvers of the first if both are
+        equal."""
+        other, leader_couplings = 1 - first, self._operator.couplings_leader
         coupled = self._both.couples(other, first)
         into = self._both.entries([other], [first]).matrix() if coupled else None
-        if self._both.is_isotropic() and led.is_isotropic():
+        if self._both.is_isotropic() and leader_couplings.is_isotropic():
             return DiagonalBlock([other], self._blocks[0].parts, into)
         block = self._block([other])
         block.into = into
@@ -528,42 +552,47 @@ class MatrixSystem(System):
             matrix = matrix + self._damping * identity_like(matrix)
         largest = float(np.abs(matrix.diagonal()).max(initial=0.0))
         self._amplification = max(self._amplification, largest)
-        led = self._operator.couplings_leader.entries(axes)
+        leader_entries = self._operator.couplings_leader.entries(axes)
         count, label = connected(matrix, strongly=False)
         guided, alone = self._guided[:, axes].ravel(), np.zeros(count, bool)
         # A component that leads stands alone: it goes with its particle, or is left out.
         alone[label[guided]] = True
         if len(axes) > 1:
             label = np.where(guided, label.reshape(-1, 2)[:, ::-1].ravel(), label)
-        held = np.zeros(count, bool)
-        held[label[led.rows[led.values != 0.0]]] = True
+        has_leader = np.zeros(count, bool)
+        has_leader[label[leader_entries.rows[leader_entries.values != 0.0]]] = True
         # What leaders move directly or not is solved together, each part that floats by itself.
-        groups = [np.flatnonzero((held & ~alone)[label])] if held.any() else []
+        groups = [np.flatnonzero((has_leader & ~alone)[label])] if has_leader.any() else []
         block = DiagonalBlock(axes, [])
-        for some in groups + [np.flatnonzero(label == n) for n in np.flatnonzero(~held & ~alone)]:
-            part = self._part(_within(matrix, some), axes, some, bool(held[label[some[0]]]))
-            block.parts.append((some, part))
+        for members in groups + [
+            np.flatnonzero(label == n) for n in np.flatnonzero(~has_leader & ~alone)
+        ]:
+            part = self._part(
+                _within(matrix, members), axes, members, bool(has_leader[label[members[0]]])
+            )
+            block.parts.append((members, part))
         return block
 
-    def _part(self, matrix: Any, axes: list[int], some: Indices, held: bool) -> Subsystem:
-        """Held parts have an inverse, unless leaders leave them some freedom."""
+    def _part(self, matrix: Any, axes: list[int], members: Indices, held: bool) -> Subsystem:
+        """Return the system of a part. Held parts have an inverse, unless leaders leave them a free
+        motion."""
         if held:
-            coordinates = self._coordinates(axes, some)
+            coordinates = self._coordinates(axes, members)
             with suppress(np.linalg.LinAlgError):
                 return ConstrainedSubsystem(matrix, self._method, coordinates, self._watch)
-        before = self._operator.couplings_previous
-        back = _within(before.entries(axes).matrix(), some) if before.parts else None
+        previous = self._operator.couplings_previous
+        back = _within(previous.entries(axes).matrix(), members) if previous.parts else None
         return SingularSubsystem(matrix, back, self._watch)
 
-    def _is_fixed(self, axes: list[int], some: Indices) -> bool:
-        """Whether what leads, led components and leaders beside these unknowns, leaves them no
-        motion as a whole: along the axes and, of two, a turn."""
-        led = self._operator.couplings_leader.entries(axes)
-        beside = np.isin(led.rows, some) & (led.values != 0.0)
-        leaders, count = np.unique(led.columns[beside]), len(axes)
-        own = some[self._guided[:, axes].ravel()[some]]
-        at = np.concatenate([self._led[leaders // count], self._X[own // count]])
-        along = np.concatenate([leaders, own]) % count
+    def _is_fixed(self, axes: list[int], members: Indices) -> bool:
+        """Return whether leaders and prescribed components adjacent to these unknowns suppress all
+        rigid motions: translation along each axis and, with two axes, rotation."""
+        leader_entries = self._operator.couplings_leader.entries(axes)
+        is_adjacent = np.isin(leader_entries.rows, members) & (leader_entries.values != 0.0)
+        leaders, count = np.unique(leader_entries.columns[is_adjacent]), len(axes)
+        guided = members[self._guided[:, axes].ravel()[members]]
+        at = np.concatenate([self._led[leaders // count], self._X[guided // count]])
+        along = np.concatenate([leaders, guided]) % count
         if not len(at):
             return False
         motions = np.eye(count)[along]
@@ -572,12 +601,15 @@ class MatrixSystem(System):
             motions = np.column_stack([motions, np.where(along == 0, -y, x)])
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
-    def _coordinates(self, axes: list[int], some: Indices) -> Coordinates:
-        """Where these unknowns lie; who leads along the one axis asked for is a leader."""
-        where, held = some[:: len(axes)] // len(axes), self._guided[:, axes]
-        led = self._X[held[:, 0]] if len(axes) == 1 else self._X[:0]
-        guided = held[where].ravel() if len(axes) > 1 and held.any() else None
-        return Coordinates(len(axes), self._X[where], np.concatenate([self._led, led]), guided)
+    def _coordinates(self, axes: list[int], members: Indices) -> Coordinates:
+        """Return the coordinates of these unknowns; particles that lead along the only axis are
+        leaders."""
+        where, is_guided = members[:: len(axes)] // len(axes), self._guided[:, axes]
+        positions = self._X[is_guided[:, 0]] if len(axes) == 1 else self._X[:0]
+        guided = is_guided[where].ravel() if len(axes) > 1 and is_guided.any() else None
+        return Coordinates(
+            len(axes), self._X[where], np.concatenate([self._led, positions]), guided
+        )
 
 
 def _within(matrix: Any, unknowns: Indices) -> Any:

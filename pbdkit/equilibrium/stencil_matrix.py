@@ -1,9 +1,9 @@
-"""The stiffness of an equilibrium as stencils on the primitive cells of a lattice.
+"""Stiffness of an equilibrium as stencils on the primitive cells of a lattice.
 
-K = -∂force/∂u, or -∂move/∂u, of the followers: most have the same stencil, of 3 × 3 places with a
-2 × 2 matrix each, which is kept once. Frame points are replaced by the body particles that they
-follow. Components of particles that lead along one axis are constrained: nothing moves them, and
-they move nobody. Rows are scaled where that makes K symmetric.
+K = -∂force/∂u, or -∂move/∂u, of the followers. Most have the same stencil of 3 × 3 places with a 2
+× 2 matrix each, which is stored once. Frame points are replaced by the body particles that they
+follow. Components of particles that lead along one axis are constrained: their rows and columns are
+empty. Rows are scaled if that makes K symmetric.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 CANDIDATES = 16
-"""Stencils among which it is chosen, each process's most frequent."""
+"""Number of each process's most frequent stencils among which the most frequent of all is
+chosen."""
 SAME = 1e-12
 """Relative difference below which two stencils count as one."""
 
@@ -48,44 +49,45 @@ def kernels() -> SimpleNamespace:
 def most_first(
     code: Integers, stencils: Floats, scale: Floats, rows: Rows
 ) -> tuple[NDArray[np.int32], Floats, Floats]:
-    """The same with the stencil of most as number 0, and those alike with it."""
+    """Return the code, stencils and scales with the most frequent stencil as number 0, and the
+    equal ones merged with it."""
     tables = stencils, scale
-    most = _most(code[..., rows.own, :], tables, rows)
-    apart = [
-        np.abs(table - one).max(axis=tuple(range(1, table.ndim)))
-        for table, one in zip(tables, most, strict=True)
+    frequent = _most(code[..., rows.own, :], tables, rows)
+    differences = [
+        np.abs(table - entry).max(axis=tuple(range(1, table.ndim)))
+        for table, entry in zip(tables, frequent, strict=True)
     ]
-    alike = sum(apart) <= SAME * np.abs(most[0]).max()
-    kept = (np.bincount(code[code >= 0], minlength=len(stencils)) > 0) & ~alike
+    is_frequent = sum(differences) <= SAME * np.abs(frequent[0]).max()
+    is_distinct = (np.bincount(code[code >= 0], minlength=len(stencils)) > 0) & ~is_frequent
     number = np.zeros(len(stencils) + 1, np.int32)
-    number[:-1][kept] = 1 + np.arange(np.count_nonzero(kept))
+    number[:-1][is_distinct] = 1 + np.arange(np.count_nonzero(is_distinct))
     number[-1] = -1
     first, second = (
-        np.concatenate([one[None], table[kept]]) for table, one in zip(tables, most, strict=True)
+        np.concatenate([entry[None], table[is_distinct]])
+        for table, entry in zip(tables, frequent, strict=True)
     )
     return number[code], first, second
 
 
 def _most(own: Integers, tables: tuple[Floats, Floats], rows: Rows) -> tuple[Floats, Floats]:
-    """The stencil and scale of most in all processes, as far as any of them has it among the most
-    frequent of its own."""
+    """Return the most frequent stencil and its scale over all processes, among the most frequent of
+    each."""
     counts = np.bincount(own[own >= 0], minlength=len(tables[0]))
-    some = np.argsort(-counts, kind="stable")[:CANDIDATES].tolist()
+    candidates = np.argsort(-counts, kind="stable")[:CANDIDATES].tolist()
     votes: dict[bytes, int] = {}
-    found: dict[bytes, tuple[Floats, Floats]] = {}
-    own_votes = [(int(counts[n]), *(table[n] for table in tables)) for n in some]
+    candidate_tables: dict[bytes, tuple[Floats, Floats]] = {}
+    own_votes = [(int(counts[n]), *(table[n] for table in tables)) for n in candidates]
     for each in rows.communicator.allgather(own_votes):
         for count, stencil, scale in each:
             key = stencil.tobytes() + scale.tobytes()
             votes[key] = votes.get(key, 0) + count
-            found.setdefault(key, (stencil, scale))
-    return found[max(votes, key=votes.__getitem__)]
+            candidate_tables.setdefault(key, (stencil, scale))
+    return candidate_tables[max(votes, key=votes.__getitem__)]
 
 
 @dataclass(frozen=True)
 class PrimitiveRaster:
-    """Primitive cells, with a ring of empty ones around: the flat place of each particle here from
-    its place on the scene's raster; `shape` is (row, place)."""
+    """Raster of primitive cells, surrounded by a ring of empty ones; `shape` is (row, place)."""
 
     shape: Index
     low: Index
@@ -93,7 +95,7 @@ class PrimitiveRaster:
 
     @classmethod
     def of(cls, scene: Scene) -> PrimitiveRaster | None:
-        """None where bonds lead farther than to a primitive cell beside."""
+        """Return the raster of a scene; None if bonds extend beyond adjacent primitive cells."""
         cell = scene.raster.cell
         steps = [primitive_step(scene, slot) for slot in scene.neighbourhood.every]
         if (
@@ -116,18 +118,19 @@ class PrimitiveRaster:
 
     @property
     def is_the_scenes(self) -> bool:
-        """Whether places here are places there."""
+        """Whether places are those of the scene's raster."""
         return len(self.scene.raster.cell.sites) == 1
 
     def places(self, place: Indices) -> Indices:
-        """The flat places here of some on the scene's raster."""
+        """Return the flat places of particles, from those on the scene's raster."""
         if self.is_the_scenes:
             return place
-        found: Indices = np.ravel_multi_index(tuple(self.index(place).T), self.shape)
-        return found
+        places: Indices = np.ravel_multi_index(tuple(self.index(place).T), self.shape)
+        return places
 
     def index(self, place: Indices) -> Indices:
-        """The same as (row, place)."""
+        """Return the places of particles as (row, place), from flat places on the scene's
+        raster."""
         if self.is_the_scenes:
             return np.stack(np.unravel_index(place, self.shape), axis=-1)
         raster = self.scene.raster
@@ -135,34 +138,35 @@ class PrimitiveRaster:
         s, *cells = np.unravel_index(place, raster.shape)
         whole = np.stack(cells, axis=-1) + raster.first
         sites = np.array([site.primitive for site in cell.sites])
-        found: Indices = whole @ np.array(cell.primitive) + sites[s] - self.low
-        return found
+        index: Indices = whole @ np.array(cell.primitive) + sites[s] - self.low
+        return index
 
 
 def primitive_step(scene: Scene, slot: Slot) -> Index:
-    """Where a slot leads in the primitive basis."""
+    """Return the step of a slot in the primitive basis."""
     return scene.neighbourhood.cell.primitive_step(slot.source, slot.target, slot.cell)
 
 
 WINDOW, OWN = 9, 4
-"""Places of a stencil, and the one of the particle itself among them."""
+"""Number of places of a stencil, and index of the place in the middle."""
 OUTSIDE, FREE, LED = 0, 1, 2
 NUDGE = 1e-7
-"""By which differences are taken, in lattice spacings: rounding and curvature do some 1e-7 to them,
-for displacements of up to a hundred."""
+"""Size of differences in lattice spacings. Rounding and curvature change them by about 1e-7 for
+displacements of up to a hundred spacings."""
 NOISE = 1e-5
-"""The share of the largest entry below which there is no bond."""
+"""Ratio to the largest entry below which there is no bond."""
 SINGULAR = 1e-14
 """Relative size below which a determinant counts as zero."""
 
 
 @dataclass(frozen=True)
 class StencilMatrix:
-    """`code` (row, place) is -1 where nobody is free, else the number of the stencil in `stencils`
-    (number, place, 4), numbers xx, xy, yx, yy; 0 is that of most. `kind` tells who is free and who
-    leads. `scale` (number, 4) takes moves to what K c equals. `at` and `place` are where the
-    followers are here and on the scene's raster, flat; None where both rasters are one. `held`
-    (axis, row, place) are the components of guided particles that lead; None where nobody is."""
+    """Matrix of stencils. `code` (row, place) is the number of the stencil in `stencils` (number,
+    place, 4), with the entries xx, xy, yx, yy; -1 where no particle is free, 0 for the most
+    frequent stencil. `kind` distinguishes free places and leaders. `scale` (number, 4) maps moves
+    to K c. `at` and `place` are the flat places of the followers on this raster and on that of the
+    scene, None if both are the same. `held` (axis, row, place) are constrained components, None if
+    there are none."""
 
     code: NDArray[np.int32]
     kind: NDArray[np.int8]
@@ -173,7 +177,7 @@ class StencilMatrix:
     held: NDArray[np.bool_] | None = None
 
     def within(self, rows: slice) -> StencilMatrix:
-        """With nobody outside some rows."""
+        """Return the matrix with empty places outside some rows."""
         if rows == slice(None):
             return self
         code, kind = self.code.copy(), self.kind.copy()
@@ -183,9 +187,12 @@ class StencilMatrix:
 
 
 def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> StencilMatrix | None:
-    """The matrix at a state with the roles of a step; None where it has no such form: in space, on
-    lattices of several sites a primitive cell, for longer bonds, rules that apply twice and frames
-    whose points show particles far away."""
+    """Assemble the matrix at a state with the roles of a step.
+
+    Returns None if it has no such form: in space, on lattices with several sites in a primitive
+    cell, for longer bonds, for rules that apply twice, and for frames whose points follow distant
+    particles.
+    """
     grid = PrimitiveRaster.of(scene)
     if grid is None or scene.inner or scene.experiment.neighbours.nearness():
         return None
@@ -193,10 +200,12 @@ def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> S
 
 
 def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> StencilMatrix | None:
-    """The same by differences of the moves, many particles at once: nine groups, of particles three
-    places apart, do not meet in anybody's stencil. Followers have stencils of their own.
+    """Assemble the matrix by differences of the moves, for many particles at once: particles of one
+    of nine groups are three places apart, so that no stencil contains two of them. Each follower
+    has a stencil of its own.
 
-    Who is moved by others farther away has a wrong one: to be compared with moves.
+    The stencil of a particle that depends on more distant ones is wrong, so that the result has to
+    be compared with moves.
     """
     grid = PrimitiveRaster.of(scene)
     kind = kinds_of_places(scene.raster, scene.leading, step)
@@ -205,7 +214,7 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     place = np.flatnonzero(kind == FOLLOWER)
     body = np.flatnonzero((kind == FOLLOWER) | (kind == LEADER))
     code = np.full(kind.size, -1, np.int32)
-    group, groups = (_number(grid.index(some).T % 3 - 1) for some in (place, body))
+    group, groups = (_number(grid.index(particles).T % 3 - 1) for particles in (place, body))
     # Where in a stencil the particles of one group lie, seen from those of another.
     ways = np.stack(np.unravel_index(np.arange(WINDOW), (3, 3)))
     numbers = _number((ways[:, :, None] - ways[:, None] + 1) % 3 - 1)
@@ -213,13 +222,13 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     nudged, nudge = replace(state, u=state.u.copy()), NUDGE * scene.neighbourhood.nudge_unit
     still, largest = moves.at(nudged, step).reshape(2, -1).copy(), 0.0
     for n in range(WINDOW):
-        some, number = body[groups == n], numbers[n][group]
+        particles, number = body[groups == n], numbers[n][group]
         for axis in range(2):
             nudged.u[...] = state.u
-            nudged.u.reshape(2, -1)[axis, some] += nudge
+            nudged.u.reshape(2, -1)[axis, particles] += nudge
             moved = moves.at(nudged, step).reshape(2, -1)
-            found = kernels().differences(still, moved, place, number, 1 / nudge, axis, stencils)
-            largest = max(largest, found)
+            maximum = kernels().differences(still, moved, place, number, 1 / nudge, axis, stencils)
+            largest = max(largest, maximum)
     kernels().clear_noise(stencils, NOISE * largest)
     code[place] = np.where(stencils[:, OWN].any(axis=(1, 2)), every, -1)
     scale = np.broadcast_to(np.eye(2).ravel(), (len(place), 4))
@@ -229,7 +238,8 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
 def _on(
     grid: PrimitiveRaster, code: Integers, led: Any, stencils: Floats, scale: Floats
 ) -> StencilMatrix:
-    """The matrix on a raster, of what is known by flat places of the scene's."""
+    """Return the matrix on a raster of primitive cells, from data by flat place of the scene's
+    raster."""
     kind = np.select([code >= 0, led], [FREE, LED], OUTSIDE).astype(np.int8)
     if grid.is_the_scenes:
         shape = grid.shape
@@ -243,7 +253,7 @@ def _on(
 
 
 class _Assembly:
-    """Puts the stencils together; particles are looked up by their flat place on the scene's
+    """Assembly of the stencils. Particles are looked up by their flat place on the scene's
     raster."""
 
     def __init__(self, scene: Scene, state: State, step: int, grid: PrimitiveRaster) -> None:
@@ -256,13 +266,13 @@ class _Assembly:
         self._count = 0
 
     def matrix(self, rows: Rows) -> StencilMatrix | None:
-        """None where a frame point shows a particle that lies outside the window."""
-        known = material_of(self._scene.experiment.rule) is not None
-        answers = ("move", "force") if known else ("move",)
+        """Return the matrix; None if a frame point depends on a particle outside the window."""
+        is_calibrated = material_of(self._scene.experiment.rule) is not None
+        answers = ("move", "force") if is_calibrated else ("move",)
         fits, every = True, by_sublattice(self._scene, self._followers)
         with rows.communicator.raise_together():
-            for s, some in every:
-                place = self._followers[some]
+            for s, members in every:
+                place = self._followers[members]
                 responses = respond(self._scene, self._state, s, place, answers)
                 fits = fits and self._add(place, responses)
         if rows.communicator.any(not fits) or not rows.communicator.any(len(self._followers) > 0):
@@ -277,50 +287,50 @@ class _Assembly:
         return _on(self._grid, code.ravel(), self._kind == LEADER, stencils, scale)
 
     def _add(self, place: Indices, responses: list[LinearResponse]) -> bool:
-        """Takes the stencils of one sublattice in; False where they do not fit."""
+        """Add the stencils of one sublattice, and return False if they do not fit."""
         moves, answers = responses[0], responses[-1]
-        own = np.zeros((len(answers.centre), WINDOW, 2, 2))
-        own[:, OWN] = -answers.centre
+        stencils = np.zeros((len(answers.centre), WINDOW, 2, 2))
+        stencils[:, OWN] = -answers.centre
         for slot, derivative in answers.neighbours.items():
-            own[:, _number(primitive_step(self._scene, slot))] -= derivative
+            stencils[:, _number(primitive_step(self._scene, slot))] -= derivative
         relaxation = self._scene.experiment.stepping.relaxation
         scale = np.matmul(answers.centre, inverses(relaxation * moves.centre))
-        shown = self._shown(place, answers, own)
-        if shown is None:
+        frame_rows = self._shown(place, answers, stencils)
+        if frame_rows is None:
             return False
-        some, rows = shown
+        numbers, rows = frame_rows
         kind = answers.kind.astype(np.int32)
-        kind[some] = len(own) + np.arange(len(some))
-        kind[(own[answers.kind, OWN] == 0.0).all(axis=(1, 2))] = -1
+        kind[numbers] = len(stencils) + np.arange(len(numbers))
+        kind[(stencils[answers.kind, OWN] == 0.0).all(axis=(1, 2))] = -1
         self._code[place] = np.where(kind >= 0, self._count + kind, -1)
-        self._stencils += [own, rows]
-        self._scale += [scale, scale[answers.kind[some]]]
-        self._count += len(own) + len(some)
+        self._stencils += [stencils, rows]
+        self._scale += [scale, scale[answers.kind[numbers]]]
+        self._count += len(stencils) + len(numbers)
         return True
 
     def _shown(
         self, place: Indices, answers: LinearResponse, own: Floats
     ) -> tuple[Indices, Floats] | None:
-        """Who sees frame points, and their stencils, with what these show in their places; None
-        where that is too far away."""
+        """Return the numbers of particles with frame points as neighbours, and their stencils with
+        the contributions of these points; None if a contribution lies outside the window."""
         frame, raster = self._scene.frame, self._scene.raster
         steps = [(slot, slot_step(raster.shape, slot)) for slot in answers.neighbours]
         sees = np.zeros(len(place), bool)
         for _, step in steps if frame else ():
             sees |= self._kind[place + step] == FRAME
-        some = np.flatnonzero(sees)
-        rows = own[answers.kind[some]]
-        if frame is None or not len(some):
-            return some, rows
-        here = np.stack(np.unravel_index(self._grid.places(place[some]), self._grid.shape))
+        numbers = np.flatnonzero(sees)
+        rows = own[answers.kind[numbers]]
+        if frame is None or not len(numbers):
+            return numbers, rows
+        index = np.stack(np.unravel_index(self._grid.places(place[numbers]), self._grid.shape))
         number = np.full(self._kind.size, -1)
         number[frame.place] = np.arange(len(frame.place))
         for slot, step in steps:
-            there = place[some] + step
-            through = np.flatnonzero(self._kind[there] == FRAME)
-            derivative = answers.neighbours[slot][answers.kind[some[through]]]
+            neighbours = place[numbers] + step
+            through = np.flatnonzero(self._kind[neighbours] == FRAME)
+            derivative = answers.neighbours[slot][answers.kind[numbers[through]]]
             rows[through, _number(primitive_step(self._scene, slot))] += derivative
-            point = number[there[through]]
+            point = number[neighbours[through]]
             first = np.searchsorted(frame.map.point, point)
             last = np.searchsorted(frame.map.point, point + 1)
             for e in range(int((last - first).max(initial=0))):
@@ -328,115 +338,117 @@ class _Assembly:
                 entry = (first + e)[has]
                 body = frame.body_place[entry]
                 free = self._kind[body] == FOLLOWER
-                entry, body, who = entry[free], body[free], through[has][free]
+                entry, body, row_numbers = entry[free], body[free], through[has][free]
                 at = np.stack(np.unravel_index(self._grid.places(body), self._grid.shape))
-                way = at - here[:, who]
-                if np.abs(way).max(initial=0) > 1:
+                offset = at - index[:, row_numbers]
+                if np.abs(offset).max(initial=0) > 1:
                     return None
                 weight = frame_matrices(frame.map.weight[entry], 2)
                 product = np.matmul(derivative[has][free], weight)
-                np.subtract.at(rows, (who, _number(way)), product)
-        return some, rows
+                np.subtract.at(rows, (row_numbers, _number(offset)), product)
+        return numbers, rows
 
 
 def _number(way: Any) -> Any:
-    """Of the place of a stencil that lies so far away."""
+    """Return the index in a stencil of the place at a step."""
     return 3 * (way[0] + 1) + way[1] + 1
 
 
 def inverses(matrices: Floats) -> Floats:
-    """Of matrices (..., 2, 2); zero where there is none."""
+    """Return the inverses of matrices, (..., 2, 2); zero for singular ones."""
     (a, b), (c, d) = np.moveaxis(matrices, (-2, -1), (0, 1))
     determinant = a * d - b * c
-    some = np.abs(determinant) > SINGULAR * np.abs(matrices).max(axis=(-2, -1)) ** 2
+    is_regular = np.abs(determinant) > SINGULAR * np.abs(matrices).max(axis=(-2, -1)) ** 2
     adjugate = np.moveaxis(np.array([[d, -b], [-c, a]]), (0, 1), (-2, -1))
-    factor = np.where(some, 1.0 / np.where(some, determinant, 1.0), 0.0)
+    factor = np.where(is_regular, 1.0 / np.where(is_regular, determinant, 1.0), 0.0)
     return np.asarray(factor[..., None, None] * adjugate)
 
 
 Held = NDArray[np.bool_]
-"""(axis, row, place)."""
+"""Mask of constrained components, (axis, row, place)."""
 
 
 def held_components(scene: Scene, step: int, rows: Rows = ALL) -> Held | None:
-    """Those of a step; None where nobody is guided."""
+    """Return the components constrained in a step; None if no particle is guided."""
     guided, grid = guided_at(scene.raster, scene.leading, step), PrimitiveRaster.of(scene)
     if grid is None or not rows.communicator.any(len(guided.place) > 0):
         return None
-    held = np.zeros((2, *grid.shape), bool)
-    held.reshape(2, -1)[:, grid.places(guided.place)] = guided.lead_axes
+    components = np.zeros((2, *grid.shape), bool)
+    components.reshape(2, -1)[:, grid.places(guided.place)] = guided.lead_axes
     for unknown in outside(rows.known, grid.shape[0]):
-        held[:, unknown] = False
-    return held
+        components[:, unknown] = False
+    return components
 
 
 def constrained(matrix: StencilMatrix, held: Held | None) -> StencilMatrix:
-    """The matrix with these components held."""
+    """Return the matrix with constrained components."""
     if held is None:
         return matrix
     code, stencils, of = with_held(matrix.code, matrix.stencils, held)
     scale = matrix.scale[of].copy()
-    here = code >= len(matrix.stencils)
-    led = held[:, here]
-    some = scale[code[here]].reshape(-1, 2, 2)
-    for axis, alone in enumerate(led):
-        some[alone, axis] = some[alone, :, axis] = 0.0
-    scale[code[here]] = some.reshape(-1, 4)
+    is_affected = code >= len(matrix.stencils)
+    held_rows = held[:, is_affected]
+    blocks = scale[code[is_affected]].reshape(-1, 2, 2)
+    for axis, alone in enumerate(held_rows):
+        blocks[alone, axis] = blocks[alone, :, axis] = 0.0
+    scale[code[is_affected]] = blocks.reshape(-1, 4)
     return replace(matrix, code=code, stencils=stencils, scale=scale, held=held)
 
 
 def with_held(
     code: NDArray[np.int32], stencils: Floats, held: Held
 ) -> tuple[NDArray[np.int32], Floats, NDArray[np.intp]]:
-    """(code, stencils, of): particles beside held components have stencils of their own, made `of`
-    others, without what comes from these; rows of held components are a number on the diagonal."""
+    """Return code, stencils and the number of the former stencil of each. Places adjacent to
+    constrained components have separate stencils without the columns of these; the rows of
+    constrained components have a number on the diagonal."""
     from scipy.ndimage import binary_dilation
 
-    beside = binary_dilation(held.any(axis=0), structure=np.ones((3, 3))) & (code >= 0)
-    row, place = np.nonzero(beside)
-    rows = stencils[code[beside]].reshape(-1, 9, 2, 2).copy()
-    own = np.abs(rows[:, OWN]).max(axis=(1, 2))
+    is_adjacent = binary_dilation(held.any(axis=0), structure=np.ones((3, 3))) & (code >= 0)
+    row, place = np.nonzero(is_adjacent)
+    rows = stencils[code[is_adjacent]].reshape(-1, 9, 2, 2).copy()
+    magnitude = np.abs(rows[:, OWN]).max(axis=(1, 2))
     for s in range(9):
-        there = held[:, row + s // 3 - 1, place + s % 3 - 1]
-        rows[:, s] *= ~there.T[:, None, :]
-    here = held[:, row, place].T
-    rows *= ~here[:, None, :, None]
-    rows[:, OWN] += (here * own[:, None])[:, :, None] * np.eye(2)
-    found = code.copy()
-    found[beside] = len(stencils) + np.arange(len(row))
-    of = np.concatenate([np.arange(len(stencils)), code[beside]])
-    return found, np.concatenate([stencils, rows.reshape(-1, 9, 4)]), of
+        held_neighbours = held[:, row + s // 3 - 1, place + s % 3 - 1]
+        rows[:, s] *= ~held_neighbours.T[:, None, :]
+    held_here = held[:, row, place].T
+    rows *= ~held_here[:, None, :, None]
+    rows[:, OWN] += (held_here * magnitude[:, None])[:, :, None] * np.eye(2)
+    codes = code.copy()
+    codes[is_adjacent] = len(stencils) + np.arange(len(row))
+    of = np.concatenate([np.arange(len(stencils)), code[is_adjacent]])
+    return codes, np.concatenate([stencils, rows.reshape(-1, 9, 4)]), of
 
 
 def without_held(code: NDArray[np.int32], stencils: Floats, held: Held) -> Floats:
-    """The stencils with nothing at all in the rows of held components."""
-    found = stencils.copy()
-    for axis, led in enumerate(held):
-        found[code[led], OWN, 3 * axis] = 0.0
-    return found
+    """Return the stencils with empty rows for constrained components."""
+    free_stencils = stencils.copy()
+    for axis, component in enumerate(held):
+        free_stencils[code[component], OWN, 3 * axis] = 0.0
+    return free_stencils
 
 
 def coarser_held(kind: NDArray[np.int8], held: Held, halved: tuple[int, int], below: Any) -> Held:
-    """Of the next grid, of a kind `below`: as its places are led that lie on leaders."""
-    found = np.zeros((2, *below.shape), bool)
-    for axis, led in enumerate(held):
-        own, out = np.where(led, LED, kind).astype(np.int8), np.zeros_like(below)
-        kernels().coarse_kinds(own, halved, out)
-        found[axis] = (out == LED) & (below == FREE)
-    return found
+    """Return the constrained components of the next grid, of kinds `below`: those at places that
+    lie on constrained ones."""
+    coarse = np.zeros((2, *below.shape), bool)
+    for axis, component in enumerate(held):
+        kinds, out = np.where(component, LED, kind).astype(np.int8), np.zeros_like(below)
+        kernels().coarse_kinds(kinds, halved, out)
+        coarse[axis] = (out == LED) & (below == FREE)
+    return coarse
 
 
 EXACT, DIFFERENCED = 1e-9, 1e-5
 """Relative difference up to which a matrix counts as symmetric: one by derivatives, one by
 differences."""
 DIGITS = 13
-"""Of factors of rows; rounding decides the others."""
+"""Number of digits of row factors; the others are rounding."""
 
 
 def is_symmetric(matrix: StencilMatrix, alike: float = EXACT, rows: Rows = ALL) -> bool:
-    """Up to a share of its largest entry."""
-    own = max(float(matrix.stencils.max()), -float(matrix.stencils.min()))
-    largest = rows.communicator.largest(own)
+    """Return whether a matrix is symmetric, up to a tolerance relative to its largest entry."""
+    magnitude = max(float(matrix.stencils.max()), -float(matrix.stencils.min()))
+    largest = rows.communicator.largest(magnitude)
     asymmetry = kernels().asymmetry(matrix.code, matrix.stencils)
     return rows.communicator.largest(asymmetry) <= alike * largest
 
@@ -444,9 +456,11 @@ def is_symmetric(matrix: StencilMatrix, alike: float = EXACT, rows: Rows = ALL) 
 def balanced(
     matrix: StencilMatrix, alike: float = EXACT, rows: Rows = ALL
 ) -> tuple[StencilMatrix, bool]:
-    """The matrix with its rows multiplied so that it is symmetric, and whether that can be: those
-    of particles with fewer neighbours, of which each has more weight. What is left of a difference
-    is shared by both sides."""
+    """Return the matrix with rows scaled such that it is symmetric, and whether that is possible.
+
+    The rows of particles with fewer neighbours, each of which has a larger weight, are scaled. A
+    remaining difference is divided between both sides.
+    """
     if is_symmetric(matrix, rows=rows):
         return matrix, True
     factor = _factors(matrix, rows)
@@ -465,95 +479,102 @@ def balanced(
         np.concatenate([table[:1], table[row] * times.reshape(-1, *[1] * (table.ndim - 1))])
         for table in (matrix.stencils, matrix.scale)
     )
-    found = replace(matrix, code=code, stencils=stencils, scale=scale)
-    if not is_symmetric(found, alike, rows):
+    symmetric = replace(matrix, code=code, stencils=stencils, scale=scale)
+    if not is_symmetric(symmetric, alike, rows):
         return matrix, False
     if alike > EXACT:
         kernels().symmetrise(code, stencils)
-    return found, True
+    return symmetric, True
 
 
 def _factors(matrix: StencilMatrix, rows: Rows) -> Floats | None:
-    """By which rows are multiplied, 1 for the stencil of most; None where some have none."""
+    """Return the factors of rows, 1 for the most frequent stencil; None if a row has no factor."""
     factor = (matrix.code == 0).astype(float)
     while True:
-        left, before = kernels().balance(matrix.code, matrix.stencils, factor)
-        if not rows.communicator.any(left < before):
-            return None if rows.communicator.any(left > 0) else factor
-        told = factor.copy()
-        rows.exchange_halo(told)
-        np.copyto(factor, told, where=told > 0.0)
+        missing, missing_before = kernels().balance(matrix.code, matrix.stencils, factor)
+        if not rows.communicator.any(missing < missing_before):
+            return None if rows.communicator.any(missing > 0) else factor
+        exchanged = factor.copy()
+        rows.exchange_halo(exchanged)
+        np.copyto(factor, exchanged, where=exchanged > 0.0)
 
 
 def transposed(matrix: StencilMatrix) -> StencilMatrix:
-    """Kᵀ, with stencils of their own for all but those whose neighbourhood is like that of most;
-    `scale` is that of K."""
+    """Return Kᵀ, with separate stencils for all places whose neighbours do not all have the most
+    frequent stencil; `scale` is that of K."""
     code, (row, place) = matrix.code, np.nonzero(matrix.code >= 0)
-    there = np.stack([code[row + s // 3 - 1, place + s % 3 - 1] for s in range(WINDOW)], axis=1)
-    alike = (there == 0).all(axis=1)
+    neighbours = np.stack(
+        [code[row + s // 3 - 1, place + s % 3 - 1] for s in range(WINDOW)], axis=1
+    )
+    is_uniform = (neighbours == 0).all(axis=1)
     codes = code.copy()
-    codes[row, place] = np.where(alike, 0, np.cumsum(~alike))
-    kept = np.concatenate([np.zeros((1, WINDOW), there.dtype), there[~alike]])
-    found = matrix.stencils[np.maximum(kept, 0), WINDOW - 1 - np.arange(WINDOW)][..., [0, 2, 1, 3]]
-    found *= (kept >= 0)[..., None]
-    scale = matrix.scale[np.maximum(kept[:, OWN], 0)]
-    return replace(matrix, code=codes, stencils=np.ascontiguousarray(found), scale=scale)
+    codes[row, place] = np.where(is_uniform, 0, np.cumsum(~is_uniform))
+    distinct = np.concatenate([np.zeros((1, WINDOW), neighbours.dtype), neighbours[~is_uniform]])
+    stencils = matrix.stencils[np.maximum(distinct, 0), WINDOW - 1 - np.arange(WINDOW)][
+        ..., [0, 2, 1, 3]
+    ]
+    stencils *= (distinct >= 0)[..., None]
+    scale = matrix.scale[np.maximum(distinct[:, OWN], 0)]
+    return replace(matrix, code=codes, stencils=np.ascontiguousarray(stencils), scale=scale)
 
 
 def leads_one_way(matrix: StencilMatrix, rows: Rows = ALL) -> bool:
-    """Whether one axis moves the other and not the reverse: they are better solved in turn."""
+    """Return whether one axis moves the other and not the reverse, so that they are better solved
+    in turn."""
     ways = matrix.stencils[..., 1], matrix.stencils[..., 2]
     return len({rows.communicator.any(bool(way.any())) for way in ways}) > 1
 
 
 def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: Rows = ALL) -> bool:
-    """Whether every connected part of the body touches a leader, along each axis, or has `held`
-    components, and no neighbours are apart, as across a crack: without a bond, and without a
-    neighbour that both have one with."""
+    """Return whether the body is held and has no crack. Every connected part has to touch a leader,
+    or to contain `held` components, along each axis; two neighbours have to be bonded, or to have a
+    common neighbour."""
     from scipy.ndimage import binary_dilation, label
 
     bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
-    known = np.logical_or.reduce(rows.communicator.allgather(bonds.any(axis=0)))
-    if rows.communicator.any(any(_apart(matrix, bonds, s) for s in np.flatnonzero(known).tolist())):
+    pattern_entries = np.logical_or.reduce(rows.communicator.allgather(bonds.any(axis=0)))
+    if rows.communicator.any(
+        any(_apart(matrix, bonds, s) for s in np.flatnonzero(pattern_entries).tolist())
+    ):
         return False
-    pattern = (known | known[::-1]).reshape(3, 3)
+    pattern = (pattern_entries | pattern_entries[::-1]).reshape(3, 3)
     parts, count = label(matrix.kind == FREE, structure=pattern)
     for axis in range(2):
-        led = binary_dilation(matrix.kind == LED, structure=pattern)
+        is_leader = binary_dilation(matrix.kind == LED, structure=pattern)
         if held is not None:
-            led |= held[axis]
-        if not _reached(parts, count, led, rows):
+            is_leader |= held[axis]
+        if not _reached(parts, count, is_leader, rows):
             return False
     return True
 
 
 def _reached(parts: Any, count: int, led: Any, rows: Rows) -> bool:
-    """Whether all parts have led places, each going on where other processes have rows."""
+    """Return whether all parts contain leaders, across the rows of all processes."""
     while True:
         reached = np.zeros(count + 1, bool)
         reached[parts[led]] = True
         reached[0] = False
         if not rows.communicator.any(not reached[1:].all()):
             return True
-        here = reached[parts]
-        there = here.copy()
-        rows.exchange_halo(there)
-        if not rows.communicator.any(bool((there > here).any())):
-            return not rows.communicator.any(bool((here < (parts > 0))[rows.own].any()))
-        led = here | there
+        reached_places = reached[parts]
+        extended = reached_places.copy()
+        rows.exchange_halo(extended)
+        if not rows.communicator.any(bool((extended > reached_places).any())):
+            return not rows.communicator.any(bool((reached_places < (parts > 0))[rows.own].any()))
+        led = reached_places | extended
 
 
 def _apart(matrix: StencilMatrix, bonds: NDArray[np.bool_], s: int) -> bool:
-    """Whether there are such neighbours along place s of the stencils."""
+    """Return whether there are separated neighbours along place s of the stencils."""
     row, place = np.nonzero(matrix.code > 0)
     down, along = s // 3 - 1, s % 3 - 1
-    there = matrix.kind[row + down, place + along] != OUTSIDE
-    some = np.flatnonzero(there & ~bonds[matrix.code[row, place], s])
-    one = matrix.code[row[some], place[some]]
-    other = matrix.code[row[some] + down, place[some] + along]
-    linked = other < 0  # a leader: nothing moves it
+    is_present = matrix.kind[row + down, place + along] != OUTSIDE
+    pairs = np.flatnonzero(is_present & ~bonds[matrix.code[row, place], s])
+    first = matrix.code[row[pairs], place[pairs]]
+    second = matrix.code[row[pairs] + down, place[pairs] + along]
+    linked = second < 0  # a leader: nothing moves it
     for t in range(9):
         a, b = t // 3 - 1 - down, t % 3 - 1 - along
         if max(abs(a), abs(b)) <= 1:
-            linked |= bonds[one, t] & bonds[other, 3 * (a + 1) + b + 1]
+            linked |= bonds[first, t] & bonds[second, 3 * (a + 1) + b + 1]
     return not linked.all()

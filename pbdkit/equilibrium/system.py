@@ -1,9 +1,9 @@
-"""The linear system of an equilibrium, A c = move with A = 1 - (step operator), and its parts.
+"""Linear system of an equilibrium, A c = move with A = 1 - (step operator), and its parts.
 
-`Moves` evaluates the right side by the rule, `System` is the interface of the solvers. `Rows` are
-the rows of the lattice that a process has, and the collective operations among the processes that
-share one; fields are (…, row, place), and what concerns the whole lattice is summed row by row, so
-that it is the same for any number of processes. Moves and displacements are planes, (axis,
+`Moves` evaluates the right side by the rule; `System` is the interface of the solvers. `Rows` are
+the rows of the lattice within a process, with the collective operations among the processes that
+share the lattice. Fields are (…, row, place); sums over the whole lattice are made row by row, so
+that they do not depend on the number of processes. Moves and displacements are planes, (axis,
 sublattice, cell, cell), as in a state.
 """
 
@@ -38,16 +38,16 @@ from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State
 
 LARGEST_BY_NUMPY = 20_000
-"""Particles beyond which moves are evaluated by the compiled engine."""
+"""Number of particles beyond which moves are evaluated by the compiled engine."""
 ROUNDING = 4 * float(np.finfo(float).eps)
 
 
 class Moves:
-    """Evaluates the moves of a scene's followers, relaxed as in its steps but without memory, the
-    frame standing where the body tells it to, and obstacles where they are at a moment.
+    """Evaluation of the moves of a scene's followers.
 
-    Of large bodies they are compiled, which is worth its seconds where they are asked for often
-    with the same numbers; `compiles` says whether that is so.
+    Moves include relaxation but not memory; frame points follow the body, and obstacles are where
+    they are at a moment. With `compiles` the moves of large bodies are compiled, which takes
+    seconds and pays if many states of one scene are evaluated.
     """
 
     def __init__(self, scene: Scene, *, compiles: bool = True) -> None:
@@ -70,30 +70,30 @@ class Moves:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether evaluating them is cheap."""
+        """Whether moves are evaluated by a compiled engine."""
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, moment: float) -> Floats:
-        """Planes, zero where nobody follows in the moment's step, or along that axis, under the
-        loads of that moment; who would enter an obstacle moves onto its outline. Brings the state's
-        frame into line."""
+        """Return the moves at a moment as planes, zero for particles and axes that do not follow. A
+        particle that would enter an obstacle moves onto its outline. Frame points of the state are
+        updated."""
         moves = self.free(state, moment)
         if self.contact:
-            there = state.u + moves
+            targets = state.u + moves
             with np.errstate(all="ignore"):
-                self.contact.push_out(there, moment)
-                np.subtract(there, state.u, out=moves)
+                self.contact.push_out(targets, moment)
+                np.subtract(targets, state.u, out=moves)
             self._stop(moves, math.ceil(moment))
         return moves
 
     def rounding(self, u: Floats) -> float:
-        """How far rounding alone may put a move off at displacements u: before obstacles, where
-        places count, by what it leaves of those."""
+        """Return the rounding error of a move at displacements u; with obstacles it includes that
+        of positions."""
         reach = self.contact.reach if self.contact else 0.0
         return ROUNDING * max(float(np.abs(u).max()), reach)
 
     def free(self, state: State, moment: float) -> Floats:
-        """The same without obstacles."""
+        """Return the moves without obstacles."""
         u, frame, step = state.u, self._scene.frame, math.ceil(moment)
         if self._loads:
             self._loads.held_at = moment
@@ -102,8 +102,8 @@ class Moves:
             frame.follow(flat, flat)
         if self._engine:
             none = (None,) * len(self._scene.leading)
-            here = replace(state, step=step - 1, previous=np.zeros_like(u), starts=none)
-            moves = self._engine.advance(here).u
+            start = replace(state, step=step - 1, previous=np.zeros_like(u), starts=none)
+            moves = self._engine.advance(start).u
         else:
             assert self._followers
             moves = u.astype(float)
@@ -116,49 +116,51 @@ class Moves:
         return moves
 
     def _stop(self, moves: Floats, step: int) -> None:
-        """Only followers move."""
+        """Set the moves of leaders and frame points to zero."""
         still, frame = moves.reshape(len(moves), -1), self._scene.frame
-        for led in self._scene.leading:
-            for axis in led.axes if led.group.leads(step) else ():
-                still[axis, led.place] = 0.0
+        for leading in self._scene.leading:
+            for axis in leading.axes if leading.group.leads(step) else ():
+                still[axis, leading.place] = 0.0
         if frame:
             still[:, frame.place] = 0.0
 
 
 def _resting(scene: Scene) -> tuple[Leading, ...]:
-    """The leader groups, holding."""
+    """Return the leader groups at rest."""
     groups = [leading.group.model_copy(update={"motion": Hold()}) for leading in scene.leading]
     pairs = zip(scene.leading, groups, strict=True)
     return tuple(replace(leading, group=group) for leading, group in pairs)
 
 
 def random_displacements(scene: Scene, size: float) -> Floats:
-    """Planes with followers of the last step put elsewhere, up to that far along each axis."""
+    """Return random displacements of the followers of the last step, of at most `size` along each
+    axis."""
     kinds = kinds_at(scene.raster, scene.leading, scene.experiment.steps)
     place = scene.raster.place_of(np.flatnonzero(kinds == FOLLOWER))
-    put: Floats = np.zeros((scene.axes, *scene.raster.shape))
-    random = np.random.default_rng(0).uniform(-size, size, (len(put), len(place)))
-    put.reshape(len(put), -1)[:, place] = random
-    return put
+    displacements: Floats = np.zeros((scene.axes, *scene.raster.shape))
+    random = np.random.default_rng(0).uniform(-size, size, (len(displacements), len(place)))
+    displacements.reshape(len(displacements), -1)[:, place] = random
+    return displacements
 
 
 def coarser_size(size: int) -> int:
-    """How many places a grid has along an axis where one of that size is halved."""
+    """Return the number of places of a grid along an axis along which one of `size` places is
+    halved."""
     return (size - 2) // 2 + 3
 
 
 def outside(rows: slice, count: int) -> tuple[slice, slice]:
-    """Those of so many rows that some are not."""
+    """Return the ranges of `count` rows before and after `rows`."""
     first, last, _ = rows.indices(count)
     return slice(0, first), slice(last, count)
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of a grid of so many, `count`, by their numbers there: an array has those from `low` on,
-    a process `begin` to `end` as its own, and knows the stencils of `first` to `last`. Where rows
-    are halved `low` is even, so that row n of the next grid lies at 2n - 1 in the arrays too:
-    `low` and what follows from it serve for so many coarser grids, `depth`."""
+    """Rows of a grid of `count` rows that a process holds, by their numbers in the grid. Arrays
+    start at `low`; the process owns `begin` to `end`, and has the stencils of `first` to `last`.
+    `low` is even where rows are halved, so that row n of the next grid lies at 2n - 1 in the arrays
+    too; this holds for `depth` coarser grids."""
 
     count: int
     low: int
@@ -170,17 +172,17 @@ class Strip:
 
     @property
     def own(self) -> slice:
-        """Its own rows, in arrays."""
+        """Range of the owned rows in arrays."""
         return slice(self.begin - self.low, self.end - self.low)
 
     @property
     def known(self) -> slice:
-        """Those with known stencils, in arrays."""
+        """Range of the rows with stencils in arrays."""
         return slice(self.first - self.low, max(self.first, self.last) - self.low)
 
     def coarser(self, half: int) -> Strip:
-        """That of the next grid: a stencil there depends on two rows on either side of its place;
-        where rows are not halved, on one."""
+        """Return the rows of the next grid. A stencil there depends on two rows on either side of
+        its place if rows are halved, else on one."""
         if not half:
             first = self.first + 1 if self.first else 0
             last = self.last - 1 if self.last < self.count else self.last
@@ -198,30 +200,30 @@ class Strip:
 
 
 class Rows:
-    """The rows of a grid that this process has: all of them, or, in `pbdkit.mpi.driver`, a strip
-    of those that the processes of a communicator share."""
+    """Rows of a grid within one process: all of them, or, in `pbdkit.mpi.driver`, a strip of those
+    that the processes of a communicator share."""
 
     strip: Strip | None = None
-    """Which rows those are; None of all."""
+    """The strip; None for all rows."""
 
     def __init__(self, communicator: Communicator = SERIAL) -> None:
         self.communicator = communicator
 
     @property
     def own(self) -> slice:
-        """Its own, among the rows of its arrays."""
+        """Range of the owned rows in arrays."""
         return self.strip.own if self.strip else slice(None)
 
     @property
     def known(self) -> slice:
-        """Those of its arrays with known stencils."""
+        """Range of the rows with stencils in arrays."""
         return self.strip.known if self.strip else slice(None)
 
     def exchange_halo(self, field: Array) -> None:
         """Update the halo of a field, in place."""
 
     def random(self, shape: tuple[int, ...]) -> Floats:
-        """Return a field of numbers from [-1, 1), always the same for the same lattice."""
+        """Return a field of random numbers from [-1, 1), the same for any number of processes."""
         return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
 
     def whole(self, numbers: Array) -> Array:
@@ -229,22 +231,22 @@ class Rows:
         return numbers
 
     def total(self, numbers: Array) -> float:
-        """Return the sum of one number a row."""
+        """Return the sum of one number for each row."""
         return float(self.whole(numbers).sum())
 
     def size(self, field: Array) -> int:
-        """Return how many numbers a field has."""
+        """Return the number of entries of a field."""
         return int(self.communicator.sum(field[..., self.own, :].size))
 
     def max_norm(self, field: Floats) -> float:
-        """Return the largest magnitude; 0 of none."""
+        """Return the largest magnitude; 0 for an empty field."""
         return self.communicator.largest(float(np.abs(field[..., self.own, :]).max(initial=0.0)))
 
     def norm(self, field: Floats) -> float:
         """Return the root of the sum of squares."""
         with np.errstate(over="ignore"):
-            own = float(np.linalg.norm(field[..., self.own, :]))
-        return math.hypot(*self.communicator.allgather(own))
+            norm = float(np.linalg.norm(field[..., self.own, :]))
+        return math.hypot(*self.communicator.allgather(norm))
 
 
 ALL: Final = Rows()
@@ -252,123 +254,134 @@ ALL: Final = Rows()
 
 @cache
 def _libraries(with_scipy: bool) -> ThreadpoolController:
-    """Those that are loaded by now; scipy has one of its own."""
+    """Return a controller of the libraries loaded so far; scipy has one of its own."""
     return ThreadpoolController()
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """Libraries of linear algebra that are loaded by now work on one thread meanwhile: on how many
-    they work decides the order of their sums, and the last digits."""
+    """Limit the loaded libraries of linear algebra to one thread. The order of their sums, and so
+    the last digits, depends on the number of threads."""
     loaded = _libraries("scipy.linalg" in sys.modules)
-    found: AbstractContextManager[object] = loaded.limit(limits=1, user_api="blas")
-    return found
+    limits: AbstractContextManager[object] = loaded.limit(limits=1, user_api="blas")
+    return limits
 
 
 ACCURACY = 1e-2
-"""Of solutions that only have to be known roughly, as a share of themselves."""
+"""Relative accuracy of rough solutions."""
 FAR, TURNS = 8.0, 4
-"""Where they come to so many times less than was taken they are solved for once more, at most so
-often."""
+"""Ratio of the assumed size of a solution to its size above which it is computed again, and maximum
+number of repetitions."""
 
 
 PUSH = 1e-10
-"""The share of moves, known by differences perhaps, that may push a part that nothing holds."""
+"""Relative error of moves, such as those from differences, that is ignored as a push on a part that
+nothing holds."""
 
 
 class StuckError(Exception):
-    """An iteration got nowhere."""
+    """An iteration makes no progress."""
 
 
 class NoEquilibriumError(ExperimentError):
-    """A part of the body has no equilibrium, or none that is unique."""
+    """A part of the body has no equilibrium, or no unique one."""
 
 
 class IndefiniteError(StuckError):
-    """Some way does not lead uphill: the body is not stable there."""
+    """The energy decreases along some direction: the body is not stable."""
 
 
 class System(ABC):
-    """A c = move for the followers of a scene, linearised at a state with the roles of a step."""
+    """Linear system A c = move for the followers of a scene, linearised at a state with the roles
+    of a step."""
 
     @property
     @abstractmethod
     def methods(self) -> str:
-        """The names of the methods used."""
+        """Names of the methods used."""
 
     @property
     @abstractmethod
     def how(self) -> str:
-        """How the distance from the solution is obtained."""
+        """Kind of the bound on the distance from the solution, a key of `certificate.WAYS`."""
 
     @property
     @abstractmethod
     def iterations(self) -> int:
-        """Of all linear solvers together."""
+        """Number of iterations of all linear solvers."""
 
     @property
     def is_stuck(self) -> bool:
-        """Whether an iteration has got nowhere, and its method allows no other."""
+        """Whether an iteration makes no progress and the method allows no other."""
         return False
 
     @property
     def amplification(self) -> float:
-        """How much larger moves are, in rounding too, than the displacements that make them."""
+        """Ratio of moves, and their rounding, to the displacements that cause them."""
         return 1.0
 
     @abstractmethod
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """The correction c, to within a length. A state is `owed` to where the step looks back:
-        what the invariants of parts that nothing holds have yet to gain. `rounding` is how far it
-        may have put the moves off.
+        """Solve for the correction c to within a length.
 
-        Raises ExperimentError where a part is pushed on for ever.
+        `owed` is the state if the step depends on the state before it: the invariants of parts that
+        nothing holds then have to change. `rounding` is the rounding error of the moves.
+
+        Raises ExperimentError if a part is pushed on without end.
         """
 
     @abstractmethod
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """A⁻¹ moves to a share of its largest number; answers that are `near`, as those of systems
-        alike, save iterations."""
+        """Solve A x = moves with an error relative to the largest number of x. Solutions `near`, as
+        of similar systems, save iterations."""
 
     @abstractmethod
     def pushed_by(self, led: Floats) -> Floats | None:
-        """The moves of followers whose leaders are displaced so much, as linear as A; None where
-        the system does not know of leaders."""
+        """Return the moves of followers for displacements of their leaders, to first order; None if
+        the system does not contain leaders."""
 
     @abstractmethod
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """λ, zero but at followers, with Σ λ · moves = Σ weights · A⁻¹ moves for all moves: Aᵀ λ =
-        weights, to a share of its largest number."""
+        """Solve Aᵀ λ = weights with an error relative to the largest number of λ. λ is zero except
+        at followers, and Σ λ · moves = Σ weights · A⁻¹ moves for all moves."""
 
     @abstractmethod
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
-        """|A c + after - before| / |A c|: how far from linear the moves before and after a
-        displacement c are."""
+        """Return
+
+        A c + after - before
+
+        /
+
+        A c
+
+        , the nonlinearity of the moves before and after a displacement c.
+        """
 
     @abstractmethod
     def distance(self, moves: Floats, rounding: float) -> float:
-        """How far any follower is from the solution at most, given its moves and what rounding may
-        have done to them."""
+        """Return a bound on the distance of any follower from the solution, for moves with a
+        rounding error."""
 
     @abstractmethod
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """Raises ExperimentError where a part that nothing holds has moves left: only linear rules
-        tell where it ends."""
+        """Raise ExperimentError if a part that nothing holds has moves: its equilibrium is defined
+        for linear rules only."""
 
     @abstractmethod
     def is_stable(self) -> bool:
-        """Whether no eigenvalue of A, as far as they are looked at, is negative: a small
-        disturbance of the solution then dies away, with a relaxation that is small enough."""
+        """Return whether no eigenvalue of A that is examined is negative. A small disturbance of
+        the solution then decays if the relaxation is small enough."""
 
 
 def solved(system: System, moves: Floats, size: float, rows: Rows = ALL) -> Floats:
-    """A⁻¹ moves, taken to come to that size, to a share of what it comes to."""
-    found = system.solve(moves, ACCURACY * size)
+    """Solve A x = moves with a relative accuracy, starting from an assumed size of x."""
+    solution = system.solve(moves, ACCURACY * size)
     for _ in range(TURNS):
-        most = rows.max_norm(found)
-        if most * FAR >= size:
+        magnitude = rows.max_norm(solution)
+        if magnitude * FAR >= size:
             break
-        size = most
-        found = system.solve(moves, ACCURACY * size)
-    return found
+        size = magnitude
+        solution = system.solve(moves, ACCURACY * size)
+    return solution
