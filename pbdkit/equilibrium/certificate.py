@@ -31,13 +31,13 @@ from pbdkit.stepping.leaders import bends_of, is_cut_short, last_event
 from pbdkit.stepping.state import State
 
 WAYS = {
-    "inverse": "the solution for what is left of the moves, and the inverse for their rounding",
-    "solution": "the solution for what is left of the moves",
-    "iteration": "some iterations more, and how they fall",
-    "damped": "the solution for what is left of the moves, but for motions that cost next to "
-    "nothing, as of what hangs by one bond",
-    "energy": "some iterations more, and the energy of what they leave",
-    "nothing to solve": "nobody follows",
+    "inverse": "the solution for the remaining moves, and the inverse for their rounding",
+    "solution": "the solution for the remaining moves",
+    "iteration": "further iterations, and their rate of decay",
+    "damped": "the solution for the remaining moves, without motions of hardly any stiffness, as "
+    "of parts that hang by one bond",
+    "energy": "further iterations, and the energy of the remaining error",
+    "nothing to solve": "there are no followers",
 }
 CORRECTION = "correction, "
 """Prefix of a kind of bound that applies only to the error that a computed correction leaves."""
@@ -70,7 +70,7 @@ class Certificate:
     def __str__(self) -> str:
         way = WAYS[self.bound.removeprefix(CORRECTION)]
         if self.bound.startswith(CORRECTION):
-            way = f"the correction to there; what it leaves is bounded by {way}"
+            way = f"the correction to it; the remaining error is bounded by {way}"
         return (
             f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of the largest "
             f"prescribed displacement), by {way}"
@@ -148,7 +148,7 @@ ACCURACY = 1e-8
 CONTRACTION = 0.1
 """Largest ratio of moves after and before a correction for which the linearisation is valid:
 further corrections, each smaller by this ratio, then amount to a ninth of the first."""
-BENT = "the rule bends too much between there and equilibrium for a bound"
+BENT = "the rule is too nonlinear between the state and equilibrium for a bound"
 
 
 @dataclass(frozen=True)

@@ -50,12 +50,12 @@ Newton's iteration converges (Deuflhard)."""
 SERVES, NEAR = 0.02, 1e-3
 """Largest ratio of errors for which a linearisation is used again, and largest relative error of
 corrections."""
-NOT_LINEAR = "the rule declares itself linear, and does not move as its linearisation says"
+NOT_LINEAR = "the rule declares itself linear, but its moves differ from the linearisation"
 NUDGE, SHARE = 1e-6, 0.25
 """Displacement of leaders, in lattice spacings, for derivatives with respect to the load, and
 fraction of the tolerance that linear systems may use."""
-UNSTABLE = "what is found is not stable"
-ROUNDING = "rounding alone allows no better"
+UNSTABLE = "the result is not stable"
+ROUNDING = "rounding alone limits the relative distance"
 FIRM = 1e5
 """Ratio of distance to rounding up to which a body counts as firm. Beyond it the body may be near a
 limit point, so that a smaller increment could converge."""
@@ -222,14 +222,14 @@ class Search(ABC):
     def _why(self, best: float) -> str:
         finder = self._finder
         if not math.isfinite(finder.rows.max_norm(self._left)):
-            return "it left the finite numbers"
+            return "displacements are not finite"
         if self._system.is_stuck:
             return (
-                f"{self._system.methods} got stuck, as where a body is slender or soft; take "
-                "solver.method: lu"
+                f"{self._system.methods} does not converge, as for slender or soft bodies; "
+                "take solver.method: lu"
             )
         if self._is_rounding(best):
-            return f"{ROUNDING} than {best:.1g}{_reachable(best)}"
+            return f"{ROUNDING} to {best:.1g}{_reachable(best)}"
         return "no correction makes the moves smaller"
 
     def _linearised(self, at: State, what: str) -> System:

@@ -466,7 +466,7 @@ def _settle_bonds_at(
             return certificate
         since = moment
     raise UnconvergedError(
-        f"bonds still change after they settled {MOST_SETTLINGS} times at step {moment:.6g}",
+        f"bonds still change after {MOST_SETTLINGS} equilibria at step {moment:.6g}",
         certificate,
     )
 
@@ -541,8 +541,8 @@ def _stepped(
             vars(state).update(vars(candidate))
             return certificate
     raise UnconvergedError(
-        f"at step {moment:.6g} the load leads no further: several equilibria meet there, as where "
-        f"a body buckles, and rounding would decide between them ({failed})",
+        f"at step {moment:.6g} the load cannot be followed: several equilibria meet there, as in "
+        f"buckling, and rounding would decide between them ({failed})",
         failed.certificate,
     )
 

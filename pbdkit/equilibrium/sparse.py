@@ -347,9 +347,9 @@ DRIFTS = (
     "leader hold it"
 )
 SOFT_MESSAGE = (
-    "double precision does not tell what holds a part of {}: it turns about a single particle, is "
-    "too slender, or held by too soft a region; let leaders hold more of it, or take stiffer "
-    "regions or fewer particles"
+    "in double precision nothing holds a part of {}: it turns about a single particle, is too "
+    "slender, or held by too soft a region; let leaders hold more of it, or take stiffer regions "
+    "or fewer particles"
 )
 
 

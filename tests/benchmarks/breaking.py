@@ -16,7 +16,8 @@ from unittest.mock import patch
 import numpy as np
 
 import pbdkit
-from pbdkit.equilibrium import solve as increments
+from pbdkit.equilibrium import breaking_kernel
+from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import State
 
@@ -69,10 +70,10 @@ def found(scene: Scene, by_numpy: bool) -> tuple[float, State]:
     """Seconds of the processor, and the equilibrium."""
     begun = time.process_time()
     if by_numpy:
-        with patch.object(increments, "settler_of", return_value=None):
-            state, _ = increments.equilibrium_state(scene)
+        with patch.object(breaking_kernel, "settler_of", return_value=None):
+            state, _ = equilibrium_state(scene)
     else:
-        state, _ = increments.equilibrium_state(scene)
+        state, _ = equilibrium_state(scene)
     return time.process_time() - begun, state
 
 

@@ -308,7 +308,7 @@ def test_a_bound_to_first_order_is_not_given_where_the_rule_has_a_kink():
     assert error_of(ds, rest) <= certificate(ds)["distance"]
     early = run(given_ | {"steps": 320})
     assert "not settled: at step" in early.attrs["stop_reason"]
-    assert "the rule bends too much" in early.attrs["stop_reason"]
+    assert "the rule is too nonlinear" in early.attrs["stop_reason"]
 
 
 @pytest.mark.filterwarnings("ignore:leaders. there are none")

@@ -214,7 +214,9 @@ def test_a_part_that_is_pushed_on_for_ever_is_refused_by_name():
 
 def test_a_tolerance_below_rounding_is_not_reached_and_says_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(pbdkit.DivergedError, match="rounding alone allows no better") as caught:
+    with pytest.raises(
+        pbdkit.DivergedError, match="rounding alone limits the relative distance"
+    ) as caught:
         run(sheet(30, 30, solver=STRAIGHT | {"tolerance": 1e-16}))
     assert caught.value.dataset.attrs["status"] == "unconverged"
     change = "solver={type: equilibrium, tolerance: 1e-16}"

@@ -253,5 +253,5 @@ def test_bonds_that_never_come_to_rest_are_no_equilibrium(monkeypatch, interpret
 
     monkeypatch.setattr("pbdkit.equilibrium.solve.MOST_SETTLINGS", 5)
     given = SHEET | {"fracture": Restless(), "solver": {"type": "equilibrium"}}
-    with pytest.raises(pbdkit.DivergedError, match="bonds still change after they settled 5 times"):
+    with pytest.raises(pbdkit.DivergedError, match="bonds still change after 5 equilibria"):
         pbdkit.run(given, progress=False)
