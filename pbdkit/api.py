@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pbdkit.fitting.strength import FittedStrength
     from pbdkit.identification.identity import Identity
     from pbdkit.model.loading import ComponentClasses, ExperimentLike
-    from pbdkit.model.reading import Settings
+    from pbdkit.model.reading import Settings, Source
     from pbdkit.stability.analysis import Analysis
 
 
@@ -127,8 +127,8 @@ def run(
     >>> ds = pbdkit.run("paper/a", progress=False)
     >>> ds.position.sel(time=400, particle=67)
     """
-    found = as_experiment(experiment, components, settings)
-    return _run(found, progress, None if output is None else Path(output), force)
+    loaded = as_experiment(experiment, components, settings)
+    return _run(loaded, progress, None if output is None else Path(output), force)
 
 
 def _run(
@@ -305,25 +305,25 @@ def resume(
 
     path = Path(output)
     with progress_bar(progress) as show:
-        found = resumption(path, Watch(show=show), steps=steps, anyway=anyway)
-        if found is None:
+        resumed = resumption(path, Watch(show=show), steps=steps, anyway=anyway)
+        if resumed is None:
             return open(path)
-        _warn(found.run.warnings)
-        report = found.record()
+        _warn(resumed.run.warnings)
+        report = resumed.record()
     if report.outcome.status in FAILED:
         raise DivergedError(report.outcome.stop_reason)
     _warn(report.warnings)
-    return open(found.sink.written)
+    return open(resumed.sink.written)
 
 
 def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
-    here = {"pbdkit": version("pbdkit")} | experiment.distributions()
+    installed = {"pbdkit": version("pbdkit")} | experiment.distributions()
     made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | json_attribute(dataset, "plugins")
-    for name, now in here.items():
-        before = made_by.get(name)
-        if name != GIVEN and before != now:
-            whose = f"{name} {before}" if before else f"an unknown version of {name}"
-            text = f"made by {whose}, run again by {now}: the result may differ"
+    for name, current in installed.items():
+        original = made_by.get(name)
+        if name != GIVEN and original != current:
+            maker = f"{name} {original}" if original else f"an unknown version of {name}"
+            text = f"made by {maker}, run again by {current}: the result may differ"
             warn_caller(text, ReproducibilityWarning)
 
 
@@ -369,7 +369,7 @@ def sweep(
     -------
     xarray.Dataset
         What `pbdkit sweep` would write, with the parameters as dimensions. A member that failed is
-        NaN, and its ``message`` says why.
+        NaN, and its ``message`` is the reason.
 
     Raises
     ------
@@ -389,10 +389,10 @@ def sweep(
     """
     from pbdkit.sweeps.execute import called
 
-    given = as_experiment(experiment)
+    base = as_experiment(experiment)
     parts = {"vary": vary or {}, "together": together or {}, "keep": keep or {}}
     parts["names"] = names or {}
-    return called(given, parts | {"replicates": replicates}, folder, workers, client, progress)
+    return called(base, parts | {"replicates": replicates}, folder, workers, client, progress)
 
 
 def fit(
@@ -401,8 +401,8 @@ def fit(
     experiment: ExperimentLike | None = None,
     measured: xarray.Dataset | None = None,
     components: ComponentClasses = (),
-) -> Fitted:
-    """Fit parameters of an experiment to what was measured.
+) -> Fitted | FittedStrength:
+    """Fit parameters of an experiment to measurements, or strengths to peaks of repeated tests.
 
     Parameters
     ----------
@@ -418,8 +418,9 @@ def fit(
 
     Returns
     -------
-    Fitted
-        The values with their errors and correlations; ``print`` shows a summary.
+    Fitted or FittedStrength
+        The values with their errors and correlations; ``print`` shows a summary. It is a
+        FittedStrength where the description has ``kind: strength``.
 
     Raises
     ------
@@ -434,12 +435,21 @@ def fit(
     """
     from pbdkit.equilibrium.certificate import UnconvergedError
     from pbdkit.fitting.fit import fit_experiment
-    from pbdkit.fitting.fit_file import described_fit
+    from pbdkit.fitting.fit_file import Fit, is_strength_fit, read_fit
 
-    asked, source = described_fit(description, given=experiment is not None, measured=measured)
-    found = as_experiment(experiment, components) if experiment is not None else None
+    if is_strength_fit(description):
+        if measured is not None:
+            raise ExperimentError(
+                "measured: a fit of strength is to peaks; list them under `measured` of the fit"
+            )
+        return fit_strength(description, experiment=experiment, components=components)
+    problem, source = read_fit(
+        Fit, description, has_experiment=experiment is not None, measured=measured
+    )
     try:
-        return fit_experiment(asked, found or Experiment.build(source, components), components)
+        return fit_experiment(
+            problem, _experiment_of_fit(experiment, source, components), components
+        )
     except UnconvergedError as error:
         raise DivergedError(str(error)) from None
 
@@ -450,16 +460,12 @@ def fit_strength(
     experiment: ExperimentLike | None = None,
     components: ComponentClasses = (),
 ) -> FittedStrength:
-    """Fit the strength of bonds and its scatter to the peaks of repeated tests.
+    """Fit the strength of bonds and its scatter, as `fit` does for ``kind: strength``.
 
     Parameters
     ----------
-    description : mapping, str or path
-        A strength fit file, the name of a shipped one, or a dict of the same.
-    experiment : Experiment, mapping, str or path, optional
-        Takes the place of that in the description.
-    components : iterable of classes
-        As in `load`.
+    description, experiment, components
+        As in `fit`.
 
     Returns
     -------
@@ -471,14 +477,24 @@ def fit_strength(
     ExperimentError, PluginError
         Where the description, the experiment or the measurement is wrong.
     DivergedError
-        Where a specimen finds no equilibrium.
+        Where a specimen has no equilibrium.
     """
     from pbdkit.equilibrium.certificate import UnconvergedError
-    from pbdkit.fitting.strength import described_strength_fit, fit_strength_of
+    from pbdkit.fitting.fit_file import StrengthFit, read_fit
+    from pbdkit.fitting.strength import fit_strength_of
 
-    asked, source = described_strength_fit(description, given=experiment is not None)
-    found = as_experiment(experiment, components) if experiment is not None else None
+    problem, source = read_fit(StrengthFit, description, has_experiment=experiment is not None)
+    fitted = _experiment_of_fit(experiment, source, components)
     try:
-        return fit_strength_of(asked, found or Experiment.build(source, components))
+        return fit_strength_of(problem, fitted)
     except UnconvergedError as error:
         raise DivergedError(str(error)) from None
+
+
+def _experiment_of_fit(
+    experiment: ExperimentLike | None, source: Source, components: ComponentClasses
+) -> Experiment:
+    """Return the experiment of a fit, the caller's or that of its source."""
+    if experiment is None:
+        return Experiment.build(source, components)
+    return as_experiment(experiment, components)

@@ -13,8 +13,8 @@ from pbdkit.stability.relaxation import tuned
 
 
 class Execution:
-    """Where runs are carried out: by one process, or, in `pbdkit.mpi.distributed_run`, by all
-    processes of a communicator, which make each call together."""
+    """Executes runs: in one process, or, in `pbdkit.mpi.distributed_run`, on all ranks of a
+    communicator, which call each method together."""
 
     def __init__(self, communicator: Communicator = SERIAL) -> None:
         self.communicator = communicator

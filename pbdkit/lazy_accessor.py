@@ -34,9 +34,9 @@ class AccessorFinder:
         """Return the specification of xarray, and None for every other module."""
         if name != LIBRARY:
             return None
-        others = [finder for finder in sys.meta_path if finder is not self]
-        specs = (finder.find_spec(name, path, target) for finder in others)
-        spec = next((found for found in specs if found is not None), None)
+        finders = [finder for finder in sys.meta_path if finder is not self]
+        specs = (finder.find_spec(name, path, target) for finder in finders)
+        spec = next((candidate for candidate in specs if candidate is not None), None)
         if spec is None or spec.loader is None:
             return spec
         execute = spec.loader.exec_module

@@ -44,7 +44,7 @@ def restore(
     """Let a run that has not begun continue from the checkpoint that the root has; `recorded` is
     the last step recorded, where that is another one than was kept. Raises StorageError for a
     checkpoint that is damaged or of another scene."""
-    own, parts = driver.state_dict(), dict[str, Any]()
+    initial, parts = driver.state_dict(), dict[str, Any]()
     with communicator.raise_together():
         if checkpoint:
             experiment, classes = driver.scene.experiment, dict[str, type]()
@@ -52,7 +52,7 @@ def restore(
                 from pbdkit.equilibrium.certificate import Pace
 
                 classes["Pace"] = Pace
-            parts = checkpoint.parts(own, experiment.steps, classes)
+            parts = checkpoint.parts(initial, experiment.steps, classes)
             if recorded is not None:
                 parts["kept"] = parts["seen"].recorded = recorded
     recorder.seen = communicator.bcast(parts.get("seen"))
@@ -204,12 +204,12 @@ def _final_state(output: Path, stack: ExitStack | None) -> Checkpoint:
         return Checkpoint({}, facts, arrays)
 
 
-def _source(about: Mapping[str, Any], name: str, steps: int | None, done: Any) -> Source:
+def _source(about: Mapping[str, Any], name: str, steps: int | None, completed: Any) -> Source:
     parts = _map(about, "experiment")
     refuse_retired(parts, f"{name}: resuming")
     if steps is not None:
-        if isinstance(done, int) and steps <= done:
-            raise ExperimentError(f"{name}: {done} steps are done; --steps must be larger")
+        if isinstance(completed, int) and steps <= completed:
+            raise ExperimentError(f"{name}: {completed} steps are done; --steps must be larger")
         parts["steps"] = steps
     return Source(name, parts)
 

@@ -646,7 +646,7 @@ class Simulation:
 
     @property
     def time(self) -> int:
-        """Current step."""
+        """Return the current step."""
         return self.driver.state.step
 
     @property

@@ -15,9 +15,8 @@ import click
 import pbdkit
 from pbdkit.cli.output import refusals_as, refuse_output, refuse_unwritable, save
 from pbdkit.errors import ExperimentError
+from pbdkit.fitting.fit_file import fit_schema, is_strength_fit
 from pbdkit.fitting.fit_result import Fitted
-from pbdkit.fitting.fit_schema import fit_schema
-from pbdkit.fitting.strength import is_strength_fit
 from pbdkit.io.atomic_file import write
 from pbdkit.io.layout import dataset_schema
 from pbdkit.model.schema import experiment_schema
@@ -118,11 +117,10 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
     if picture:
         refuse_output(picture, force=force)
     refuse_unwritable(picture, path)
-    repeats = is_strength_fit(file)
-    if picture and repeats:
+    if picture and is_strength_fit(file):
         raise ExperimentError("a strength fit has no picture; leave --plot out")
     with waiting(f"fitting {file}", silent=quiet):
-        result = pbdkit.fit_strength(file) if repeats else pbdkit.fit(file)
+        result = pbdkit.fit(file)
     write(path, json.dumps(result.as_dict(), indent=2) + "\n", replace=force)
     if not quiet:
         click.echo(str(result))

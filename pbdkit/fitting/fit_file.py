@@ -1,5 +1,5 @@
-"""The fit file: an experiment, its unknown parameters, and the measurements (fields of
-displacements, tracks in time, curves)."""
+"""Fit files: an experiment, its unknown parameters, and the measurements (fields of displacements,
+tracks in time, curves), or the peaks of repeated tests for a fit of strength."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import (
@@ -44,8 +44,9 @@ from pbdkit.model.reading import (
     of_kind,
     read_file,
 )
+from pbdkit.model.schema import DIALECT
 from pbdkit.model.solver import Equilibrium
-from pbdkit.model.validation import closed_part, report
+from pbdkit.model.validation import closed_part, fault, report
 from pbdkit.plugin.component import Component, Strict
 from pbdkit.scene.scene import Scene, build_scene
 
@@ -394,20 +395,163 @@ class Fit(Strict):
         return self
 
 
-def described_fit(
+KIND = "strength"
+"""Value of `kind` in strength fits."""
+MIN_BROKEN = 3
+"""Smallest number of broken specimens from which scatter can be estimated."""
+
+
+class Peaks(Strict):
+    """The peak load of each specimen: a list of `peaks`, or the `column` of a CSV `file` beside
+    this one. `of` is their quantity: the `force` or the `displacement` of the leader group `group`
+    at the peak, or `factor`, the fraction of the experiment's load.
+
+    Instead of `column`, `curve` names the columns specimen, displacement and force of whole curves,
+    whose peaks are used. `broke` is 1 if a specimen broke and 0 if its test ended before, as a list
+    or the name of a column; by default all broke. Forces are those of a body of `youngs_modulus`
+    and `thickness`. `group` is by default the one with the largest displacement.
+    """
+
+    file: str | None = None
+    column: str = "peak"
+    curve: Annotated[tuple[str, str, str] | None, Field(strict=False)] = None
+    peaks: Annotated[tuple[float, ...], Field(strict=False)] = ()
+    broke: str | Annotated[tuple[Annotated[int, Field(ge=0, le=1)], ...], Field(strict=False)] = ()
+    of: Literal["force", "displacement", "factor"]
+    group: Annotated[int, Field(ge=0)] | None = None
+    youngs_modulus: Positive = 1.0
+    thickness: Positive = 1.0
+    _values: Any = None
+    _broke: Any = None
+
+    @model_validator(mode="after")
+    def _read(self, info: ValidationInfo) -> Self:
+        if (self.file is None) == (not self.peaks):
+            raise fault("needs either a file, or the peaks themselves", key="file")
+        values, broke = self._columns(info) if self.file is not None else self._listed()
+        for n, value in enumerate(values):
+            if not 0.0 < value < np.inf:
+                text = f"peaks must be above 0; that of specimen {n + 1} is {value:g}"
+                raise fault(text, key="file" if self.file else "peaks")
+        if broke.sum() < MIN_BROKEN:
+            raise fault(
+                f"{int(broke.sum())} specimens broke; scatter needs at least {MIN_BROKEN}",
+                key="file" if self.file else "peaks",
+            )
+        object.__setattr__(self, "_values", values)
+        object.__setattr__(self, "_broke", broke)
+        return self
+
+    def _listed(self) -> tuple[Floats, Any]:
+        if isinstance(self.broke, str):
+            raise fault("names a column without a file; give a list of 0 and 1", key="broke")
+        broke = np.array(self.broke or [1] * len(self.peaks), bool)
+        if len(broke) != len(self.peaks):
+            text = f"{len(broke)} numbers for {len(self.peaks)} peaks; give one each"
+            raise fault(text, key="broke")
+        return np.array(self.peaks), broke
+
+    def _columns(self, info: ValidationInfo) -> tuple[Floats, Any]:
+        if self.broke and not isinstance(self.broke, str):
+            raise fault("is a list, and peaks are in a file; name its column", key="broke")
+        further = (self.broke,) if isinstance(self.broke, str) else ()
+        if self.curve is None:
+            rows = np.array(read_columns(self.file, info, (self.column, *further)))
+        else:
+            if self.of == "factor":
+                raise fault("curves contain forces and displacements, but no factor", key="of")
+            rows = _peaks_of_curves(
+                np.array(read_columns(self.file, info, (*self.curve, *further))), self.of
+            )
+        return rows[:, 0], rows[:, 1] != 0.0 if further else np.ones(len(rows), bool)
+
+    @property
+    def values(self) -> Floats:
+        """Return the peaks, (specimen,)."""
+        return np.asarray(self._values)
+
+    @property
+    def failed(self) -> Any:
+        """Return whether each specimen broke, (specimen,)."""
+        return self._broke
+
+
+def _peaks_of_curves(rows: Floats, quantity: str) -> Floats:
+    """Return the largest force of each specimen, or the displacement there, and the rest of the
+    row."""
+    peaks = []
+    for specimen in np.unique(rows[:, 0]):
+        curve = rows[rows[:, 0] == specimen]
+        top = curve[curve[:, 2].argmax()]
+        peaks.append([top[2] if quantity == "force" else top[1], *top[3:]])
+    return np.array(peaks)
+
+
+class StrengthFit(Strict):
+    """Fits the strength of bonds and its scatter, the `unknown` parameters within bounds, to
+    repeats of one experiment.
+
+    `law` is the distribution of strengths, by default that of the experiment's fracture. `method`:
+    `likelihood` assumes that a specimen fails with its first bond, `simulation` compares with
+    simulated specimens, `auto` uses the second if that assumption does not hold. `check` is the
+    number of specimens that are simulated to test it, `simulations` the number for the second
+    method, `seed` that of the random numbers of both.
+    """
+
+    version: Version = 1
+    kind: Literal["strength"]
+    experiment: Base
+    law: Literal["weibull", "uniform"] | None = None
+    unknown: Annotated[dict[str, Bounds], Field(min_length=1)]
+    measured: Peaks
+    method: Literal["auto", "likelihood", "simulation"] = "auto"
+    check: Annotated[int, Field(ge=0, le=1000)] = 8
+    simulations: Annotated[int, Field(ge=100, le=1_000_000)] = 2000
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+
+    @model_validator(mode="after")
+    def _positive(self) -> Self:
+        for path, (low, _) in self.unknown.items():
+            if low <= 0.0:
+                raise fault(f"strengths and their scatter must be above 0; got {low:g}", key=path)
+        return self
+
+
+def is_strength_fit(description: Mapping[str, Any] | str | Path) -> bool:
+    """Return whether a fit file, a shipped fit or a mapping describes a strength fit, by its
+    `kind`.
+
+    It is False if the file cannot be read, which is reported when it is read again.
+    """
+    if isinstance(description, Mapping):
+        return description.get("kind") == KIND
+    shipped = FOLDER / f"{description}.yaml"
+    path = shipped if shipped.is_file() and not Path(description).is_file() else Path(description)
+    return path.is_file() and dict(of_kind(FIT, read_file(path)).data).get("kind") == KIND
+
+
+AnyFit = TypeVar("AnyFit", Fit, StrengthFit)
+
+
+def read_fit(
+    model: type[AnyFit],
     description: Mapping[str, Any] | str | Path,
     *,
-    given: bool,
+    has_experiment: bool = False,
     measured: xarray.Dataset | None = None,
-) -> tuple[Fit, Source]:
+) -> tuple[AnyFit, Source]:
     """Read a fit from a file, a shipped name or a mapping.
 
     Parameters
     ----------
+    model
+        Class of the fit, `Fit` or `StrengthFit`.
     description
         Path or name, or the content.
-    given
-        Whether the experiment comes from elsewhere, so that the fit need not name one.
+    has_experiment
+        Whether the caller has the experiment, so that the fit need not name one.
+    measured
+        Dataset in place of the file of the measurement.
 
     Returns
     -------
@@ -426,20 +570,16 @@ def described_fit(
     else:
         path = _file(str(description))
         source = of_kind(FIT, read_file(path))
-    if isinstance(source.data, dict) and source.data.get("kind") == "strength":
-        raise ExperimentError(
-            f"{source.name}: is a fit of strength; use pbdkit.fit_strength", ("kind",)
-        )
-    if given and isinstance(source.data, dict):
+    if has_experiment and isinstance(source.data, dict):
         source = Source(source.name, {"experiment": "", **source.data}, source.places, source.files)
     context: dict[str, Any] = {"files": source.files}
     if measured is not None:
         source, context[DATASET] = _with_dataset(source), measured
     try:
-        fit = Fit.model_validate(source.data, context=context)
+        fit = model.model_validate(source.data, context=context)
     except ValidationError as error:
         raise report(error, source) from None
-    return fit, source if given else base_source(path, fit.experiment, source)
+    return fit, source if has_experiment else base_source(path, fit.experiment, source)
 
 
 def _with_dataset(source: Source) -> Source:
@@ -466,3 +606,9 @@ def _file(name: str) -> Path:
     files = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
     hint = did_you_mean(name, [*files, *names])
     raise ExperimentError(f"{name}: is neither a file nor a shipped fit{hint} ({', '.join(names)})")
+
+
+def fit_schema() -> dict[str, Any]:
+    """Return the JSON Schema of fit files of both kinds, without that of their experiments."""
+    schema = TypeAdapter[Any](Fit | StrengthFit).json_schema(by_alias=True)
+    return {"$schema": DIALECT, **schema, "title": "pbdkit fit"}

@@ -74,7 +74,7 @@ class FittedNumbers:
 
 
 @dataclass(frozen=True)
-class Met:
+class Misfit:
     """Residuals of one measurement.
 
     Parameters
@@ -128,7 +128,7 @@ class Fitted:
         Correlations of the estimates.
     youngs_modulus
         Young's modulus if a force is given.
-    met
+    misfits
         Residuals of each measurement, independent of its weight.
     ratio
         Standard deviation of all residuals over the noise.
@@ -148,7 +148,7 @@ class Fitted:
     values: Mapping[str, Estimate]
     correlations: Floats
     youngs_modulus: Estimate | None
-    met: tuple[Met, ...]
+    misfits: tuple[Misfit, ...]
     ratio: float
     problem: Problem = field(repr=False)
     solution: Solution = field(repr=False)
@@ -160,7 +160,7 @@ class Fitted:
     @property
     def noise(self) -> float:
         """Return the noise of the first measurement."""
-        return self.met[0].noise
+        return self.misfits[0].noise
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the JSON file as plain values."""
@@ -177,7 +177,7 @@ class Fitted:
             },
             "youngs_modulus": None if modulus is None else modulus.as_dict(),
             "residual_over_noise": self.ratio,
-            "measured": [asdict(met) for met in self.met],
+            "measured": [asdict(misfit) for misfit in self.misfits],
             "evaluations": self.solution.evaluations,
         } | self._on_request()
 
@@ -289,7 +289,7 @@ class Fitted:
             for m, second in list(enumerate(self.values))[n + 1 :]:
                 if abs(self.correlations[n, m]) > 0.5:
                     yield f"correlation of {first} and {second}: {self.correlations[n, m]:.2f}"
-        yield from map(str, self.met)
+        yield from map(str, self.misfits)
         for path, profile in self.profiles.items():
             yield f"{path}: {profile}, by its profile"
         if self.sample:
@@ -317,18 +317,18 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     residuals = solution.at.residuals.copy()
     for observation, rows in problem.rows():
         residuals[rows] /= np.sqrt(observation.weight)
-    met = tuple(_residuals_of(each, residuals[rows], fit.loss) for each, rows in problem.rows())
+    misfits = tuple(_residuals_of(each, residuals[rows], fit.loss) for each, rows in problem.rows())
     ratio = spread_of(residuals, problem.size, fit.loss)
     modulus = youngs_modulus(fit.force, problem, solution)
     several = combinations(problem, solution)
     return Fitted(
-        values, correlations, modulus, met, ratio, problem, solution, combinations=several
+        values, correlations, modulus, misfits, ratio, problem, solution, combinations=several
     )
 
 
-def _residuals_of(observation: Observation, residuals: Floats, loss: Loss) -> Met:
+def _residuals_of(observation: Observation, residuals: Floats, loss: Loss) -> Misfit:
     """Summarise the residuals of an observation."""
-    return Met(
+    return Misfit(
         observation.kind,
         observation.noise * observation.unit,
         spread_of(residuals, 0, loss),

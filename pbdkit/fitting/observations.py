@@ -657,10 +657,10 @@ class RunObservation(Observation):
         """
         last = -1.0
         for state in run:
-            within = run.driver.load_time
-            moment = state.step if within is None else within
-            wanted = within is not None or run.scene.experiment.records(state.step)
-            if (wanted or run.driver.ends_early) and moment > last:
+            load_time = run.driver.load_time
+            moment = state.step if load_time is None else load_time
+            is_due = load_time is not None or run.scene.experiment.records(state.step)
+            if (is_due or run.driver.ends_early) and moment > last:
                 last = moment
                 yield moment, state
         if run.outcome is None or run.outcome.status in FAILED:
@@ -941,7 +941,7 @@ class FieldObservation(Observation):
         return np.concatenate([*coefficients, np.zeros(self.own_unknowns - self._coefficients)])
 
     def places(self) -> Floats:
-        """Return the points."""
+        """Return the measured points."""
         return self.evidence.points
 
     def part(self, mask: NDArray[np.bool_]) -> FieldObservation:
@@ -1066,7 +1066,7 @@ class TracksObservation(RunObservation):
         return "displacements (lattice unit)", "time (step)", False
 
     def places(self) -> Floats:
-        """Return the points."""
+        """Return the tracked points."""
         return self.points
 
     def part(self, mask: NDArray[np.bool_]) -> TracksObservation:

@@ -1,5 +1,4 @@
-"""Strength of bonds and its scatter from repeated tests: fit file, likelihood, simulated specimens
-and result.
+"""Strength of bonds and its scatter from repeated tests: likelihood, simulated specimens, result.
 
 The load at which the first bond breaks in a body with displacements proportional to the load: with
 d the difference along a bond under the experiment's full load, the strain at the load factor λ is
@@ -29,213 +28,29 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import chain, combinations_with_replacement
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from pydantic import Field, ValidationError, ValidationInfo, model_validator
 
 from pbdkit.array_types import Floats, Mask
 from pbdkit.components.diagnostics import reactions
 from pbdkit.equilibrium.solve import finder_of, increments, moments
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
-from pbdkit.fitting.fit_file import FOLDER, Bounds, Positive
+from pbdkit.fitting.fit_file import Peaks, StrengthFit
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import TELLS
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import FOLLOWER, Places
-from pbdkit.model.experiment import Experiment, Version, given_classes
-from pbdkit.model.loading import Base, base_source
-from pbdkit.model.motions import read_columns
-from pbdkit.model.reading import FIT, OF_PROGRAM, Source, of_kind, read_file, with_value
+from pbdkit.model.experiment import Experiment, given_classes
+from pbdkit.model.reading import with_value
 from pbdkit.model.solver import Equilibrium
-from pbdkit.model.validation import fault, report
 from pbdkit.plugin import BreaksAtStrain, Calibrated, Softens
-from pbdkit.plugin.component import Strict
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import State, initial_state, unmoved_state
-
-KIND = "strength"
-"""Value of `kind` in strength fits."""
-MIN_BROKEN = 3
-"""Smallest number of broken specimens from which scatter can be estimated."""
-
-
-class Peaks(Strict):
-    """The peak load of each specimen: a list of `peaks`, or the `column` of a CSV `file` beside
-    this one. `of` is their quantity: the `force` or the `displacement` of the leader group `group`
-    at the peak, or `factor`, the fraction of the experiment's load.
-
-    Instead of `column`, `curve` names the columns specimen, displacement and force of whole curves,
-    whose peaks are used. `broke` is 1 if a specimen broke and 0 if its test ended before, as a list
-    or the name of a column; by default all broke. Forces are those of a body of `youngs_modulus`
-    and `thickness`. `group` is by default the one with the largest displacement.
-    """
-
-    file: str | None = None
-    column: str = "peak"
-    curve: Annotated[tuple[str, str, str] | None, Field(strict=False)] = None
-    peaks: Annotated[tuple[float, ...], Field(strict=False)] = ()
-    broke: str | Annotated[tuple[Annotated[int, Field(ge=0, le=1)], ...], Field(strict=False)] = ()
-    of: Literal["force", "displacement", "factor"]
-    group: Annotated[int, Field(ge=0)] | None = None
-    youngs_modulus: Positive = 1.0
-    thickness: Positive = 1.0
-    _values: Any = None
-    _broke: Any = None
-
-    @model_validator(mode="after")
-    def _read(self, info: ValidationInfo) -> Self:
-        if (self.file is None) == (not self.peaks):
-            raise fault("needs either a file, or the peaks themselves", key="file")
-        values, broke = self._columns(info) if self.file is not None else self._listed()
-        for n, value in enumerate(values):
-            if not 0.0 < value < np.inf:
-                text = f"peaks must be above 0; that of specimen {n + 1} is {value:g}"
-                raise fault(text, key="file" if self.file else "peaks")
-        if broke.sum() < MIN_BROKEN:
-            raise fault(
-                f"{int(broke.sum())} specimens broke; scatter needs at least {MIN_BROKEN}",
-                key="file" if self.file else "peaks",
-            )
-        object.__setattr__(self, "_values", values)
-        object.__setattr__(self, "_broke", broke)
-        return self
-
-    def _listed(self) -> tuple[Floats, Any]:
-        if isinstance(self.broke, str):
-            raise fault("names a column without a file; give a list of 0 and 1", key="broke")
-        broke = np.array(self.broke or [1] * len(self.peaks), bool)
-        if len(broke) != len(self.peaks):
-            text = f"{len(broke)} numbers for {len(self.peaks)} peaks; give one each"
-            raise fault(text, key="broke")
-        return np.array(self.peaks), broke
-
-    def _columns(self, info: ValidationInfo) -> tuple[Floats, Any]:
-        if self.broke and not isinstance(self.broke, str):
-            raise fault("is a list, and peaks are in a file; name its column", key="broke")
-        further = (self.broke,) if isinstance(self.broke, str) else ()
-        if self.curve is None:
-            rows = np.array(read_columns(self.file, info, (self.column, *further)))
-        else:
-            if self.of == "factor":
-                raise fault("curves contain forces and displacements, but no factor", key="of")
-            rows = _peaks_of_curves(
-                np.array(read_columns(self.file, info, (*self.curve, *further))), self.of
-            )
-        return rows[:, 0], rows[:, 1] != 0.0 if further else np.ones(len(rows), bool)
-
-    @property
-    def values(self) -> Floats:
-        """Return the peaks, (specimen,)."""
-        return np.asarray(self._values)
-
-    @property
-    def failed(self) -> Any:
-        """Return whether each specimen broke, (specimen,)."""
-        return self._broke
-
-
-def _peaks_of_curves(rows: Floats, quantity: str) -> Floats:
-    """Return the largest force of each specimen, or the displacement there, and the rest of the
-    row."""
-    peaks = []
-    for specimen in np.unique(rows[:, 0]):
-        curve = rows[rows[:, 0] == specimen]
-        top = curve[curve[:, 2].argmax()]
-        peaks.append([top[2] if quantity == "force" else top[1], *top[3:]])
-    return np.array(peaks)
-
-
-class StrengthFit(Strict):
-    """Fits the strength of bonds and its scatter, the `unknown` parameters within bounds, to
-    repeats of one experiment.
-
-    `law` is the distribution of strengths, by default that of the experiment's fracture. `method`:
-    `likelihood` assumes that a specimen fails with its first bond, `simulation` compares with
-    simulated specimens, `auto` uses the second if that assumption does not hold. `check` is the
-    number of specimens that are simulated to test it, `simulations` the number for the second
-    method, `seed` that of the random numbers of both.
-    """
-
-    version: Version = 1
-    kind: Literal["strength"]
-    experiment: Base
-    law: Literal["weibull", "uniform"] | None = None
-    unknown: Annotated[dict[str, Bounds], Field(min_length=1)]
-    measured: Peaks
-    method: Literal["auto", "likelihood", "simulation"] = "auto"
-    check: Annotated[int, Field(ge=0, le=1000)] = 8
-    simulations: Annotated[int, Field(ge=100, le=1_000_000)] = 2000
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-
-    @model_validator(mode="after")
-    def _positive(self) -> Self:
-        for path, (low, _) in self.unknown.items():
-            if low <= 0.0:
-                raise fault(f"strengths and their scatter must be above 0; got {low:g}", key=path)
-        return self
-
-
-def is_strength_fit(description: Mapping[str, Any] | str | Path) -> bool:
-    """Return whether a fit file, a shipped fit or a mapping describes a strength fit, by its
-    `kind`.
-
-    It is False if the file cannot be read, which is reported when it is read again.
-    """
-    if isinstance(description, Mapping):
-        return description.get("kind") == KIND
-    path = _file(description)
-    return path.is_file() and dict(of_kind(FIT, read_file(path)).data).get("kind") == KIND
-
-
-def described_strength_fit(
-    description: Mapping[str, Any] | str | Path, *, given: bool
-) -> tuple[StrengthFit, Source]:
-    """Read a strength fit from a file, a shipped name or a mapping.
-
-    Parameters
-    ----------
-    description
-        Path or name, or the content.
-    given
-        Whether the experiment comes from elsewhere, so that the fit need not name one.
-
-    Returns
-    -------
-    fit
-        The fit.
-    source
-        Source of its experiment.
-
-    Raises
-    ------
-    ExperimentError
-        If the fit is invalid.
-    """
-    if isinstance(description, Mapping):
-        path, source = Path("fit"), Source("fit", dict(description), {}, OF_PROGRAM)
-    else:
-        path = _file(description)
-        source = of_kind(FIT, read_file(path))
-    if given and isinstance(source.data, dict):
-        data = {"experiment": "", **source.data}
-        source = Source(source.name, data, source.places, source.files)
-    try:
-        fit = StrengthFit.model_validate(source.data, context={"files": source.files})
-    except ValidationError as error:
-        raise report(error, source) from None
-    return fit, source if given else base_source(path, fit.experiment, source)
-
-
-def _file(name: str | Path) -> Path:
-    shipped = FOLDER / f"{name}.yaml"
-    return shipped if not Path(name).is_file() and shipped.is_file() else Path(name)
-
 
 PARTS = 4
 """Number of load increments after which proportionality is checked."""
@@ -639,7 +454,7 @@ FINE = 64
 NEGLIGIBLE = 18.0
 """Difference to the largest logarithm above which the likelihood is negligible (2e-8)."""
 DRAWS = 20_000
-"""Number of draws."""
+"""Number of draws for the likelihood."""
 DEPTH = 1e-8
 """Fraction of the strain of the weakest specimen that is negligible."""
 LawBounds = tuple[tuple[float, float], tuple[float, float]]
@@ -766,7 +581,7 @@ class UniformLaw(StrengthLaw):
 
     @staticmethod
     def variation(first: Floats, second: Floats) -> Floats:
-        """Return s/√3."""
+        """Return the coefficient of variation, s/√3."""
         return np.asarray(second / np.sqrt(3.0))
 
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
@@ -834,7 +649,7 @@ def _refine_nodes(logarithms: Floats, *nodes: Floats) -> tuple[Floats, ...]:
 
 
 LAWS: dict[str, StrengthLaw] = {"weibull": WeibullLaw(), "uniform": UniformLaw()}
-"""Laws by name."""
+"""Distributions of strength by name."""
 OF_FRACTURE = {"weibull": "weibull", "strain": "uniform"}
 """Law of the strengths of a fracture model, by its type."""
 

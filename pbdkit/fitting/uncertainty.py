@@ -332,7 +332,7 @@ class Profile:
     high: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values."""
+        """Return the profile as plain values."""
         return {
             "values": self.values.tolist(),
             "rises": self.rises.tolist(),
@@ -587,7 +587,7 @@ class Combination:
         return f"{self.name}: {self.estimate}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values."""
+        """Return the combination as plain values."""
         key = "exponents" if self.is_product else "factors"
         return {key: self.weights} | self.estimate.as_dict()
 

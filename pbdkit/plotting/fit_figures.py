@@ -67,8 +67,8 @@ def _curve_size(count: int) -> tuple[float, float]:
 
 def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
     field, information = fitted.field(n), fitted.information(n)
-    noise, largest = fitted.met[n].noise, max(t.max() for t in information.values())
-    factor, unit = fitted.met[n].factor, fitted.met[n].unit
+    noise, largest = fitted.misfits[n].noise, max(t.max() for t in information.values())
+    factor, unit = fitted.misfits[n].factor, fitted.misfits[n].unit
     counted = f" ({unit})" if unit else ""
     wide, count = _is_wide(fitted, n), 3 + len(information)
     shape = (count, 2) if wide else (2, count)
@@ -89,7 +89,7 @@ def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
         ]
         for path, sensitivity in information.items():
             share = sensitivity.reshape(2, -1)[column] / largest
-            panels.append((f"{name}, sensitivity to {path}", share, (0.0, 1.0), "magma_r"))
+            panels.append((f"{name} sensitivity to {path}", share, (0.0, 1.0), "magma_r"))
         column_axes = axes[:, column] if wide else axes[column]
         for ax, (title, values, limits, colours) in zip(column_axes, panels, strict=True):
             _scatter(ax, factor * field.points, values, limits, colours, size)
@@ -118,7 +118,7 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
     axes[0].legend(fontsize=8)
     axes[1].plot(measured, predicted, ".", markersize=3)
     axes[1].axline((float(measured[0]),) * 2, slope=1.0, color="0.6", linewidth=0.8)
-    axes[2].plot(along, numbers.residual / fitted.met[n].noise, ".", markersize=3)
+    axes[2].plot(along, numbers.residual / fitted.misfits[n].noise, ".", markersize=3)
     axes[2].axhline(0.0, color="0.6", linewidth=0.8)
     titles = [what, "fitted over measured", "residual / noise"]
     largest = max(t.max() for t in information.values())
@@ -134,7 +134,7 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
 def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
     """Return for tracks or a curve the factor of its values, the abscissa, and the labels of both,
     in the units of the experiment where it has some."""
-    numbers, observed = fitted.numbers(n), fitted.met[n]
+    numbers, observed = fitted.numbers(n), fitted.misfits[n]
     units = fitted.problem.observations[n].experiment.units
     if units is None:
         return 1.0, numbers.along, numbers.what, numbers.over

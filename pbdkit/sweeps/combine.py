@@ -63,14 +63,14 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     attributes = {
         name: [str(run.attrs.get(name, "")) for run in datasets] for name in _attributes(datasets)
     }
-    taken = {
+    reserved = {
         dim,
         *map(str, combined.variables),
         *map(str, combined.dims),
         *attributes,
         *reserved_names(),
     }
-    names = names_of([*parameters], taken)
+    names = names_of([*parameters], reserved)
     coordinates: dict[str, Any] = {n: (dim, values) for n, values in attributes.items()}
     for path, values in parameters.items():
         coordinates[names[path]] = (dim, values_along(_numbers(values)), {"long_name": path})

@@ -114,13 +114,13 @@ class Queue:
             return [self.jobs.popleft()]
         size = int(HANDED_OUT_S * self._count / max(self._seconds, 1e-9))
         size = min(size, MOST_AT_ONCE, len(self.jobs) // (2 * self.workers))
-        found = [self.jobs.popleft()]
-        while len(found) < size and self.jobs and self.jobs[0].key not in self._losses:
-            found.append(self.jobs.popleft())
-        return found
+        chunk = [self.jobs.popleft()]
+        while len(chunk) < size and self.jobs and self.jobs[0].key not in self._losses:
+            chunk.append(self.jobs.popleft())
+        return chunk
 
     def reported(self, reports: list[MemberReport]) -> Iterator[MemberReport]:
-        """The reports."""
+        """Count the reports and pass them on."""
         for report in reports:
             self._seconds, self._count = self._seconds + report.seconds, self._count + 1
             yield report
@@ -128,7 +128,7 @@ class Queue:
     def lost(self, chunk: list[Job], reason: str) -> Iterator[MemberReport]:
         """Put back the members of a worker that ended; a member that was lost alone too often has
         failed."""
-        again = []
+        retries = []
         for job in chunk:
             losses = self._losses.get(job.key, 0) + (len(chunk) == 1)
             self._losses[job.key] = losses
@@ -136,8 +136,8 @@ class Queue:
                 text = f"{reason} {losses} times while it ran; it runs again with the next call"
                 yield report_of(job.key, LOST, text, lasting=False)
             else:
-                again.append(job)
-        self.jobs.extendleft(reversed(again))
+                retries.append(job)
+        self.jobs.extendleft(reversed(retries))
 
 
 class SerialExecutor(Executor):
@@ -161,9 +161,9 @@ class ClusterExecutor(Executor):
         self._client = client
 
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
-        """Chunks as tasks, a few more than there are threads; those still out are cancelled where
-        the work ends early. Raises ExperimentError where no worker is there, and StorageError where
-        the scheduler is lost."""
+        """Run chunks as tasks, a few more than there are threads; pending ones are cancelled where
+        the work ends early. Raises ExperimentError where the cluster has no worker, and
+        StorageError where the scheduler is lost."""
         out: dict[Any, list[Job]] = {}
         try:
             yield from self._with_workers(stopping)
@@ -173,7 +173,7 @@ class ClusterExecutor(Executor):
                 raise
             raise StorageError(
                 f"--dask: the scheduler is lost ({type(error).__name__}); what was finished is "
-                "held, and the same command goes on with the others"
+                "held, and the same command runs the others"
             ) from None
         finally:
             if self._is_there():
@@ -234,8 +234,8 @@ TEXT = 8
 
 
 class SizeEstimate:
-    """Looks at the experiments of all members, builds the scene of each different body, and sums up
-    the dataset that they come to."""
+    """Estimates the size of the dataset from the experiments of all members, building the scene of
+    each distinct body."""
 
     def __init__(self, keep: Keep, count: int) -> None:
         self._keep, self._count = keep, count
@@ -245,11 +245,11 @@ class SizeEstimate:
         self._times: set[tuple[int, tuple[int, ...] | None, int, int]] = set()
 
     def look(self, experiment: Experiment, words: str) -> None:
-        """At one more, which messages call so. Raises ExperimentError and PluginError where it has
-        no scene, and where a variable that is to be kept is none of its dataset."""
-        steps, asked = experiment.steps, experiment.record
-        between = experiment.record_count - asked.count(steps)
-        self._times.add((steps, asked.at, asked.every, between))
+        """Include a member, which messages name by `words`. Raises ExperimentError and PluginError
+        where its scene cannot be built, and where its dataset lacks a variable to keep."""
+        steps, record = experiment.steps, experiment.record
+        between = experiment.record_count - record.count(steps)
+        self._times.add((steps, record.at, record.every, between))
         data = experiment.model_dump(mode="json", by_alias=True)
         shape = xxhash.xxh3_128_digest(json.dumps([data.get(part) for part in SHAPING]).encode())
         if shape in self._seen:
@@ -258,38 +258,38 @@ class SizeEstimate:
         plan = MemorySink()
         with named(words):
             Recorder(build_scene(experiment), plan).begin()
-        known = {column.name: column for column in plan.columns}
+        columns = {column.name: column for column in plan.columns}
         for name in self._keep.variables or ():
-            if name not in known:
-                hint = did_you_mean(name, known)
-                what = f"there is no variable '{name}'{hint} (known: {', '.join(known)})"
+            if name not in columns:
+                hint = did_you_mean(name, columns)
+                what = f"there is no variable '{name}'{hint} (known: {', '.join(columns)})"
                 raise ExperimentError(f"keep.variables: {what}", ("keep", "variables"))
-        self._columns |= known
+        self._columns |= columns
         for dim, size in plan.sizes.items():
             self._sizes[dim] = max(size, self._sizes.get(dim, 0))
         self._sizes["step"] = max(steps + 1, self._sizes.get("step", 0))
 
     def refuse_too_large(self) -> None:
-        """Raises ExperimentError where the dataset cannot be in memory at once, or where no member
-        comes to a step that is to be kept."""
+        """Raise ExperimentError where the dataset does not fit into memory, or where no member
+        reaches a step to keep."""
         keep, last = self._keep, max(steps for steps, *_ in self._times)
         if isinstance(keep.times, tuple) and min(keep.times) > last:
             text = f"keep.times: {min(keep.times)} is beyond the last step of all, {last}"
             raise ExperimentError(text, ("keep", "times"))
         sizes = self._sizes | {"time": self._number_of_times()}
         names = self._columns if keep.variables is None else keep.variables
-        wanted = [self._columns[name] for name in names]
-        each = sum(math.prod(sizes.get(d, 1) for d in c.dims) * _bytes(c) for c in wanted)
-        if each * self._count > (most := int(SHARE * machine_memory())):
+        columns = [self._columns[name] for name in names]
+        each = sum(math.prod(sizes.get(d, 1) for d in c.dims) * _bytes(c) for c in columns)
+        if each * self._count > (limit := int(SHARE * machine_memory())):
             raise ExperimentError(
                 f"{self._count} members come to a dataset of {each * self._count / 2**30:.3g} GiB, "
-                f"and this machine can hold {most / 2**30:.3g}; keep fewer variables, or "
+                f"and this machine can hold {limit / 2**30:.3g}; keep fewer variables, or "
                 "`times: last`, or vary less",
                 ("keep",),
             )
 
     def _number_of_times(self) -> int:
-        """Along the joined dimension, as far as it is known before."""
+        """Return the length of the joined dimension, as far as it is known in advance."""
         times = self._keep.times
         if times == "last":
             return len({steps for steps, *_ in self._times})
@@ -332,12 +332,12 @@ class Summary:
 
 
 def carry_out(
-    asked: SweepPlan, folder: Path, crew: Executor, stopping: Callable[[], bool], show: Show
+    plan: SweepPlan, folder: Path, crew: Executor, stopping: Callable[[], bool], show: Show
 ) -> Summary:
-    """Validates every member, runs those that the folder does not hold, and writes the dataset.
+    """Validate all members, run those that the folder does not hold, and write the dataset.
 
     Raises ExperimentError and PluginError before anything runs, and StorageError. `stopping` is
-    asked all the time; once it says so, what is finished is kept and there is no dataset.
+    called continually; once it returns True, completed members are kept and no dataset is written.
     """
 
     def show_unless_stopped(what: str, share: float) -> None:
@@ -346,7 +346,7 @@ def carry_out(
         show(what, share)
 
     try:
-        grid, members, versions = validated(asked, show_unless_stopped)
+        grid, members, versions = validated(plan, show_unless_stopped)
     except _StoppedError:
         return Summary([], {}, 0, [], None)
     jobs = {member.job.key: member.job for member in members}
@@ -369,7 +369,7 @@ def carry_out(
         if run < len(todo):
             return Summary(members, ends, run, store.faults, None)
         dataset = combine_members(grid, members, lambda key: passing.get(key) or store.report(key))
-        dataset.attrs = _attributes(asked, versions)
+        dataset.attrs = _attributes(plan, versions)
         write_dataset(dataset, folder / RESULT, replace=True)
     return Summary(members, ends, run, store.faults, folder / RESULT)
 
@@ -387,12 +387,12 @@ def _heard(
         if report is not None and report.status == INTERRUPTED:
             continue
         run, failed = run + bool(report), failed + bool(report and report.status not in KEPT)
-        told = f"{members - todo + run} of {members} members"
-        show(told + (f", {failed} failed" if failed else ""), run / todo)
+        progress = f"{members - todo + run} of {members} members"
+        show(progress + (f", {failed} failed" if failed else ""), run / todo)
         yield report
 
 
-def validated(asked: SweepPlan, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
+def validated(plan: SweepPlan, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
     """Validate all members.
 
     Returns
@@ -405,25 +405,25 @@ def validated(asked: SweepPlan, show: Show) -> tuple[list[Dimension], list[Membe
     ExperimentError, PluginError
         With the parameters of an invalid member.
     """
-    experiment = asked.experiment()
-    grid, outlook = asked.grid(experiment), SizeEstimate(asked.sweep.keep, asked.sweep.count)
+    base = plan.experiment()
+    grid, outlook = plan.grid(base), SizeEstimate(plan.sweep.keep, plan.sweep.count)
     members: list[Member] = []
     versions: dict[str, str] = {}
     try:
-        for member, one in asked.members(grid, lambda share: show("validating", share)):
-            outlook.look(one, member.words)
+        for member, experiment in plan.members(grid, lambda share: show("validating", share)):
+            outlook.look(experiment, member.words)
             members.append(member)
             versions |= member.job.versions
         outlook.refuse_too_large()
     except ExperimentError as error:
-        name = asked.source.name
+        name = plan.source.name
         raise ExperimentError(f"{name}: {error}" if name else str(error), error.where) from None
     return grid, members, versions
 
 
-def _attributes(asked: SweepPlan, versions: dict[str, str]) -> dict[str, str]:
-    experiment = asked.experiment()
-    sweep = asked.sweep.model_dump(mode="json", by_alias=True)
+def _attributes(plan: SweepPlan, versions: dict[str, str]) -> dict[str, str]:
+    experiment = plan.experiment()
+    sweep = plan.sweep.model_dump(mode="json", by_alias=True)
     sweep["experiment"] = experiment.model_dump(mode="json", by_alias=True)
     return {
         "Conventions": CONVENTIONS,
@@ -443,8 +443,8 @@ MOST_STARTS = 10
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
-"""What limits the threads of linear algebra where it is said before that is loaded. Kernels keep to
-the one that each member asks for."""
+"""Environment variables that limit the threads of linear algebra, if they are set before it is
+loaded. Kernels use the one thread of each member's settings."""
 
 
 class ProcessExecutor(Executor):
@@ -533,9 +533,9 @@ class _Worker:
         waiting = [job for jobs in self.chunks.values() for job in jobs]
         self.chunks.clear()
         queue.jobs.extendleft(reversed(waiting))
-        begun = not self._begun.exception()
+        has_started = not self._begun.exception()
         self._renew()
-        if begun:
+        if has_started:
             yield from queue.lost(chunk, "its process was killed, as where memory runs out,")
             return
         queue.jobs.extendleft(reversed(chunk))
@@ -553,10 +553,10 @@ class _Worker:
 
     def _current(self) -> ProcessPoolExecutor:
         if self._pool is None:
-            others = {*active_children()}
+            earlier = {*active_children()}
             self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
             self._begun = self._pool.submit(os.getpid)
-            self._processes = {*active_children()} - others
+            self._processes = {*active_children()} - earlier
         return self._pool
 
 
@@ -583,14 +583,14 @@ def _spawning() -> Iterator[None]:
     """
     blocks: Any = getattr(signal, "pthread_sigmask", None)
     mask = blocks(signal.SIG_BLOCK, {signal.SIGINT}) if blocks else None
-    main, before = sys.modules["__main__"], {name: os.environ.get(name) for name in ONE_THREAD}
+    main, environment = sys.modules["__main__"], {name: os.environ.get(name) for name in ONE_THREAD}
     sys.modules["__main__"] = ModuleType("__main__")
     os.environ.update(ONE_THREAD)
     try:
         yield
     finally:
         sys.modules["__main__"] = main
-        for name, value in before.items():
+        for name, value in environment.items():
             if value is None:
                 del os.environ[name]
             else:
@@ -607,23 +607,23 @@ def called(
     client: Any,
     progress: bool,
 ) -> xarray.Dataset:
-    """The dataset of a sweep with these parts, loaded where no folder keeps it."""
+    """Return the dataset of a sweep, loaded into memory unless a folder keeps it."""
     base = replace(experiment.as_written(), name="")
     if base.files.folder is None:
         base.files = OF_PROGRAM
-    given = given_classes(experiment)
-    if given and folder is not None:
+    classes = given_classes(experiment)
+    if classes and folder is not None:
         raise ExperimentError(
             "folder: members are known by the versions of what they use, and classes from Python "
             "have none; leave it out, or make a plugin of them (`pbdkit plugins new`)"
         )
-    crew = crew_of(workers, client, given)
+    crew = crew_of(workers, client, classes)
     sweep = checked(parts | {"experiment": base.data}, Source())
-    asked = SweepPlan(sweep, base, Source(), given)
+    plan = SweepPlan(sweep, base, Source(), classes)
     with ExitStack() as ending:
-        kept = Path(folder or ending.enter_context(tempfile.TemporaryDirectory(prefix="pbdkit-")))
+        path = Path(folder or ending.enter_context(tempfile.TemporaryDirectory(prefix="pbdkit-")))
         with progress_bar(progress) as show:
-            summary = carry_out(asked, kept, crew, lambda: False, show)
+            summary = carry_out(plan, path, crew, lambda: False, show)
         for text in summary.faults:
             warn_caller(text, StorageWarning)
         if failures := summary.failures:

@@ -201,7 +201,7 @@ CASE = "case"
 """Dimension of the lists of `together`."""
 
 REPLICATE = "replicate"
-"""Dimension of replicates."""
+"""Name of the dimension of replicates."""
 
 MESSAGE = "message"
 """Variable with the message of each member."""
@@ -335,7 +335,7 @@ def names_of(paths: list[str], reserved: Set[str]) -> dict[str, str]:
     names: dict[str, str] = {}
     for path, candidates in tails.items():
         tails_of_others = {
-            tail for other, others in tails.items() if other != path for tail in others
+            tail for other, other_tails in tails.items() if other != path for tail in other_tails
         }
         name = next(
             (

@@ -31,7 +31,7 @@ from pbdkit.simulation import Simulation, record
 from pbdkit.sweeps.specification import Job
 
 LENGTH = 8
-"""Bytes of the number that says how long the JSON is."""
+"""Bytes of the number with the length of the JSON header."""
 
 
 class MemberVariable(NamedTuple):
@@ -45,43 +45,47 @@ class MemberVariable(NamedTuple):
 
 
 def packed(variables: dict[str, MemberVariable]) -> bytes:
-    """The bytes."""
+    """Serialise variables as bytes."""
     head, parts = {}, []
     for name, (dims, values, attributes, *marks) in variables.items():
-        said = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes.items()}
-        head[name] = [dims, values.dtype.str, values.shape, said, *marks]
+        entries = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes.items()}
+        head[name] = [dims, values.dtype.str, values.shape, entries, *marks]
         parts.append(np.ascontiguousarray(values).tobytes())
-    described = json.dumps(head).encode()
-    return b"".join([len(described).to_bytes(LENGTH, "little"), described, *parts])
+    header = json.dumps(head).encode()
+    return b"".join([len(header).to_bytes(LENGTH, "little"), header, *parts])
 
 
 def unpacked(content: bytes) -> dict[str, MemberVariable]:
-    """What was packed; the values are views of the bytes."""
+    """Deserialise variables; their values are views of the bytes."""
     begin = LENGTH + int.from_bytes(content[:LENGTH], "little")
-    found = {}
+    variables = {}
     for name, entry in json.loads(content[LENGTH:begin]).items():
         dims, dtype, shape, attributes, coordinate, fixed = entry
         count, kind = int(np.prod(shape, dtype=np.int64)), np.dtype(dtype)
         values = np.frombuffer(content, kind, count, begin) if count else np.zeros(0, kind)
         begin += count * kind.itemsize
         flags = {k: np.array(v, kind) if isinstance(v, list) else v for k, v in attributes.items()}
-        found[name] = MemberVariable(tuple(dims), values.reshape(shape), flags, coordinate, fixed)
-    return found
+        variables[name] = MemberVariable(
+            tuple(dims), values.reshape(shape), flags, coordinate, fixed
+        )
+    return variables
 
 
 KEPT = (*WHOLE, "separated")
-"""The status of members whose values are in the dataset: of a body that came apart under an
-equilibrium, all that was recorded before."""
+"""Status of members with values in the dataset; a body that came apart under an equilibrium has
+those recorded before."""
 FAILED, INTERRUPTED, LOST = "failed", "interrupted", "lost"
-"""The status of one that could not be run, and of those that the machine did not let end."""
+"""Status of members that cannot be run, that were interrupted, and that were lost with their
+process."""
 _one_at_a_time = threading.Lock()
-"""Threads of one process, as a dask worker may have, take turns: warnings and the threads of linear
-algebra belong to the process."""
+"""Lock of the threads of a process, as of a dask worker: warnings and the threads of linear algebra
+are global."""
 
 
 class MemberReport(NamedTuple):
-    """What came of a member: `message` says why it failed, or what its run warned of. `digest` is
-    that of all the rest; `lasting` whether another attempt would come to the same."""
+    """Result of a member: `message` is the reason of a failure, or the warnings of its run.
+    `digest` covers all other fields; `lasting` is False where another attempt could have another
+    result."""
 
     key: str
     status: str
@@ -93,18 +97,18 @@ class MemberReport(NamedTuple):
 
 
 def report_of(
-    key: str, status: str, message: str, content: bytes = b"", lasting: bool = True, **more: Any
+    key: str, status: str, message: str, content: bytes = b"", lasting: bool = True, **options: Any
 ) -> MemberReport:
-    """The report with its digest."""
+    """Return a report with its digest."""
     whole = digest_of(key, status, message, content)
-    return MemberReport(key, status, message, content, whole, lasting, **more)
+    return MemberReport(key, status, message, content, whole, lasting, **options)
 
 
 def digest_of(key: str, status: str, message: str, content: bytes) -> bytes:
-    """Of a whole report."""
-    found = xxhash.xxh3_128(json.dumps([key, status, message]).encode())
-    found.update(content)
-    return found.digest()
+    """Return the digest of a report."""
+    digest = xxhash.xxh3_128(json.dumps([key, status, message]).encode())
+    digest.update(content)
+    return digest.digest()
 
 
 class KeptSink(MemorySink):
@@ -146,7 +150,7 @@ def kept_columns(columns: list[Column], variables: set[str] | None) -> list[Colu
 
 
 def run_members(jobs: list[Job]) -> list[MemberReport]:
-    """One after the other."""
+    """Run members one after the other."""
     return [run_member(job) for job in jobs]
 
 
@@ -155,8 +159,8 @@ def run_member(
     components: Iterable[type[Component]] = (),
     stopping: Callable[[], bool] = lambda: False,
 ) -> MemberReport:
-    """Runs a member on one thread; what it raises becomes a report of the status `failed`."""
-    begun, sink = time.perf_counter(), KeptSink(job.variables, job.times)
+    """Run a member on one thread; an exception becomes a report with the status `failed`."""
+    start, sink = time.perf_counter(), KeptSink(job.variables, job.times)
     content, lasting = b"", False
     with _one_at_a_time, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a run warns of is in its message
@@ -175,22 +179,28 @@ def run_member(
             status, message = FAILED, str(error)
         except (Exception, SystemExit) as error:
             status, message = FAILED, worded(error)
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - start
     return report_of(job.key, status, message, content, lasting, seconds=seconds)
 
 
 def _ran(experiment: Experiment, sink: KeptSink, stopping: Callable[[], bool]) -> tuple[str, str]:
-    """Status and message of the run."""
+    """Return status and message of the run."""
     run = Simulation.of_scene(build_scene(experiment), watch=Watch(stopping))
-    said = run.warnings
+    messages = run.warnings
     report = record(run, sink)
     status, reason = report.outcome.status, report.outcome.stop_reason
-    return status, "; ".join((*said, *report.warnings)) if status in WHOLE else reason
+    return status, "; ".join((*messages, *report.warnings)) if status in WHOLE else reason
 
 
 def _refuse_other_versions(job: Job, experiment: Experiment) -> None:
-    """Raises PluginError: a machine of a cluster may have other versions than the sweep's own."""
-    here = {"pbdkit": version("pbdkit")} | experiment.distributions()
-    if here != job.versions:
-        told = [f"{k} {here.get(k)}, not {v}" for k, v in job.versions.items() if here.get(k) != v]
-        raise PluginError(f"the worker has {', '.join(told)}; install the same versions there")
+    """Raise PluginError where a machine of a cluster has other versions than the sweep."""
+    installed = {"pbdkit": version("pbdkit")} | experiment.distributions()
+    if installed != job.versions:
+        differences = [
+            f"{k} {installed.get(k)}, not {v}"
+            for k, v in job.versions.items()
+            if installed.get(k) != v
+        ]
+        raise PluginError(
+            f"the worker has {', '.join(differences)}; install the same versions there"
+        )

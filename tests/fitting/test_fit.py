@@ -360,7 +360,6 @@ WRONG = {
     "a force the other way": ({"force": {"group": 1, "value": [-1.0, 0.0]}}, "change its sign"),
     "bounds too wide": ({"unknown": {"rule.poisson_ratio": [0.2, 0.9]}}, "a bound is not valid"),
     "a term twice": ({"measured": {"distortion": {"ux": [[1, 0], [1, 0]]}}}, "twice"),
-    "of strength": ({"kind": "strength"}, "fit_strength"),
 }
 
 

@@ -149,9 +149,9 @@ def test_a_margin_leaves_out_as_many_points_of_a_grid_as_of_a_rectangle(tmp_path
         found = pbdkit.fit(
             {"experiment": made, "unknown": {"rule.poisson_ratio": [0.0, 0.49]}, "measured": given}
         )
-        assert found.met[0].numbers == 2 * expected
-        assert found.met[0].left_out == 300 - expected
-        assert "nearer to its outline than the margin" in found.met[0].left_out_because
+        assert found.misfits[0].numbers == 2 * expected
+        assert found.misfits[0].left_out == 300 - expected
+        assert "nearer to its outline than the margin" in found.misfits[0].left_out_because
 
 
 @pytest.mark.parametrize("radius", [0.3, 1.6, 2.6])

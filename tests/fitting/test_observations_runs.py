@@ -10,7 +10,7 @@ import pytest
 
 import pbdkit
 from pbdkit.fitting.fit import problem_of
-from pbdkit.fitting.fit_file import described_fit
+from pbdkit.fitting.fit_file import Fit, read_fit
 from pbdkit.fitting.observations import TracksObservation
 from pbdkit.plotting.fit_figures import draw_fit
 from pbdkit.simulation import Simulation
@@ -94,7 +94,7 @@ def test_tracks_in_time_tell_the_material_and_the_relaxation(measured):
     found = pbdkit.fit({"experiment": bar(), "unknown": TOLD, "measured": tracks(measured)})
     within(found)
     assert found.ratio == pytest.approx(1.0, abs=0.2)
-    assert found.met[0].left_out == 0
+    assert found.misfits[0].left_out == 0
 
 
 @pytest.mark.parametrize("against", ["displacement", "time"])
@@ -135,7 +135,7 @@ def test_with_units_forces_are_newtons_and_the_modulus_is_in_mpa(measured, tmp_p
     assert modulus.value == pytest.approx(MODULUS, abs=4 * modulus.error)
     assert re.search(r"^Young's modulus: [\d.]+ ± [\d.]+ MPa$", str(found), re.M)
     assert modulus.as_dict()["unit"] == "MPa"
-    assert " N, over " in str(found.met[0])
+    assert " N, over " in str(found.misfits[0])
     axes = draw_fit(found).subfigs[0].axes
     assert axes[0].get_title() == "force on group 1 (N)"
     assert axes[0].get_xlabel() == "displacement of group 1 (mm)"
@@ -152,7 +152,7 @@ def test_two_measurements_tell_more_than_each(measured):
     ]
     one, other, together = (f.solution.covariance[0, 0] / max(1, f.ratio) ** 2 for f in found)
     assert 1 / together == pytest.approx(1 / one + 1 / other, rel=0.02)
-    assert [met.kind for met in found[2].met] == ["tracks", "curve"]
+    assert [met.kind for met in found[2].misfits] == ["tracks", "curve"]
 
 
 def test_a_weight_counts_like_a_smaller_noise(measured):
@@ -183,13 +183,13 @@ def test_residuals_are_told_over_the_same_noise_whatever_the_weight(noise, measu
         for weight in (1.0, 0.25, 4.0)
     }
     whole = found.pop(1.0)
-    assert whole.met[0].noise == pytest.approx(NOISE, rel=0.1)
+    assert whole.misfits[0].noise == pytest.approx(NOISE, rel=0.1)
     for weight, each in found.items():
-        assert each.met[0].noise == pytest.approx(whole.met[0].noise, rel=1e-6)
-        assert each.met[0].ratio == pytest.approx(whole.met[0].ratio, rel=1e-6)
+        assert each.misfits[0].noise == pytest.approx(whole.misfits[0].noise, rel=1e-6)
+        assert each.misfits[0].ratio == pytest.approx(whole.misfits[0].ratio, rel=1e-6)
         assert each.ratio == pytest.approx(whole.ratio, rel=1e-6)
         own = np.sqrt(np.mean(each.numbers().residual ** 2))
-        assert each.met[0].ratio * each.met[0].noise == pytest.approx(own, rel=1e-6)
+        assert each.misfits[0].ratio * each.misfits[0].noise == pytest.approx(own, rel=1e-6)
         errors = [f.values["rule.poisson_ratio"].error for f in (each, whole)]
         assert errors[0] / errors[1] == pytest.approx(max(1.0, weight**-0.5), rel=0.1)
 
@@ -220,7 +220,7 @@ SETTLING = {"type": "stepping", "relaxation": 0.8, "engine": "numpy", "settle": 
 
 def posed(experiment, given):
     fit = {"experiment": experiment, "unknown": {"rule.poisson_ratio": [0.0, 0.45]}}
-    asked, source = described_fit(fit | {"measured": given}, given=False)
+    asked, source = read_fit(Fit, fit | {"measured": given})
     return problem_of(asked, pbdkit.Experiment.build(source))
 
 
@@ -342,7 +342,7 @@ def test_a_measurement_may_have_settings_of_its_own(measured, tmp_path):
         {"experiment": bar(), "unknown": unknown, "measured": [curve(measured), second]}
     )
     within(found)
-    assert found.met[1].ratio < 0.5  # it has no noise
+    assert found.misfits[1].ratio < 0.5  # it has no noise
 
 
 def test_derivatives_are_those_of_differences(measured):
@@ -351,7 +351,7 @@ def test_derivatives_are_those_of_differences(measured):
         "unknown": TOLD,
         "measured": [tracks(measured), curve(measured)],
     }
-    asked, source = described_fit(fit, given=False)
+    asked, source = read_fit(Fit, fit)
     problem = problem_of(asked, pbdkit.Experiment.build(source))
     z = problem.start()
     at = problem.at(z)

@@ -11,19 +11,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 from scipy.stats import weibull_min
 
 import pbdkit
 from pbdkit.fitting import strength as strength_simulation
+from pbdkit.fitting.fit_file import Peaks, is_strength_fit
 from pbdkit.fitting.strength import (
     LAWS,
     BondStrains,
     Breaks,
     ElasticResponse,
-    Peaks,
     Specimens,
     bond_strains,
-    is_strength_fit,
     seeded,
     strengths,
     weibull_sums,
@@ -269,7 +269,7 @@ def test_where_the_first_break_is_not_the_failure_it_is_said():
         "measured": {"peaks": specimens.tolist(), "of": "force"}, "method": "likelihood",
         "check": 4,
     }  # fmt: skip
-    found = pbdkit.fit_strength(fit)
+    found = pbdkit.fit(fit)
     assert not found.checked.holds
     assert "the first break is not the failure" in str(found)
     assert found.as_dict()["first_break_is_failure"] is False
@@ -346,6 +346,8 @@ def test_kinds_of_fits_are_told_apart():
     assert is_strength_fit({"kind": "strength"})
     assert not is_strength_fit("plate-with-hole")
     assert not is_strength_fit("nowhere")
+    with pytest.raises(pbdkit.ExperimentError, match="a fit of strength is to peaks"):
+        pbdkit.fit("fibres", measured=xarray.Dataset())
 
 
 def test_a_sample_of_the_long_trial():

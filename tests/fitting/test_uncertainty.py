@@ -9,7 +9,7 @@ import pytest
 
 import pbdkit
 from pbdkit.fitting.fit import problem_of
-from pbdkit.fitting.fit_file import described_fit
+from pbdkit.fitting.fit_file import Fit, read_fit
 from pbdkit.fitting.problem import rise_of_loss
 from pbdkit.fitting.uncertainty import _marginal
 from tests.fitting.test_fit import NOISE, fitted, in_series, measured, plate
@@ -234,7 +234,7 @@ def test_wide_bounds_start_where_the_gap_is_least(tmp_path):
         "measured": {"file": str(tmp_path / "field.csv"), "noise": NOISE},
         "modes": 4,
     }
-    asked, source = described_fit(fit, given=False)
+    asked, source = read_fit(Fit, fit)
     start = problem_of(asked, pbdkit.Experiment.build(source)).start()[0]
     assert 0.5 < start < 3.0
     found = pbdkit.fit(fit)

@@ -8,8 +8,7 @@ import pytest
 from scene_strategies import in_turn
 
 import pbdkit
-from pbdkit.fitting.fit_file import shipped_fits
-from pbdkit.fitting.fit_schema import fit_schema
+from pbdkit.fitting.fit_file import fit_schema, shipped_fits
 from pbdkit.io.layout import dataset_schema
 from pbdkit.model.reading import read_file
 from pbdkit.model.schema import experiment_schema

@@ -31,6 +31,7 @@ from scipy.stats import chi2
 
 import pbdkit
 from pbdkit.fitting import strength as strength_simulation
+from pbdkit.fitting.fit_file import Peaks, StrengthFit
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.strength import (
     LAWS,
@@ -38,10 +39,8 @@ from pbdkit.fitting.strength import (
     Breaks,
     ElasticResponse,
     MachineReading,
-    Peaks,
     Specimen,
     Specimens,
-    StrengthFit,
     fit_strength_of,
     fitted_strength,
     seeded,
