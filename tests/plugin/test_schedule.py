@@ -165,11 +165,9 @@ def test_each_step_is_that_of_a_scene_with_the_numbers_at_its_end(name):
 
 
 @pytest.mark.parametrize("name", COMPILED)
-def test_kernels_follow_courses_to_the_bit(name, request):
-    """The one with most in it compiled, the others interpreted."""
+def test_kernels_follow_courses_to_the_bit(name, interpreted):
+    """`stepping/numba_engine/test_engine` compiles one that has several."""
     parts = CHANGING[name]
-    if name != "both":
-        request.getfixturevalue("interpreted")
     one = pbdkit.run(sheet(**parts), progress=False)
     other = pbdkit.run(sheet(engine="compiled", **parts), progress=False)
     assert same(one, other)

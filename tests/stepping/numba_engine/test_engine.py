@@ -177,7 +177,30 @@ COMPILED = {
         "initial": {"type": "noise", "amplitude": 0.1},
         "solver": {"type": "stepping", "relaxation": 0.7, "memory": 0.2},
     },
-    "matrices of a frame that tears": {"frame": Turning(), "fracture": TORN | {"placement": 1.0}},
+    "matrices of a frame, all that tears, guides and changes": {
+        "frame": Turning(),
+        "fracture": {
+            "type": "strain",
+            "failure": {"steps": [3, 20], "values": [0.6, 0.3]},
+            "cracks": TORN["cracks"],
+        },
+        "cuts": [{"from": [5.5, 7.0], "to": [5.5, 4.6], "at": 6}],
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}, "axes": ["x"]},
+            pull_right(0.3, 0.1) | {"until": 9},
+        ],
+        "obstacles": [
+            {
+                "shape": {"half_plane": {"point": [0.0, -0.3], "normal": [0.1, 1.0]}},
+                "motion": {"type": "velocity", "velocity": [0.0, 0.1], "steps": 8},
+            }
+        ],
+        "solver": {
+            "type": "stepping",
+            "relaxation": {"steps": [2, 9], "values": [0.8, 0.6]},
+            "memory": 0.2,
+        },
+    },
     "48 neighbours that soften, drawn and counted": {
         "neighbours": MANY,
         "rule": Tiring(spread=0.1),
