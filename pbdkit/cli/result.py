@@ -15,7 +15,7 @@ import numpy as np
 from pbdkit.cli.output import refuse_output
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io import vtkhdf
-from pbdkit.io.explain import BondStatus, BondTable
+from pbdkit.io.explain import BondRecords, BondStatus
 from pbdkit.io.layout import scene_of
 from pbdkit.io.open import reading
 from pbdkit.io.other_files import refuse_other_file
@@ -35,14 +35,14 @@ def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_jso
     For one bond, report its distance from breaking, or its break, and what happened around it.
     """
     with waiting(f"reading {file}", silent=as_json), reading(file, at=at) as dataset:
-        explained = BondTable(dataset, scene_of(dataset, "explain"))
+        explained = BondRecords(dataset, scene_of(dataset, "explain"))
         facts = _bond_facts(explained, *bond) if bond else _run_facts(explained)
         lines = _bond_in_words(facts) if bond else _run_in_words(facts)
         text = json.dumps(facts, default=asdict) if as_json else "\n".join(lines)
     click.echo(text)
 
 
-def _run_facts(explained: BondTable) -> dict[str, Any]:
+def _run_facts(explained: BondRecords) -> dict[str, Any]:
     steps = explained.steps
     return {
         "fracture": explained.model.type,
@@ -55,7 +55,7 @@ def _run_facts(explained: BondTable) -> dict[str, Any]:
     }
 
 
-def _bond_facts(explained: BondTable, a: int, b: int) -> dict[str, Any]:
+def _bond_facts(explained: BondRecords, a: int, b: int) -> dict[str, Any]:
     row = explained.row(a, b)
     step, strain = explained.most_strained(row)
     (standing,) = explained.statuses(np.array([row]))

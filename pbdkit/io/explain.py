@@ -56,7 +56,7 @@ class BondStatus:
         return self.strain / self.breaks_above if self.breaks_above else None
 
 
-class BondTable:
+class BondRecords:
     """The bonds of a dataset and their histories. Raises ExperimentError where the dataset has no
     table of bonds."""
 

@@ -24,7 +24,7 @@ from pbdkit.array_types import Array
 from pbdkit.bench.work_precision import COLUMNS
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io.atomic_file import write
-from pbdkit.io.explain import BondStatus, BondTable
+from pbdkit.io.explain import BondRecords, BondStatus
 from pbdkit.io.layout import OF_BODY, in_this_layout, json_attribute, scene_of
 from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone
 from pbdkit.io.open import reading
@@ -337,7 +337,7 @@ def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> BondArray
     if dataset.sizes.get("bond") == 0:  # of a body whose particles have no neighbours
         return None
     if scene is not None and "bond_ends" in dataset.variables:
-        return _from_bond_table(BondTable(dataset, scene), dataset)
+        return _from_bond_table(BondRecords(dataset, scene), dataset)
     if "bond_ends" in dataset.variables and dataset["bond_ends"].ndim == 2:
         return _from_table(dataset)
     if scene is None or scene.experiment.neighbours.nearness():
@@ -358,7 +358,7 @@ def _whole(ends: Array, rest: Array, shell: Array) -> BondArrays:
     return BondArrays(ends, rest, shell, never, unknown, unknown, state, order)
 
 
-def _from_bond_table(table: BondTable, dataset: xarray.Dataset) -> BondArrays:
+def _from_bond_table(table: BondRecords, dataset: xarray.Dataset) -> BondArrays:
     bonds = table.bonds
     names = table.remembered(0) if len(bonds) else ()
     last = {n: dataset[n].isel(time=-1, missing_dims="ignore").values for n in names}

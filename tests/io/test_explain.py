@@ -8,7 +8,7 @@ from property_cases import pull_right
 from remembering_parts import Weakest
 
 import pbdkit
-from pbdkit.io.explain import BondTable
+from pbdkit.io.explain import BondRecords
 from pbdkit.scene.scene import build_scene
 
 RATE = 0.03125
@@ -153,7 +153,7 @@ def test_a_run_without_bonds(explain):
 
 def explained(given, **more):
     ds = pbdkit.run(given, progress=False, **more)
-    return ds, BondTable(ds, build_scene(pbdkit.Experiment(**given)))
+    return ds, BondRecords(ds, build_scene(pbdkit.Experiment(**given)))
 
 
 @pytest.mark.parametrize(
@@ -206,4 +206,4 @@ def test_a_file_that_was_changed_is_refused():
     ds = pbdkit.run(given, progress=False)
     other = build_scene(pbdkit.Experiment(**given | {"neighbours": {"type": "chebyshev"}}))
     with pytest.raises(pbdkit.ExperimentError, match="its bonds are not those of the experiment"):
-        BondTable(ds, other)
+        BondRecords(ds, other)

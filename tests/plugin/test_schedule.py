@@ -17,7 +17,7 @@ from pbdkit.equilibrium.solve import moments
 from pbdkit.errors import NotSharedError
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting, scene_like
-from pbdkit.io.explain import BondTable
+from pbdkit.io.explain import BondRecords
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source
@@ -378,7 +378,7 @@ def test_wrong_courses_are_told_with_their_place(name):
 
 
 def test_explain_says_the_limit_of_the_step_in_which_a_bond_broke(aged):
-    found = BondTable(aged, build_scene(pbdkit.load("modelling/ageing")))
+    found = BondRecords(aged, build_scene(pbdkit.load("modelling/ageing")))
     broken = found.steps > 0
     limits = np.interp(found.steps[broken], [100, 1000], [0.2, 0.02])
     np.testing.assert_allclose(found.limits[broken], limits, rtol=1e-12)

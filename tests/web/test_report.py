@@ -14,7 +14,7 @@ from hypothesis import given, strategies as st
 from PIL import Image
 
 import pbdkit
-from pbdkit.io.explain import BondTable
+from pbdkit.io.explain import BondRecords
 from pbdkit.io.layout import json_attribute
 from pbdkit.model.reading import read_text
 from pbdkit.scene.scene import build_scene
@@ -172,7 +172,7 @@ def test_a_click_on_a_particle_shows_its_history(page, sheet):
 
 def test_a_click_on_a_bond_tells_its_story(page, torn):
     dataset, path = torn
-    known = BondTable(dataset, build_scene(pbdkit.load("paper/d1")))
+    known = BondRecords(dataset, build_scene(pbdkit.load("paper/d1")))
     opened(page, path)
     show_step(page, 0)
     first = known.order[0]
