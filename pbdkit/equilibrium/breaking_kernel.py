@@ -7,7 +7,7 @@ sides: `wide` is the number of unknowns of a follower. Row i of a band holds A[i
 i + half]. Factors are L with ones on the diagonal and U, without exchanges, in its place. A row
 depends on earlier rows only: if bonds have changed, only rows from the first of them on are
 assembled and factorised again, from the moves caused by a displacement of each neighbour by 1 at
-rest, which is exact for linear rules. The general path takes 25 times as long
+rest, which is exact for linear rules. The general path takes 20 times as long
 (docs/decisions/0010).
 """
 

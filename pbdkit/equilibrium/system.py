@@ -32,10 +32,11 @@ from pbdkit.scene.leader_groups import Leading, kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.engine_choice import Choice, make_engine, obstacle
-from pbdkit.stepping.followers import SlotFollowers
-from pbdkit.stepping.leaders import Guidance
+from pbdkit.stepping.followers import MoveFollowers, SlotFollowers
 from pbdkit.stepping.numpy_engine import Engine
+from pbdkit.stepping.program import Program, moves_of
 from pbdkit.stepping.state import State
+from pbdkit.stepping.step import Step
 
 LARGEST_BY_NUMPY = 20_000
 """Number of particles beyond which moves are evaluated by the compiled engine."""
@@ -54,7 +55,6 @@ class Moves:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
         self._scene = scene
         self._engine: Engine | None = None
-        self._guidance = Guidance(scene)
         self.contact = Contact(scene) if scene.barriers else None
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         self._loads = replace(scene.loads) if scene.loads else None
@@ -66,7 +66,10 @@ class Moves:
             stepped = replace(free, experiment=experiment, leading=_resting(scene))
             choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
             self._engine, _ = make_engine(stepped, choice)
-        self._followers = None if self._engine else SlotFollowers(stepped, stepping)
+        self._operations: Program = ()
+        if self._engine is None:
+            sweep = MoveFollowers(stepped, SlotFollowers(stepped, stepping))
+            self._operations = moves_of(stepped, sweep)
 
     @property
     def is_compiled(self) -> bool:
@@ -105,11 +108,9 @@ class Moves:
             start = replace(state, step=step - 1, previous=np.zeros_like(u), starts=none)
             moves = self._engine.advance(start).u
         else:
-            assert self._followers
             moves = u.astype(float)
-            with np.errstate(all="ignore"):
-                self._followers.move(u, moves, state)
-                self._guidance.correct(moves, u, step)
+            for operation in self._operations:
+                operation.apply(Step(step, u, moves, state))
         with np.errstate(all="ignore"):
             moves -= u
         self._stop(moves, step)

@@ -256,6 +256,8 @@ def _summed(part: Any, owner: Indices, count: int) -> Any:
 class MoveFollowers(Operation):
     """Move the particles of the body by the rule, leaders and guided particles too."""
 
+    makes_moves = True
+
     def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
         super().__init__(scene)
         self._known = followers

@@ -492,6 +492,8 @@ class HoldDirections(TurnDirections):
 class CorrectGuided(Operation):
     """Add what guided particles make of the moves along the axes along which they lead."""
 
+    makes_moves = True
+
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         self._guidance = Guidance(scene)

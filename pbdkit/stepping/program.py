@@ -47,6 +47,11 @@ def program_of(scene: Scene, sweep: MoveFollowers | None = None) -> Program:
     return tuple(found)
 
 
+def moves_of(scene: Scene, sweep: MoveFollowers) -> Program:
+    """Return the operations that make the moves of a scene's particles, in the order of a step."""
+    return tuple(operation for operation in program_of(scene, sweep) if operation.makes_moves)
+
+
 def hindrance(scene: Scene, mode: Mode) -> Hindrance | None:
     """Return the first reason for which the steps of a scene cannot be made in a mode; None where
     they can."""

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 from numpy.typing import NDArray
 
@@ -82,6 +82,10 @@ class Step:
 
 class Operation(ABC):
     """What one feature of a scene does in a step."""
+
+    makes_moves: ClassVar[bool] = False
+    """Whether it contributes to the move that a rule makes from given positions. An equilibrium is
+    where these moves vanish; the other operations place what is given there, or change bonds."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
