@@ -143,7 +143,7 @@ def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
 def _free(hats: Any, held: Mask) -> tuple[Any, Mask]:
     """Return the hats of free unknowns, and a mask of the held unknowns of the next grid: those to
     which a held unknown is nearer than any other."""
-    led_weights, free_weights = (_chosen(some) @ hats for some in (held, ~held))
+    led_weights, free_weights = (_chosen(mask) @ hats for mask in (held, ~held))
     below = (led_weights.max(axis=0).toarray() > free_weights.max(axis=0).toarray()).ravel()
     return (free_weights @ _chosen(~below)).tocsr(), below
 
@@ -168,7 +168,7 @@ def _nearest(at: Floats, low: Indices, shape: tuple[int, ...]) -> Floats:
 
 def _pieces(A: Any, axes: int, row: Indices, point: Indices, count: int) -> tuple[int, Indices]:
     """Return the number of pieces and the piece of each entry of hats. Entries around one point
-    whose particles are bonded to each other form one piece."""
+    belong to one piece if their particles are bonded to each other."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import connected_components
 

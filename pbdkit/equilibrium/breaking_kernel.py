@@ -131,36 +131,36 @@ def solve(band: Any, inverse: Any, x: Any) -> None:
 
 
 def refactor(
-    work: Any, blocks: Any, pattern: Any, factors: Any, known: Any, first: int, alike: bool
+    work: Any, blocks: Any, pattern: Any, factors: Any, facts: Any, first: int, is_uniform: bool
 ) -> None:
-    """Update the factors from follower `first` on. `known` holds the number of unknowns of a
+    """Update the factors from follower `first` on. `facts` holds the number of unknowns of a
     follower, the norm of A⁻¹ for random signs times a safety factor, the largest diagonal entry,
-    and the reach of the band; `alike` is true if all axes of frame points follow alike."""
+    and the reach of the band; `is_uniform` is true if all axes of frame points follow alike."""
     diagonal, inverse, signs = factors
     count, axes = blocks.shape[0], blocks.shape[2]
-    wide = 1 if alike and are_alike(blocks) else axes
-    if wide != known[0]:
+    wide = 1 if is_uniform and are_alike(blocks) else axes
+    if wide != facts[0]:
         first = 0
-    known[0], known[2] = wide, 1.0
-    band, size = rows_of(work, count, int(known[3]), wide), count * wide
+    facts[0], facts[2] = wide, 1.0
+    band, size = rows_of(work, count, int(facts[3]), wide), count * wide
     assemble(band, blocks, pattern, first, wide)
     factor(band, first * wide, diagonal, inverse)
     x = np.empty((size, 1))
     for i in range(size):
         x[i, 0] = signs[i]
-        known[2] = max(known[2], abs(diagonal[i]))
+        facts[2] = max(facts[2], abs(diagonal[i]))
     solve(band, inverse, x)
-    known[1] = SAFETY * largest(x)
+    facts[1] = SAFETY * largest(x)
 
 
-def correct(work: Any, factors: Any, known: Any, r: Any, c: Any) -> None:
+def correct(work: Any, factors: Any, facts: Any, r: Any, c: Any) -> None:
     """Solve A c = r for c, (follower, axis)."""
     count, axes = r.shape
-    wide = 1 if known[0] == 1.0 else axes
+    wide = 1 if facts[0] == 1.0 else axes
     for e in range(count):
         for a in range(axes):
             c[e, a] = r[e, a]
-    band = rows_of(work, count, int(known[3]), wide)
+    band = rows_of(work, count, int(facts[3]), wide)
     solve(band, factors[1], c.reshape(count * wide, axes // wide))
 
 

@@ -213,10 +213,10 @@ class ErrorBound:
                 return self._outlook(start, at_rest)
         return self._outlook(start, self._linearised(start, u), anew=True)
 
-    def _system_at_rest(self, here: State) -> System:
-        system, broken = self._at_rest, broken_bonds(here)
+    def _system_at_rest(self, state: State) -> System:
+        system, broken = self._at_rest, broken_bonds(state)
         if system is None or broken != self._broken or system.iterations:
-            system = self._linearised(here, np.zeros_like(here.u))
+            system = self._linearised(state, np.zeros_like(state.u))
             self._at_rest, self._broken = system, broken
         return system
 
@@ -224,15 +224,15 @@ class ErrorBound:
         at, steps = replace(state, u=u), self._scene.experiment.steps
         return linearised(self._scene, at, steps, "auto", self._watch)
 
-    def _outlook(self, here: State, known: System, *, anew: bool = False) -> PredictedEquilibrium:
+    def _outlook(self, state: State, system: System, *, anew: bool = False) -> PredictedEquilibrium:
         """Predict by the system at rest, or by one linearised `anew` at the state."""
-        moves = self._moves.at(here, self._scene.experiment.steps)
-        ahead, distance = here.u.copy(), math.inf
-        correction, obstacle = self._correction(here, known, moves, anew)
+        moves = self._moves.at(state, self._scene.experiment.steps)
+        ahead, distance = state.u.copy(), math.inf
+        correction, obstacle = self._correction(state, system, moves, anew)
         if correction is not None:
             ahead += correction
-            remainder = self._moves.at(replace(here, u=ahead), self._scene.experiment.steps)
-            bound = known.distance(remainder, self._moves.rounding(ahead)) * (
+            remainder = self._moves.at(replace(state, u=ahead), self._scene.experiment.steps)
+            bound = system.distance(remainder, self._moves.rounding(ahead)) * (
                 FIRST_ORDER if anew else 1.0
             )
             distance = float(np.sqrt((correction**2).sum(axis=0)).max(initial=0.0)) + bound
@@ -243,36 +243,38 @@ class ErrorBound:
                 distance, obstacle = math.inf, BENT
         distance = math.inf if math.isnan(distance) else distance
         certificate = Certificate(
-            method=known.methods,
+            method=system.methods,
             iterations=1,
-            inner_iterations=known.iterations,
+            inner_iterations=system.iterations,
             residual=float(np.abs(moves).max(initial=0.0)),
             distance=distance,
             share=distance / self._scale,
-            bound=CORRECTION + known.how,
+            bound=CORRECTION + system.how,
             linearised=anew,
         )
         return PredictedEquilibrium(ahead, certificate, obstacle)
 
     def _correction(
-        self, here: State, known: System, moves: Floats, anew: bool
+        self, state: State, system: System, moves: Floats, anew: bool
     ) -> tuple[Floats | None, str]:
         """Return the correction; None, with the reason, if no equilibrium is known."""
         try:
             if anew:
-                known.refuse_moving_floats(moves, self._moves.rounding(here.u))
-            rounding = known.amplification * self._moves.rounding(here.u)
-            return known.solve(moves, ACCURACY * self._scale, here, rounding), ""
+                system.refuse_moving_floats(moves, self._moves.rounding(state.u))
+            rounding = system.amplification * self._moves.rounding(state.u)
+            return system.solve(moves, ACCURACY * self._scale, state, rounding), ""
         except ExperimentError as error:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"
 
-    def _is_linear(self, here: State, known: System) -> bool:
+    def _is_linear(self, state: State, system: System) -> bool:
         """Return whether random displacements, of the size of those of the body, cause the moves of
         the linearisation at rest."""
-        size = float(np.abs(here.u).max()) or spacing_of(self._scene)
+        size = float(np.abs(state.u).max()) or spacing_of(self._scene)
         probe, steps = random_displacements(self._scene, size), self._scene.experiment.steps
-        moves, moved = (self._moves.at(replace(here, u=u), steps) for u in (here.u, here.u + probe))
-        return known.mismatch(probe, moves, moved) <= LINEAR
+        moves, moved = (
+            self._moves.at(replace(state, u=u), steps) for u in (state.u, state.u + probe)
+        )
+        return system.mismatch(probe, moves, moved) <= LINEAR
 
 
 FINEST, COARSEST = 256, 4

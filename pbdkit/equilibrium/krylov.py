@@ -166,7 +166,7 @@ class ConjugateGradients(LatticeKrylov):
 
 @dataclass
 class Stabilised(KrylovResult):
-    """Result of the stabilised biconjugate gradient iteration, whose jumps are not monotonic."""
+    """Result of the stabilised biconjugate gradient iteration; its jumps are not monotonic."""
 
     x: Floats
     jumps: list[float] = field(default_factory=list)

@@ -223,23 +223,25 @@ class PreconditionedKrylov(LinearSolver):
         if not 0.0 < whole < math.inf:
             return np.zeros_like(b)
 
-        def tell(left: float) -> None:
+        def report(residual: float) -> None:
             self.iterations += 1
-            self._watch.look(math.log(left) / math.log(accuracy) if 0.0 < left < 1.0 else 0.0)
+            self._watch.look(
+                math.log(residual) / math.log(accuracy) if 0.0 < residual < 1.0 else 0.0
+            )
 
-        def told(r: Floats) -> Floats:
+        def precondition(r: Floats) -> Floats:
             """Precondition the residual of an iteration of conjugate gradients."""
-            tell(float(np.linalg.norm(r)) / whole)
+            report(float(np.linalg.norm(r)) / whole)
             return self._cycle(r)
 
-        first = told if self._symmetric else self._cycle
+        first = precondition if self._symmetric else self._cycle
         M = LinearOperator(self._matrix.shape, matvec=first, dtype=float)
         how: dict[str, Any] = {"M": M, "rtol": accuracy, "atol": 0.0}
         with np.errstate(all="ignore"):  # A that is no matrix for it: what comes out shows it
             if self._symmetric:
                 x, _ = cg(self._matrix, b, maxiter=self._most, **how)
             else:
-                how |= {"callback": tell, "callback_type": "pr_norm", "restart": 30}
+                how |= {"callback": report, "callback_type": "pr_norm", "restart": 30}
                 x, _ = gmres(self._matrix, b, maxiter=MAX_ITERATIONS // 30, **how)
         self._watch.look(1.0)
         return np.asarray(x)

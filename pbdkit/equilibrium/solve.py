@@ -45,7 +45,7 @@ def finder_of(
     rows: Rows = ALL,
 ) -> Finder:
     """Return the search for equilibria of a scene, from its initial state. `compiles` is false if
-    many scenes with different parameters follow, whose moves are not worth compiling."""
+    many scenes with different parameters follow, for which compiling the moves does not pay."""
     settings, scale = scene.experiment.solver.equilibrium, scale_of(scene, start, rows)
     length = settings.tolerance * scale
     return Finder(scene, length, scale, settings.method, watch or Watch(), compiles, rows)
@@ -451,13 +451,15 @@ def _settle_bonds_at(
     finder: Finder,
     since: float,
     moment: float,
-    most: int,
+    max_changes: int,
     step: int = 0,
 ) -> Certificate:
-    """Move to equilibrium until no bond changes any more, at most `most` times. Bonds break in a
-    `step`, by default that of the moment."""
+    """Move to equilibrium until no bond changes any more, at most `max_changes` times.
+
+    Bonds break in a `step`, by default that of the moment.
+    """
     fracturing = Fracturing.of(scene.at(moment))
-    for _ in range(most):
+    for _ in range(max_changes):
         if finder.linear:
             certificate = _settle_at(scene, state, finder, moment)
         else:
