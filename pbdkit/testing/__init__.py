@@ -1,13 +1,13 @@
-"""The conformance suite: every property that components of an interface must have, for anybody's.
+"""The conformance suite: the properties that every component of an interface must have.
 
-In a plugin's tests one line is enough::
+In the tests of a plugin one line is enough::
 
     from pbdkit.testing import conformance
 
     test_conformance = conformance(MyRule())
 
-`examine` gives the same as a report, and `pbdkit plugins check DISTRIBUTION` does it for all
-components of a distribution. docs/extending/testing.md lists the properties.
+`examine` returns the same as a report, and `pbdkit plugins check DISTRIBUTION` tests all components
+of a distribution. docs/extending/testing.md lists the properties.
 """
 
 from pbdkit.testing.conformance import (
@@ -19,11 +19,11 @@ from pbdkit.testing.conformance import (
     examine_all,
     properties_of,
 )
-from pbdkit.testing.subject import NotAskedError, Property, PropertyError, examples_of
+from pbdkit.testing.subject import NotApplicableError, Property, PropertyError, examples_of
 
 __all__ = [
     "PROPERTIES",
-    "NotAskedError",
+    "NotApplicableError",
     "Outcome",
     "Property",
     "PropertyError",

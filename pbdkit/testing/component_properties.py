@@ -1,7 +1,7 @@
 """Properties of components by themselves: parameters, lattices, neighbour metrics, the scenes that
-they take part in, and the answers of their functions.
+they take part in, and the results of their functions.
 
-Functions are called with whole arrays, single numbers and probes; their answers follow from their
+Functions are called with whole arrays, single numbers and probes; their results depend on their
 arguments alone.
 """
 
@@ -69,24 +69,24 @@ from pbdkit.testing.states import (
 )
 from pbdkit.testing.subject import (
     Arrays,
-    NotAskedError,
+    FunctionCall,
+    NotApplicableError,
     PropertyError,
-    Question,
     Subject,
-    asked_of,
     each,
     experiments_with,
     flat,
     place_of,
+    property_of,
 )
 
 WORD = r"[a-z][a-z0-9]*(-[a-z0-9]+)*"
 
 
-@asked_of()
+@property_of()
 def names_itself(subject: Subject) -> None:
-    """Its `type` is one literal in lower case, words joined by hyphens, so that experiments name
-    it, schemas tell it apart and `distribution:type` can be read."""
+    """The `type` is one literal in lower case, words joined by hyphens: experiments refer to it,
+    schemas distinguish components by it, and `distribution:type` is unambiguous."""
     component = type(subject.component)
     field, name = component.model_fields["type"], component.type_name()
     if not re.fullmatch(WORD, name):
@@ -96,10 +96,10 @@ def names_itself(subject: Subject) -> None:
         raise PropertyError(f"any other word passes as its type too: {remedy}")
 
 
-@asked_of()
+@property_of()
 def is_documented(subject: Subject) -> None:
-    """The class has a docstring and every parameter a description: the schema shows them, and with
-    it every editor."""
+    """The class has a docstring and every parameter a description: the JSON Schema contains them,
+    and editors show them."""
     component = type(subject.component)
     if not (component.__dict__.get("__doc__") or "").strip():
         raise PropertyError(f"{component.__name__} has no docstring: say what it computes")
@@ -109,10 +109,10 @@ def is_documented(subject: Subject) -> None:
             raise PropertyError(f"the parameter `{name}` has no description: write {remedy}")
 
 
-@asked_of()
+@property_of()
 def is_frozen(subject: Subject) -> None:
-    """Its parameters cannot be set after it is made, and it can be hashed: the same component is
-    shared by scenes and engines, and told from others by value."""
+    """Parameters cannot be changed and the component is hashable: scenes and engines share
+    components and compare them by value."""
     component = subject.component
     for name in type(component).model_fields:
         with suppress(ValidationError):
@@ -126,47 +126,46 @@ def is_frozen(subject: Subject) -> None:
         raise PropertyError("a copy of it is not equal to it, or has another hash")
 
 
-@asked_of()
+@property_of()
 def refuses_unknown_keys(subject: Subject) -> None:
-    """A parameter that it does not have is refused, so that a misspelt one is never ignored."""
-    given = subject.component.model_dump(by_alias=True) | {"no_such_parameter": 1}
+    """Unknown parameters raise an error: a misspelt one is never ignored."""
+    parameters = subject.component.model_dump(by_alias=True) | {"no_such_parameter": 1}
     with suppress(ValidationError):
-        type(subject.component).model_validate(given)
+        type(subject.component).model_validate(parameters)
         raise PropertyError('it takes any key: leave `extra` in `model_config` at "forbid"')
 
 
-@asked_of()
+@property_of()
 def survives_json(subject: Subject) -> None:
-    """Written as JSON and read again it is equal: every dataset carries its experiment as JSON, and
-    is run again from that."""
+    """Written as JSON and read again it is equal: every dataset contains its experiment as JSON."""
     component = subject.component
     text, kind = component.model_dump_json(by_alias=True), type(component)
-    for again in (kind.model_validate_json(text), kind.model_validate(json.loads(text))):
+    for copy in (kind.model_validate_json(text), kind.model_validate(json.loads(text))):
         for name in kind.model_fields:
-            before, after = getattr(component, name), getattr(again, name)
-            if before != after:
-                raise PropertyError(f"`{name}` is {before!r}, and {after!r} after JSON")
+            original, restored = getattr(component, name), getattr(copy, name)
+            if original != restored:
+                raise PropertyError(f"`{name}` is {original!r}, and {restored!r} after JSON")
 
 
-@asked_of()
+@property_of()
 def survives_pickling(subject: Subject) -> None:
-    """Pickled and unpickled it is equal, so that worker processes can be given it."""
+    """Pickled and unpickled it is equal: worker processes receive components by pickle."""
     try:
-        again = pickle.loads(pickle.dumps(subject.component))
+        copy = pickle.loads(pickle.dumps(subject.component))
     except Exception as error:
         kind = type(subject.component)
         importable = inspect.getmodule(kind) is not None and "<locals>" not in kind.__qualname__
         remedy = "" if importable else "; define the class at the top of a module"
         raise PropertyError(f"{type(error).__name__}: {error}{remedy}") from None
-    if again != subject.component:
+    if copy != subject.component:
         raise PropertyError("it is another one after pickling")
 
 
-@asked_of(Lattice, is_needed=True)
+@property_of(Lattice, is_needed=True)
 def has_a_sound_cell(subject: Subject) -> None:
-    """The cell vectors span an area, no two basis sites share an index, a place or a primitive
-    index, all lie within the period and near where their index says, and `primitive` counts equal
-    steps alike and leaves none out."""
+    """The cell vectors span an area; basis sites differ in index, position and primitive index, and
+    lie within the period, near the position of their index; `primitive` counts equal steps equally
+    and omits none."""
     try:
         cell = checked_cell(subject.component)
     except ExperimentError as error:
@@ -180,44 +179,44 @@ def has_a_sound_cell(subject: Subject) -> None:
 
 
 def _refuse_miscounted(cell: Cell) -> None:
-    """Raises where `primitive` tells one step from another that leads the same way, or two sites
-    alike, or counts in steps that no site takes."""
+    """Raise PropertyError if `primitive` counts equal steps differently, equal sites twice, or
+    steps between which there is no site."""
     if np.linalg.det(cell.primitive) == 0.0:
         raise PropertyError(f"`primitive` gives the cell vectors {cell.primitive}: in line")
-    for (m, one), (n, other) in combinations(enumerate(cell.sites), 2):
-        between = np.subtract(other.primitive, one.primitive).astype(float)
-        apart = np.linalg.solve(np.transpose(cell.primitive), between)
-        if np.abs(apart - np.round(apart)).max() < 1e-9:
-            fault = f"basis sites {m} and {n} have the same primitive index {one.primitive}"
+    for (m, site), (n, other_site) in combinations(enumerate(cell.sites), 2):
+        between = np.subtract(other_site.primitive, site.primitive).astype(float)
+        cells = np.linalg.solve(np.transpose(cell.primitive), between)
+        if np.abs(cells - np.round(cells)).max() < 1e-9:
+            fault = f"basis sites {m} and {n} have the same primitive index {site.primitive}"
             raise PropertyError(f"{fault}, up to whole cells: they must differ")
     counted: dict[tuple[float, ...], tuple[int, ...]] = {}
     lengths = [math.hypot(*vector) for vector in cell.vectors]
     for offset in chain(*(cell.offsets(s, 1.5 * sum(lengths)) for s in range(len(cell.sites)))):
         step = tuple((np.round(np.divide(tuple(offset.rest), lengths[0]), 6) + 0.0).tolist())
-        if (known := counted.setdefault(step, offset.primitive)) != offset.primitive:
-            twice = f"as {known} and from another as {offset.primitive}"
+        if (count := counted.setdefault(step, offset.primitive)) != offset.primitive:
+            twice = f"as {count} and from another as {offset.primitive}"
             counts = f"`primitive` counts the step {tuple(offset.rest)}"
             raise PropertyError(f"{counts} from one site {twice}")
-    first, *others = cell.sites
-    steps = [*cell.primitive, *(np.subtract(s.primitive, first.primitive) for s in others)]
-    spanned = [np.linalg.det(np.array(some)) for some in combinations(steps, len(cell.vectors))]
+    first, *further = cell.sites
+    steps = [*cell.primitive, *(np.subtract(s.primitive, first.primitive) for s in further)]
+    spanned = [np.linalg.det(np.array(basis)) for basis in combinations(steps, len(cell.vectors))]
     if np.gcd.reduce(np.rint(spanned).astype(int)) != 1:
         raise PropertyError("`primitive` counts steps that no site takes: count whole ones only")
 
 
-@asked_of(Lattice)
+@property_of(Lattice)
 def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
-    """The origin moves the lattice and does not enter its cell: no digit of a run depends on where
-    the body lies."""
+    """The origin moves the lattice and does not change its cell: no digit of a run depends on the
+    position of the body."""
     moved = subject.component.model_copy(update={"origin": (1000.3, -77.1)})
     if moved.cell() != subject.component.cell():
         raise PropertyError("another origin gives another cell: leave `self.origin` out of `cell`")
 
 
-@asked_of(NeighbourMetric, is_needed=True)
+@property_of(NeighbourMetric, is_needed=True)
 def is_mutual(subject: Subject) -> None:
-    """Whoever is a neighbour has this particle as its own neighbour, in the same shell, once: bonds
-    have two ends, and a body at rest stays at rest."""
+    """Neighbours are mutual, in the same shell, and occur once: bonds have two ends, and a body at
+    rest stays at rest."""
     for where, cell, _, _ in _tried(subject):
         try:
             build_neighbourhood(cell, subject.component)
@@ -225,10 +224,10 @@ def is_mutual(subject: Subject) -> None:
             raise PropertyError(f"{where}: {error}") from None
 
 
-@asked_of(NeighbourMetric)
+@property_of(NeighbourMetric)
 def takes_offsets_of_the_cell(subject: Subject) -> None:
-    """Every offset is one that the cell itself gives, so that its site index and its opposite
-    agree with the lattice's."""
+    """Every offset is one of the cell's own: its site index and its opposite agree with the
+    lattice."""
     for where, cell, s, shells in _tried(subject):
         for offset in chain(*shells):
             if offset != cell.offset(s, offset.target, offset.cell):
@@ -237,37 +236,37 @@ def takes_offsets_of_the_cell(subject: Subject) -> None:
                 raise PropertyError(f"{where} {fault}: {remedy}")
 
 
-@asked_of(NeighbourMetric)
+@property_of(NeighbourMetric)
 def takes_sublattices_in_any_order(subject: Subject) -> None:
-    """The basis sites in another order have the same neighbours: how a cell is written down means
-    nothing."""
+    """The order of the basis sites does not change neighbours: it is a matter of notation."""
     for where, cell, s, shells in _tried(subject):
         backwards = replace(cell, sites=cell.sites[::-1])
-        others = subject.component.shells_around(backwards, len(cell.sites) - 1 - s)
-        if [_sites(shell) for shell in shells] != [_sites(shell) for shell in others]:
+        shells_backwards = subject.component.shells_around(backwards, len(cell.sites) - 1 - s)
+        if [_sites(shell) for shell in shells] != [_sites(shell) for shell in shells_backwards]:
             fault = f"basis site {s} has other neighbours where the sites are listed backwards"
             raise PropertyError(f"{where} {fault}")
 
 
-@asked_of(NeighbourMetric, is_needed=True)
+@property_of(NeighbourMetric, is_needed=True)
 def finds_the_same_anew(subject: Subject) -> None:
-    """Neighbours that are found anew at every step are, in the reference configuration, those that
-    it chooses on the lattice."""
+    """Neighbours that are searched at every step are, in the reference configuration, the
+    neighbours on the lattice: a body at rest keeps its neighbours."""
     near = subject.component.nearness()
     if near is None:
-        raise NotAskedError("its neighbours stay as they are")
+        raise NotApplicableError("its neighbours stay as they are")
     scale = np.sqrt(near.weights)
     far, limit = near.radius / scale.min() * (1 + 1e-6), near.radius * (1 + 1e-9)
     for where, cell, s, shells in _tried(subject):
-        met = (o for o in cell.offsets(s, far) if np.hypot(*(scale * tuple(o.rest))) <= limit)
-        if _sites(met) != _sites(chain(*shells)):
+        offsets = (o for o in cell.offsets(s, far) if np.hypot(*(scale * tuple(o.rest))) <= limit)
+        if _sites(offsets) != _sites(chain(*shells)):
             fault = "`nearness` finds other neighbours in the reference configuration"
             raise PropertyError(f"{where} {fault} than `shells_around` chooses")
 
 
 def _tried(subject: Subject) -> Iterator[tuple[str, Cell, int, Sequence[Sequence[Offset]]]]:
-    """Each basis site of the lattices to try, but for those that the metric refuses: where it is,
-    in which cell, and the shells around it."""
+    """Yield basis sites of the tested lattices, except those that the metric refuses: place, cell,
+    sublattice and shells.
+    """
     metric = subject.component
     experiments = experiments_with(metric, subject.parts)
     for lattice in dict.fromkeys(experiment.lattice for experiment in experiments):
@@ -279,17 +278,17 @@ def _tried(subject: Subject) -> Iterator[tuple[str, Cell, int, Sequence[Sequence
 
 
 def _sites(offsets: Iterable[Offset]) -> set[tuple[int, ...]]:
-    """The steps between sites."""
+    """Return the steps between sites."""
     return {offset.site for offset in offsets}
 
 
 NAME = r"[a-z][a-z0-9_]*"
 
 
-@asked_of(Diagnostic)
+@property_of(Diagnostic)
 def labels_its_variables(subject: Subject) -> None:
-    """Every variable has a name in lower case, a long name and units ("1" where it has none), so
-    that a dataset can be read without the program; none is a name that the dataset has already."""
+    """Every variable has a name in lower case that the dataset does not reserve, a long name, and
+    units ("1" if it has none): the dataset can be read without the program."""
     diagnostic = subject.component
     variables = {variable.name: variable for variable in diagnostic.variables()}
     for name in (*diagnostic.coordinates(), diagnostic.own_dimension, *variables):
@@ -299,25 +298,25 @@ def labels_its_variables(subject: Subject) -> None:
         _refuse_unlabelled(variable, f"the variable '{name}'", "my_quantity")
 
 
-def _refuse_unlabelled(quantity: Any, told: str, example: str) -> None:
+def _refuse_unlabelled(quantity: Any, description: str, example: str) -> None:
     if not re.fullmatch(NAME, quantity.name):
-        raise PropertyError(f"{told} is not named as `{example}` is")
+        raise PropertyError(f"{description} is not named as `{example}` is")
     for what in ("long_name", "units"):
         if not getattr(quantity, what).strip():
-            raise PropertyError(f"{told} has no {what}")
+            raise PropertyError(f"{description} has no {what}")
 
 
-@asked_of(is_needed=True)
+@property_of(is_needed=True)
 def takes_part(subject: Subject) -> None:
-    """A scene can be built with it: at least one of those tried takes it, and none makes it fail
-    with anything but an ExperimentError."""
+    """At least one of the tested scenes can be built with it: it may refuse others by an
+    ExperimentError, and raises nothing else."""
     assert subject.scenes
 
 
-@asked_of(FollowerRule, FractureModel, is_needed=True)
+@property_of(FollowerRule, FractureModel, is_needed=True)
 def declares_what_it_remembers(subject: Subject) -> None:
-    """Every number that it remembers has a name in lower case that is free in the dataset, a long
-    name, units ("1" where it has none), and an initial value that its dtype holds."""
+    """Every number that it remembers has a name in lower case that the dataset does not reserve, a
+    long name, units ("1" if it has none), and an initial value that its dtype can hold."""
     for scene in subject.scenes:
         numbers = remembered(subject, scene)
         remembered_names(scene.experiment)  # refuses what is declared twice
@@ -330,27 +329,33 @@ def declares_what_it_remembers(subject: Subject) -> None:
 
 
 def remembered(subject: Subject, scene: Scene) -> tuple[Remembered, ...]:
-    """The numbers that a rule or a fracture model remembers; NotAskedError where there are none."""
+    """Return the numbers that a rule or a fracture model remembers.
+
+    Raises
+    ------
+    NotApplicableError
+        If there are none.
+    """
     if numbers := numbers_of(subject.component, scene):
         return numbers
     whose = "particles" if isinstance(subject.component, FollowerRule) else "bonds"
-    raise NotAskedError(f"it remembers nothing of {whose}")
+    raise NotApplicableError(f"it remembers nothing of {whose}")
 
 
-@asked_of(FollowerRule, FractureModel, is_needed=True)
+@property_of(FollowerRule, FractureModel, is_needed=True)
 def draws_what_it_remembers(subject: Subject) -> None:
-    """`draw` gives one finite value a bond or particle, by the name of a number that it remembers,
-    such as its dtype holds; all numbers at random are of the generator that it is given."""
+    """`draw` returns one finite value for each bond or particle, by the name of a number that it
+    remembers, which its dtype can hold; random numbers come from the given generator."""
     part = subject.component
     for scene in subject.scenes:
         numbers = {number.name: number for number in remembered(subject, scene)}
         if not isinstance(subject.component, Draws):
-            raise NotAskedError("all that it remembers starts at its `initial`")
+            raise NotApplicableError("all that it remembers starts at its `initial`")
         rows = owners(part, scene)
         for name, values in part.draw(rows, np.random.default_rng(SEED)).items():
             if name not in numbers:
-                known = ", ".join(numbers)
-                raise PropertyError(f"`draw` gives '{name}'; what it remembers is {known}")
+                declared = ", ".join(numbers)
+                raise PropertyError(f"`draw` gives '{name}'; what it remembers is {declared}")
             if (shape := np.shape(values)) != (len(rows),):
                 needed = f"not ({len(rows)},)"
                 raise PropertyError(f"`draw` gives '{name}' with the shape {shape}, {needed}")
@@ -359,88 +364,91 @@ def draws_what_it_remembers(subject: Subject) -> None:
             _refuse_unheld(numbers[name], values, "is drawn as")
 
 
-def _refuse_unheld(number: Remembered, values: Any, how: str) -> None:
-    """PropertyError where writing the values into arrays of the dtype would change them."""
-    given = np.asarray(values)
+def _refuse_unheld(number: Remembered, values: Any, verb: str) -> None:
+    """Raise PropertyError if the dtype of a number would change the values."""
+    array = np.asarray(values)
     with np.errstate(all="ignore"):
-        lost = given[given.astype(number.dtype) != given]
+        lost = array[array.astype(number.dtype) != array]
     if lost.size:
-        fault = f"'{number.name}' {how} {lost.flat[0]}, which {number.dtype} does not hold"
+        fault = f"'{number.name}' {verb} {lost.flat[0]}, which {number.dtype} does not hold"
         raise PropertyError(f"{fault}: declare another `dtype`")
 
 
 UNUSUAL = 918273645
-"""A seed that nobody else takes."""
+"""Seed that no other code uses."""
 
 
-def differing(one: Arrays, other: Arrays) -> list[str]:
-    """The names of the answers that are not the same to the last bit."""
-    shared = one.keys() & other.keys()
-    return [n for n in one | other if n not in shared or not _same(one[n], other[n])]
+def differing(first: Arrays, second: Arrays) -> list[str]:
+    """Return the names of arrays that are not equal to the last bit."""
+    shared = first.keys() & second.keys()
+    return [n for n in first | second if n not in shared or not _same(first[n], second[n])]
 
 
-def _same(one: Any, other: Any) -> bool:
-    a, b = np.asarray(one), np.asarray(other)
+def _same(first: Any, second: Any) -> bool:
+    a, b = np.asarray(first), np.asarray(second)
     return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
 
 
-@asked_of(FollowerRule, FractureModel, FramePolicy, ParticleOperation, Diagnostic, is_needed=True)
+@property_of(
+    FollowerRule, FractureModel, FramePolicy, ParticleOperation, Diagnostic, is_needed=True
+)
 def changes_no_input(subject: Subject) -> None:
-    """What it is given it leaves as it is: the arrays belong to the state of the run."""
-    for question in subject.questions():
-        given = each(np.array, question.inputs)
+    """Functions do not change their arguments: the arrays belong to the state of the run."""
+    for call in subject.calls():
+        inputs = each(np.array, call.inputs)
         try:
             with np.errstate(all="ignore"):
-                question.ask(**given)
+                call.compute(**inputs)
         except ValueError as error:
             if "read-only" not in str(error):
                 raise
-            raise PropertyError(_written(question.what, "what it is given")) from error
-        if names := differing(flat(question.inputs), flat(given)):
-            raise PropertyError(_written(question.what, _listed(names)))
+            raise PropertyError(_written(call.function, "what it is given")) from error
+        if names := differing(flat(call.inputs), flat(inputs)):
+            raise PropertyError(_written(call.function, _listed(names)))
 
 
 def _written(function: str, where: str) -> str:
     return f"`{function}` writes into {where}: make new arrays, `x = x + 1` and not `x += 1`"
 
 
-@asked_of(is_needed=True)
+@property_of(is_needed=True)
 def remembers_nothing(subject: Subject) -> None:
-    """What it was asked before does not matter: whatever must be remembered belongs to the state of
-    the run, or a run that is continued would differ from one that was never interrupted."""
-    for question, other in zip(subject.questions(0), subject.questions(-1), strict=False):
-        before = reached_by(subject.component)
-        _, one, again = (question.answer() for _ in range(3))
+    """Results do not depend on previous calls: memory belongs to the state of the run, or a resumed
+    run would differ."""
+    for call, other in zip(subject.calls(0), subject.calls(-1), strict=False):
+        reachable = reached_by(subject.component)
+        _, first, second = (call.answer() for _ in range(3))
         other.answer()
-        question.answer(lambda v: 10.0 * v if v.dtype.kind == "f" else v.copy())
-        later, after = question.answer(), reached_by(subject.component)
-        kept = sorted(n for n in before | after if before.get(n) != after.get(n))
-        if differing(again, later) and (kept or not differing(one, again)):
-            what = f", and keeps {_listed(kept)} from call to call" if kept else ""
-            told = f"`{question.what}` answers the same question otherwise after another one"
-            raise PropertyError(told + what)
+        call.answer(lambda v: 10.0 * v if v.dtype.kind == "f" else v.copy())
+        third, reachable_later = call.answer(), reached_by(subject.component)
+        names = reachable | reachable_later
+        changes = sorted(n for n in names if reachable.get(n) != reachable_later.get(n))
+        if differing(second, third) and (changes or not differing(first, second)):
+            what = f", and keeps {_listed(changes)} from call to call" if changes else ""
+            fault = f"`{call.function}` answers the same call otherwise after another one"
+            raise PropertyError(fault + what)
 
 
-@asked_of(is_needed=True)
+@property_of(is_needed=True)
 def answers_the_same(subject: Subject) -> None:
-    """The same question gets the same answer to the last bit, and the generators of random numbers
-    that all share stay as they are, so that every run can be repeated."""
-    for question in subject.questions():
-        kept = random.getstate(), np.random.get_state()
+    """Equal calls return equal results to the last bit and leave the global generators of random
+    numbers unchanged: every run can be repeated."""
+    for call in subject.calls():
+        saved = random.getstate(), np.random.get_state()
         random.seed(UNUSUAL)
         np.random.seed(UNUSUAL)
-        before = _shared_generators()
-        names = differing(question.answer(), question.answer())
-        after = _shared_generators()
-        random.setstate(kept[0])
-        np.random.set_state(kept[1])
+        initial = _shared_generators()
+        names = differing(call.answer(), call.answer())
+        final = _shared_generators()
+        random.setstate(saved[0])
+        np.random.set_state(saved[1])
         if names:
-            fault = f"answers the same question otherwise the second time ({_listed(names)})"
-            cause = "it draws numbers at random that nobody gave it, or looks at a clock"
-            raise PropertyError(f"`{question.what}` {fault}: {cause}")
-        if after != before:
-            fault = "seeds or uses the generator of random numbers that all share"
-            raise PropertyError(f"`{question.what}` {fault}")
+            fault = f"answers the same call otherwise the second time ({_listed(names)})"
+            cause = "it draws random numbers from a generator of its own, or reads a clock"
+            raise PropertyError(f"`{call.function}` {fault}: {cause}")
+        if final != initial:
+            fault = "seeds or uses the global generator of random numbers"
+            raise PropertyError(f"`{call.function}` {fault}")
 
 
 def _shared_generators() -> bytes:
@@ -448,12 +456,12 @@ def _shared_generators() -> bytes:
 
 
 def _listed(names: list[str]) -> str:
-    shown = ", ".join(f"`{name}`" for name in names[:3])
-    return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    text = ", ".join(f"`{name}`" for name in names[:3])
+    return text + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def reached_by(component: Component) -> dict[str, bytes]:
-    """Every value that the component's functions can reach and change, by name, as bytes."""
+    """Return every value that the component's functions can read and change, by name, as bytes."""
     return {name: _content(value) for name, value in _reached(component)}
 
 
@@ -476,7 +484,7 @@ def _reached(component: Component) -> Iterator[tuple[str, Any]]:
 
 
 def _of_function(function: types.FunctionType, helpers: bool = True) -> Iterator[tuple[str, Any]]:
-    """Globals, closures, defaults and attributes of a function; helpers one call away."""
+    """Yield globals, closures, defaults and attributes of a function and of its helpers."""
     yield f"defaults of {function.__name__}", (function.__defaults__, function.__kwdefaults__)
     yield f"attributes of {function.__name__}", vars(function)
     reached = inspect.getclosurevars(function)
@@ -497,18 +505,19 @@ def _content(value: Any) -> bytes:
 
 
 ROUNDING = 1e-12
-"""Some thousand roundings: functions of numpy may differ in the last digit from place to place."""
+"""Some thousand roundings: the last digit of numpy functions may depend on the position in an
+array."""
 
 
-@asked_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
+@property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def returns_a_value_a_particle(subject: Subject) -> None:
-    """Each component of an answer is one value a particle, or one number for all of them; a rule
-    contributes as many from every neighbour, and `breaks` says yes or no."""
-    for question in _elementwise(subject):
-        for name, value in question.answer().items():
+    """Results have one value for each particle, or one number for all; a rule contributes equally
+    many from every neighbour, and `breaks` returns booleans."""
+    for call in _elementwise(subject):
+        for name, value in call.answer().items():
             if value.shape not in ((), SHAPE):
                 fault = f"returns the shape {value.shape} for particles of shape {SHAPE} ({name})"
-                raise PropertyError(f"`{question.what}` {fault}: it is not elementwise")
+                raise PropertyError(f"`{call.function}` {fault}: it is not elementwise")
     if isinstance(subject.component, FollowerRule):
         scene = subject.scene
         counts = {len(c) for c in gathered(scene, differences(scene, 0))}
@@ -516,27 +525,27 @@ def returns_a_value_a_particle(subject: Subject) -> None:
             raise PropertyError(f"`gather` returns now {min(counts)}, now {max(counts)} values")
 
 
-@asked_of()
+@property_of()
 def is_finite(subject: Subject) -> None:
-    """Finite numbers get finite answers, for a rule also where all neighbours meet in the particle:
-    one NaN spreads over the body within a few steps."""
-    for question in subject.questions():
-        for name, value in question.answer().items():
+    """Finite arguments give finite results, for a rule also if all neighbours coincide with the
+    particle: one NaN spreads over the body within a few steps."""
+    for call in subject.calls():
+        for name, value in call.answer().items():
             if value.dtype.kind in "fc" and not np.isfinite(value).all():
                 worst = value[~np.isfinite(value)].flat[0]
                 remedy = "guard the division, as in `a / where(b > 0.0, b, 1.0)`"
-                raise PropertyError(f"`{question.what}` answers {worst} ({name}): {remedy}")
+                raise PropertyError(f"`{call.function}` answers {worst} ({name}): {remedy}")
 
 
-@asked_of(FollowerRule, FractureModel, is_needed=True)
+@property_of(FollowerRule, FractureModel, is_needed=True)
 def renews_what_it_remembers(subject: Subject) -> None:
     """`update`, or `remember`, returns one value for each number that changes, in their order, and
-    a whole number where one is declared."""
+    an integer for integer numbers."""
     changing = [number for number in remembered(subject, subject.scene) if number.changes]
-    asked = [q for q in subject.questions() if q.what in ("update", "remember")]
-    if not asked:
-        raise NotAskedError("what it remembers stays as it starts")
-    what, answer = asked[0].what, asked[0].asked()
+    renewals = [call for call in subject.calls() if call.function in ("update", "remember")]
+    if not renewals:
+        raise NotApplicableError("what it remembers stays as it starts")
+    what, answer = renewals[0].function, renewals[0].evaluate()
     for values in answer if what == "update" else [answer]:
         if len(values) != len(changing):
             returned = f"{len(values)} value{'s' * (len(values) != 1)}"
@@ -548,51 +557,52 @@ def renews_what_it_remembers(subject: Subject) -> None:
                 raise PropertyError(f"{fault} as {number.dtype}: fractions would be lost")
 
 
-@asked_of(FollowerRule, FractureModel, ParticleOperation)
+@property_of(FollowerRule, FractureModel, ParticleOperation)
 def keeps_single_precision(subject: Subject) -> None:
-    """Numbers of float32 get answers of float32: a run in single precision is one throughout."""
-    for question in _elementwise(subject):
-        for name, value in flat(question.asked(_single)).items():
+    """Arguments of float32 give results of float32: a run in single precision is one throughout."""
+    for call in _elementwise(subject):
+        for name, value in flat(call.evaluate(_single)).items():
             kind = getattr(value, "dtype", None)
             if kind is not None and kind.kind == "f" and kind != np.float32:
                 raise PropertyError(
-                    f"`{question.what}` returns {kind} for float32 ({name}): leave the dtype to "
+                    f"`{call.function}` returns {kind} for float32 ({name}): leave the dtype to "
                     "the arithmetic, and make parameters and constants plain numbers, `float(...)`"
                 )
 
 
-@asked_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
+@property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def takes_particles_in_any_order(subject: Subject) -> None:
-    """Particles in another order get the same answers in that order, and neighbours summed in the
-    opposite order the same move, to rounding: numbering means nothing."""
+    """Results do not depend on the order of particles, nor the move, up to rounding, on the order
+    in which neighbours are summed: numbering has no meaning."""
     order = np.random.default_rng(0).permutation(int(np.prod(SHAPE)))
-    for question in _elementwise(subject):
-        whole = question.answer()
-        mixed = question.answer(lambda value: _in_order(value, order))
+    for call in _elementwise(subject):
+        whole = call.answer()
+        mixed = call.answer(lambda value: _in_order(value, order))
         for name, value in mixed.items():
             expected = _in_order(np.broadcast_to(whole[name], SHAPE), order)
             if (place := _apart(np.broadcast_to(value, SHAPE), expected)) is not None:
-                fault = "gives a particle another answer where it stands in another order"
-                told = f"({name}: {value[place]} and {expected[place]})"
-                raise PropertyError(f"`{question.what}` {fault} {told}")
+                fault = "returns another value for a particle if the particles are in another order"
+                values = f"({name}: {value[place]} and {expected[place]})"
+                raise PropertyError(f"`{call.function}` {fault} {values}")
     _refuse_an_order_of_rows(subject)
     if isinstance(subject.component, FollowerRule):
         _refuse_an_order_of_slots(subject.scene)
 
 
 class Alike(np.random.Generator):
-    """Draws the same for everybody: what then differs differs by what the part was shown."""
+    """Generator that returns the same number in every draw: results then differ only by the
+    arguments."""
 
     def __getattribute__(self, name: str) -> Any:
-        """Every method draws anew, and the first draw counts for all."""
+        """Return a method that draws anew at each call and repeats its first number."""
         if name.startswith("_") or not callable(getattr(np.random.Generator, name)):
             return super().__getattribute__(name)
 
         def draw(*given: Any, **named: Any) -> Any:
-            found = getattr(np.random.default_rng(SEED), name)(*given, **named)
+            values = getattr(np.random.default_rng(SEED), name)(*given, **named)
             if name == "shuffle":
                 given[0][...] = given[0][0]
-            return np.full_like(found, found.flat[0]) if np.size(found) > 1 else found
+            return np.full_like(values, values.flat[0]) if np.size(values) > 1 else values
 
         return draw
 
@@ -601,51 +611,52 @@ def _refuse_an_order_of_rows(subject: Subject) -> None:
     part = subject.component
     if not isinstance(part, Draws):
         return
-    shown = owners(subject.component, subject.scene)
-    order = np.random.default_rng(0).permutation(len(shown))
-    mixed = type(shown)(**{name: table[order] for name, table in vars(shown).items()})
-    one, other = (part.draw(rows, Alike(np.random.PCG64(SEED))) for rows in (shown, mixed))
-    for name, values in one.items():
-        if not np.array_equal(np.asarray(values)[order], other[name]):
+    table = owners(subject.component, subject.scene)
+    order = np.random.default_rng(0).permutation(len(table))
+    mixed = type(table)(**{name: column[order] for name, column in vars(table).items()})
+    first, second = (part.draw(rows, Alike(np.random.PCG64(SEED))) for rows in (table, mixed))
+    for name, values in first.items():
+        if not np.array_equal(np.asarray(values)[order], second[name]):
             remedy = "take it from what a row holds, or from the generator"
             raise PropertyError(f"`draw` gives '{name}' by the row: {remedy}")
 
 
 def _refuse_an_order_of_slots(scene: Scene) -> None:
     contributions, at = gathered(scene, differences(scene, 0)), here(scene, 0)
-    one, other = (flat(applied(scene, c, **at)) for c in (contributions, contributions[::-1]))
-    for name, value in one.items():
-        if _apart(value, other[name]) is not None:
+    orders = contributions, contributions[::-1]
+    forwards, backwards = (flat(applied(scene, order, **at)) for order in orders)
+    for name, value in forwards.items():
+        if _apart(value, backwards[name]) is not None:
             fault = f"the move depends on the order in which neighbours are summed ({name})"
             raise PropertyError(f"{fault}: do not sum large numbers that cancel")
 
 
-@asked_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
+@property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def is_local(subject: Subject) -> None:
-    """A particle that is asked about alone, with plain numbers, gets the answer that it gets among
-    the others: only itself and its neighbours count."""
-    for question in _elementwise(subject):
-        whole = question.answer()
+    """The result for a single particle, with plain numbers, is its result among others: only the
+    particle and its neighbours count."""
+    for call in _elementwise(subject):
+        whole = call.answer()
         for place in [(0, 0), (2, 1), (3, 2)]:
             try:
-                alone = flat(question.asked(methodcaller("item", *place)))
+                alone = flat(call.evaluate(methodcaller("item", *place)))
             except Exception as error:
-                fault = f"`{question.what}` fails with plain numbers in the place of arrays"
+                fault = f"`{call.function}` fails with plain numbers in the place of arrays"
                 raise PropertyError(f"{fault}: {type(error).__name__}: {error}") from None
             for name, value in alone.items():
                 among = np.broadcast_to(whole[name], SHAPE)[place]
                 if np.shape(value) or _apart(value, among) is not None:
-                    fault = "gives a particle another answer alone than among others"
-                    told = f"({name}: {value} and {among}): it is not elementwise"
-                    raise PropertyError(f"`{question.what}` {fault} {told}")
+                    fault = "returns another value for a particle alone than among others"
+                    values = f"({name}: {value} and {among}): it is not elementwise"
+                    raise PropertyError(f"`{call.function}` {fault} {values}")
 
 
 def _single(value: NDArray[Any]) -> NDArray[Any]:
     return value.astype(np.float32) if value.dtype.kind == "f" else value.copy()
 
 
-def _elementwise(subject: Subject) -> list[Question]:
-    return [question for question in subject.questions() if question.elementwise]
+def _elementwise(subject: Subject) -> list[FunctionCall]:
+    return [call for call in subject.calls() if call.elementwise]
 
 
 def _in_order(value: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
@@ -653,53 +664,54 @@ def _in_order(value: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
 
 
 def _apart(value: Any, expected: Any) -> tuple[int, ...] | None:
-    """The first place at which two answers differ by more than rounding."""
-    one, other = np.asarray(value), np.asarray(expected)
-    if one.dtype == bool:
-        differs = one != other
+    """Return the first index at which two results differ by more than rounding."""
+    answer, reference = np.asarray(value), np.asarray(expected)
+    if answer.dtype == bool:
+        differs = answer != reference
     else:
-        size = max(1e-300, float(np.abs(other).max(initial=0.0)))
-        differs = ~(np.abs(one - other) <= ROUNDING * size)
+        size = max(1e-300, float(np.abs(reference).max(initial=0.0)))
+        differs = ~(np.abs(answer - reference) <= ROUNDING * size)
     return next(map(tuple, np.argwhere(differs).tolist()), None)
 
 
 CLOSE = 1e-9
-"""How near to its breaking strain a bond is tried, as a share of its length."""
+"""Distance from the breaking strain at which a bond is tested, relative to its length."""
 
 
-@asked_of(FractureModel, is_needed=True)
+@property_of(FractureModel, is_needed=True)
 def is_seen_alike_from_both_ends(subject: Subject) -> None:
-    """A bond breaks for both ends or for none: `breaks` and `update` answer the same for (-d, -r)
+    """A bond breaks for both ends or for none: `breaks` and `update` return the same for (-d, -r)
     as for (d, r), and `constants` for a slot and its opposite; they are called for one end only."""
     model, scene = subject.component, subject.scene
     for plane in scene.neighbourhood.planes:
-        here, there = model.constants(plane.slot), model.constants(plane.opposite)
-        if here != there:
-            fault = f"{here} for the slot {plane.slot.site} and {there} for its opposite"
+        constants, opposite = model.constants(plane.slot), model.constants(plane.opposite)
+        if constants != opposite:
+            fault = f"{constants} for the slot {plane.slot.site} and {opposite} for its opposite"
             raise PropertyError(f"`constants` are {fault}: take lengths and shells, not directions")
-    evaluator, own = Evaluator(scene), remembers(model, scene, 0)
+    evaluator, numbers = Evaluator(scene), remembers(model, scene, 0)
     cells = tuple(CellStress(*cell) for cell in stressed(model, 0))
     sides = _from_the_other_end([number.name for number in bond_numbers(scene.experiment)])
-    theirs = tuple(own[n] for n in sides)
-    asks: dict[str, list[tuple[CellStress, ...]]] = {"breaks": []}
+    numbers_opposite = tuple(numbers[n] for n in sides)
+    functions: dict[str, list[tuple[CellStress, ...]]] = {"breaks": []}
     if isinstance(model, RenewsBonds):
-        asks["update"] = [cells] if cells else []
+        functions["update"] = [cells] if cells else []
     tried = differences(scene, 0, share=2.0)
     for slot, d in zip(scene.neighbourhood.slots[0], tried, strict=True):
         limits = scene.constants.limits[slot]
-        for what, beside in asks.items():
-            ask = getattr(evaluator, what)
-            one = ask(d, slot.rest, limits, own, *beside)
-            other = ask(-d, -slot.rest, limits, theirs, *(cells[::-1] for cells in beside))
-            if beside:
-                other = tuple(other[n] for n in sides)
-            if not np.array_equal(np.asarray(one), np.asarray(other)):
+        for name, stresses in functions.items():
+            function = getattr(evaluator, name)
+            answer = function(d, slot.rest, limits, numbers, *stresses)
+            opposite_stresses = (cells[::-1] for cells in stresses)
+            answer_opposite = function(-d, -slot.rest, limits, numbers_opposite, *opposite_stresses)
+            if stresses:
+                answer_opposite = tuple(answer_opposite[n] for n in sides)
+            if not np.array_equal(np.asarray(answer), np.asarray(answer_opposite)):
                 along = f"for (-d, -r) than for (d, r) along {slot.site}"
-                raise PropertyError(f"`{what}` answers otherwise {along}")
+                raise PropertyError(f"`{name}` answers otherwise {along}")
 
 
 def _from_the_other_end(names: list[str]) -> list[int]:
-    """The place of each number that is seen from the other end of a bond: left for right."""
+    """Return the index of each number as seen from the other end of a bond: left for right."""
     turned = {"_left": "_right", "_right": "_left"}
     swapped = [
         next((n.removesuffix(a) + b for a, b in turned.items() if n.endswith(a)), n) for n in names
@@ -707,64 +719,64 @@ def _from_the_other_end(names: list[str]) -> list[int]:
     return [names.index(n) for n in swapped]
 
 
-@asked_of(FractureModel)
+@property_of(FractureModel)
 def breaks_as_declared(subject: Subject) -> None:
-    """Where it declares `can_break = False` nothing breaks, however long: the scene then has no
-    bond state."""
+    """With `can_break = False` no bond breaks at any length: the scene then has no bond state."""
     scene = subject.scene
     if subject.component.can_break:
         return
     slots, breaks = scene.neighbourhood.slots[0], Evaluator(scene).breaks
     for slot, d in zip(slots, differences(scene, 0, share=1e3), strict=True):
         if np.any(breaks(d, slot.rest, scene.constants.limits[slot], ())):
-            raise PropertyError("it declares `can_break = False`, and `breaks` says yes")
+            raise PropertyError("it declares `can_break = False`, and `breaks` returns True")
 
 
-@asked_of(FractureModel)
+@property_of(FractureModel)
 def breaks_beyond_its_strain(subject: Subject) -> None:
-    """Where it tells a `breaking_strain`, a bond that is drawn out along itself breaks a little
-    above it and, if it has not broken, not a little below: `pbdkit explain` tells users so."""
+    """A bond that is extended along itself breaks slightly above the `breaking_strain` that the
+    model declares and, unless broken before, not slightly below: `pbdkit explain` prints it."""
     model, scene = subject.component, subject.scene
     if not isinstance(subject.component, BreaksAtStrain):
-        raise NotAskedError("it tells no `breaking_strain`")
-    evaluator, own, p = Evaluator(scene), remembers(model, scene, 0), scene.constants.fracture
+        raise NotApplicableError("it declares no `breaking_strain`")
+    evaluator, numbers, p = Evaluator(scene), remembers(model, scene, 0), scene.constants.fracture
     for slot in scene.neighbourhood.slots[0]:
         r, limits = slot.rest, scene.constants.limits[slot]
-        told = model.breaking_strain(r, scene.constants.of_bond(*limits, *own), p)
-        limit = np.broadcast_to(told, SHAPE)
+        strain = model.breaking_strain(r, scene.constants.of_bond(*limits, *numbers), p)
+        limit = np.broadcast_to(strain, SHAPE)
         for side, expected in ((CLOSE, True), (-CLOSE, False)):
             stretch = limit + side * (1.0 + np.abs(limit))
-            d, now = r * stretch, [np.array(value) for value in own]
-            evaluator.renew_bonds(d, r, limits, now, np.ones(SHAPE, bool))
-            wrong = np.broadcast_to(evaluator.breaks(d, r, limits, now), SHAPE) != expected
+            d, renewed = r * stretch, [np.array(value) for value in numbers]
+            evaluator.renew_bonds(d, r, limits, renewed, np.ones(SHAPE, bool))
+            wrong = np.broadcast_to(evaluator.breaks(d, r, limits, renewed), SHAPE) != expected
             if wrong.any():
                 where = f"at strain {stretch[wrong][0]:.6g} along {slot.site} the bond"
                 fault = f"{where} {'stays' if expected else 'breaks'}"
                 raise PropertyError(f"`breaking_strain` and `breaks` disagree: {fault}")
 
 
-@asked_of(ParticleOperation)
+@property_of(ParticleOperation)
 def rests_as_declared(subject: Subject) -> None:
-    """Where it declares `rests`, a particle that the rule leaves where it is stays there, exactly,
-    and any other moves: equilibria are then those of the rule alone."""
+    """With `rests`, a particle that the rule does not move stays exactly where it is, and any other
+    moves: equilibria are those of the rule alone."""
     if not subject.component.rests:
-        raise NotAskedError("it does not declare `rests`")
-    (question,) = subject.questions()
-    u, new = question.inputs["u"], question.inputs["new"]
-    if differing(flat(question.ask(u, u)), flat(u)):
+        raise NotApplicableError("it does not declare `rests`")
+    (call,) = subject.calls()
+    u, new = call.inputs["u"], call.inputs["new"]
+    if differing(flat(call.compute(u, u)), flat(u)):
         raise PropertyError(
             "`displacement` moves a particle that rests: write it as `new` plus what vanishes with "
             "`new - u`, or leave `rests` out"
         )
-    stays = np.all([a == b for a, b in zip(question.ask(u, new), u, strict=True)], axis=0)
+    stays = np.all([a == b for a, b in zip(call.compute(u, new), u, strict=True)], axis=0)
     if stays.any():
-        told = "`displacement` holds a particle that the rule moves: leave `rests` out"
-        raise PropertyError(told)
+        fault = "`displacement` holds a particle that the rule moves: leave `rests` out"
+        raise PropertyError(fault)
 
 
-@asked_of(FramePolicy)
+@property_of(FramePolicy)
 def takes_every_point_alone(subject: Subject) -> None:
-    """Whom a frame point follows does not depend on which other points there are."""
+    """The particles that a frame point follows do not depend on the other points: ranks and probes
+    compute points separately."""
     policy, reason = subject.component, "it has no points"
     for scene in subject.scenes:
         frame = sites_of_frame(scene.raster, scene.experiment.rule)
@@ -772,30 +784,33 @@ def takes_every_point_alone(subject: Subject) -> None:
             continue
         point, body = frame.nearest()
         whole = policy.follow(frame_showing(frame, frame.site, point, body))
-        for some in (np.arange(0, len(frame.site), 2), np.array([len(frame.site) - 1])):
-            kept = np.isin(point, some)
-            anew = np.searchsorted(some, point[kept])
+        for points in (np.arange(0, len(frame.site), 2), np.array([len(frame.site) - 1])):
+            is_in_points = np.isin(point, points)
+            indices = np.searchsorted(points, point[is_in_points])
             try:
-                part = policy.follow(frame_showing(frame, frame.site[some], anew, body[kept]))
+                subset = frame_showing(frame, frame.site[points], indices, body[is_in_points])
+                part = policy.follow(subset)
             except ExperimentError as refusal:
                 reason = reason and f"it takes whole frames only: {refusal}"
                 continue
             reason = ""
-            for n, one in enumerate(some):
-                if _followed(part, n) != _followed(whole, int(one)):
-                    fault = "follows somebody else where fewer points are asked about"
-                    raise PropertyError(f"frame point {one} {fault} ({place_of(scene.experiment)})")
+            for n, number in enumerate(points):
+                if _followed(part, n) != _followed(whole, int(number)):
+                    fault = (
+                        f"frame point {number} follows another particle if there are fewer points"
+                    )
+                    raise PropertyError(f"{fault} ({place_of(scene.experiment)})")
     if reason:
-        raise NotAskedError(reason)
+        raise NotApplicableError(reason)
 
 
-@asked_of(FramePolicy)
+@property_of(FramePolicy)
 def follows_who_is_near(subject: Subject) -> None:
-    """Where it declares itself `local`, points follow particles that are nearest to them, or no
-    farther off than twice the layers in site index."""
+    """Points of a `local` frame follow the particles nearest to them, or particles at most twice
+    the layers away in site index."""
     policy = subject.component
     if not policy.local:
-        raise NotAskedError("it does not declare itself `local`")
+        raise NotApplicableError("it does not declare itself `local`")
     for scene in subject.scenes:
         raster = scene.raster
         frame = sites_of_frame(raster, scene.experiment.rule)
@@ -814,16 +829,17 @@ def follows_who_is_near(subject: Subject) -> None:
 
 
 def _followed(follow: FrameMap, point: int) -> tuple[list[int], list[Any]]:
-    """The body particles that a point follows, and their weights."""
+    """Return the body particles that a point follows, and their weights."""
     entries = follow.point == point
     return follow.body[entries].tolist(), follow.weight[entries].tolist()
 
 
-@asked_of(Diagnostic, is_needed=True)
+@property_of(Diagnostic, is_needed=True)
 def measures_what_it_declares(subject: Subject) -> None:
-    """`measure` returns one array for each of its variables, shaped as their `dims` say, of numbers
-    that go into the declared dtype without loss of kind."""
-    diagnostic, scene, own = subject.component, subject.scene, subject.component.own_dimension
+    """`measure` returns one array for each variable, with the shape of its `dims`, of numbers that
+    the declared dtype holds without change of kind."""
+    diagnostic, scene = subject.component, subject.scene
+    own_dimension = diagnostic.own_dimension
     sizes = {"particle": scene.raster.count, "axis": 2, "leader_group": len(scene.leading)}
     sizes |= {"load": len(scene.experiment.loads)}
     sizes |= {"obstacle": len(scene.barriers), "principal": 2}
@@ -832,12 +848,13 @@ def measures_what_it_declares(subject: Subject) -> None:
     measured = [np.asarray(value) for value in diagnostic.measure(moment_of(scene, 0))]
     if len(variables) != len(measured):
         raise PropertyError(f"{len(measured)} arrays for {len(variables)} variables")
-    if own and not diagnostic.at_end:
+    if own_dimension and not diagnostic.at_end:
         remedy = "has a length only where it declares `at_end` too"
-        raise PropertyError(f"its `own_dimension` '{own}' {remedy}")
+        raise PropertyError(f"its `own_dimension` '{own_dimension}' {remedy}")
     for variable, value in zip(variables, measured, strict=True):
-        if own in variable.dims and value.ndim == len(variable.dims):
-            sizes.setdefault(own, value.shape[variable.dims.index(own)])  # as the first has it
+        if own_dimension in variable.dims and value.ndim == len(variable.dims):
+            # the length of the first variable with that dimension
+            sizes.setdefault(own_dimension, value.shape[variable.dims.index(own_dimension)])
     for variable, value in zip(variables, measured, strict=True):
         for dim in variable.dims:
             if dim not in sizes:
@@ -851,18 +868,20 @@ def measures_what_it_declares(subject: Subject) -> None:
             raise PropertyError(f"'{variable.name}' {fault}: digits would be lost without a word")
 
 
-@asked_of(Diagnostic)
+@property_of(Diagnostic)
 def takes_rows_in_any_order(subject: Subject) -> None:
-    """Particles in another order have the same values in that order, and all else stays, to
-    rounding: rows are found by `now.rows(numbers)` and mean nothing else."""
+    """Values follow the particles if rows are permuted, up to rounding: rows are found by
+    `now.rows(numbers)` and mean nothing else."""
     diagnostic, scene = subject.component, subject.scene
     moment, order = moment_of(scene, 0), np.random.default_rng(0).permutation(scene.raster.count)
-    values, seen = diagnostic.measure(moment), diagnostic.measure(Shown(moment, order))
-    for variable, one, other in zip(diagnostic.variables(), values, seen, strict=True):
-        expected = np.asarray(one)
+    values, permuted = diagnostic.measure(moment), diagnostic.measure(Shown(moment, order))
+    variables = diagnostic.variables()
+    for variable, value, permuted_value in zip(variables, values, permuted, strict=True):
+        expected = np.asarray(value)
         for axis, dim in enumerate(variable.dims):
             expected = np.take(expected, order, axis) if dim == "particle" else expected
         size = float(np.nanmax(np.abs(expected), initial=1e-300))
-        if not np.allclose(other, expected, rtol=0.0, atol=ROUNDING * size, equal_nan=True):
-            remedy = "ask `now.rows(numbers)` for particles by number"
+        atol = ROUNDING * size
+        if not np.allclose(permuted_value, expected, rtol=0.0, atol=atol, equal_nan=True):
+            remedy = "take rows from `now.rows(numbers)`"
             raise PropertyError(f"'{variable.name}' depends on the order of the rows: {remedy}")

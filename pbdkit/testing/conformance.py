@@ -1,6 +1,4 @@
-"""The conformance suite: examine the properties of a component, each in its own guard, as a report
-or as a test of pytest.
-"""
+"""The conformance suite: test the properties of a component, as a report or as a test of pytest."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ from pbdkit.hooks import worded
 from pbdkit.plugin import Component, Lattice, NeighbourMetric
 from pbdkit.testing import component_properties, mechanics_properties, step_properties
 from pbdkit.testing.subject import (
-    NotAskedError,
+    NotApplicableError,
     Property,
     PropertyError,
     Subject,
@@ -25,16 +23,16 @@ from pbdkit.testing.subject import (
 )
 
 PROPERTIES: tuple[Property, ...] = tuple(
-    found
+    attribute
     for page in (component_properties, step_properties, mechanics_properties)
-    for found in vars(page).values()
-    if isinstance(found, Property)
+    for attribute in vars(page).values()
+    if isinstance(attribute, Property)
 )
-"""Page by page, as they stand there."""
+"""Properties of components, in the order of their files."""
 
 
 def properties_of(component: type[Component]) -> list[Property]:
-    """Those that are asked of components of this class."""
+    """Return the properties that components of a class must have."""
     return [p for p in PROPERTIES if issubclass(component, p.interfaces)]
 
 
@@ -43,7 +41,17 @@ State = Literal["held", "failed", "skipped"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one property came out for one component; `reason` is the fault, or why it was skipped."""
+    """Result of one property for one component.
+
+    Parameters
+    ----------
+    property
+        Name of the property.
+    state
+        "held", "failed" or "skipped".
+    reason
+        Fault, or reason for which it was skipped.
+    """
 
     property: str
     state: State
@@ -52,33 +60,42 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Report:
-    """All outcomes of one component; `component` names it with its parameters."""
+    """Outcomes of one component.
+
+    Parameters
+    ----------
+    component
+        Name of the component, with its parameters.
+    outcomes
+        Outcomes, in the order of the properties.
+    """
 
     component: str
     outcomes: tuple[Outcome, ...]
 
     @property
     def ran(self) -> list[Outcome]:
-        """Those that were judged, held or failed."""
+        """Outcomes that held or failed."""
         return [o for o in self.outcomes if o.state != "skipped"]
 
     @property
     def failed(self) -> list[Outcome]:
-        """Those that do not hold."""
+        """Outcomes of properties that do not hold."""
         return [o for o in self.outcomes if o.state == "failed"]
 
     @property
     def skipped(self) -> list[Outcome]:
-        """Those that were not judged, with the reason."""
+        """Outcomes that were skipped."""
         return [o for o in self.outcomes if o.state == "skipped"]
 
     @property
     def holds(self) -> bool:
-        """Whether nothing failed, and something ran."""
+        """True if no property failed and at least one ran."""
         return bool(self.ran) and not self.failed
 
     def summary(self) -> str:
-        """One line: how many ran and failed, and why others were skipped."""
+        """Return a line with the numbers of properties that ran and failed, and the reasons of
+        others."""
         reasons = Counter(o.reason for o in self.skipped)
         counts = f"{self.component}: {len(self.ran)} properties ran, {len(self.failed)} failed"
         return "; ".join([counts, *(f"{n} skipped: {why}" for why, n in reasons.items())])
@@ -90,108 +107,141 @@ class Report:
 
 
 def _outcomes(component: Component, parts: Mapping[str, Any]) -> Iterator[Outcome]:
-    """How each property comes out, in their order; none is judged after a needed one that fails."""
+    """Yield the outcome of each property in order; if a needed one fails, others are skipped."""
     subject, failed = Subject(component, parts), ""
-    for asked in properties_of(type(component)):
+    for tested in properties_of(type(component)):
         if failed:
-            yield Outcome(asked.name, "skipped", f"not judged while {failed} fails")
+            yield Outcome(tested.name, "skipped", f"not judged while {failed} fails")
             continue
-        outcome = _judged(asked, subject)
+        outcome = _judged(tested, subject)
         yield outcome
-        failed = asked.name if asked.is_needed and outcome.state == "failed" else ""
+        failed = tested.name if tested.is_needed and outcome.state == "failed" else ""
 
 
-def _judged(asked: Property, subject: Subject) -> Outcome:
+def _judged(tested: Property, subject: Subject) -> Outcome:
     try:
-        asked.check(subject)
-    except NotAskedError as reason:
-        return Outcome(asked.name, "skipped", str(reason))
+        tested.check(subject)
+    except NotApplicableError as reason:
+        return Outcome(tested.name, "skipped", str(reason))
     except PropertyError as fault:
-        return Outcome(asked.name, "failed", str(fault))
+        return Outcome(tested.name, "failed", str(fault))
     except Exception as error:
         package = type(subject.component).__module__.split(".")[0]
-        return Outcome(asked.name, "failed", worded(error, package))
-    return Outcome(asked.name, "held")
+        return Outcome(tested.name, "failed", worded(error, package))
+    return Outcome(tested.name, "held")
 
 
 def examine(component: Component | type[Component], **parts: Any) -> Report:
-    """The report of one component; a class stands for its first example. `parts` of an experiment
-    (lattice=..., neighbours=...) stand in for those that are tried, for a component that goes with
-    them alone. Of a class of which none can be made the report says why."""
-    one: Any = component
+    """Test the properties of one component.
+
+    Parameters
+    ----------
+    component : Component or type
+        Component, or a class, of which the first example is tested.
+    **parts
+        Parts of experiments (``lattice=...``, ``neighbours=...``) that replace the usual ones, for
+        a
+        component that requires them.
+
+    Returns
+    -------
+    Report
+        Outcome of each property. For a class without usable examples it contains the reason.
+
+    Examples
+    --------
+    >>> print(pbdkit.testing.examine(MyRule(strength=2.0)))
+    """
+    instance: Any = component
     if isinstance(component, type):
         try:
-            one = examples_of(component)[0]
+            instance = examples_of(component)[0]
         except PluginError as error:
             # The one property of a class: that components can be made of it.
             return Report(component.__name__, (Outcome("has-examples", "failed", str(error)),))
-    return Report(full_name(one), tuple(_outcomes(one, parts)))
+    return Report(full_name(instance), tuple(_outcomes(instance, parts)))
 
 
 def examine_all(components: Sequence[type[Component]]) -> Iterator[Report]:
-    """A report for each example of each class.
+    """Yield a report for each example of each class.
 
-    What takes part in none of the usual scenes is tried on the lattices and with the neighbours
-    that are offered beside it.
+    A component that takes part in none of the usual scenes is tested on the lattices and with the
+    neighbour metrics among the classes.
     """
     for component in components:
         for example in _made(component) or (component,):
             yield _examined(example, components)
 
 
-def _examined(one: Component | type[Component], beside: Sequence[type[Component]]) -> Report:
-    report = examine(one)
+def _examined(component: Component | type[Component], offered: Sequence[type[Component]]) -> Report:
+    report = examine(component)
     takes_part = all(outcome.property != "takes-part" for outcome in report.failed)
-    if takes_part or isinstance(one, (Lattice, NeighbourMetric)):
+    if takes_part or isinstance(component, (Lattice, NeighbourMetric)):
         return report
-    lattices = {"lattice": [e for c in beside if issubclass(c, Lattice) for e in _made(c)]}
-    around = {"neighbours": [e for c in beside if issubclass(c, NeighbourMetric) for e in _made(c)]}
+    lattices = {"lattice": [e for c in offered if issubclass(c, Lattice) for e in _made(c)]}
+    metrics = [e for c in offered if issubclass(c, NeighbourMetric) for e in _made(c)]
+    around = {"neighbours": metrics}
     for parts in (lattices, around, lattices | around):
-        if all(parts.values()) and (found := examine(one, **parts)).holds:
-            return found
+        if all(parts.values()) and (other := examine(component, **parts)).holds:
+            return other
     return report
 
 
 def _made(component: type[Component]) -> list[Component]:
-    """The examples of a class; none where none can be made."""
+    """Return the examples of a class; empty if there are none."""
     with suppress(PluginError):
         return examples_of(component)
     return []
 
 
 def conformance(*components: Component | type[Component], **parts: Any) -> Any:
-    """A test function of pytest with a case for each property of each component::
+    """Return a test function of pytest with a case for each property of each component.
 
-        test_conformance = conformance(MyRule(strength=2.0), MyLattice)
+    Skipped properties are skipped in pytest with their reason. After the last property of a
+    component
+    a line summarises what ran.
 
-    A class stands for its examples. `parts` of an experiment (lattice=..., neighbours=...) stand in
-    for those that are tried. What was skipped is skipped in pytest too, with its reason, and after
-    the last property of a component a line tells what ran. Raises ValueError without a component,
-    PluginError where none can be made of a class.
+    Parameters
+    ----------
+    *components : Component or type
+        Components, or classes, of which all examples are tested.
+    **parts
+        As in `examine`.
+
+    Raises
+    ------
+    ValueError
+        Without a component.
+    PluginError
+        If a class has no usable examples.
+
+    Examples
+    --------
+    >>> test_conformance = conformance(MyRule(strength=2.0), MyLattice)
     """
     import pytest
 
     if not components:
         raise ValueError("conformance() is given no component")
-    tried: list[Component] = []
-    for given in components:
-        tried += examples_of(given) if isinstance(given, type) else [given]
-    report_of = cache(lambda n: examine(tried[n], **parts))
+    instances: list[Component] = []
+    for component in components:
+        instances += examples_of(component) if isinstance(component, type) else [component]
+    report_of = cache(lambda n: examine(instances[n], **parts))
     cases = [
-        pytest.param(n, asked.name, id=f"{full_name(one)}-{asked.name}")
-        for n, one in enumerate(tried)
-        for asked in properties_of(type(one))
+        pytest.param(n, tested.name, id=f"{full_name(instance)}-{tested.name}")
+        for n, instance in enumerate(instances)
+        for tested in properties_of(type(instance))
     ]
 
-    @pytest.mark.parametrize(("component", "asked"), cases)
-    def test_conformance(component: int, asked: str, capsys: pytest.CaptureFixture[str]) -> None:
+    @pytest.mark.parametrize(("component", "name"), cases)
+    def test_conformance(component: int, name: str, capsys: pytest.CaptureFixture[str]) -> None:
         report = report_of(component)
-        outcome = next(o for o in report.outcomes if o.property == asked)
+        outcome = next(o for o in report.outcomes if o.property == name)
         if outcome is report.outcomes[-1]:
             with capsys.disabled():
                 print(f"\n{report.summary()}")
         if outcome.state == "failed":
-            pytest.fail(f"{report.component}: {asked}: {outcome.reason}", pytrace=False)
+            pytest.fail(f"{report.component}: {name}: {outcome.reason}", pytrace=False)
         if outcome.state == "skipped":
             pytest.skip(outcome.reason)  # the property does not apply to this component
 

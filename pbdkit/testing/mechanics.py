@@ -1,9 +1,9 @@
-"""Laws of mechanics, measured: how far a scene is from each, as a share of its largest stiffness.
+"""Laws of mechanics: the deviation of a scene from each, relative to its largest stiffness.
 
-A rigid motion of a body stores no energy; what particle a does to b, b does to a (Maxwell and
-Betti); no deformation gives energy back; a broken bond makes nothing stiffer. All follow from the
-stiffness matrix K = -∂force/∂u of the particles of the body, leaders included, which is probed here
-by the forces that the stepper computes, for small solids with free edges.
+A rigid motion of a body stores no energy; the stiffness is symmetric (Maxwell and Betti); no
+deformation has a negative energy; a broken bond increases no stiffness. All follow from the
+stiffness matrix K = -∂force/∂u of the particles of the body, leaders included, which is computed
+from the forces of the stepper, for small solids with free edges.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from pbdkit.stepping.state import State, initial_state
 from pbdkit.testing.states import displacements, state_with
 
 SHARE_BROKEN = 0.2
-"""The share of bonds that are broken in a pattern at random."""
+"""Fraction of bonds that are broken at random."""
 NUDGE = 1e-5
-"""By what share of the spacing a particle is moved where the rule is not linear: the error of a
-central difference is its square."""
+"""Displacement of central differences for nonlinear rules, relative to the spacing; their error is
+its square."""
 
 
 def whole_state(scene: Scene) -> State:
-    """The scene at rest with every bond that cracks and cuts leave."""
+    """Return the scene at rest with every bond that cracks and cuts leave."""
     state = initial_state(scene)
     state.u[...] = state.previous[...] = 0.0
     return state
 
 
-def torn_state(scene: Scene, seed: int, before: State) -> State:
-    """A state at rest with bonds broken at random besides those that are broken."""
-    state = before.copy()
+def torn_state(scene: Scene, seed: int, initial: State) -> State:
+    """Return a state at rest with further bonds broken at random."""
+    state = initial.copy()
     state.u[...] = state.previous[...] = 0.0
     if state.broken_step is not None:
         generator, bonds = np.random.default_rng(seed), scene.bonds
@@ -64,15 +64,19 @@ def torn_state(scene: Scene, seed: int, before: State) -> State:
 
 
 def softened_state(scene: Scene, seed: int) -> State:
-    """The scene at rest after its particles were put elsewhere at random and back again, so that
-    bonds have broken and softened as its fracture model has it, and with bonds broken besides."""
+    """Return the scene at rest after a random displacement and back, with further bonds broken.
+
+    Bonds have broken and softened according to its fracture model.
+    """
     state = Stepper(scene).advance(state_with(scene, displacements(scene, seed, share=0.3)), 1)
     return torn_state(scene, seed, state)
 
 
 def stiffness(scene: Scene, state: State) -> Floats:
-    """K over Young's modulus and thickness at rest with the bonds of a state, (2 particles of the
-    body, 2 particles): x of the first, y of the first, ..."""
+    """Return K over Young's modulus and thickness at rest, with the bonds of a state.
+
+    The shape is (2 particles of the body, 2 particles): x of the first, y of the first, ...
+    """
     followers, raster = SlotFollowers(scene), scene.raster
     place = raster.place_of(raster.body_rows)
     is_linear = not isinstance(scene.experiment.rule, StoresEnergy)
@@ -103,45 +107,53 @@ def stiffness(scene: Scene, state: State) -> Floats:
 
 
 def pulls_at_rest(scene: Scene, state: State) -> bool:
-    """Whether particles at rest exert forces, as where fictitious points stand off: these turn with
-    the body, so that a rotation changes them."""
+    """Return whether particles at rest exert forces.
+
+    This is so if fictitious points are displaced: these turn with the body, so that a rotation
+    changes
+    the forces.
+    """
     u = np.zeros_like(state.u, dtype=float)
     return bool(np.abs(SlotFollowers(scene).forces(u, state)).max() > 0.0)
 
 
 def rigid_motions(scene: Scene) -> Floats:
-    """The translations and the small rotation about the middle, (2 particles, 3), of which the
-    largest displacement is 1."""
+    """Return the translations and the small rotation about the middle, (2 particles, 3).
+
+    Their largest displacement is 1.
+    """
     raster = scene.raster
     X = raster.reference(raster.body_rows)
     x, y = (X - X.mean(axis=0)).T
-    one, none = np.ones(len(X)), np.zeros(len(X))
-    motions = np.array([[one, none], [none, one], [-y, x]]).transpose(0, 2, 1)
+    ones, zeros = np.ones(len(X)), np.zeros(len(X))
+    motions = np.array([[ones, zeros], [zeros, ones], [-y, x]]).transpose(0, 2, 1)
     motions = motions.reshape(3, -1)
     largest = np.abs(motions).max(axis=1, keepdims=True)
     return np.asarray((motions / np.where(largest > 0.0, largest, 1.0)).T)
 
 
 def resistance_to_rigid_motions(scene: Scene, K: Floats) -> float:
-    """The largest force of a rigid motion. Where K is symmetric no deformation has a resultant or a
-    moment, then."""
+    """Return the largest force of a rigid motion.
+
+    If K is symmetric and this is zero, no deformation has a resultant or a moment.
+    """
     return _share(np.abs(K @ rigid_motions(scene)).max(), K)
 
 
 def asymmetry(K: Floats) -> float:
-    """The largest difference of what a does to b and b to a."""
+    """Return the largest difference between K and its transpose."""
     return _share(np.abs(K - K.T).max(), K)
 
 
 def energy_given_back(K: Floats) -> float:
-    """By how much the smallest eigenvalue of the symmetric part is below 0."""
+    """Return the negative part of the smallest eigenvalue of the symmetric part of K."""
     return _share(-np.linalg.eigvalsh((K + K.T) / 2)[0], K)
 
 
-def stiffening(before: Floats, after: Floats) -> float:
-    """By how much some deformation costs more after than before."""
-    more = after - before
-    return _share(np.linalg.eigvalsh((more + more.T) / 2)[-1], before)
+def stiffening(K: Floats, K_damaged: Floats) -> float:
+    """Return the largest eigenvalue of the increase of the stiffness by damage."""
+    increase = K_damaged - K
+    return _share(np.linalg.eigvalsh((increase + increase.T) / 2)[-1], K)
 
 
 def _share(value: float, K: Floats) -> float:
@@ -149,22 +161,21 @@ def _share(value: float, K: Floats) -> float:
     return max(0.0, float(value)) / float(largest) if largest > 0.0 else 0.0
 
 
-def resumed(scene: Scene, again: Scene, step: int, start: State | None = None) -> Any:
-    """The dataset of a run that is stopped at a step, kept as the run store keeps it, and gone on
-    with in a scene made anew."""
+def resumed(scene: Scene, rebuilt: Scene, step: int, start: State | None = None) -> Any:
+    """Return the dataset of a run that is stopped, stored, and resumed in a rebuilt scene."""
     sink = MemorySink()
-    left, recorder = Simulation.of_scene(scene, start=start), Recorder(scene, sink)
+    stopped, recorder = Simulation.of_scene(scene, start=start), Recorder(scene, sink)
     recorder.begin()
-    for state in left:
+    for state in stopped:
         recorder.observe(state)
         if state.step >= step:
             break
-    kept = checkpoint_of(left.driver, recorder)
-    facts = json.loads(json.dumps(kept.facts))
-    rest, recorder = Simulation.of_scene(again), Recorder(again, sink)
-    checkpoint = Checkpoint(kept.about, facts, kept.copied().arrays)
-    restore(rest.driver, recorder, checkpoint, SERIAL)
-    record(rest, sink, recorder=recorder)
+    saved = checkpoint_of(stopped.driver, recorder)
+    facts = json.loads(json.dumps(saved.facts))
+    continued, recorder = Simulation.of_scene(rebuilt), Recorder(rebuilt, sink)
+    checkpoint = Checkpoint(saved.about, facts, saved.copied().arrays)
+    restore(continued.driver, recorder, checkpoint, SERIAL)
+    record(continued, sink, recorder=recorder)
     return sink.dataset()
 
 
@@ -172,38 +183,42 @@ BODY = {"type": "grid", "columns": 4, "rows": 4}
 TEARS = {"type": "strain", "failure": 0.1}
 SPRINGS = {"type": "springs"}
 MOST = 2
-"""So many lattices are tried."""
+"""Maximum number of lattices."""
 
 
 class NoSolidError(Exception):
-    """A component takes part in no scene of known forces and free edges; the text is the reason."""
+    """A component has no scene with known forces and free edges; the text is the reason."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A scene whose rule knows forces and whose edges are free, and its stiffness: with all bonds,
-    softened by displacements at random with some broken besides, and with more of them broken."""
+    """A scene whose rule knows forces and whose edges are free, and its stiffness.
+
+    The stiffness is that with all bonds, after random displacements with some bonds broken, and
+    with
+    further bonds broken.
+    """
 
     scene: Scene
 
     @cached_property
     def whole(self) -> Floats:
-        """With all bonds."""
+        """Stiffness with all bonds."""
         return stiffness(self.scene, whole_state(self.scene))
 
     @cached_property
     def softened(self) -> Floats:
-        """With some softened, some broken."""
+        """Stiffness with some bonds softened or broken."""
         return stiffness(self.scene, self._softened)
 
     @cached_property
     def torn(self) -> Floats:
-        """With more broken."""
+        """Stiffness with further bonds broken."""
         return stiffness(self.scene, torn_state(self.scene, 4, self._softened))
 
     @property
     def stages(self) -> list[tuple[str, Floats]]:
-        """Each stiffness by what the body is then; one after the other bonds are lost."""
+        """Name and stiffness of each stage of damage, in order."""
         if not self.scene.has_fracture:
             return [("whole", self.whole)]
         return [("whole", self.whole), ("softened", self.softened), ("torn", self.torn)]
@@ -214,34 +229,39 @@ class Solid:
 
 
 def solids_of(component: Component, around: Mapping[str, Any]) -> list[Solid]:
-    """Those that a component takes part in, one a lattice, with the `lattice` and `neighbours` that
-    are tried. Raises NoSolidError without any."""
-    found: dict[str, Solid] = {}
+    """Return the solids of a component, one for each lattice.
+
+    Raises
+    ------
+    NoSolidError
+        If there are none.
+    """
+    solids: dict[str, Solid] = {}
     for experiment in _experiments(component, around):
         name = experiment.lattice.type
-        if name not in found and len(found) < MOST:
+        if name not in solids and len(solids) < MOST:
             with suppress(ExperimentError):
                 solid = Solid(build_scene(experiment))
                 if not (_is_tied(solid.scene) or pulls_at_rest(solid.scene, solid._softened)):
-                    found[name] = solid
-    if not found:
+                    solids[name] = solid
+    if not solids:
         raise NoSolidError("no scene has known forces, free edges, and no forces at rest")
-    return list(found.values())
+    return list(solids.values())
 
 
 def _experiments(component: Component, around: Mapping[str, Any]) -> Iterator[Experiment]:
-    given: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 4}
+    base: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 4}
     lattices, neighbours = (
         list(part) if isinstance(part := around[name], (list, tuple)) else [part]
         for name in ("lattice", "neighbours")
     )
-    for parts, lattice, near in product(_parts(component), lattices, neighbours):
+    for parts, lattice, metric in product(_parts(component), lattices, neighbours):
         with suppress(ExperimentError):
-            yield Experiment(**given, **parts, lattice=lattice, neighbours=near)
+            yield Experiment(**base, **parts, lattice=lattice, neighbours=metric)
 
 
 def _parts(component: Component) -> list[dict[str, Any]]:
-    """Rule, frame and fracture with which it is tried, those first in which bonds break."""
+    """Return rule, frame and fracture for the tests of a component, those with fracture first."""
     if isinstance(component, FollowerRule):
         if material_of(component) is None:
             raise NoSolidError("it knows no forces")
@@ -256,10 +276,12 @@ def _parts(component: Component) -> list[dict[str, Any]]:
 
 
 def _is_tied(scene: Scene) -> bool:
-    """Whether what takes the place of a lost neighbour stands somewhere in space, which a body that
-    moves as a whole feels."""
+    """Return whether a fictitious neighbour is fixed in space, so that translations of the body
+    change
+    forces.
+    """
     model, slot = scene.experiment.fracture, scene.neighbourhood.slots[0][0]
     u, p = vector([0.1] * scene.axes), scene.constants.fracture
-    there = (model.fictitious(u * share, slot.rest, p) for share in (0.0, 1.0))
-    one, other = (as_vector(each, "fictitious", u) for each in there)
-    return any(float(a) != float(b) for a, b in zip(one, other, strict=True))
+    points = (model.fictitious(u * share, slot.rest, p) for share in (0.0, 1.0))
+    first, second = (as_vector(each, "fictitious", u) for each in points)
+    return any(float(a) != float(b) for a, b in zip(first, second, strict=True))

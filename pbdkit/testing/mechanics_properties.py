@@ -37,13 +37,13 @@ from pbdkit.testing.mechanics import (
     stiffening,
 )
 from pbdkit.testing.states import advanced, displacements
-from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, place_of
+from pbdkit.testing.subject import NotApplicableError, PropertyError, Subject, place_of, property_of
 
 STEPS = 3
 ROUNDING = 1e-11
-"""As a share of the largest displacement."""
+"""Tolerance relative to the largest displacement."""
 LARGER = 2.0**20
-"""By so much lengths are multiplied: a power of two, so that nothing is rounded."""
+"""Factor of lengths: a power of two, so that nothing is rounded."""
 AXES: dict[str, Floats] = {
     "mirrored in x": np.diag([-1.0, 1.0]),
     "mirrored in y": np.diag([1.0, -1.0]),
@@ -54,31 +54,31 @@ REMEDY = (
     "lengths with `pbdkit.plugin.LENGTH`, powers of lengths with a `pbdkit.plugin.Quantity`"
 )
 EVEN = {"type": "grid", "columns": 5, "rows": 5}
-"""A body that is its own image."""
+"""Body that is symmetric under reflection and rotation by a right angle."""
 
 
-@asked_of(Lattice, NeighbourMetric, FollowerRule, FramePolicy, FractureModel)
+@property_of(Lattice, NeighbourMetric, FollowerRule, FramePolicy, FractureModel)
 def goes_alike_in_all_units(subject: Subject) -> None:
-    """Where all lengths are multiplied by one number, a step makes displacements that are as much
-    longer: no length is told apart from its share of the spacing, and parameters that are lengths
-    are annotated as such."""
+    """If all lengths are multiplied by a number, so are the displacements of a step: lengths matter
+    relative to the spacing only, and parameters that are lengths are annotated as such."""
     if isinstance(subject.component, Lattice) and not _lengths(subject.component):
-        raise NotAskedError("it has no length among its parameters: it is of one size")
+        raise NotApplicableError("it has no length among its parameters: it is of one size")
     for scene in subject.scenes[:2]:
         u = displacements(scene, 8)
         if np.abs(advanced(scene, 0.0 * u, 1)).max() > 0.0:
-            continue  # which is told elsewhere
+            continue  # the property `rests` reports it
         larger = _scaled_scene(scene.experiment)
-        one, other = advanced(scene, u, STEPS)[-1], advanced(larger, LARGER * u, STEPS)[-1]
-        off = np.abs(other / LARGER - one).max() / max(1e-300, np.abs(one).max())
-        if not off <= ROUNDING:
+        original, scaled = advanced(scene, u, STEPS)[-1], advanced(larger, LARGER * u, STEPS)[-1]
+        deviation = np.abs(scaled / LARGER - original).max() / max(1e-300, np.abs(original).max())
+        if not deviation <= ROUNDING:
             fault = f"with all lengths {LARGER:g} times as large a body moves otherwise"
-            where = place_of(scene.experiment)
-            raise PropertyError(f"{fault}, by {off:.3g} of its displacement, {where}: {REMEDY}")
+            extent = f"by {deviation:.3g} of its displacement, {place_of(scene.experiment)}"
+            raise PropertyError(f"{fault}, {extent}: {REMEDY}")
 
 
 def _scaled_scene(experiment: Experiment) -> Scene:
-    """The scene with all lengths of lattice, neighbours, rule and fracture multiplied."""
+    """Return the scene with all lengths of lattice, neighbours, rule, frame and fracture
+    multiplied."""
     names = ("lattice", "neighbours", "rule", "frame", "fracture")
     parts = {name: _scaled(getattr(experiment, name)) for name in names}
     try:
@@ -89,73 +89,83 @@ def _scaled_scene(experiment: Experiment) -> Scene:
 
 
 def _scaled(part: Component) -> Component:
-    """The component with its lengths multiplied."""
-    found: dict[str, Any] = part.model_dump(by_alias=True)
+    """Return the component with its lengths multiplied."""
+    parameters: dict[str, Any] = part.model_dump(by_alias=True)
     for key, power in _lengths(part).items():
-        found[key] = _times(LARGER**power, found[key])
-    return type(part).model_validate(found)
+        parameters[key] = _times(LARGER**power, parameters[key])
+    return type(part).model_validate(parameters)
 
 
 def _lengths(part: Component) -> dict[str, int]:
-    """The parameters that count in lengths, with the power; where a lattice lies is none."""
-    found = {}
+    """Return the parameters that are powers of lengths, with the power; the origin is excluded."""
+    lengths = {}
     for name, field in type(part).model_fields.items():
         powers = {q.length for q in _quantities([field.annotation, *field.metadata])}
         if len(powers) == 1 and name != "origin":
-            found[field.alias or name] = powers.pop()
-    return found
+            lengths[field.alias or name] = powers.pop()
+    return lengths
 
 
-def _quantities(found: Any) -> Iterator[Quantity]:
-    """Those that an annotation names, however deep."""
-    for one in found:
-        if isinstance(one, Quantity):
-            yield one
-        elif isinstance(one, type) and issubclass(one, BaseModel):
-            inner = one.model_fields.values()
+def _quantities(annotations: Any) -> Iterator[Quantity]:
+    """Yield the quantities that annotations contain at any depth."""
+    for annotation in annotations:
+        if isinstance(annotation, Quantity):
+            yield annotation
+        elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            inner = annotation.model_fields.values()
             yield from _quantities([x for f in inner for x in (f.annotation, *f.metadata)])
         else:
-            yield from _quantities((*typing.get_args(one), *getattr(one, "__metadata__", ())))
+            metadata = getattr(annotation, "__metadata__", ())
+            yield from _quantities((*typing.get_args(annotation), *metadata))
 
 
 def _times(factor: float, value: Any) -> Any:
     if isinstance(value, Mapping):
         return {k: v if k == "steps" else _times(factor, v) for k, v in value.items()}
     if isinstance(value, (tuple, list)):
-        return type(value)(_times(factor, one) for one in value)
+        return type(value)(_times(factor, item) for item in value)
     return factor * value if isinstance(value, (int, float)) else value
 
 
-@asked_of(FollowerRule, FramePolicy, FractureModel)
+@property_of(FollowerRule, FramePolicy, FractureModel)
 def goes_alike_mirrored_and_turned(subject: Subject) -> None:
-    """A body on the square lattice that is mirrored, or turned by a right angle, moves as before,
-    mirrored or turned, to rounding; parts that declare `has_axes` need not."""
+    """A body on the square lattice that is reflected, or rotated by a right angle, moves as the
+    original, reflected or rotated, up to rounding; components with `has_axes` are exempt."""
     if subject.component.has_axes:
-        raise NotAskedError("it declares `has_axes`: directions count")
+        raise NotApplicableError("it declares `has_axes`: directions count")
     scenes = [scene for each in subject.scenes if (scene := _even_scene(each.experiment))][:2]
     if not scenes:
-        raise NotAskedError("numbers are drawn or remembered, or directions count, in every scene")
+        raise NotApplicableError(
+            "every scene draws or remembers numbers, or has preferred directions"
+        )
     for scene in scenes:
         u = displacements(scene, 9, share=0.5)
         if np.abs(advanced(scene, 0.0 * u, 1)).max() > 0.0:
-            continue  # which is told elsewhere
+            continue  # the property `rests` reports it
         X = scene.raster.reference(scene.raster.body_rows)
-        one, most = advanced(scene, u, STEPS)[-1], 0.0
+        original = advanced(scene, u, STEPS)[-1]
         for name, matrix in AXES.items():
             order = _images(X, matrix)
             image = np.empty_like(u)
             image[order] = u @ matrix.T
-            other = advanced(scene, image, STEPS)[-1][order]
-            most = np.abs(other - one @ matrix.T).max() / max(1e-300, np.abs(one).max())
-            if not most <= ROUNDING:
-                fault = f"a body that is {name} moves otherwise, by {most:.3g} of its displacement"
+            mapped = advanced(scene, image, STEPS)[-1][order]
+            distance = np.abs(mapped - original @ matrix.T).max()
+            deviation = distance / max(1e-300, np.abs(original).max())
+            if not deviation <= ROUNDING:
+                extent = f"by {deviation:.3g} of its displacement"
+                fault = f"a body that is {name} moves otherwise, {extent}"
                 remedy = "take lengths and products, not single components, or declare `has_axes`"
                 raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
 
 
 def _even_scene(experiment: Experiment) -> Scene | None:
-    """The scene on the square lattice with a body that is its own image; None where parts besides
-    the one that is asked tell directions or an order."""
+    """Return the scene on the square lattice with a symmetric body.
+
+    Returns
+    -------
+    Scene or None
+        None if other parts have preferred directions, or remember numbers.
+    """
     parts: Any = (experiment.rule, experiment.frame, experiment.fracture)
     if experiment.lattice.type != "square" or any(part.has_axes for part in parts):
         return None
@@ -168,21 +178,21 @@ def _even_scene(experiment: Experiment) -> Scene | None:
 
 
 def _images(X: Floats, matrix: Floats) -> Any:
-    """The particle at whose place each comes to lie."""
+    """Return the particle at whose position each particle is mapped."""
     middle = X.mean(axis=0)
-    there = (X - middle) @ matrix.T + middle
-    return np.abs(there[:, None] - X[None]).max(axis=2).argmin(axis=1)
+    images = (X - middle) @ matrix.T + middle
+    return np.abs(images[:, None] - X[None]).max(axis=2).argmin(axis=1)
 
 
 LINEAR, NEARLY = 1e-11, 1e-8
-"""What rounding leaves, as a share of the largest stiffness: of rules that are linear, and of
-others, whose stiffness is a difference of forces."""
+"""Tolerances relative to the largest stiffness: of linear rules, and of others, whose stiffness is
+a difference of forces."""
 
 
-@asked_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
+@property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
 def moves_rigidly_for_nothing(subject: Subject) -> None:
-    """Where forces are known and edges are free, a body that is moved or turned a little as a whole
-    exerts no force, whatever bonds are broken."""
+    """With known forces and free edges, a small rigid motion of a body causes no force, whatever
+    bonds are broken."""
     _check_stiffness(
         subject,
         resistance_to_rigid_motions,
@@ -192,10 +202,10 @@ def moves_rigidly_for_nothing(subject: Subject) -> None:
     )
 
 
-@asked_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
+@property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
 def acts_both_ways_alike(subject: Subject) -> None:
-    """There, what a particle's displacement does to another is what the other's does to it (Maxwell
-    and Betti): forces have no resultant, and a work."""
+    """With known forces and free edges, the stiffness is symmetric (Maxwell and Betti): forces have
+    no resultant, and derive from an energy."""
     _check_stiffness(
         subject,
         lambda _, K: asymmetry(K),
@@ -204,9 +214,9 @@ def acts_both_ways_alike(subject: Subject) -> None:
     )
 
 
-@asked_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
+@property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
 def gives_no_energy_back(subject: Subject) -> None:
-    """There, no displacement from rest has a negative energy."""
+    """With known forces and free edges, no displacement from rest has a negative energy."""
     _check_stiffness(
         subject,
         lambda _, K: energy_given_back(K),
@@ -219,23 +229,24 @@ def gives_no_energy_back(subject: Subject) -> None:
 def _check_stiffness(
     subject: Subject, measure: Callable[[Scene, Floats], float], fault: str, remedy: str
 ) -> None:
-    """Raise PropertyError where a measure of the stiffness of a solid exceeds its rounding."""
+    """Raise PropertyError if a measure of the stiffness of a solid exceeds its rounding."""
     for solid in _solids(subject):
         for body, K in solid.stages:
             if (measured := measure(solid.scene, K)) > _rounding(solid.scene):
                 _fail(solid.scene, fault.format(body=body, measure=measured), remedy)
 
 
-@asked_of(FollowerRule, FramePolicy, FractureModel)
+@property_of(FollowerRule, FramePolicy, FractureModel)
 def does_not_stiffen_by_breaking(subject: Subject) -> None:
-    """There, no displacement needs more force after bonds have softened or broken than before."""
+    """With known forces and free edges, no displacement requires more force after bonds have
+    softened or broken."""
     for solid in _solids(subject):
-        for (_, before), (what, after) in pairwise(solid.stages):
-            if (more := stiffening(before, after)) > _rounding(solid.scene):
+        for (_, K), (what, K_damaged) in pairwise(solid.stages):
+            if (increase := stiffening(K, K_damaged)) > _rounding(solid.scene):
                 _fail(
                     solid.scene,
                     f"some displacement of a {what} body meets more force than before, by "
-                    f"{more:.3g} of the largest stiffness",
+                    f"{increase:.3g} of the largest stiffness",
                     "let what is seen of a bond be a share of its difference, falling from 1 to 0",
                 )
 
@@ -244,7 +255,7 @@ def _solids(subject: Subject) -> list[Solid]:
     try:
         return subject.solids
     except NoSolidError as reason:
-        raise NotAskedError(str(reason)) from None
+        raise NotApplicableError(str(reason)) from None
 
 
 def _fail(scene: Scene, fault: str, remedy: str) -> None:

@@ -1,5 +1,5 @@
-"""States made by hand and what a few steps make of them; the numbers that a part remembers, and
-moments shown in another order."""
+"""States for tests and the results of a few steps; numbers that components remember, and moments
+with permuted rows."""
 
 from __future__ import annotations
 
@@ -36,20 +36,22 @@ from pbdkit.stepping.state import State, describe_bonds, describe_particles, ini
 
 
 def spacing(scene: Scene) -> float:
-    """The smallest rest length."""
-    return min(math.hypot(*slot.rest) for own in scene.neighbourhood.slots for slot in own)
+    """Return the smallest rest length."""
+    return min(math.hypot(*slot.rest) for slots in scene.neighbourhood.slots for slot in slots)
 
 
 def displacements(scene: Scene, seed: int, share: float = 0.2) -> Floats:
-    """u of the body at random, (body particle, axis), up to a share of the spacing."""
+    """Return random displacements of the body, (particle, axis), up to a share of the spacing."""
     size = share * spacing(scene)
     return np.random.default_rng(seed).uniform(-size, size, (len(scene.raster.body_rows), 2))
 
 
 def state_with(scene: Scene, u: Any) -> State:
-    """The state whose body has displacements u, (body particle, axis), and stands still; the frame
-    follows by its map. It is that of step 1: what an engine knows of step 0 is the experiment's own
-    start."""
+    """Return the state of step 1 at rest whose body has displacements u, (particle, axis).
+
+    The frame follows by its map. It is not the state of step 0, which engines may replace by the
+    experiment's initial state.
+    """
     state = initial_state(scene)
     raster, flat = scene.raster, state.u.reshape(2, -1)
     flat[:, raster.place_of(raster.body_rows)] = np.asarray(u).T
@@ -61,7 +63,7 @@ def state_with(scene: Scene, u: Any) -> State:
 
 
 def advanced(scene: Scene, u: Any, steps: int) -> Floats:
-    """The body's displacements some steps after those given, (step, body particle, axis)."""
+    """Return the displacements of the body in the steps from u on, (step, particle, axis)."""
     stepper, raster = Stepper(scene), scene.raster
     states = accumulate(
         range(steps), lambda state, _: stepper.advance(state), initial=state_with(scene, u)
@@ -70,19 +72,19 @@ def advanced(scene: Scene, u: Any, steps: int) -> Floats:
 
 
 SHAPE = (4, 3)
-"""The shape of the arrays with which elementwise functions are called."""
+"""Shape of the arrays with which elementwise functions are called."""
 SEED = 7
-"""Of the generators that parts are given to draw from."""
+"""Seed of the generators that components draw from."""
 
 
 def numbers_of(part: Component, scene: Scene) -> tuple[Remembered, ...]:
-    """What a fracture model remembers of each bond, or a rule of each particle."""
+    """Return the numbers that a fracture model remembers of bonds, or a rule of particles."""
     declared = particle_numbers if isinstance(part, FollowerRule) else bond_numbers
     return declared(scene.experiment)
 
 
 def owners(part: Component, scene: Scene) -> Bonds | Particles:
-    """Those of whom it remembers numbers, as `draw` is shown them."""
+    """Return the bonds or particles of which a component remembers numbers, as passed to `draw`."""
     return (describe_particles if isinstance(part, FollowerRule) else describe_bonds)(scene)
 
 
@@ -91,14 +93,15 @@ def _vector(size: float, rng: np.random.Generator) -> Vector:
 
 
 def differences(scene: Scene, seed: int, share: float = 0.3) -> list[Vector]:
-    """A difference along each slot of the first sublattice, at random."""
+    """Return a random difference along each slot of the first sublattice."""
     rng = np.random.default_rng(seed)
     return [_vector(share * spacing(scene), rng) for _ in scene.neighbourhood.slots[0]]
 
 
 def stressed(model: Component, seed: int) -> tuple[Any, ...]:
-    """The cells to the left and right of some bonds, by the numbers of their stress, where a
-    fracture model softens cells by it."""
+    """Return the cells to the left and right of some bonds, as numbers of their stress, for a model
+    that softens cells.
+    """
     rng, count = np.random.default_rng(seed), 2 * isinstance(model, SoftensCells)
     return tuple(
         (*rng.uniform(-0.2, 0.5, (3, *SHAPE)), rng.integers(0, 2, SHAPE).astype(float))
@@ -107,15 +110,22 @@ def stressed(model: Component, seed: int) -> tuple[Any, ...]:
 
 
 def here(scene: Scene, seed: int) -> dict[str, Any]:
-    """u and X of some particles, at random, and what the rule remembers of some, as `own`."""
+    """Return random u and X of some particles, and numbers that the rule remembers, as `own`."""
     rng, size = np.random.default_rng(seed + 1), spacing(scene)
-    own = remembers(scene.experiment.rule, scene, seed)
-    return {"u": _vector(0.3 * size, rng), "X": _vector(5 * size, rng), "own": own}
+    remembered = remembers(scene.experiment.rule, scene, seed)
+    return {"u": _vector(0.3 * size, rng), "X": _vector(5 * size, rng), "own": remembered}
 
 
 def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ...]]:
-    """The contributions of every slot; `shared` is what is remembered of the particle and of the
-    neighbour there, by slot, unless it is as at the start."""
+    """Return the contributions of every slot.
+
+    Parameters
+    ----------
+    scene, d
+        Scene, and the difference along each slot.
+    shared
+        Numbers remembered of the particle and its neighbour, by slot; by default initial ones.
+    """
     evaluator, named = Evaluator(scene), scene.constants.of_particle
     neighbours = evaluator.everywhere(scene.neighbourhood.slots[0])
     if shared:
@@ -125,24 +135,25 @@ def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ..
 
 
 def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
-    """The move that the sums of contributions make."""
+    """Return the move that the sums of contributions give."""
     return Evaluator(scene).move(summed((c, None) for c in contributions), standing(scene, **at))
 
 
 def standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
-    """What stands at a particle."""
+    """Return the local values of particles that a rule reads."""
     place: Any = X if scene.experiment.rule.uses_reference else None
     return Here(u, place, place, scene.constants.of_particle(*own))
 
 
 def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
-    """Numbers that it remembers of some particles, or of some bonds that have not broken, as they
-    are at the start or two steps later; those of one owner stand together."""
+    """Return numbers that a component remembers of some particles or intact bonds, at the start or
+    two steps later. Numbers of one owner stay together.
+    """
     numbers = numbers_of(part, scene)
     if not numbers:
         return ()
     states = [initial_state(scene)]
-    with suppress(PluginError):  # what fails is asked about directly, and named there
+    with suppress(PluginError):  # another property reports the failure
         start = state_with(scene, displacements(scene, seed, share=0.1))
         states.append(Stepper(scene).advance(start, 2))
     pools = []
@@ -155,8 +166,9 @@ def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
 
 
 def shared(scene: Scene, own: tuple[Any, ...]) -> list[Any]:
-    """Along each slot of the first sublattice what is remembered of particles and of neighbours,
-    for rules that see it: each neighbour is another of the particles."""
+    """Return the remembered numbers of particle and neighbour along each slot of the first
+    sublattice, for rules that read both; the neighbour is another of the particles.
+    """
     if not shares_particles(scene.experiment.rule):
         return []
     slots = range(1, len(scene.neighbourhood.slots[0]) + 1)
@@ -164,21 +176,24 @@ def shared(scene: Scene, own: tuple[Any, ...]) -> list[Any]:
 
 
 def moment_of(scene: Scene, seed: int) -> StateMoment:
-    """The scene two steps after a random start; bonds may have broken."""
+    """Return the scene two steps after a random start, in which bonds may have broken."""
     state = state_with(scene, displacements(scene, seed, share=0.6))
     return StateMoment(Stepper(scene).advance(state, 2), Tables(scene))
 
 
 def measured_by(diagnostic: Diagnostic, now: Any) -> dict[str, Any]:
-    """What a diagnostic measures of a moment, by variable."""
+    """Return the values that a diagnostic measures of a moment, by variable."""
     names = [variable.name for variable in diagnostic.variables()]
     return dict(zip(names, diagnostic.measure(now), strict=True))
 
 
 class Shown:
-    """A moment, its cells or its forces with other tables in the place of its own, or with its
-    particles in another order: row n shows what stands in row order[n]. What is in no order of
-    particles is as it is."""
+    """A moment, its cells or its forces with replaced tables or permuted particles.
+
+    Row n contains what row order[n] of the inner object does. Values that have no order of
+    particles
+    are unchanged.
+    """
 
     OWN = ("displacement", "previous_displacement", "reference")
     OF_PARTICLES = (
@@ -191,35 +206,35 @@ class Shown:
 
     @property
     def tables(self) -> dict[str, Any]:
-        """Those that particles have in every moment, by name, in this order."""
+        """Tables that particles have in every moment, by name, in this order."""
         return self._tables or {n: getattr(self._inner, n)()[self._order] for n in self.OWN}
 
     def __getattr__(self, name: str) -> Any:
         if name in self.OWN:
             table = self.tables[name]
             return lambda rows=None: table if rows is None else table[rows]
-        found = getattr(self._inner, name)
+        attribute = getattr(self._inner, name)
         if name in ("cells", "forces"):
-            return Shown(found, self._order)
-        if not callable(found):
-            return self._shown(name, found)
-        return lambda *given, **named: self._shown(name, found(*given, **named))
+            return Shown(attribute, self._order)
+        if not callable(attribute):
+            return self._shown(name, attribute)
+        return lambda *given, **named: self._shown(name, attribute(*given, **named))
 
-    def _shown(self, name: str, found: Any) -> Any:
+    def _shown(self, name: str, value: Any) -> Any:
         place = np.argsort(self._order)
         if name in ("rows", "nearest"):
-            return place[found]
+            return place[value]
         if name == "leader_groups":
-            return tuple(group._replace(rows=place[group.rows]) for group in found)
+            return tuple(group._replace(rows=place[group.rows]) for group in value)
         if name == "loads":
-            return tuple(load._replace(rows=place[load.rows]) for load in found)
+            return tuple(load._replace(rows=place[load.rows]) for load in value)
         if name == "touching":
-            return tuple(TouchingRows(place[one.rows], one.normals) for one in found)
-        in_order = name in self.OF_PARTICLES and len(found) == len(place)
-        return found[self._order] if in_order else found
+            return tuple(TouchingRows(place[contact.rows], contact.normals) for contact in value)
+        in_order = name in self.OF_PARTICLES and len(value) == len(place)
+        return value[self._order] if in_order else value
 
 
 def frame_showing(frame: Any, site: Any, point: Any, body: Any) -> Any:
-    """The frame with other sites, and with these pairs for those that are nearest."""
+    """Return the frame with other sites, and with these pairs as the nearest ones."""
     same = {name: getattr(frame, name) for name in ("cell", "low", "high", "rule", "body_at")}
     return SimpleNamespace(**same, site=site, nearest=lambda: (point, body))

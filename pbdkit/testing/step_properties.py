@@ -1,6 +1,5 @@
-"""Properties of whole steps in which a component takes part, of rules that take loads, and of rules
-whose particles have directions.
-"""
+"""Properties of whole steps with a component, of rules that take loads, and of rules whose
+particles have directions."""
 
 from __future__ import annotations
 
@@ -46,21 +45,28 @@ from pbdkit.testing.states import (
     standing,
     state_with,
 )
-from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, flat, place_of
+from pbdkit.testing.subject import (
+    NotApplicableError,
+    PropertyError,
+    Subject,
+    flat,
+    place_of,
+    property_of,
+)
 
 LOAD_ROUNDING = 1e-9
-"""As a share of the largest number: sums cancel."""
+"""Tolerance relative to the largest number; sums cancel."""
 
 
-@asked_of(FollowerRule)
+@property_of(FollowerRule)
 def bears_loads_as_forces(subject: Subject) -> None:
-    """Where it takes loads, one adds itself to `force`, what it adds to the move is the same
-    wherever neighbours stand, and none changes nothing."""
+    """A load adds itself to `force`, its contribution to the move does not depend on the positions
+    of neighbours, and a load of zero changes nothing."""
     rule, scene = subject.component, subject.scene
     if not isinstance(rule, Loadable):
-        raise NotAskedError("it takes no loads")
+        raise NotApplicableError("it takes no loads")
     if material_of(subject.component) is None:
-        raise NotAskedError("its parameters leave it without a material")
+        raise NotApplicableError("its parameters leave it without a material")
     evaluator, p = Evaluator(scene), scene.constants.rule
     load, added = here(scene, 1)["u"], []
     for seed in (0, 1):
@@ -74,28 +80,28 @@ def bears_loads_as_forces(subject: Subject) -> None:
     _compare(added[0], added[1], "what it adds to the move is not, wherever neighbours stand,")
 
 
-def _compare(one: object, other: object, what: str) -> None:
-    expected = flat(other)
-    size = max(float(np.abs(value).max()) for value in expected.values())
-    for name, value in flat(one).items():
-        if not (np.abs(value - expected[name]) <= LOAD_ROUNDING * size).all():
-            raise PropertyError(f"`loaded`: {what} the same as without, and the load ({name})")
+def _compare(value: object, reference: object, subject: str) -> None:
+    expected = flat(reference)
+    size = max(float(np.abs(number).max()) for number in expected.values())
+    for name, number in flat(value).items():
+        if not (np.abs(number - expected[name]) <= LOAD_ROUNDING * size).all():
+            raise PropertyError(f"`loaded`: {subject} the same as without, and the load ({name})")
 
 
 STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
 STEP_ROUNDING = 1e-12
-"""As a share of the largest displacement; a few steps are some hundred roundings of 1e-16."""
+"""Tolerance relative to the largest displacement, for some hundred roundings of 1e-16."""
 STEPS = 4
 
 
-@asked_of(*STEPPED)
+@property_of(*STEPPED)
 def rests(subject: Subject) -> None:
-    """A body at rest inside a frame stays at rest exactly, and none of its bonds breaks: what moves
-    by 1e-17 has moved."""
+    """A body at rest inside a frame stays exactly at rest, and none of its bonds breaks: a
+    displacement of 1e-17 is one."""
     fracture = [(scene, scene.experiment.fracture) for scene in subject.scenes]
     quiet = [scene for scene, model in fracture if not model.check(scene.neighbourhood.shells())]
     if not quiet:
-        raise NotAskedError("it warns that bonds break at rest in every scene that was tried")
+        raise NotApplicableError("it warns that bonds break at rest in every scene that was tried")
     for scene in quiet:
         engine, state = Stepper(scene), initial_state(scene)
         if scene.frame is None:
@@ -111,31 +117,33 @@ def rests(subject: Subject) -> None:
 
 
 def _refuse_to_leave_rest(scene: Scene) -> None:
-    """Raises PropertyError where a particle moves that has all its neighbours, at rest: without a
-    frame those at edges may."""
+    """Raise PropertyError if a particle with all its neighbours moves from rest.
+
+    Without a frame particles at edges may move.
+    """
     for slots in scene.neighbourhood.slots:
-        most = max(abs(float(component)) for component in Evaluator(scene).at_rest(slots))
-        if most > 0.0:
-            raise PropertyError(_restless(most, place_of(scene.experiment)))
+        largest = max(abs(float(component)) for component in Evaluator(scene).at_rest(slots))
+        if largest > 0.0:
+            raise PropertyError(_restless(largest, place_of(scene.experiment)))
 
 
-def _restless(most: float, where: str) -> str:
+def _restless(largest: float, where: str) -> str:
     wanted = "zero differences must give a move of exactly zero"
     remedy = "let terms of opposite neighbours cancel one by one"
-    return f"a body at rest moves by {most:.3g} {where}: {wanted}; {remedy}"
+    return f"a body at rest moves by {largest:.3g} {where}: {wanted}; {remedy}"
 
 
-@asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy)
+@property_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy)
 def follows_translations(subject: Subject) -> None:
-    """A body that is translated as a whole moves as before, translated, to rounding; rules that
-    declare `uses_reference` and frames that take on `Anchors` need not."""
-    component, most = subject.component, 0.0
+    """A translated body moves as the original, translated, up to rounding; rules with
+    `uses_reference` and frames that derive from `Anchors` are exempt."""
+    component, largest = subject.component, 0.0
     anchors = isinstance(component, Anchors)
     for scene in _free(subject):
         u, shift = displacements(scene, 1), spacing(scene) * np.array([0.75, -1.5])
-        moved, there = advanced(scene, u, STEPS) + shift, advanced(scene, u + shift, STEPS)
-        most = max(most, _apart(there[-1], moved[-1], moved))
-        if most > STEP_ROUNDING and not anchors:
+        moved, shifted = advanced(scene, u, STEPS) + shift, advanced(scene, u + shift, STEPS)
+        largest = max(largest, _apart(shifted[-1], moved[-1], moved))
+        if largest > STEP_ROUNDING and not anchors:
             remedy = ""
             if isinstance(component, FollowerRule):
                 remedy = ": use differences `d`, not `here.u`, or declare `uses_reference`"
@@ -143,14 +151,20 @@ def follows_translations(subject: Subject) -> None:
                 remedy = (
                     ": let the weights of each point sum to 1, or take on `pbdkit.plugin.Anchors`"
                 )
-            fault = f"a translated body moves otherwise, by {most:.3g} of its displacement"
+            fault = f"a translated body moves otherwise, by {largest:.3g} of its displacement"
             raise PropertyError(f"{fault}, {place_of(scene.experiment)}{remedy}")
-    if anchors and most <= STEP_ROUNDING:
+    if anchors and largest <= STEP_ROUNDING:
         raise PropertyError("it says that it `anchors` the body, and follows every translation")
 
 
 def _free(subject: Subject) -> list[Scene]:
-    """The scenes in which nothing else counts where particles stand; NotAskedError without any."""
+    """Return the scenes without another part that depends on positions.
+
+    Raises
+    ------
+    NotApplicableError
+        If there are none.
+    """
     free = []
     for scene in subject.scenes:
         rule, frame = scene.experiment.rule, scene.experiment.frame
@@ -159,7 +173,7 @@ def _free(subject: Subject) -> list[Scene]:
             free.append(scene)
     if not free:
         reason = f"{_whose(subject)} declares `uses_reference`, or a frame anchors"
-        raise NotAskedError(f"{reason}: where a body lies may count")
+        raise NotApplicableError(f"{reason}: where a body lies may count")
     return free
 
 
@@ -167,84 +181,84 @@ def _whose(subject: Subject) -> str:
     return "it" if isinstance(subject.component, FollowerRule) else "the rule"
 
 
-@asked_of(FollowerRule, FramePolicy)
+@property_of(FollowerRule, FramePolicy)
 def superposes(subject: Subject) -> None:
-    """Where a rule declares `linear`, and with every frame, the steps from two displacements
-    together are the steps from each, added, to rounding."""
+    """With a rule that declares `linear`, the steps from the sum of two displacements are the sum
+    of the steps from each, up to rounding."""
     scenes = [scene for scene in subject.scenes if scene.experiment.rule.linear]
     if not scenes:
-        raise NotAskedError(f"{_whose(subject)} does not declare `linear`")
+        raise NotApplicableError(f"{_whose(subject)} does not declare `linear`")
     for scene in scenes:
-        one, other = displacements(scene, 2, share=0.5), displacements(scene, 3, share=0.5)
-        both, a, b, none = (advanced(scene, u, STEPS) for u in (one + other, one, other, 0.0 * one))
-        off = _apart((both - none)[-1], (a + b - 2 * none)[-1], np.array([both, a, b, none]))
-        if not off <= STEP_ROUNDING:
+        first, second = displacements(scene, 2, share=0.5), displacements(scene, 3, share=0.5)
+        starts = first + second, first, second, 0.0 * first
+        both, a, b, none = (advanced(scene, u, STEPS) for u in starts)
+        deviation = _apart((both - none)[-1], (a + b - 2 * none)[-1], np.array([both, a, b, none]))
+        if not deviation <= STEP_ROUNDING:
             remedy = "do not declare `linear`" if _whose(subject) == "it" else ""
-            fault = f"displacements do not superpose, by {off:.3g} of the largest"
+            fault = f"displacements do not superpose, by {deviation:.3g} of the largest"
             raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
 
 
-def _apart(one: Floats, other: Floats, all_of_them: Floats) -> float:
-    """How far two states are apart, as a share of the largest displacement there was: what grows
-    takes its roundings with it."""
-    return float(np.abs(one - other).max() / max(1e-300, np.abs(all_of_them).max()))
+def _apart(state: Floats, reference: Floats, states: Floats) -> float:
+    """Return the distance of two states, relative to the largest displacement in the history."""
+    return float(np.abs(state - reference).max() / max(1e-300, np.abs(states).max()))
 
 
-@asked_of(is_needed=True)
+@property_of(is_needed=True)
 def continues_where_it_stopped(subject: Subject) -> None:
-    """A run that is saved, read by a component made anew from its JSON and continued is the same to
-    the last bit as one that was never interrupted; so is what is recorded of one that is kept as
-    the run store keeps it."""
+    """A run that is saved and continued by a component rebuilt from its JSON is equal to the last
+    bit to an uninterrupted one, as are its records if it is stored and resumed."""
     component, kind = subject.component, type(subject.component)
-    anew = kind.model_validate_json(component.model_dump_json(by_alias=True))
-    if any(getattr(anew, name) != getattr(component, name) for name in kind.model_fields):
-        raise NotAskedError("it is another one after JSON")
-    scenes = zip(subject.scenes, Subject(anew, subject.parts).scenes, strict=True)
-    for n, (scene, again) in enumerate(scenes):
+    copy = kind.model_validate_json(component.model_dump_json(by_alias=True))
+    if any(getattr(copy, name) != getattr(component, name) for name in kind.model_fields):
+        raise NotApplicableError("it is another one after JSON")
+    scenes = zip(subject.scenes, Subject(copy, subject.parts).scenes, strict=True)
+    for n, (scene, rebuilt) in enumerate(scenes):
         start = displacements(scene, n, share=0.4)
-        _refuse_difference(initial_state(again), initial_state(scene), "a run made anew", scene)
+        _refuse_difference(initial_state(rebuilt), initial_state(scene), "a run made anew", scene)
         whole = Stepper(scene).advance(state_with(scene, start), 2 * STEPS)
         half = Stepper(scene).advance(state_with(scene, start), STEPS)
-        saved, kept = pickle.dumps(half), half.copy()
+        saved, duplicate = pickle.dumps(half), half.copy()
         Stepper(scene).advance(half, STEPS)
-        continued = Stepper(again).advance(pickle.loads(saved), STEPS)
+        continued = Stepper(rebuilt).advance(pickle.loads(saved), STEPS)
         _refuse_difference(continued, whole, f"a run continued at step {STEPS}", scene)
-        copied = Stepper(again).advance(kept, STEPS)
+        copied = Stepper(rebuilt).advance(duplicate, STEPS)
         _refuse_difference(copied, whole, f"a run continued from a copy of step {STEPS}", scene)
         if isinstance(component, Diagnostic):
-            one = measured_by(anew, StateMoment(continued, Tables(again)))
-            other = measured_by(component, StateMoment(whole, Tables(scene)))
-            for name in differing(other, one):
+            measured = measured_by(copy, StateMoment(continued, Tables(rebuilt)))
+            expected = measured_by(component, StateMoment(whole, Tables(scene)))
+            for name in differing(expected, measured):
                 raise PropertyError(f"`{name}` of a run continued at step {STEPS} is another one")
     with suppress(PluginError):  # what no dataset can be made of, other properties tell
-        _refuse_other_records(subject.scene, Subject(anew, subject.parts).scene)
+        _refuse_other_records(subject.scene, Subject(copy, subject.parts).scene)
 
 
-def _refuse_other_records(scene: Scene, again: Scene) -> None:
-    """Raises PropertyError where a run that is stopped, kept as the run store keeps it, and gone on
-    with in a scene made anew records something else than one that was never interrupted."""
+def _refuse_other_records(scene: Scene, rebuilt: Scene) -> None:
+    """Raise PropertyError if a run that is stopped, stored and resumed in a rebuilt scene has other
+    records than an uninterrupted one.
+    """
     whole, start = MemorySink(), state_with(scene, displacements(scene, 5, share=0.4))
     record(Simulation.of_scene(scene, start=start.copy()), whole)
-    datasets = resumed(scene, again, STEPS - 1, start), whole.dataset()
-    found, needed = ({str(n): v for n, v in ds.variables.items()} for ds in datasets)
-    for name in differing(needed, found):
+    datasets = resumed(scene, rebuilt, STEPS - 1, start), whole.dataset()
+    records, expected = ({str(n): v for n, v in ds.variables.items()} for ds in datasets)
+    for name in differing(expected, records):
         raise PropertyError(f"`{name}` of a run gone on with after step {STEPS - 1} is another one")
 
 
-@asked_of(*STEPPED, ParticleOperation)
+@property_of(*STEPPED, ParticleOperation)
 def is_the_same_compiled(subject: Subject) -> None:
-    """The compiled engine gives the numbers of the numpy engine, to the last bit; what does not
-    compile is stepped by numpy, and says so."""
+    """The compiled engine gives the numbers of the numpy engine to the last bit; a component that
+    does not compile is stepped by numpy, with a warning."""
     scene = subject.scene
     if reason := obstacle():
-        raise NotAskedError(reason)
+        raise NotApplicableError(reason)
     from pbdkit.stepping.numba_engine.engine import CompiledStepper
 
     try:
         compiled = CompiledStepper(scene)
     except PluginError as error:
         text = str(error).splitlines()[0]
-        raise NotAskedError(f"numpy alone steps it, more slowly: {text}") from None
+        raise NotApplicableError(f"numpy alone steps it, more slowly: {text}") from None
     start = displacements(scene, 4, share=0.6)
     state, expected = state_with(scene, start), state_with(scene, start)
     for steps in (1, 2, STEPS):
@@ -253,43 +267,44 @@ def is_the_same_compiled(subject: Subject) -> None:
 
 
 def _refuse_difference(state: State, expected: State, whose: str, scene: Scene) -> None:
-    found, needed = flat(state), flat(expected)
-    for name in differing(needed, found):
-        by, one, other = "", np.asarray(found.get(name)), np.asarray(needed.get(name))
-        if one.shape == other.shape:
-            by = f", by {np.abs(one.astype(float) - other).max():.3g} at most,"
+    arrays, references = flat(state), flat(expected)
+    for name in differing(references, arrays):
+        difference = ""
+        array, reference = np.asarray(arrays.get(name)), np.asarray(references.get(name))
+        if array.shape == reference.shape:
+            difference = f", by {np.abs(array.astype(float) - reference).max():.3g} at most,"
         where = f"at step {expected.step}, {place_of(scene.experiment)}"
-        raise PropertyError(f"{whose} gives another `{name}`{by} {where}")
+        raise PropertyError(f"{whose} gives another `{name}`{difference} {where}")
 
 
 ROUNDING = 1e-11
-"""As a share of the spacing; rotations sum some hundred roundings of 1e-16."""
+"""Tolerance relative to the spacing; rotations sum some hundred roundings of 1e-16."""
 ANGLE = 2.0
 
 
-@asked_of(FollowerRule)
+@property_of(FollowerRule)
 def follows_rotations(subject: Subject) -> None:
-    """A body without frame whose particles have directions moves as before, turned, where it is
-    turned as a whole, its directions with it, to rounding."""
+    """A body without frame whose particles have directions, rotated with them as a whole, moves as
+    the original, rotated, up to rounding."""
     anywhere = not subject.component.uses_reference
     if not isinstance(subject.component, TurnsParticles):
-        raise NotAskedError("its particles have no directions")
+        raise NotApplicableError("its particles have no directions")
     scenes = [scene for scene in subject.scenes if anywhere and scene.frame is None]
     if not scenes:
-        raise NotAskedError("a frame, or where a particle stands, may tell directions apart")
+        raise NotApplicableError("a frame, or where a particle stands, may tell directions apart")
     for scene in scenes:
         start = Stepper(scene).advance(state_with(scene, displacements(scene, 6)), 2)
         turned = _turned(scene, start.copy())
         expected = _positions(scene, _turned(scene, Stepper(scene).advance(start, STEPS)))
-        found = _positions(scene, Stepper(scene).advance(turned, STEPS))
-        if (off := np.abs(found - expected).max() / spacing(scene)) > ROUNDING:
-            fault = f"a turned body moves otherwise, by {off:.3g} of the spacing"
+        positions = _positions(scene, Stepper(scene).advance(turned, STEPS))
+        if (deviation := np.abs(positions - expected).max() / spacing(scene)) > ROUNDING:
+            fault = f"a turned body moves otherwise, by {deviation:.3g} of the spacing"
             remedy = "count its neighbours' places from its own direction"
             raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
 
 
 def _turned(scene: Scene, state: State) -> State:
-    """The state turned about the origin, its directions with it, in place."""
+    """Rotate the state and its directions about the origin in place."""
     c, s = np.cos(ANGLE), np.sin(ANGLE)
     raster, rows = scene.raster, scene.raster.body_rows
     place, X = raster.place_of(rows), raster.reference(rows).T

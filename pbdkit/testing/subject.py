@@ -1,9 +1,8 @@
-"""Properties and their subject: one component in small scenes, of every lattice with every
-neighbourhood, and the calls that are made of it.
+"""Properties and their subject: a component in small scenes, on every lattice with every
+neighbourhood, and the calls that are made of its functions.
 
-A `Question` is one call whose arguments are kept, so that it is made again with other arguments.
-Arguments and answers are trees: arrays and numbers in vectors, tuples, lists and dicts; answers
-also in dataclasses.
+A `FunctionCall` keeps its arguments, so that it can be repeated with others. Arguments and results
+are trees: arrays and numbers in vectors, tuples, lists and dicts; results also in dataclasses.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ Arrays = dict[str, Any]
 
 
 def flat(tree: Any, name: str = "") -> Arrays:
-    """The arrays and numbers of a tree by name."""
+    """Return the arrays and numbers of a tree by name."""
     if isinstance(tree, Vector):
         parts = {f"{name}.{c}".lstrip("."): v for c, v in zip("xyz", tree, strict=False)}
     elif isinstance(tree, dict) or is_dataclass(tree):
@@ -89,7 +88,7 @@ def flat(tree: Any, name: str = "") -> Arrays:
 
 
 def each(change: Callable[[Any], Any], tree: Any) -> Any:
-    """The tree of what a function makes of every array and number."""
+    """Return the tree with a function applied to every array and number."""
     if isinstance(tree, Vector):
         return tree.each(change)
     if isinstance(tree, dict):
@@ -100,81 +99,99 @@ def each(change: Callable[[Any], Any], tree: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Question:
-    """One call: `what` is called, with which inputs by name, and how.
+class FunctionCall:
+    """A call of a function of a component.
 
-    An `elementwise` one is asked with arrays of one shape, a value a particle or bond.
+    Parameters
+    ----------
+    function
+        Name of the function in messages.
+    inputs
+        Arguments by name.
+    compute
+        Function of these arguments.
+    elementwise
+        Whether the arrays have one shape, with a value for each particle or bond.
     """
 
-    what: str
+    function: str
     inputs: dict[str, Any]
-    ask: Callable[..., Any]
+    compute: Callable[..., Any]
     elementwise: bool = False
 
-    def asked(self, change: Callable[[Any], Any] = np.array) -> Any:
-        """The answer as it comes, to inputs that are copied, or changed."""
+    def evaluate(self, change: Callable[[Any], Any] = np.array) -> Any:
+        """Return the result for inputs that are copied, or changed by a function."""
         with np.errstate(all="ignore"):
-            return self.ask(**each(change, self.inputs))
+            return self.compute(**each(change, self.inputs))
 
     def answer(self, change: Callable[[Any], Any] = np.array) -> Arrays:
-        """The answer by name, as it was at that moment."""
-        return {name: np.array(value) for name, value in flat(self.asked(change)).items()}
+        """Return copies of the arrays of the result by name."""
+        return {name: np.array(value) for name, value in flat(self.evaluate(change)).items()}
 
 
 @singledispatch
-def questions_of(component: Component, scene: Scene, seed: int) -> list[Question]:
-    """Those that its interface allows."""
+def calls_of(component: Component, scene: Scene, seed: int) -> list[FunctionCall]:
+    """Return the calls of the functions of a component that its interface permits."""
     raise TypeError(f"{type(component).__name__} is of no interface")
 
 
-@questions_of.register
-def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
-    """`gather` and `apply`, also where r + d = 0 along every slot; `remember`, `force`, `loaded`
-    and `draw` where it has them."""
+@calls_of.register
+def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[FunctionCall]:
+    """Return calls of `gather` and `apply`, also with r + d = 0 along every slot, and of
+    `remember`,
+    `force`, `loaded` and `draw` if the rule has them.
+    """
     d, at, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
     contributions = gathered(scene, each(np.array, d))
-    given = {"d": d, "shared": shared(scene, at["own"])}
-    gather = Question("gather", given, partial(gathered, scene), elementwise=True)
+    inputs = {"d": d, "shared": shared(scene, at["own"])}
+    gather = FunctionCall("gather", inputs, partial(gathered, scene), elementwise=True)
     if len({len(flat(parts)) for parts in contributions}) > 1:
         return [gather]  # they cannot be summed, which is found elsewhere
     sums = summed((c, None) for c in contributions)
     total = each(lambda t: np.broadcast_to(t, SHAPE).copy(), sums)
-    asks: dict[str, Callable[[Any, Here], Any]] = {"apply": evaluator.move}
+    functions: dict[str, Callable[[Any, Here], Any]] = {"apply": evaluator.move}
     if isinstance(rule, RenewsParticles):
-        asks["remember"] = evaluator.remember
+        functions["remember"] = evaluator.remember
     if material_of(rule) is not None:
-        asks["force"] = evaluator.force
+        functions["force"] = evaluator.force
 
-    def question(what: str) -> Question:
-        def ask(total: Any, **to: Any) -> Any:
-            return asks[what](total, standing(scene, **to))
+    def call(function: str) -> FunctionCall:
+        def compute(total: Any, **to: Any) -> Any:
+            return functions[function](total, standing(scene, **to))
 
-        return Question(what, {"total": total} | at, ask, elementwise=True)
+        return FunctionCall(function, {"total": total} | at, compute, elementwise=True)
 
-    loads: list[Question] = []
+    loads: list[FunctionCall] = []
     if isinstance(rule, Loadable) and material_of(rule) is not None:
-        given = {"total": total, "load": here(scene, seed + 1)["u"]}
-        loads.append(Question("loaded", given, partial(rule.loaded, p=scene.constants.rule), True))
+        inputs = {"total": total, "load": here(scene, seed + 1)["u"]}
+        loads.append(
+            FunctionCall("loaded", inputs, partial(rule.loaded, p=scene.constants.rule), True)
+        )
     slots = zip(d, scene.neighbourhood.slots[0], strict=True)
     meeting = {"d": [v.each(lambda x, r: np.full_like(x, -r), slot.rest) for v, slot in slots]}
-    what = "apply, where all neighbours meet in the particle,"
-    met = Question(what, meeting | at, lambda d, **to: applied(scene, gathered(scene, d), **to))
-    return [gather, *map(question, asks), *loads, met, *_to_draw(rule, scene)]
+    name = "apply, where all neighbours meet in the particle,"
+
+    def coincident_move(d: Any, **to: Any) -> Any:
+        return applied(scene, gathered(scene, d), **to)
+
+    coincident = FunctionCall(name, meeting | at, coincident_move)
+    return [gather, *map(call, functions), *loads, coincident, *_to_draw(rule, scene)]
 
 
-@questions_of.register
-def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Question]:
-    """`breaks` and `fictitious`; `update`, `seen` and `draw` where it has them."""
+@calls_of.register
+def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[FunctionCall]:
+    """Return calls of `breaks` and `fictitious`, and of `update`, `seen` and `draw`."""
     slots, evaluator = scene.neighbourhood.slots[0], Evaluator(scene)
     p, limits = scene.constants.fracture, scene.constants.limits
 
-    def question(what: str, ask: Callable[..., Any], **inputs: Any) -> Question:
-        """One that is asked along every slot, with the difference along it where there are `d`."""
+    def call(function: str, compute: Callable[..., Any], **inputs: Any) -> FunctionCall:
+        """Return a call along every slot, with the difference along it as `d`."""
 
-        def along(d: Any = slots, **given: Any) -> Any:
-            return [ask(v, s.rest, limits[s], **given) for v, s in zip(d, slots, strict=True)]
+        def along(d: Any = slots, **arguments: Any) -> Any:
+            pairs = zip(d, slots, strict=True)
+            return [compute(v, slot.rest, limits[slot], **arguments) for v, slot in pairs]
 
-        return Question(what, inputs, along, elementwise=True)
+        return FunctionCall(function, inputs, along, elementwise=True)
 
     def fictitious(_: Any, r: Any, __: Any, u: Any) -> Any:
         return as_vector(model.fictitious(u, r, p), "fictitious", u)
@@ -189,30 +206,30 @@ def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
 
     bonds = {"d": differences(scene, seed, share=2.0), "own": remembers(model, scene, seed)}
     u, lost = here(scene, seed)["u"], here(scene, seed + 3)["u"]
-    questions = [
-        question("breaks", evaluator.breaks, **bonds),
-        question("fictitious", fictitious, u=u),
+    calls = [
+        call("breaks", evaluator.breaks, **bonds),
+        call("fictitious", fictitious, u=u),
     ]
     if isinstance(model, RenewsBonds):
-        questions.append(question("update", update, **bonds, cells=stressed(model, seed)))
+        calls.append(call("update", update, **bonds, cells=stressed(model, seed)))
     if isinstance(model, Softens):
-        questions.append(question("seen", seen, **bonds, lost=lost))
-    return [*questions, *_to_draw(model, scene)]
+        calls.append(call("seen", seen, **bonds, lost=lost))
+    return [*calls, *_to_draw(model, scene)]
 
 
-def _to_draw(part: Component, scene: Scene) -> list[Question]:
+def _to_draw(part: Component, scene: Scene) -> list[FunctionCall]:
     if not isinstance(part, Draws):
         return []
     rows = owners(part, scene)
 
-    def draw(**given: Any) -> Any:
-        return part.draw(type(rows)(**given), generator_for(SEED, "fracture"))
+    def draw(**columns: Any) -> Any:
+        return part.draw(type(rows)(**columns), generator_for(SEED, "fracture"))
 
-    return [Question("draw", dict(vars(rows)), draw)]
+    return [FunctionCall("draw", dict(vars(rows)), draw)]
 
 
-@questions_of.register
-def _to_frame(policy: FramePolicy, scene: Scene, _: int) -> list[Question]:
+@calls_of.register
+def _to_frame(policy: FramePolicy, scene: Scene, _: int) -> list[FunctionCall]:
     sites = sites_of_frame(scene.raster, scene.experiment.rule)
     if sites is None:
         return []
@@ -221,53 +238,52 @@ def _to_frame(policy: FramePolicy, scene: Scene, _: int) -> list[Question]:
     def follow(**tables: Any) -> Any:
         return policy.follow(frame_showing(sites, **tables))
 
-    return [Question("follow", {"site": sites.site, "point": point, "body": body}, follow)]
+    return [FunctionCall("follow", {"site": sites.site, "point": point, "body": body}, follow)]
 
 
-@questions_of.register
-def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Question]:
+@calls_of.register
+def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[FunctionCall]:
     moment = moment_of(scene, seed)
 
     def measure(**tables: Any) -> Any:
-        found = measured_by(diagnostic, Shown(moment, tables=tables))
+        measured = measured_by(diagnostic, Shown(moment, tables=tables))
         for variable in diagnostic.variables():
-            values = np.asarray(found[variable.name])
+            values = np.asarray(measured[variable.name])
             sizes = dict(zip(variable.dims, values.shape, strict=False))
             if values.dtype.kind == "f" and sizes.get("particle") == len(moment.body):
                 # NaN may stand at frame points, and beyond the outline.
                 allowed = np.isnan(values) & variable.is_recordable(values, moment.inside)
-                found[variable.name] = np.where(allowed, 0.0, values)
-        return found
+                measured[variable.name] = np.where(allowed, 0.0, values)
+        return measured
 
-    return [Question("measure", Shown(moment).tables, measure)]
+    return [FunctionCall("measure", Shown(moment).tables, measure)]
 
 
-@questions_of.register
-def _to_operation(operation: ParticleOperation, scene: Scene, seed: int) -> list[Question]:
-    """`displacement`."""
+@calls_of.register
+def _to_operation(operation: ParticleOperation, scene: Scene, seed: int) -> list[FunctionCall]:
     operated = scene.operations[0]
 
     def displaced(u: Any, new: Any) -> Any:
-        found = operation.displacement(u, new, operated.parameters)
-        return as_vector(found, "displacement", u)
+        vector = operation.displacement(u, new, operated.parameters)
+        return as_vector(vector, "displacement", u)
 
     inputs = {"u": here(scene, seed)["u"], "new": here(scene, seed + 1)["u"]}
-    return [Question("displacement", inputs, displaced, elementwise=True)]
+    return [FunctionCall("displacement", inputs, displaced, elementwise=True)]
 
 
-@questions_of.register
-def _to_lattice(lattice: Lattice, _: Scene, __: int) -> list[Question]:
-    return [Question("cell", {}, lattice.cell)]
+@calls_of.register
+def _to_lattice(lattice: Lattice, _: Scene, __: int) -> list[FunctionCall]:
+    return [FunctionCall("cell", {}, lattice.cell)]
 
 
-@questions_of.register
-def _to_metric(metric: NeighbourMetric, scene: Scene, _: int) -> list[Question]:
+@calls_of.register
+def _to_metric(metric: NeighbourMetric, scene: Scene, _: int) -> list[FunctionCall]:
     cell = scene.experiment.lattice.cell()
 
     def shells() -> Any:
         return [metric.shells_around(cell, s) for s in range(len(cell.sites))]
 
-    return [Question("shells_around", {}, shells)]
+    return [FunctionCall("shells_around", {}, shells)]
 
 
 LATTICES: dict[str, dict[str, Any]] = {
@@ -282,59 +298,66 @@ NEIGHBOURS: dict[str, dict[str, Any]] = {
     for name, shells in product(("coordination", "chebyshev"), (1, 2))
 }
 PARTNERS = ({"type": "barycentre"}, {"type": "distance-weighted"})
-"""The rules with which lattices and neighbours are tried: a linear one, and one that is not."""
+"""Rules with which lattices and neighbour metrics are tested: a linear and a nonlinear one."""
 MEAN, NATURAL = {"type": "mean"}, {"type": "natural"}
 ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
-"""The rule with which frames are tried whose edges are free of stress."""
+"""Rule with which frames with traction-free edges are tested."""
 BODY = {"type": "grid", "columns": 6, "rows": 5}
 PULLED = [
     {"select": {"edge": "left"}, "motion": {"type": "hold"}},
     {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [0.3, 0.1]}},
 ]
-"""The leaders of the scenes that diagnostics measure."""
+"""Leaders of the scenes that diagnostics measure."""
 LOADED = [
     {"select": {"edge": "top"}, "force": [0.02, 0.05]},
     {"select": {"edge": "right"}, "body_force": [0.01, -0.03], "from": 2},
 ]
-"""The loads of those that measure loads."""
+"""Loads of the scenes for diagnostics of loads."""
 PRESSING = {
     "shape": {"half_plane": {"point": [0.0, -0.1], "normal": [0.0, 1.0]}},
     "motion": {"type": "displace", "displacement": [0.0, 0.3]},
 }
-"""The obstacle of the scenes that diagnostics of obstacles measure."""
+"""Obstacle of the scenes for diagnostics of obstacles."""
 TEARING = {"type": "threshold", "thresholds": [1.6]}
 
 
 def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator[Experiment]:
-    """Small experiments that a component takes part in; `parts`, each one or a list of them, stand
-    in for those tried.
+    """Yield small experiments with a component.
 
-    Rules, frames and fracture models meet each of the five lattices with each of four
-    neighbourhoods, lattices and neighbour metrics each of the other with two rules; what works cell
-    by cell meets frames or rules that do.
+    Rules, frames and fracture models are combined with each of the five lattices and each of four
+    neighbourhoods, lattices and neighbour metrics each with the other and two rules. Components
+    that
+    work cell by cell are combined with frames or rules that do.
+
+    Parameters
+    ----------
+    component
+        Component.
+    parts
+        Parts of the experiments, each one or a list, that replace the usual ones.
     """
     field = next(f for f, i in INTERFACES.items() if i is interface_of(type(component)))
     neighbours = list(NEIGHBOURS.values())
-    given: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 6, **parts}
+    base: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 6, **parts}
     if isinstance(component, Diagnostic):
-        given |= {"leaders": PULLED, "fracture": parts.get("fracture", TEARING)}
-        with suppress(Exception):  # what fails is asked about directly, and named there
+        base |= {"leaders": PULLED, "fracture": parts.get("fracture", TEARING)}
+        with suppress(Exception):  # another property reports the failure
             if any("obstacle" in v.dims for v in component.variables()):
-                given |= {"obstacles": [PRESSING]}
+                base |= {"obstacles": [PRESSING]}
         neighbours = [n for n in neighbours if n["shells"] == 1]  # the model has one threshold
-        given |= {"loads": LOADED} if "loads" in getattr(component, "needs", ()) else {}
+        base |= {"loads": LOADED} if "loads" in getattr(component, "needs", ()) else {}
     choices = {
         "lattice": list(LATTICES.values()),
         "neighbours": neighbours,
         "rule": _rules(component),
         "frame": _frames(component),
     }
-    given[field] = [component] if field in LISTS else component
-    for name in choices.keys() & given.keys():
-        part = given[name]
+    base[field] = [component] if field in LISTS else component
+    for name in choices.keys() & base.keys():
+        part = base[name]
         choices[name] = list(part) if isinstance(part, (list, tuple)) else [part]
     for choice in product(*choices.values()):
-        yield Experiment(**given | dict(zip(choices, choice, strict=True)))
+        yield Experiment(**base | dict(zip(choices, choice, strict=True)))
 
 
 def _frames(component: Component) -> list[dict[str, Any]]:
@@ -356,7 +379,7 @@ def _rules(component: Component) -> list[dict[str, Any]]:
 
 
 def place_of(experiment: Experiment) -> str:
-    """Where something was found, for messages."""
+    """Describe lattice and neighbourhood of an experiment for messages."""
     lattice, neighbours = experiment.lattice, experiment.neighbours
     shells = getattr(neighbours, "shells", None)
     around = f"{neighbours.type} neighbours" + (f" in {shells} shells" if shells else "")
@@ -364,15 +387,15 @@ def place_of(experiment: Experiment) -> str:
 
 
 class PropertyError(Exception):
-    """A property does not hold; the text names the fault, and the remedy where there is one."""
+    """A property does not hold; the text states the fault, and the remedy if there is one."""
 
 
-class NotAskedError(Exception):
-    """A property says nothing about this component; the text is the reason."""
+class NotApplicableError(Exception):
+    """A property does not apply to a component; the text is the reason."""
 
 
 class Subject:
-    """One component; what is asked of it is made once and shared by the properties."""
+    """A component under test. Its scenes and calls are built once for all properties."""
 
     def __init__(self, component: Component, parts: Mapping[str, Any]) -> None:
         self.component: Any = component
@@ -380,9 +403,12 @@ class Subject:
 
     @cached_property
     def scenes(self) -> list[Scene]:
-        """The scenes that it takes part in; ExperimentErrors are its right to refuse.
+        """Scenes with the component; it may refuse some by an ExperimentError.
 
-        Raises PropertyError where it refuses all of them.
+        Raises
+        ------
+        PropertyError
+            If it refuses all.
         """
         scenes: list[Scene] = []
         refusals: list[ExperimentError] = []
@@ -400,18 +426,24 @@ class Subject:
 
     @cached_property
     def solids(self) -> list[Solid]:
-        """The small solids that it takes part in. Raises NoSolidError without any."""
+        """Small solids with the component.
+
+        Raises
+        ------
+        NoSolidError
+            If there are none.
+        """
         every = {"lattice": [*LATTICES.values()], "neighbours": [*NEIGHBOURS.values()]}
         return solids_of(self.component, every | dict(self.parts))
 
     @property
     def scene(self) -> Scene:
-        """The first of the scenes."""
+        """First scene with the component."""
         return self.scenes[0]
 
-    def questions(self, n: int = 0) -> list[Question]:
-        """What can be asked of the component directly, on its n-th scene and with seed n."""
-        return questions_of(self.component, self.scenes[n], n % 1000)
+    def calls(self, n: int = 0) -> list[FunctionCall]:
+        """Return the calls of the functions of the component in its n-th scene, with seed n."""
+        return calls_of(self.component, self.scenes[n], n % 1000)
 
 
 Check = Callable[[Subject], None]
@@ -419,10 +451,20 @@ Check = Callable[[Subject], None]
 
 @dataclass(frozen=True)
 class Property:
-    """One thing that is asked of every component of some interfaces.
+    """A property that every component of some interfaces has.
 
-    Where one that `is_needed` does not hold, those after it are not judged: their answers would
-    mean nothing, and a fault is reported once and by its own name.
+    Parameters
+    ----------
+    name
+        Name, in lower case with hyphens.
+    interfaces
+        Interfaces of the components.
+    check
+        Function that raises PropertyError if the property does not hold.
+    is_needed
+        Whether later properties presuppose this one: if it fails they are skipped, so that a fault
+        is
+        reported once.
     """
 
     name: str
@@ -431,31 +473,40 @@ class Property:
     is_needed: bool = False
 
     @property
-    def asks(self) -> str:
-        """What is asked, in one sentence: the first paragraph of the check's docstring."""
+    def description(self) -> str:
+        """The property in a sentence: the first paragraph of the check's docstring."""
         return " ".join((inspect.getdoc(self.check) or "").split("\n\n")[0].split())
 
 
-def asked_of(*interfaces: type[Component], is_needed: bool = False) -> Callable[[Check], Property]:
-    """Makes a property of a check, asked of these interfaces, or of all; its name is that of the
-    function."""
-    asked = interfaces or tuple(INTERFACES.values())
+def property_of(
+    *interfaces: type[Component], is_needed: bool = False
+) -> Callable[[Check], Property]:
+    """Return a decorator that makes a check a property of these interfaces, by default of all.
+
+    The name of the property is that of the function.
+    """
+    classes = interfaces or tuple(INTERFACES.values())
 
     def make(check: Check) -> Property:
-        return Property(check.__name__.replace("_", "-"), asked, check, is_needed)
+        return Property(check.__name__.replace("_", "-"), classes, check, is_needed)
 
     return make
 
 
 def examples_of(component: type[Component]) -> list[Component]:
-    """One with the first example of each parameter that has no default, and one for each further
-    example, all else being the same.
+    """Return examples of a component class.
 
-    Raises PluginError where a parameter has neither default nor example, an example is refused, or
-    the class lacks a method of its interface.
+    The first has the first example of each parameter without default; each further example of a
+    parameter gives a further component, with all other parameters unchanged.
+
+    Raises
+    ------
+    PluginError
+        If a parameter has neither default nor example, an example is refused, or the class lacks a
+        method of its interface.
     """
     base: dict[str, Any] = {}
-    others: list[dict[str, Any]] = [{}]
+    variants: list[dict[str, Any]] = [{}]
     for name, field in component.model_fields.items():
         key, examples = field.alias or name, list(field.examples or [])
         if is_needed(field):
@@ -464,24 +515,25 @@ def examples_of(component: type[Component]) -> list[Component]:
                 remedy = f"write `{name}: ... = Field(description=..., examples=[...])`"
                 raise PluginError(f"{fault}: {remedy}")
             base[key] = examples.pop(0)
-        others += [{key: value} for value in examples]
-    return [_made(component, base | other) for other in others]
+        variants += [{key: value} for value in examples]
+    return [_made(component, base | variant) for variant in variants]
 
 
-def _made(component: type[Component], given: dict[str, Any]) -> Component:
+def _made(component: type[Component], parameters: dict[str, Any]) -> Component:
     try:
-        return component.model_validate(given)
+        return component.model_validate(parameters)
     except TypeError as error:  # an abstract method is missing
         raise PluginError(f"{component.__name__} cannot be made: {error}") from None
     except ValidationError as error:
         fault = error.errors()[0]
-        told = f"{'.'.join(map(str, fault['loc'])) or 'the whole'}: {fault['msg']}"
-        raise PluginError(f"{component.__name__} refuses its examples {given}: {told}") from None
+        detail = f"{'.'.join(map(str, fault['loc'])) or 'the whole'}: {fault['msg']}"
+        text = f"{component.__name__} refuses its examples {parameters}: {detail}"
+        raise PluginError(text) from None
 
 
 def full_name(component: Component) -> str:
-    """Its interface and type, with the parameters that are not at their defaults."""
+    """Return interface and type of a component, with parameters that differ from their defaults."""
     dumped = component.model_dump(exclude_defaults=True, exclude={"type"}, mode="json")
-    given = ", ".join(f"{k}={v}" for k, v in dumped.items())
+    parameters = ", ".join(f"{k}={v}" for k, v in dumped.items())
     name = f"{interface_of(type(component)).__name__} {component.type}"
-    return f"{name} ({given})" if given else name
+    return f"{name} ({parameters})" if parameters else name

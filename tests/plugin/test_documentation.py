@@ -154,7 +154,7 @@ def test_the_table_of_properties_is_whole():
     for (_, of, told), asked in zip(rows, PROPERTIES, strict=True):
         whom = {i.__name__ for i in INTERFACES.values()} if of == "all" else set(of.split(", "))
         assert whom == {i.__name__ for i in asked.interfaces}
-        assert asked.asks.startswith(told)
+        assert asked.description.startswith(told)
 
 
 PUBLIC = {

@@ -187,7 +187,7 @@ def test_every_property_finds_a_fault():
 
 def test_every_property_says_what_it_asks_and_of_whom():
     for asked in PROPERTIES:
-        assert len(asked.asks) > 30, asked.name
+        assert len(asked.description) > 30, asked.name
         assert asked.interfaces
         assert set(asked.interfaces) <= set(INTERFACES.values())
 
