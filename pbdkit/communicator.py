@@ -24,7 +24,7 @@ class Communicator(ABC):
 
     @property
     def is_root(self) -> bool:
-        """Whether this process reads, writes and prints for all."""
+        """True if this process reads, writes and prints for all."""
         return self.rank == 0
 
     @abstractmethod
@@ -71,22 +71,22 @@ class Communicator(ABC):
 
 
 class SerialCommunicator(Communicator):
-    """One process alone."""
+    """Communicator of a single process."""
 
     def allgather(self, value: Any) -> list[Any]:
         """Return the value, in a list."""
         return [value]
 
     def raise_together(self) -> AbstractContextManager[None]:
-        """Change nothing."""
+        """Run the block; nothing is communicated."""
         return nullcontext()
 
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """Return the numbers."""
+        """Return the numbers unchanged."""
         return numbers
 
     def processes_on_machine(self) -> int:
-        """Return 1."""
+        """Return 1, for this process."""
         return 1
 
 

@@ -20,7 +20,7 @@ class Execution:
         self.communicator = communicator
 
     def scene(self, experiment: Experiment) -> Scene:
-        """Return what this process needs of an experiment's scene."""
+        """Return the part of an experiment's scene that this process needs."""
         return build_scene(experiment)
 
     def tuned(self, scene: Scene) -> Scene:
@@ -28,7 +28,7 @@ class Execution:
         return tuned(scene)
 
     def by_root(self, work: Callable[[], int]) -> int:
-        """Return what the root alone comes to."""
+        """Return the result of work that the root does alone."""
         return work()
 
     def run(self, scene: Scene, watch: Watch) -> Simulation:

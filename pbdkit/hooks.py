@@ -67,7 +67,7 @@ class Command:
 
 
 class Hooks:
-    """What a plugin may implement, as functions of the module that its entry point names."""
+    """Hooks that a plugin may implement, as functions of the module that its entry point names."""
 
     @hookspec
     def pbdkit_components(self) -> list[type[Any]]:
@@ -238,7 +238,7 @@ class Plugin:
 
     @property
     def components(self) -> tuple[type[Any], ...]:
-        """Usable component classes."""
+        """Component classes that are usable."""
         return tuple(o.component for o in self.offers if o.component)
 
     def answers_to(self, name: str) -> bool:

@@ -128,7 +128,7 @@ class _Line:
         self._write(f"{task} {fraction:.0%} after {time.perf_counter() - self._start:.0f} s")
 
     def stop(self) -> None:
-        """Clear the line."""
+        """Clear the line of text."""
         self._write("")
 
     def _write(self, text: str) -> None:
@@ -195,7 +195,7 @@ class Stop:
         self.signal: signal.Signals | None = None
 
     def __call__(self) -> bool:
-        """Return whether the process was asked to stop."""
+        """Return whether there was a request to stop."""
         return self.signal is not None
 
     @property

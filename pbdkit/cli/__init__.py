@@ -20,7 +20,7 @@ from pbdkit.cli.streams import standard_streams
 from pbdkit.memory import refuse_little_memory
 
 COMPLETING = "_PBDKIT_COMPLETE"
-"""The variable in which a shell asks how a line goes on."""
+"""Environment variable by which a shell requests completions."""
 
 
 FIRST = {
@@ -144,7 +144,7 @@ def _report(error: BaseException) -> int:
 
 
 def _contexts(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield the error and the errors in whose handling it was raised."""
+    """Yield the error and those that were handled when it was raised."""
     while error:
         yield error
         error = error.__context__

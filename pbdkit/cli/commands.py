@@ -119,7 +119,7 @@ def plugins_with_commands() -> list[Plugin]:
 
 
 class CommandTable(click.Group):
-    """A group whose commands are imported when they are called."""
+    """A group of commands that are imported when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands, in the order of a first session."""

@@ -69,7 +69,7 @@ def experiments(context: click.Context, prefix: str) -> Iterator[str | Completio
 
 @completer
 def shipped(context: click.Context, prefix: str) -> Iterable[str]:
-    """Complete shipped experiments."""
+    """Complete the names of shipped experiments."""
     return _shipped_names()
 
 

@@ -210,11 +210,11 @@ def animate(**options: Any) -> None:
 
 
 CURVES = ("stress-strain", "load-displacement", "energies")
-"""Kinds of curves."""
+"""Kinds of curves of a result."""
 CRACKS: dict[str, Any] = {"crack": "map", "crack-length": "length", "broken-bonds": "bonds"}
 """Kinds of pictures of cracks, with their names in `pbdkit.plotting.crack`."""
 HISTORY = "history"
-"""Kind of histories."""
+"""Kind of curves of particles and bonds."""
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""Command ``pbdkit resume``."""
+"""Command ``pbdkit resume``: continue a run."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class PE1(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `pe1`."""
+        """Declare the variable `pe1`."""
         return (Variable("pe1", ("particle",), "pseudo-energy PE1", AREA.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
@@ -53,7 +53,7 @@ class PE1Intact(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `pe1_intact`."""
+        """Declare the variable `pe1_intact`."""
         name = "pseudo-energy PE1 of intact bonds"
         return (Variable("pe1_intact", ("particle",), name, AREA.lattice),)
 
@@ -73,7 +73,7 @@ class PE2(Diagnostic):
     local: ClassVar[bool] = True
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `pe2`."""
+        """Declare the variable `pe2`."""
         return (Variable("pe2", ("particle",), "pseudo-energy PE2", LENGTH.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
@@ -90,11 +90,11 @@ class Displacement(Diagnostic):
     local: ClassVar[bool] = True
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `u`."""
+        """Declare the variable `u`."""
         return (Variable("u", ("particle", "axis"), "displacement", LENGTH.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return the displacements."""
+        """Return the displacements of particles."""
         return (now.displacement(),)
 
 
@@ -109,7 +109,7 @@ class Track(Diagnostic):
     every_step: ClassVar[bool] = True
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `track`."""
+        """Declare the variable `track`."""
         return (
             Variable("track", ("tracked", "axis"), "position of tracked particles", LENGTH.lattice),
         )
@@ -134,7 +134,7 @@ class BrokenBonds(Diagnostic):
     type: Literal["broken"] = "broken"
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `broken_bonds`."""
+        """Declare the variable `broken_bonds`."""
         return (Variable("broken_bonds", (), "number of broken bonds", "1", dtype="i8"),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
@@ -154,7 +154,7 @@ class SmallestCellArea(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `smallest_cell_area`."""
+        """Declare the variable `smallest_cell_area`."""
         name = "smallest signed cell area over that at rest, negative inside out"
         return (Variable("smallest_cell_area", (), name, "1"),)
 
@@ -281,11 +281,11 @@ class LocalRotation(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `rotation`."""
+        """Declare the variable `rotation`."""
         return (Variable("rotation", ("particle",), "angle of rotation", "rad"),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return the angle."""
+        """Return the angle of rotation."""
         H = now.cells.gradient()
         return _inside(now, np.arctan2(H[:, 1, 0] - H[:, 0, 1], 2.0 + H[:, 0, 0] + H[:, 1, 1]))
 
@@ -417,7 +417,7 @@ class StrainEnergy(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `strain_energy`."""
+        """Declare the variable `strain_energy`."""
         return (Variable("strain_energy", (), "strain energy", ENERGY.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
@@ -443,7 +443,7 @@ class Reaction(Diagnostic):
     needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `reaction`."""
+        """Declare the variable `reaction`."""
         name = "force that the leader group exerts"
         return (Variable("reaction", ("leader_group", "axis"), name, FORCE.lattice),)
 

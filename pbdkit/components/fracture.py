@@ -51,7 +51,7 @@ Limit = Annotated[float, Field(gt=0.0, le=1e150), LENGTH]
 
 
 class LimitCourse(Course[Limit]):
-    """Time-dependent threshold."""
+    """Threshold that depends on time."""
 
 
 LimitInTime = Annotated[
@@ -73,12 +73,12 @@ class NoFracture(FractureModel):
     can_break: ClassVar[bool] = False
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """Return no constants."""
+        """Return an empty dictionary."""
         return {}
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
-        """Return False."""
+        """Return False for every bond."""
         return False
 
     @staticmethod
@@ -118,11 +118,11 @@ class Parting(StartsCracked, FractureModel):
         }
 
     def breaks_frame_bonds(self) -> bool:
-        """Return `frame_bonds`."""
+        """Return the value of `frame_bonds`."""
         return self.frame_bonds
 
     def segments(self) -> tuple[Segment, ...]:
-        """Return the `cracks`."""
+        """Return the value of `cracks`."""
         return self.cracks
 
     @staticmethod
@@ -434,7 +434,7 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
     )
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """Return `onset_strain`."""
+        """Return the value of `onset_strain`."""
         return {"onset_strain": self.onset}
 
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:

@@ -61,7 +61,7 @@ class MeanDisplacement(FollowerRule):
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector, Number]:
-        """Return (d, 1)."""
+        """Return the contributions (d, 1)."""
         return d, 1.0
 
     @staticmethod

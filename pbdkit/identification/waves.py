@@ -308,7 +308,7 @@ class LongWaves:
     diffusivity : (2, 2)
         D_cd if x and y diffuse separately and equally, else None.
     elasticity
-        The elastic body whose equilibrium the rule approaches, also that of a diffusion.
+        The elastic body with the equilibrium that the rule approaches, also that of a diffusion.
     fast, slow
         Diffusivities of the two waves by direction.
     gradients

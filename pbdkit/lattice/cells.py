@@ -58,7 +58,7 @@ class Patch:
     corners
         Blocks of the k-th corners.
     whole
-        Mask of the cells whose corners are all particles of the body, (cell, cell).
+        Mask of the cells with all corners in the body, (cell, cell).
     """
 
     polygon: CellPolygon
@@ -89,7 +89,7 @@ class Patch:
 
 
 def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
-    """Divide the cells whose corners are all in the body into patches."""
+    """Divide the cells with all corners in the body into patches."""
     result = []
     for polygon in tiling.polygons:
         block = _within(raster, polygon)
@@ -128,7 +128,7 @@ class WeighedCells:
     weight
         The share times the stiffness of the cell over that of the rule, 0 for the cells in `mixed`.
     mixed
-        Shares of the cells whose stiffness is not a multiple of that of the rule, one array for
+        Shares of the cells with a stiffness not proportional to that of the rule, one array for
         each of several stiffnesses.
     weights
         Weights of the rule by slot, for each stiffness of `mixed`.
@@ -200,7 +200,7 @@ def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:
 
 
 def whole_cells(raster: Raster, tiling: Tiling) -> WeighedCells:
-    """Return the cells whose corners are all in the body, each with a share of 1."""
+    """Return the cells with all corners in the body, each with a share of 1."""
     share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *raster.shape))
     for patch in patches(raster, tiling):
         patch.corners[0].of(share[patch.polygon.kind])[...] = patch.whole
@@ -208,7 +208,7 @@ def whole_cells(raster: Raster, tiling: Tiling) -> WeighedCells:
 
 
 def _within(raster: Raster, polygon: CellPolygon) -> Block | None:
-    """Return the block of first corners in the body whose other corners lie on the raster."""
+    """Return the block of first corners in the body with all other corners on the raster."""
     block = raster.body_block(polygon.source)
     if not block:
         return None
@@ -220,7 +220,7 @@ def _within(raster: Raster, polygon: CellPolygon) -> Block | None:
 
 
 def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[CellPolygon]:
-    """Return the polygons whose first corner is of sublattice `source`, counterclockwise.
+    """Return the polygons with the first corner of sublattice `source`, counterclockwise.
 
     Corners that are neighbours have exactly the rest offsets of the slots.
     """

@@ -73,7 +73,7 @@ class Filling:
         return low, high
 
     def left_out_on(self, lines: Lines | None = None) -> LeftOut:
-        """Return the cells omitted at narrow voids whose first corner lies on the lines."""
+        """Return the cells omitted at narrow voids, with the first corner on the lines."""
         if self.left_out is None:
             return LeftOut()
         line = self.left_out[:, 0]
@@ -312,7 +312,7 @@ KINK = 1 / 32
 """Change of slope of the signed distance along a side of a cell above which more than one line of
 the outline may cross the cell."""
 FINER = 2 * FINE
-"""Number of parts along each edge of a triangle in a cell whose inside may be disconnected."""
+"""Number of parts along each edge of a triangle in a cell that may have several parts."""
 NOTICEABLE_SHARE = 0.1
 """Share above which cells omitted at a void are counted. Smaller ones also occur in the corners of
 wide voids and are as negligible as those below `MIN_SHARE`."""

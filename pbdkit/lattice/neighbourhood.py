@@ -207,7 +207,7 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
 def _refuse_unbalanced(slots: tuple[Slot, ...], metric: NeighbourMetric) -> None:
     """Raise ExperimentError if a site is not the barycentre of its neighbours.
 
-    Mutual neighbourhood does not imply this on lattices whose sites are not centres of inversion.
+    Mutual neighbourhood does not imply this if sites are not centres of inversion.
     """
     sums = [math.fsum(along) for along in zip(*(slot.rest for slot in slots), strict=True)]
     if math.hypot(*sums) > BARYCENTRE_RTOL * math.fsum(math.hypot(*slot.rest) for slot in slots):

@@ -204,7 +204,7 @@ class RowRange:
     own
         Range of the lines that belong to this process.
     framed
-        Range of the lines whose frame points this process resolves.
+        Range of the lines with frame points that this process resolves.
     """
 
     stretch: Stretch
@@ -322,7 +322,7 @@ class Raster:
         return (lines >= low) & (lines < high)
 
     def sees_frame(self, lines: Indices) -> Mask:
-        """Return the lines of sites whose frame points this process resolves."""
+        """Return the lines of sites with frame points that this process resolves."""
         low, high = self.row_range.framed if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
@@ -344,7 +344,7 @@ class Raster:
 
     @cached_property
     def _full(self) -> bool:
-        """Whether every site of the window is a particle, so that rows follow from indices."""
+        """True if every site of the window is a particle, so that rows follow from indices."""
         return self.count == self.sites.size
 
     @cached_property

@@ -52,7 +52,7 @@ class CoordinateMatrix:
         return np.bincount(place, self.values, self.shape[0] * self.shape[1]).reshape(self.shape)
 
     def sparse(self) -> Any:
-        """Return a scipy.sparse.csr_array."""
+        """Return the entries as a scipy.sparse.csr_array."""
         import scipy.sparse
 
         return scipy.sparse.coo_array((self.values, (self.rows, self.columns)), self.shape).tocsr()

@@ -139,12 +139,12 @@ class StepOperator:
 
     @cached_property
     def current(self) -> scipy.sparse.csr_array:
-        """Assemble ∂u(t+1)/∂u(t)."""
+        """Assemble the matrix ∂u(t+1)/∂u(t)."""
         return self.couplings_current.entries().sparse()
 
     @cached_property
     def previous(self) -> scipy.sparse.csr_array:
-        """Assemble ∂u(t+1)/∂u(t-1)."""
+        """Assemble the matrix ∂u(t+1)/∂u(t-1)."""
         return self.couplings_previous.entries().sparse()
 
     @cached_property
@@ -179,11 +179,11 @@ def step_operator(
     Parameters
     ----------
     scene
-        Scene whose rule is linearised.
+        Scene with the rule that is linearised.
     state
         State at which the rule is linearised; default: the initial state.
     step
-        Step whose roles and loads apply; default: the last.
+        Step of the roles and loads; default: the last.
 
     Raises
     ------

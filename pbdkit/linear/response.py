@@ -145,7 +145,7 @@ def _varies(scene: Scene, state: State) -> bool:
 def _group_alike(
     scene: Scene, state: State, sublattice: int, place: Indices
 ) -> tuple[Indices, Indices]:
-    """Group places whose particles respond alike.
+    """Group places by the response of their particles.
 
     They have the same neighbours, the same fractions of cells around them, and the same broken
     bonds.

@@ -13,7 +13,7 @@ from pbdkit.linear.block_matrix import DENSE, connected
 from pbdkit.scene.scene import Scene
 
 MAX_PARTICLES = 50_000
-"""Largest number of particles of a scene whose step operator is assembled."""
+"""Largest number of particles for which the step operator is assembled."""
 
 MAX_BOND_ENDS = 800_000
 """Largest number of bond ends, two a bond."""
@@ -43,7 +43,7 @@ def excess(scene: Scene) -> str:
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 NEUTRAL = 1e-9
-"""Eigenvalues whose modulus differs from 1 by less count as 1."""
+"""Tolerance within which the modulus of an eigenvalue counts as 1."""
 STRAIGHT = 1e-6
 """Imaginary parts below this are rounding errors: such a mode does not oscillate."""
 

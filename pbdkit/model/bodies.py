@@ -52,7 +52,7 @@ class Body(Component):
 
     @abstractmethod
     def boxes(self) -> list[Box]:
-        """Return boxes whose union contains the body."""
+        """Return boxes that together contain the body."""
 
     @abstractmethod
     def distance(self, sites: Sites) -> Floats:
@@ -104,7 +104,7 @@ class Rectangle(Body):
     _elsewhere: ClassVar[Mapping[str, str]] = CORNER
 
     def boxes(self) -> list[Box]:
-        """Return the rectangle."""
+        """Return the rectangle as a box."""
         x, y = self.origin
         return [Box((x, y), (x + self.width, y + self.height))]
 
@@ -270,7 +270,7 @@ class Composed(Body):
 
 
 class Union(Composed):
-    """Union of bodies."""
+    """Union of several bodies."""
 
     type: Literal["union"] = "union"
 
@@ -284,7 +284,7 @@ class Union(Composed):
 
 
 class Intersection(Composed):
-    """Intersection of bodies."""
+    """Intersection of several bodies."""
 
     type: Literal["intersection"] = "intersection"
 
@@ -330,7 +330,7 @@ def _hull(boxes: list[Box]) -> Box:
 
 
 BODIES = (Grid, Rectangle, Disc, Ring, Polygon, Dogbone, Union, Intersection, Difference)
-"""Classes of bodies."""
+"""Classes of the built-in bodies."""
 AnyBody = Annotated[SerializeAsAny[Body], closed_part(Body, *BODIES)]
 """Type of a body in an experiment."""
 Bodies = Annotated[tuple[AnyBody, ...], Field(strict=False, min_length=1)]

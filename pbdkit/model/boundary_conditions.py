@@ -29,7 +29,7 @@ from pbdkit.model.validation import closed_part, fault
 from pbdkit.plugin import Component, Pair
 from pbdkit.plugin.component import Strict
 from pbdkit.plugin.fracture_model import Segment
-from pbdkit.plugin.particles import Selection
+from pbdkit.plugin.operation import Selection
 from pbdkit.plugin.schedule import BodyForce, Course, Force, at
 from pbdkit.plugin.units import LENGTH, Place
 
@@ -77,9 +77,9 @@ class Initial(Component):
     """
 
     at_rest: ClassVar[bool] = False
-    """Whether the body starts at rest in the reference configuration."""
+    """True if the body starts at rest in the reference configuration."""
     is_drawn: ClassVar[bool] = False
-    """Whether the displacements are random."""
+    """True if the displacements are random."""
 
     @abstractmethod
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
@@ -109,7 +109,7 @@ class Reference(Initial):
     at_rest: ClassVar[bool] = True
 
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
-        """Return zeros."""
+        """Return zero displacements, (particle, axis)."""
         return np.zeros_like(X)
 
 

@@ -512,7 +512,7 @@ class Experiment(Strict):
 
     @property
     def is_as_validated(self) -> bool:
-        """Whether all parts are those that were validated; `model_copy` replaces parts without
+        """True if all parts are those that were validated; `model_copy` replaces parts without
         validation.
         """
         return all(self._validated.get(name) is part for name, part in self.__dict__.items())
@@ -536,12 +536,12 @@ class Experiment(Strict):
 
     @property
     def parts_bonds(self) -> bool:
-        """Whether bonds can be torn by fracture, or cut."""
+        """True if bonds can be torn by fracture, or cut."""
         return self.fracture.can_break or bool(self.cuts)
 
     @property
     def shows_bonds(self) -> bool:
-        """Whether the dataset has a table of bonds, for fracture, cuts or a diagnostic."""
+        """True if the dataset has a table of bonds, for fracture, cuts or a diagnostic."""
         return self.parts_bonds or any("bonds" in d.needs for d in self.diagnostics)
 
     def materials(self) -> dict[str, Experiment]:

@@ -166,10 +166,10 @@ class Motion(Component):
     """Prescribed motion, relative to the position at its start."""
 
     rests: ClassVar[bool] = True
-    """Whether the motion ends, at the last of its knots."""
+    """True if the motion ends, at the last of its knots."""
 
     of_reference: ClassVar[bool] = False
-    """Whether `start` is the reference position rather than the current position."""
+    """True if `start` is the reference position rather than the current position."""
 
     @abstractmethod
     def offset(self, n: float, start: Floats) -> Floats:
@@ -376,7 +376,7 @@ class Hold(Motion):
     type: Literal["hold"] = "hold"
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """Return zeros."""
+        """Return a zero displacement, (axis,)."""
         return np.zeros(start.shape[1])
 
 
@@ -443,7 +443,7 @@ class Tabulated(Motion):
         )
 
     def knots(self) -> tuple[int, ...]:
-        """Return the steps."""
+        """Return the steps of the table."""
         return self.steps
 
 

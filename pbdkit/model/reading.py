@@ -376,7 +376,7 @@ PARTS = COMMON_KEYS | {
     *("lattice", "body", "regions", "neighbours", "rule", "frame", "fracture", "cuts", "initial"),
     *("leaders", "loads", "obstacles", "operations", "diagnostics", "solver"),
 }
-"""All keys of experiments."""
+"""Keys that may occur in experiments."""
 EXPERIMENT = "an experiment"
 """Kind of an experiment file in messages."""
 SWEEP = "a sweep"

@@ -91,7 +91,7 @@ _Relaxation = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
 class RelaxationCourse(Course[_Relaxation]):
-    """Time-dependent relaxation."""
+    """Relaxation that depends on time."""
 
 
 Relaxation = Annotated[
@@ -103,7 +103,7 @@ _Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class MemoryCourse(Course[_Memory]):
-    """Time-dependent momentum coefficient."""
+    """Momentum coefficient that depends on time."""
 
 
 Memory = Annotated[
@@ -126,7 +126,7 @@ class Solver(Component):
     """Method that advances a scene from its start to its end."""
 
     makes_steps: ClassVar[bool] = True
-    """Whether every step is computed."""
+    """True if every step is computed."""
 
     @property
     def stepping(self) -> Stepping:
@@ -140,7 +140,7 @@ class Solver(Component):
 
     @property
     def courses(self) -> dict[str, Course[float]]:
-        """Time-dependent parameters."""
+        """Time-dependent parameters by name."""
         return {}
 
 
@@ -175,12 +175,12 @@ class Stepping(Solver):
 
     @property
     def stepping(self) -> Stepping:
-        """The settings themselves."""
+        """These settings, of which this solver has its own."""
         return self
 
     @property
     def is_open(self) -> bool:
-        """Whether a parameter has yet to be selected for the scene."""
+        """True if a parameter has yet to be selected for the scene."""
         return bool(self.open_parameters)
 
     @property
@@ -254,7 +254,7 @@ class Equilibrium(Solver):
 
     @property
     def equilibrium(self) -> Equilibrium:
-        """The settings themselves."""
+        """These settings, of which this solver has its own."""
         return self
 
 

@@ -130,7 +130,7 @@ class CellValues(ABC):
         *,
         intact_only: bool = False,
     ) -> Floats:
-        """Evaluate a function on every cell whose corners are all in the body.
+        """Evaluate a function on every cell with all corners in the body.
 
         Parameters
         ----------
@@ -320,17 +320,17 @@ class Diagnostic(Component):
     experiments without loads are an error. Variables can then have the dimension `load`.
     """
     every_step: ClassVar[bool] = False
-    """Whether to evaluate at every step (dimension `step`) rather than at recorded steps."""
+    """True to evaluate at every step (dimension `step`) instead of at recorded steps."""
     at_end: ClassVar[bool] = False
-    """Whether to evaluate once, after the last step; variables then have no leading dimension."""
+    """True to evaluate once, after the last step; variables then have no leading dimension."""
     local: ClassVar[bool] = False
-    """Whether the value at a particle depends only on the particle and its neighbours.
+    """True if the value at a particle depends only on the particle and its neighbours.
 
-    With several processes each then evaluates its own part of the lattice; otherwise one process
+    With several processes each then evaluates its part of the lattice; otherwise one process
     evaluates the whole.
     """
     own_dimension: ClassVar[str] = ""
-    """With `at_end`: name of a dimension whose length is that of the values."""
+    """With `at_end`: name of a dimension that has the length of the values."""
 
     @abstractmethod
     def variables(self) -> tuple[Variable, ...]:

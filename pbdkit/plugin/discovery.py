@@ -31,11 +31,11 @@ def interface_of(component: type[Component]) -> type[Component]:
     return next(i for i in INTERFACES.values() if issubclass(component, i))
 
 
-def whose(component: type[Component]) -> str:
+def full_description(component: type[Component]) -> str:
     """Return interface, type and distribution of a component: ``FollowerRule 'odd' of pbdkit-odd
     0.3``.
 
-    The distribution is that whose entry point refers to the package of the component.
+    The distribution is that with an entry point into the package of the component.
     """
     package, origin = component.__module__.split(".")[0], ""
     with suppress(Exception):  # metadata of other distributions can be damaged
@@ -48,7 +48,7 @@ def whose(component: type[Component]) -> str:
 def blame(component: type[Component], when: str, error: BaseException) -> PluginError:
     """Return the PluginError for an error in the code of a component."""
     message = worded(error, component.__module__.split(".")[0], component)
-    return PluginError(f"{whose(component)} failed {when}: {message}")
+    return PluginError(f"{full_description(component)} failed {when}: {message}")
 
 
 @contextmanager
@@ -61,7 +61,7 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"in {whose(type(component))} {when}") from None
+        raise KeyboardInterrupt(f"in {full_description(type(component))} {when}") from None
     except ExperimentError as error:
         if not field:
             raise blame(type(component), when, error) from error
@@ -244,7 +244,7 @@ RETIRED = (
         renumbers=True,
     ),
 )
-"""All retired components."""
+"""Retired components with their successors."""
 
 
 def retired_parts(parts: Mapping[str, Any]) -> list[Retired]:

@@ -83,7 +83,7 @@ class ByRegion(Varying):
 
     @property
     def samples(self) -> dict[str, float]:
-        """All values."""
+        """Values by region, with `otherwise`."""
         return {"otherwise": self.otherwise, **dict(self.values)}
 
     def at(self, x: Floats, y: Floats, regions: Held, reach: float = 0.0) -> Floats:
@@ -478,7 +478,7 @@ class Field(RootModel[Any]):
 
 
 class TakesFields(Component):
-    """Component whose numbers can vary in space or time.
+    """Component with numbers that can vary in space or time.
 
     Fields contain the value that is used where a single number is required, for time-dependent
     numbers the last one. `varying` and `courses` contain the variation.

@@ -1,4 +1,5 @@
-"""The FractureModel interface: when a bond breaks, and what each end sees from then on."""
+"""The interface FractureModel: the condition under which a bond breaks, and the difference that
+replaces it."""
 
 from __future__ import annotations
 
@@ -17,101 +18,186 @@ from pbdkit.plugin.units import Place
 from pbdkit.plugin.vector import Condition, Constants, Number, Parameters, Vector
 
 Segment = tuple[Place, Place]
-"""A straight crack, from one point to another (lattice units)."""
+"""Straight crack, from one point to another, in lattice units."""
 
 
 class FractureModel(TakesFields):
-    """Breaks bonds for good, and puts a fictitious point in the place of the lost neighbour.
+    """Breaks bonds permanently and replaces the lost neighbour by a fictitious point.
 
-    To add a model, write `breaks` and `fictitious`, both static and elementwise as a rule's
-    functions are. d = u_k - u_j is the difference along the bond, r its rest offset, c the
-    slot's constants and what is remembered of the bond, by name, and p the parameters.
+    To add a model, write `constants`, `breaks` and `fictitious`; the latter two are static and
+    elementwise, as the functions of a rule. Arguments: d = u_k - u_j is the difference along the
+    bond, r its rest offset, c the constants of the slot and the remembered numbers of the bond by
+    name, and p the parameters.
 
-    In the intermediate configuration, for each bond that has not broken and can: a model that
-    `RenewsBonds` gives their new values, then ``breaks`` decides; from then on they stay.
-    Afterwards a model that `Softens` says what the rule sees at bonds that have not broken.
+    In the intermediate configuration, for each intact bond that can break, a model that derives
+    from `RenewsBonds` first renews its remembered numbers; then ``breaks`` decides. The numbers of
+    broken bonds no longer change. Afterwards a model that derives from `Softens` replaces the
+    difference that the rule sees at intact bonds.
 
-    What only some models can do is a class that they take on besides: `Remembers`, `Draws`,
-    `RenewsBonds`, `Softens`, `SoftensCells`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
+    Optional capabilities are further base classes: `Remembers`, `Draws`, `RenewsBonds`, `Softens`,
+    `SoftensCells`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
     """
 
     has_axes: ClassVar[bool] = False
-    """Whether directions count: mirrored, or turned by a right angle, bonds may then break
-    otherwise."""
+    """True if directions matter: bonds of a body that is reflected, or rotated by a right angle,
+    may then break differently."""
     can_break: ClassVar[bool] = True
-    """False where nothing ever breaks: the scene then has no bond state at all."""
+    """False if no bond ever breaks; the scene then has no bond state."""
 
     def breaks_frame_bonds(self) -> bool:
-        """Whether bonds to frame points can break too; by default they do."""
+        """Return whether bonds to frame points can break; by default they can."""
         return True
 
     def parameters(self) -> dict[str, float]:
-        """The numbers that the functions see as ``p.name``; by default the model's own."""
+        """Return the numbers that functions see as ``p.name``; by default the model's numeric
+        fields."""
         return self.numeric_parameters()
 
     @abstractmethod
     def constants(self, slot: Slot) -> dict[str, float]:
-        """The constants of a slot, seen as ``c.name``; the same for a slot and its opposite, and
-        the same names for all."""
+        """Return the constants of a slot, which functions see as ``c.name``.
+
+        Parameters
+        ----------
+        slot : Slot
+            Slot; its opposite must have the same constants.
+
+        Returns
+        -------
+        dict of str to float
+            Constants by name; all slots have the same names.
+        """
 
     @staticmethod
     @abstractmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
-        """Whether the bond breaks in the intermediate configuration; called for one end only."""
+        """Return whether the bond breaks in the intermediate configuration, elementwise.
+
+        It is called for one end of a bond only, so it must be the same for (-d, -r).
+
+        Parameters
+        ----------
+        d : Vector
+            Difference u_k - u_j, in lattice units.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        c : Constants
+            Constants of the slot and remembered numbers of the bond.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        Condition
+            True where the bond breaks.
+        """
 
     @staticmethod
     @abstractmethod
     def fictitious(u: Vector, r: Vector, p: Parameters) -> Vector:
-        """The difference that stands in for d once the bond is broken, a vector; u is that of this
-        end."""
+        """Return the difference that replaces d at a broken bond, elementwise.
+
+        Parameters
+        ----------
+        u : Vector
+            Displacement of the particle at this end, in lattice units.
+        r : Vector
+            Rest offset of the bond.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        Vector
+            Difference from the particle to its fictitious neighbour.
+        """
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
-        """Warnings about the model on these rest lengths, a sequence a shell; by default none.
+        """Return warnings about the model; by default there are none.
 
-        Raise ExperimentError where the model does not go with them.
+        Parameters
+        ----------
+        shells : sequence of sequence of float
+            Rest lengths of each shell, in lattice units.
+
+        Raises
+        ------
+        ExperimentError
+            If the model cannot be combined with them.
         """
         return []
 
 
 class RenewsBonds(Remembers):
-    """A fracture model of which some remembered numbers change from step to step."""
+    """A fracture model with remembered numbers that change from step to step."""
 
     @staticmethod
     @abstractmethod
     def update(d: Vector, r: Vector, c: Constants, p: Parameters) -> tuple[Number, ...]:
-        """The new values of the numbers that change, in their order; called for one end only.
+        """Return the new values of the numbers that change, in their order, elementwise.
 
-        Where a configuration lasts the values must come to an end (a largest value so far does, a
-        count of steps does not), or the solver `equilibrium` finds none.
+        It is called for one end of a bond only. In a lasting configuration the values must converge
+        (the largest value so far does, a count of steps does not); otherwise the solver
+        `equilibrium` finds no equilibrium.
+
+        Parameters
+        ----------
+        d, r, c, p
+            As in `FractureModel.breaks`.
         """
 
 
 class KnowsStiffness(ABC):
-    """A fracture model that goes with calibrated rules, some constants of which follow from the
-    material and the cells."""
+    """A fracture model for calibrated rules, with constants that follow from the material and the
+    cells."""
 
     @abstractmethod
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
-        """Further constants of a slot, seen as ``c.name`` after those of `constants`.
+        """Return further constants of a slot, which functions see as ``c.name``.
 
-        `rule` has an elasticity. Raise ExperimentError where the model does not go with it.
+        Parameters
+        ----------
+        slot : Slot
+            Slot.
+        rule : Calibrated
+            Rule with an elasticity.
+        setting : Setting
+            Lattice and body.
+
+        Raises
+        ------
+        ExperimentError
+            If the model cannot be combined with the rule.
         """
 
 
 class Softens(ABC):
-    """A fracture model under which the rule sees something else than d at bonds that have not
-    broken."""
+    """A fracture model that replaces the difference that the rule sees at intact bonds."""
 
     @staticmethod
     @abstractmethod
     def seen(d: Vector, lost: Vector, r: Vector, c: Constants, p: Parameters) -> Vector:
-        """The difference that the rule sees; `lost` is the fictitious one: damage D softens a bond
-        as (1 - D) d + D lost."""
+        """Return the difference that the rule sees, elementwise.
+
+        Parameters
+        ----------
+        d, r, c, p
+            As in `FractureModel.breaks`.
+        lost : Vector
+            Difference to the fictitious point. Damage D softens a bond as (1 - D) d + D lost.
+        """
 
 
 class CellStress(NamedTuple):
-    """The stress that a cell would have without damage, over its own Young's modulus, and the
-    `share` of it that belongs to the body: 0 where there is no cell."""
+    """Stress of a cell without damage, over its own Young's modulus.
+
+    Parameters
+    ----------
+    xx, yy, xy
+        Components σ_xx, σ_yy and σ_xy.
+    share
+        Share of the cell in the body, 0 to 1; 0 if there is no cell.
+    """
 
     xx: Number
     yy: Number
@@ -120,13 +206,13 @@ class CellStress(NamedTuple):
 
 
 class SoftensCells(RenewsBonds):
-    """A fracture model that softens bonds in each of the two cells beside them, by the stress of
-    that cell; for rules that `TearsCells`, with a frame that weighs cells.
+    """A fracture model that softens bonds by the stress of the two cells beside them.
 
-    Its numbers come in pairs, with names that end in `_left` and `_right`, as seen along the slot
-    by which the bond is kept; all start at 0, and stay there until the cell begins to soften.
-    `damage_left` and `damage_right` are the shares of its pull that the bond has lost in the two.
-    A diagonal has one cell on both sides.
+    It requires a rule that derives from `TearsCells`, and a frame that weighs cells. Its numbers
+    come in pairs, with names that end in `_left` and `_right`, as seen along the slot of the bond.
+    All start at 0 and stay there until the cell softens. `damage_left` and `damage_right` are the
+    fractions of its pull that the bond has lost in the two cells. A diagonal has the same cell on
+    both sides.
     """
 
     @staticmethod
@@ -134,40 +220,71 @@ class SoftensCells(RenewsBonds):
     def update(  # type: ignore[override]  # receives the cells too
         d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
     ) -> tuple[Number, ...]:
-        """The new values of the numbers that change, in their order, from the stress of the cell
-        on either side of the bond as well."""
+        """Return the new values of the numbers that change, in their order, elementwise.
+
+        Parameters
+        ----------
+        d, r, c, p
+            As in `FractureModel.breaks`.
+        left, right : CellStress
+            Stress of the cells on both sides of the bond.
+        """
 
     @staticmethod
     @abstractmethod
     def load(stress: CellStress, c: Constants, p: Parameters) -> Number:
-        """How far the stress of a cell has come on the way to where it begins to soften: 1 there.
+        """Return the stress of a cell relative to that at which it begins to soften, elementwise.
 
-        Of cells that would begin together under `solver: equilibrium`, the most loaded do."""
+        With the solver `equilibrium`, the most loaded of several cells at their limit softens
+        first.
+
+        Parameters
+        ----------
+        stress : CellStress
+            Stress of the cell.
+        c, p
+            As in `FractureModel.breaks`.
+        """
 
 
 class StartsCracked(ABC):
-    """A fracture model with cracks that are there from the start."""
+    """A fracture model with cracks in the initial state."""
 
     @abstractmethod
     def segments(self) -> Sequence[Segment]:
-        """The cracks: all bonds that cross them are broken at step 0."""
+        """Return the cracks; all bonds that cross them are broken at step 0."""
 
 
 class BreaksAtStrain(ABC):
-    """A fracture model that says how far a bond may be strained, for those who explain."""
+    """A fracture model with a breaking strain, which `pbdkit explain` prints."""
 
     @staticmethod
     @abstractmethod
     def breaking_strain(r: Vector, c: Constants, p: Parameters) -> Number:
-        """The strain |r + d| / |r| - 1 beyond which the bond breaks."""
+        """Return the strain |r + d| / |r| - 1 above which the bond breaks, elementwise.
+
+        Parameters
+        ----------
+        r, c, p
+            As in `FractureModel.breaks`.
+        """
 
 
 def breaking_order(
     steps: NDArray[np.integer[Any]], strains: NDArray[np.floating[Any]]
 ) -> NDArray[np.intp]:
-    """The places of the broken ones among some bonds, in the order in which they broke: by step
-    (-1: not broken), within a step those that were cut (NaN) first, then the most strained, what
-    ties as it comes."""
+    """Return the rows of broken bonds in the order in which they broke.
+
+    The order is that of the steps; within a step bonds that were cut come first, then the most
+    strained.
+
+    Parameters
+    ----------
+    steps : (bond,)
+        Step in which each bond broke; -1 if it is intact.
+    strains : (bond,)
+        Strain at that step; NaN for bonds that were cut.
+    """
     broken = np.flatnonzero(steps >= 0)
     order = np.where(np.isnan(strains), -np.inf, -strains)
     return broken[np.lexsort((order[broken], steps[broken]))]

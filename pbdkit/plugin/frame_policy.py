@@ -83,24 +83,24 @@ class FramePolicy(Component):
     """
 
     weighs_cells: ClassVar[bool] = False
-    """Whether the body consists of cells, each weighted by its share inside the outline.
+    """True if the body consists of cells, each weighted by its share inside the outline.
 
     For rules that declare `uses_cells`. The corners of cut cells on both sides of the outline are
     then particles of the body.
     """
     local: ClassVar[bool] = False
-    """Whether each frame point can be mapped independently, to particles near it.
+    """True if each frame point can be mapped independently, to particles near it.
 
     These are the nearest particles, or those within twice the number of layers in site index.
     Several processes then build the frame in parts; otherwise each builds the whole.
     """
     has_axes: ClassVar[bool] = False
-    """Whether the map depends on directions or on the order of sites.
+    """True if the map depends on directions or on the order of sites.
 
-    A body that is mirrored or rotated by a right angle may then move differently.
+    A body that is reflected, or rotated by a right angle, may then move differently.
     """
     edges_are_free: ClassVar[bool] = False
-    """Whether edges are free of stress under a calibrated rule; otherwise a warning is issued."""
+    """True if edges are traction-free under a calibrated rule; otherwise a warning is issued."""
 
     @abstractmethod
     def depth(self, reach: int) -> int:

@@ -21,20 +21,26 @@ from pbdkit.plugin.units import Place
 from pbdkit.plugin.vector import Vector, vector
 
 Index = tuple[int, ...]
-"""One number an axis."""
+"""Integers, one for each axis."""
 
 
 PLANE_ORIGIN = Vector(0.0, 0.0)
 NEARLY = 1e-9
-"""What two ways to round may make of a length."""
+"""Relative tolerance of lengths, for differences of rounding."""
 
 
 @dataclass(frozen=True)
 class BasisSite:
-    """One site of the repeat cell.
+    """A site of the repeat cell.
 
-    `at` is its place in the cell (lattice units), `index` its site index within the cell's
-    period, `primitive` the same in the primitive basis, in which Chebyshev distance is counted.
+    Parameters
+    ----------
+    at : Vector of float
+        Position in the cell, in lattice units.
+    index : Index
+        Site index within the period of the cell.
+    primitive : Index
+        Index in the primitive basis, in which Chebyshev distances are counted.
     """
 
     at: Vector[float] = PLANE_ORIGIN
@@ -44,10 +50,18 @@ class BasisSite:
 
 @dataclass(frozen=True)
 class Offset:
-    """From a site to another: which sublattice it lands on, and how far away.
+    """Step from one site to another.
 
-    `cell` counts repeat cells, `site` and `primitive` are differences of site index (i, j) and of
-    primitive index, `rest` is the vector in lattice units.
+    Parameters
+    ----------
+    target : int
+        Sublattice of the other site.
+    cell : Index
+        Number of repeat cells along each axis.
+    site, primitive : Index
+        Differences of site index and of primitive index.
+    rest : Vector of float
+        Vector in lattice units.
     """
 
     target: int
@@ -64,7 +78,7 @@ class Offset:
 
 @cache
 def _of_one_site(axes: int) -> tuple[tuple[BasisSite], Index, tuple[Index, ...]]:
-    """The sites, period and primitive steps of a cell with one site at its corner."""
+    """Return sites, period and primitive steps of a cell with one site at its corner."""
     nowhere, every = (0,) * axes, range(axes)
     corner = BasisSite(vector(map(float, nowhere)), nowhere, nowhere)
     return (corner,), (1,) * axes, tuple(tuple(int(a == b) for b in every) for a in every)
@@ -72,13 +86,23 @@ def _of_one_site(axes: int) -> tuple[tuple[BasisSite], Index, tuple[Index, ...]]
 
 @dataclass(frozen=True)
 class Cell:
-    """The repeat cell of a lattice, with as many vectors as space has axes.
+    """The repeat cell of a lattice.
 
-    Sites carry integer indices (i, j). The cell repeats every `period[0]` of i along
-    `vectors[0]`, every `period[1]` of j along `vectors[1]` and so on; the site with index (i, j)
-    has the basis site whose `index` is (i mod period[0], j mod period[1]), and where there is none
-    the lattice has a hole. `primitive` gives each cell vector in the primitive basis. What is left
-    out is that of one site a cell, at its corner.
+    Sites have integer indices (i, j). The cell repeats every `period[0]` of i along `vectors[0]`,
+    every `period[1]` of j along `vectors[1]` and so on. The site with index (i, j) has the basis
+    site whose `index` is (i mod period[0], j mod period[1]); if there is none, the lattice has a
+    hole.
+
+    Parameters
+    ----------
+    vectors : tuple of Vector
+        Cell vectors in lattice units, as many as space has axes.
+    sites : tuple of BasisSite
+        Basis; by default one site at the corner.
+    period : Index
+        Period of the site index along each vector; by default 1.
+    primitive : tuple of Index
+        Cell vectors in the primitive basis; by default unit vectors.
     """
 
     vectors: tuple[Vector[float], ...]
@@ -94,7 +118,7 @@ class Cell:
 
     @property
     def axes(self) -> int:
-        """How many axes space has."""
+        """Number of axes of space."""
         return len(self.vectors)
 
     @cached_property
@@ -111,56 +135,80 @@ class Cell:
         return result
 
     def shift(self, cell: Iterable[Any]) -> Any:
-        """m·a + n·b, the vector from a repeat cell to that `cell` further on; numbers or arrays."""
+        """Return m·a + n·b, the vector from a repeat cell to another.
+
+        Parameters
+        ----------
+        cell
+            Numbers (m, n) of cells along the vectors; numbers or arrays.
+        """
         steps = [n * v for n, v in zip(cell, self.vectors, strict=True)]
         return sum(steps[1:], steps[0])
 
     def offset(self, source: int, target: int, cell: Index) -> Offset:
-        """The offset from sublattice `source` to `target`, `cell` repeat cells on.
+        """Return the offset between two sublattices.
 
-        The reverse offset has exactly the negated `rest`: every operation here is odd.
+        The reverse offset has exactly the negated `rest`.
+
+        Parameters
+        ----------
+        source, target : int
+            Sublattices.
+        cell : Index
+            Number of repeat cells between them.
         """
-        here, there = self.sites[source], self.sites[target]
+        start, end = self.sites[source], self.sites[target]
         periods = map(mul, cell, self.period)
         return Offset(
             target,
             cell,
-            tuple(map(add, map(sub, there.index, here.index), periods)),
+            tuple(map(add, map(sub, end.index, start.index), periods)),
             self.primitive_step(source, target, cell),
-            (there.at - here.at) + self.shift(cell),
+            (end.at - start.at) + self.shift(cell),
         )
 
     def primitive_step(self, source: int, target: int, cell: Index) -> Index:
-        """The same offset in the primitive basis."""
-        here, there = self.sites[source].primitive, self.sites[target].primitive
+        """Return the offset between two sublattices in the primitive basis; arguments as in
+        `offset`."""
+        start, end = self.sites[source].primitive, self.sites[target].primitive
         along = (sum(map(mul, cell, step)) for step in zip(*self.primitive, strict=True))
-        return tuple(map(add, map(sub, there, here), along))
+        return tuple(map(add, map(sub, end, start), along))
 
     def offsets(self, source: int, radius: float) -> list[Offset]:
-        """All offsets from a site of `source` with 0 < |rest| ≤ radius, the nearest first."""
+        """Return the offsets from a site of `source` with 0 < |rest| ≤ radius, sorted by length.
+
+        Parameters
+        ----------
+        source : int
+            Sublattice.
+        radius : float
+            Radius in lattice units.
+        """
         sites = self.basis
         cells = np.array(list(self._cells_within(radius + 2 * np.linalg.norm(sites, axis=1).max())))
         rests = (cells @ np.array(self.vectors))[:, None] + (sites - sites[source])
         near = np.argwhere(np.linalg.norm(rests, axis=2) <= radius * (1 + NEARLY))
-        found = [self.offset(source, t, tuple(cells[n].tolist())) for n, t in near.tolist()]
-        others = [offset for offset in found if any(offset.site) and offset.length <= radius]
-        return sorted(others, key=lambda o: (o.length, o.site))
+        candidates = [self.offset(source, t, tuple(cells[n].tolist())) for n, t in near.tolist()]
+        offsets = [offset for offset in candidates if any(offset.site) and offset.length <= radius]
+        return sorted(offsets, key=lambda o: (o.length, o.site))
 
     def _cells_within(self, radius: float) -> Iterator[Index]:
-        """All repeat cells within a radius, and few others: axis by axis, of each the range that
-        the axes before leave (Fincke and Pohst); of nearly collinear vectors all combinations would
-        be too many."""
+        """Yield the repeat cells within a radius, and few others.
+
+        Axis by axis, the range is what the previous axes leave (Fincke and Pohst); for nearly
+        collinear vectors all combinations would be too many.
+        """
         # Columns in reverse, so that the first axis is the outermost.
         R = np.linalg.qr(np.array(self.vectors[::-1]).T, mode="r")
 
         def inside(fixed: Index) -> Iterator[Index]:
-            left = len(R) - len(fixed)
-            if not left:
+            unfixed = len(R) - len(fixed)
+            if not unfixed:
                 yield fixed
                 return
-            row = R[left - 1]
-            centre = -sum(row[len(R) - 1 - n] * m for n, m in enumerate(fixed)) / row[left - 1]
-            half = radius / abs(row[left - 1])
+            row = R[unfixed - 1]
+            centre = -sum(row[len(R) - 1 - n] * m for n, m in enumerate(fixed)) / row[unfixed - 1]
+            half = radius / abs(row[unfixed - 1])
             for n in range(math.floor(centre - half), math.ceil(centre + half) + 1):
                 yield from inside((*fixed, n))
 
@@ -168,7 +216,7 @@ class Cell:
 
 
 class Lattice(Component):
-    """Where sites lie: a repeat cell with one or more sites, from `origin`, in lattice units.
+    """Positions of sites: a repeat cell with one or more sites, from `origin`, in lattice units.
 
     To add a lattice, write `cell`. A site has an integer index (i, j); (0, 0) lies at `origin`.
     """
@@ -177,15 +225,23 @@ class Lattice(Component):
 
     @abstractmethod
     def cell(self) -> Cell:
-        """The repeat cell; see Cell for what it must tell."""
+        """Return the repeat cell, which does not depend on `origin`."""
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One neighbour that every particle of a sublattice has, at a constant offset.
+    """A neighbour that every particle of a sublattice has, at a constant offset.
 
-    `source` and `target` are sublattices, `cell` the step between repeat cells, `site` between
-    site indices, `rest` the rest offset R = X_k - X_j (lattice units), `shell` counts from 1.
+    Parameters
+    ----------
+    source, target : int
+        Sublattices.
+    cell, site : Index
+        Steps between repeat cells and between site indices.
+    rest : Vector of float
+        Rest offset X_k - X_j, in lattice units.
+    shell : int
+        Number of the shell, from 1.
     """
 
     source: int
@@ -198,40 +254,67 @@ class Slot:
 
 @dataclass(frozen=True)
 class Nearness:
-    """Who is near in the current configuration: √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9)."""
+    """Neighbourhood in the current configuration: √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9).
+
+    Parameters
+    ----------
+    radius : float
+        Radius in lattice units.
+    weights : tuple of float
+        Weight w of each axis.
+    """
 
     radius: float
     weights: tuple[float, ...]
 
 
 class NeighbourMetric(Component):
-    """Chooses the neighbours of a site on the infinite lattice, by shells.
+    """Selects the neighbours of a site on the infinite lattice, by shells.
 
-    To add a metric, write `shells_around`. Neighbourhood is mutual: with the offset from j to k
-    the offset from k to j must be chosen too, in the same shell, or the metric is refused.
+    To add a metric, write `shells_around`. Neighbourhood is mutual: if the offset from j to k is
+    selected, so must be that from k to j, in the same shell; other metrics are refused.
     """
 
     @abstractmethod
     def shells_around(self, cell: Cell, sublattice: int) -> Sequence[Sequence[Offset]]:
-        """The neighbours of a site of `sublattice`, the first shell first.
+        """Return the neighbours of a site, the first shell first.
 
-        Offsets come from `cell.offsets(sublattice, radius)`, which lists all within a radius.
+        Parameters
+        ----------
+        cell : Cell
+            Repeat cell; `cell.offsets(sublattice, radius)` lists all offsets within a radius.
+        sublattice : int
+            Sublattice of the site.
+
+        Returns
+        -------
+        sequence of sequence of Offset
+            Offsets of `cell` in each shell.
         """
 
     def nearness(self) -> Nearness | None:
-        """How neighbours are found anew at every step; by default they stay as they are at
-        step 0, as in a solid."""
+        """Return the neighbourhood that is searched at every step, or None.
+
+        By default it is None: neighbours remain those of step 0, as in a solid.
+        """
         return None
 
 
 @dataclass(frozen=True)
 class CellPolygon:
-    """A cell: sites on one circle with no site inside it (Delaunay's; the square lattice's squares,
-    the hexagonal one's triangles). It is met once for each site of sublattice `source`, as number
-    `kind` of those that are.
+    """A cell: sites on a circle without sites inside (Delaunay).
 
-    `corners` are the offsets from that site to all corners, itself first, counter-clockwise. The
-    first corner is the lowest, of those the leftmost.
+    These are squares on the square lattice and triangles on the hexagonal one.
+
+    Parameters
+    ----------
+    source : int
+        Sublattice of the first corner.
+    kind : int
+        Number of the cell among those of this sublattice.
+    corners : tuple of Offset
+        Offsets from the first corner to all corners, itself included, counterclockwise. The first
+        corner is the lowest, of those the leftmost.
     """
 
     source: int
@@ -240,12 +323,12 @@ class CellPolygon:
 
     @cached_property
     def rest(self) -> tuple[Vector[float], ...]:
-        """X_k - X_0 of the corners, lattice units."""
+        """X_k - X_0 of the corners, in lattice units."""
         return tuple(corner.rest for corner in self.corners)
 
     @cached_property
     def rectangle(self) -> tuple[float, float] | None:
-        """The sides (a, b) of a rectangle along the axes."""
+        """Sides (a, b) if the cell is a rectangle along the axes, else None."""
         if len(self.rest) != 4:
             return None
         _, right, opposite, up = self.rest
@@ -255,16 +338,24 @@ class CellPolygon:
 
     @cached_property
     def is_regular(self) -> bool:
-        """Whether all sides are equal, and so, on a circle, all angles."""
+        """True if all sides are equal, and therefore, on a circle, all angles."""
         sides = [math.dist(self.rest[k - 1], self.rest[k]) for k in range(len(self.rest))]
         return max(sides) - min(sides) <= 1e-9 * max(sides)
 
 
 @dataclass(frozen=True)
 class Side:
-    """A cell beside a bond: the polygon number `kind` of the sublattice of its first corner, which
-    lies at slot `first` of the bond's start (None: the start itself); the bond leads from corner
-    `start` to corner `end`."""
+    """A cell beside a bond.
+
+    Parameters
+    ----------
+    kind : int
+        Number of the polygon of the sublattice of its first corner.
+    first : Slot or None
+        Slot from the start of the bond to the first corner; None if it is the start itself.
+    start, end : int
+        Corners between which the bond lies.
+    """
 
     kind: int
     first: Slot | None
@@ -274,11 +365,16 @@ class Side:
 
 @dataclass(frozen=True)
 class Tiling:
-    """The cells of a lattice, and which of them lie beside the bonds.
+    """The cells of a lattice, and those beside each bond.
 
-    `beside[slot]` are the cells to the left and to the right of a slot, for a diagonal one cell
-    twice. It is empty unless the neighbours of every site are the corners of the cells around it,
-    triangles or parallelograms: 8 on the square and rectangular lattices, 6 on the hexagonal one.
+    Parameters
+    ----------
+    polygons : tuple of CellPolygon
+        Cells.
+    beside : dict of Slot to pair of Side
+        Cells to the left and right of a slot; a diagonal has one cell twice. It is empty unless the
+        neighbours of every site are the corners of the cells around it, which are triangles or
+        parallelograms: 8 on the square and rectangular lattices, 6 on the hexagonal one.
     """
 
     polygons: tuple[CellPolygon, ...] = ()
@@ -286,38 +382,41 @@ class Tiling:
 
     @cached_property
     def rectangle(self) -> tuple[float, float] | None:
-        """The sides of the cells beside the bonds, where all are one rectangle along the axes."""
+        """Sides of the cells if all are the same rectangle along the axes, else None."""
         sides = {polygon.rectangle for polygon in self.polygons}
         return sides.pop() if self.beside and len(sides) == 1 else None
 
     @cached_property
     def regular(self) -> int | None:
-        """3 where the cells beside the bonds are equilateral triangles, 4 where they are squares,
-        in whatever direction."""
+        """3 if the cells are equilateral triangles, 4 if they are squares, in any orientation; else
+        None."""
         kinds = {len(cell.corners) if cell.is_regular else None for cell in self.polygons}
         return kinds.pop() if self.beside and len(kinds) == 1 else None
 
     def is_diagonal(self, slot: Slot) -> bool:
-        """Whether a slot crosses a cell, which is then on both of its sides."""
+        """Return whether a slot crosses a cell, which is then on both of its sides."""
         left, right = self.beside[slot]
         return left == right
 
 
 def signed_area(corners: Sequence[Any]) -> Any:
-    """The area of a polygon, counter-clockwise; negative where it is inside out. Elementwise."""
+    """Return the area of a polygon, negative if its corners are clockwise, elementwise."""
     pairs = [(corners[k - 1], corners[k]) for k in range(len(corners))]
     return sum(a.x * b.y - b.x * a.y for a, b in pairs) / 2
 
 
 def area_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
-    """The signed area of a polygon whose corners have gone by d from r, over that at rest."""
-    now = [a + b for a, b in zip(r, d, strict=True)]
-    return signed_area(now) / signed_area(r)
+    """Return the signed area of a polygon with corners r + d relative to that with corners r."""
+    current = [a + b for a, b in zip(r, d, strict=True)]
+    return signed_area(current) / signed_area(r)
 
 
 def corner_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
-    """The smallest of the same of the triangles at its corners, each spanned by the two sides that
-    meet there: all are positive exactly where a polygon is convex and the right way round."""
+    """Return the smallest relative signed area of the triangles at the corners of a polygon.
+
+    Each triangle is spanned by two adjacent sides; all areas are positive exactly if the polygon is
+    convex and not inverted.
+    """
     triples = [(k - 1, k, (k + 1) % len(r)) for k in range(len(r))]
     shares = (area_share([d[k] for k in three], [r[k] for k in three]) for three in triples)
     return reduce(np.minimum, shares)

@@ -1,44 +1,91 @@
-"""The ParticleOperation interface: what happens to selected particles in a step besides the move of
-their rule.
-"""
+"""The interface ParticleOperation, and selections of body particles, as experiments write them."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field, model_serializer, model_validator
 
-from pbdkit.plugin.component import Component
-from pbdkit.plugin.particles import Selection
+from pbdkit.plugin.component import Component, Strict
+from pbdkit.plugin.units import LENGTH, Place
 from pbdkit.plugin.vector import Parameters, Vector
+
+Length = Annotated[float, LENGTH]
+Box = Annotated[tuple[Length, Length, Length, Length], Field(strict=False)]
+Numbers = Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)]
+Points = Annotated[tuple[Place, ...], Field(strict=False, min_length=1)]
+
+
+class Selection(Strict):
+    """Selection of body particles in the reference configuration, by one of five criteria.
+
+    `edge`: the outermost particle of every row (left, right) or column (bottom, top); `box`: the
+    particles within [xmin, ymin, xmax, ymax], inclusive; `numbers`: particle numbers; `nearest`:
+    the particle nearest to each point; `region`: the particles inside a region.
+    """
+
+    model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})
+
+    edge: Literal["left", "right", "bottom", "top"] | None = None
+    box: Box | None = None
+    numbers: Numbers | None = None
+    nearest: Points | None = None
+    region: str | None = None
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Selection:
+        if len(self._criteria()) != 1:
+            raise ValueError("give exactly one of edge, box, numbers, nearest, region")
+        return self
+
+    def _criteria(self) -> dict[str, Any]:
+        names = type(self).model_fields
+        return {n: getattr(self, n) for n in names if getattr(self, n) is not None}
+
+    @model_serializer
+    def _serialize(self) -> dict[str, Any]:
+        return self._criteria()
 
 
 class ParticleOperation(Component):
-    """What happens to selected particles in each step, after their rule has moved them.
+    """Changes the displacement of selected particles in each step, after the move of their rule.
 
-    To add an operation, write `displacement`, static and elementwise as the functions of a rule
-    are: numpy calls it with whole arrays, kernels have it inlined. It comes after the rule's move,
-    with relaxation and memory, and before obstacles push; leaders stand where they are prescribed
-    whatever it returns, and frame points follow. Operations are made in the order in which the
-    experiment lists them.
+    To add an operation, write `displacement`, static and elementwise as the functions of a rule. It
+    is applied after the move with relaxation and memory, and before obstacles; leaders are placed
+    at their prescribed positions afterwards, and frame points follow. Operations are applied in the
+    order in which the experiment lists them.
     """
 
     rests: ClassVar[bool] = False
-    """Whether a particle rests under the operation where it rests without, and nowhere else:
-    ``displacement(u, u, p)`` is u, exactly, and for any other `new` it is not. Equilibria are then
-    those of the rule alone; experiments that look for one refuse other operations."""
+    """True if ``displacement(u, u, p)`` is exactly u, and differs from u for any other `new`.
+    Equilibria are then those of the rule alone; experiments that look for an equilibrium refuse
+    other operations."""
 
     select: Selection | None = Field(
         None, description="The particles of the body to which it happens; all where it is left out."
     )
 
     def parameters(self) -> dict[str, float]:
-        """The numbers that `displacement` sees as ``p.name``; by default the operation's own."""
+        """Return the numbers that `displacement` sees as ``p.name``; by default the fields"""
         return self.numeric_parameters()
 
     @staticmethod
     @abstractmethod
     def displacement(u: Vector, new: Vector, p: Parameters) -> Vector:
-        """The displacement of a particle at the end of the step, a vector, elementwise: `u` is that
-        at its beginning, and `new` where the rule, and operations before, have moved it."""
+        """Return the displacement of a particle at the end of the step, elementwise.
+
+        Parameters
+        ----------
+        u : Vector
+            Displacement at the beginning of the step, in lattice units.
+        new : Vector
+            Displacement after the move of the rule and preceding operations.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        Vector
+            Displacement, in lattice units.
+        """

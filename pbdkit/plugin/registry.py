@@ -48,7 +48,7 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """All plugins, the built-in one first."""
+        """Plugins with components, the built-in one first."""
         return [p for p in self._local if p.offers] + self.installed
 
     def find(self, interface: type[Component], name: str) -> type[Component]:
@@ -208,8 +208,8 @@ def _judged_offer(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: 
         change = "change the type"
         remedy = f"{advice}, or {change}" if plugin.distribution else change
         return replace(offer, reason=f"{what}; {remedy}")
-    if others := [str(p) for p, _ in twins if p.distribution != plugin.distribution]:
-        reason = f"'{name}' is offered by {', '.join(others)} too; {advice}"
+    if rivals := [str(p) for p, _ in twins if p.distribution != plugin.distribution]:
+        reason = f"'{name}' is offered by {', '.join(rivals)} too; {advice}"
         return replace(offer, reason=reason)
     return offer
 

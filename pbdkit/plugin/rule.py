@@ -1,4 +1,4 @@
-"""The FollowerRule interface: two elementwise functions and their parameters."""
+"""The interface FollowerRule: two elementwise functions and their parameters."""
 
 from __future__ import annotations
 
@@ -17,13 +17,20 @@ from pbdkit.plugin.vector import Number, Numbers, Parameters, Vector, Weights
 
 
 class Here(NamedTuple):
-    """What stands at the follower itself.
+    """Local values at the follower.
 
-    `u` is its displacement in the intermediate configuration. `X` is its reference position, as in
-    the experiment and the dataset, and `centred` the same from the middle of the body's box, of
-    which no digit depends on where the body lies; both are given to rules that declare
-    `uses_reference`, otherwise None. `own` are the numbers that the rule remembers of the particle,
-    by name.
+    Parameters
+    ----------
+    u : Vector
+        Displacement in the intermediate configuration, in lattice units.
+    X : Vector
+        Reference position, as in the experiment and the dataset; None unless the rule declares
+        `uses_reference`.
+    centred : Vector
+        Reference position relative to the middle of the body's box, independent of the position of
+        the body to the last bit; None unless the rule declares `uses_reference`.
+    own : Numbers
+        Numbers that the rule remembers of the particle, by name.
     """
 
     u: Vector
@@ -33,8 +40,11 @@ class Here(NamedTuple):
 
 
 class Stiffness(NamedTuple):
-    """Plane elasticity over Young's modulus and thickness: σ_x = xx ε_x + xy ε_y + x_shear γ,
-    σ_y = xy ε_x + yy ε_y + y_shear γ, τ = x_shear ε_x + y_shear ε_y + shear γ."""
+    """Plane elasticity over Young's modulus and thickness.
+
+    σ_x = xx ε_x + xy ε_y + x_shear γ, σ_y = xy ε_x + yy ε_y + y_shear γ and
+    τ = x_shear ε_x + y_shear ε_y + shear γ.
+    """
 
     xx: Any
     yy: Any
@@ -44,16 +54,31 @@ class Stiffness(NamedTuple):
     y_shear: Any = 0.0
 
     def own_modulus(self, through_thickness: Any) -> Any:
-        """Young's modulus along x, over that of the material it is compared with, given σ_zz over
-        σ_xx + σ_yy."""
+        """Return Young's modulus along x over that of the reference material.
+
+        Parameters
+        ----------
+        through_thickness
+            σ_zz over σ_xx + σ_yy.
+        """
         return (self.xx - self.xy * self.xy / self.yy) * (1.0 - through_thickness**2)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a rule may derive its constants from: the lattice, the slots of each sublattice, and
-    the box (`lower`, `upper`) of the body's reference configuration, frame not included. `cells`
-    are the lattice's cells, and which of them lie beside a slot."""
+    """Lattice and body, from which a rule may derive its constants.
+
+    Parameters
+    ----------
+    cell : Cell
+        Repeat cell of the lattice.
+    slots : tuple of tuple of Slot
+        Slots of each sublattice.
+    lower, upper : Vector of float
+        Corners of the body's box in the reference configuration, without the frame.
+    cells : Tiling
+        Cells of the lattice and those beside each slot.
+    """
 
     cell: Cell
     slots: tuple[tuple[Slot, ...], ...]
@@ -69,24 +94,24 @@ SCALES_FORCES = (
 
 
 class FollowerRule(TakesFields):
-    """How a follower moves, given its neighbours in the intermediate configuration m.
+    """Moves a follower according to its neighbours in the intermediate configuration m.
 
-    To add a rule, write `gather` and `apply`, both static and elementwise: the framework calls
-    them with whole arrays, single numbers or probes. With u = x - X:
+    To add a rule, write `gather` and `apply`, both static and elementwise: they are called with
+    whole arrays, single numbers and probes, and compiled into kernels. With u = x - X:
 
-    1. for each neighbour k that is present, ``gather(d, r, w, p)`` with the difference
-       d = u_k - u_j, the rest offset r = X_k - X_j (so x_k - x_j = r + d), the slot's weights w
-       and the parameters p returns a tuple of contributions, vectors and numbers;
-    2. the contributions are summed over the neighbours, in the order of the slots;
-    3. ``apply(total, here, p)`` returns the move, a vector, from where the particle stands in m to
-       its target: zero moves mean rest, exactly.
+    1. for each present neighbour k, ``gather(d, r, w, p)`` returns contributions, vectors and
+       numbers; d = u_k - u_j is the difference, r = X_k - X_j the rest offset (x_k - x_j = r +
+       d), w the weights of the slot and p the parameters;
+    2. the contributions are summed over the neighbours in the order of the slots;
+    3. ``apply(total, here, p)`` returns the move, a vector, from the position in m to the target. A
+       move of exactly zero is rest.
 
-    Relaxation and memory are applied afterwards and are no concern of the rule. A particle that
-    has no neighbour stays. A fictitious neighbour counts as present.
+    Relaxation and memory are applied afterwards by the framework. A particle without neighbours
+    does not move. A fictitious neighbour counts as present.
 
-    What only some rules can do is a class that they take on besides: `Calibrated`, `Loadable`,
-    `TearsCells`, `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`,
-    `SharesParticles`, `TurnsParticles`, `AppliesTwice`.
+    Optional capabilities are further base classes: `Calibrated`, `Loadable`, `TearsCells`,
+    `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`,
+    `TurnsParticles`, `AppliesTwice`.
     """
 
     _elsewhere: ClassVar[Mapping[str, str]] = {
@@ -94,91 +119,174 @@ class FollowerRule(TakesFields):
         "thickness": SCALES_FORCES,
     }
     linear: ClassVar[bool] = False
-    """Whether moves superpose: with the same neighbours the move is a constant and a part linear in
-    the displacements. What `check` predicts then holds for the whole run, not near its start
-    alone."""
+    """True if moves superpose: for given neighbours the move is a constant plus a linear function
+    of the displacements. Predictions of `check` then hold for the whole run."""
     uses_reference: ClassVar[bool] = False
-    """Whether it counts where the particle stands: `here.X` and `here.centred` are then given.
-    Other rules move a translated body in the same way, wherever it stands."""
+    """True if the move depends on the position: `here.X` and `here.centred` are then set. Other
+    rules move a translated body equally."""
     has_axes: ClassVar[bool] = False
-    """Whether directions count: mirrored, or turned by a right angle, a body may then move
-    otherwise."""
+    """True if directions matter: a body that is reflected, or rotated by a right angle, may then
+    move differently."""
     uses_cells: ClassVar[bool] = False
-    """Whether the rule works cell by cell of the lattice. ``w.left`` and ``w.right`` are then the
-    shares, 0 to 1, of the cells to the left and to the right of the bond, seen from j, that belong
-    to the body: both 1 inside, and everywhere unless the frame is one that weighs cells. A bond
-    across a cell has that cell on both sides."""
+    """True if the rule works cell by cell of the lattice. ``w.left`` and ``w.right`` are then the
+    shares, 0 to 1, of the cells to the left and right of the bond, seen from j, that belong to the
+    body: 1 inside, and everywhere unless the frame weighs cells. A bond across a cell has that cell
+    on both sides."""
 
     def parameters(self, setting: Setting) -> dict[str, float]:
-        """The numbers that `gather` and `apply` see as ``p.name``; by default the rule's own.
+        """Return the numbers that `gather` and `apply` see as ``p.name``; by default the numeric
+        fields.
 
-        Raise ExperimentError where the rule does not go with the lattice.
+        Parameters
+        ----------
+        setting : Setting
+            Lattice and body.
+
+        Raises
+        ------
+        ExperimentError
+            If the rule cannot be combined with the lattice.
         """
         return self.numeric_parameters()
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """The constants of a slot that `gather` sees as ``w.name``; by default none. All slots
-        have the same names."""
+        """Return the constants of a slot that `gather` sees as ``w.name``; by default none.
+
+        Parameters
+        ----------
+        slot : Slot
+            Slot; all slots must have the same names.
+        setting : Setting
+            Lattice and body.
+        """
         return {}
 
     @staticmethod
     @abstractmethod
     def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector | Number, ...]:
-        """The contributions of one neighbour, elementwise."""
+        """Return the contributions of one neighbour, elementwise.
+
+        Parameters
+        ----------
+        d : Vector
+            Difference u_k - u_j, in lattice units.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        w : Weights
+            Constants of the slot.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        tuple of Vector or Number
+            Contributions; they are summed over the neighbours.
+        """
 
     @staticmethod
     @abstractmethod
     def apply(total: tuple[Any, ...], here: Here, p: Parameters) -> Vector:
-        """The move of the follower (target - where it stands in m), elementwise."""
+        """Return the move of the follower, from its position in m to its target, elementwise.
+
+        Parameters
+        ----------
+        total : tuple of Vector or Number
+            Sums of the contributions.
+        here : Here
+            Local values of the particle.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        Vector
+            Move, in lattice units.
+        """
 
 
 class Calibrated(ABC):
-    """A rule that is calibrated to a material: it knows forces."""
+    """A rule that is calibrated to a material, so that it has forces."""
 
     @abstractmethod
     def elasticity(self) -> Stiffness | None:
-        """The material whose linear elasticity the rule is; None where its parameters leave it
-        without one."""
+        """Return the linear elasticity of the rule; None if its parameters define no material."""
 
     def through_thickness(self) -> float:
-        """σ_zz over σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain."""
+        """Return σ_zz over σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain."""
         return 0.0
 
     @staticmethod
     @abstractmethod
     def force(total: tuple[Any, ...], here: Here, p: Parameters) -> Vector:
-        """The force of the neighbours on the particle over Young's modulus and thickness, a vector
-        in the lattice's units, from the sums. It vanishes in equilibrium."""
+        """Return the force of the neighbours on the particle, elementwise.
+
+        It vanishes in equilibrium.
+
+        Parameters
+        ----------
+        total, here, p
+            As in `FollowerRule.apply`.
+
+        Returns
+        -------
+        Vector
+            Force over Young's modulus and thickness, in lattice units.
+        """
 
 
 class Loadable(Calibrated):
-    """A calibrated rule that takes loads: forces from outside that act on followers."""
+    """A calibrated rule that takes loads: external forces on followers."""
 
     @staticmethod
     @abstractmethod
     def loaded(total: tuple[Any, ...], load: Vector, p: Parameters) -> tuple[Vector | Number, ...]:
-        """The sums as they would be if a neighbour exerted the force `load` besides, a vector over
-        Young's modulus and thickness in the lattice's units, elementwise:
+        """Return the sums as if a neighbour exerted the force `load` in addition, elementwise::
 
-            force(loaded(total, f, p), here, p) = force(total, here, p) + f.
+            force(loaded(total, f, p), here, p) = force(total, here, p) + f
 
-        What it adds to the move is the same wherever neighbours stand.
+        The contribution to the move must not depend on the positions of the neighbours.
+
+        Parameters
+        ----------
+        total : tuple of Vector or Number
+            Sums of the contributions.
+        load : Vector
+            Force over Young's modulus and thickness, in lattice units.
+        p : Parameters
+            Parameters.
         """
 
 
 class StoresEnergy(Calibrated):
-    """A calibrated rule that is not linear; the energy of others is -½ Σ u·force."""
+    """A nonlinear calibrated rule; the energy of linear rules is -½ Σ u·force."""
 
     @staticmethod
     @abstractmethod
     def energy(d: Vector, r: Vector, w: Weights, p: Parameters) -> Number:
-        """The half of a bond's strain energy that falls to this end, over Young's modulus and
-        thickness, elementwise."""
+        """Return the half of the strain energy of a bond that belongs to this end, elementwise.
+
+        Parameters
+        ----------
+        d, r, w, p
+            As in `FollowerRule.gather`.
+
+        Returns
+        -------
+        Number
+            Energy over Young's modulus and thickness.
+        """
 
 
 class Torn(NamedTuple):
-    """Damage beside a bond, 0 where nothing is damaged and 1 where a bond is broken: the largest of
-    any bond of the cell to the left and to the right of it, and its own in each of the two."""
+    """Damage beside a bond: 0 is undamaged, 1 broken.
+
+    Parameters
+    ----------
+    left, right
+        Largest damage of any bond of the cell to the left and to the right.
+    bond_left, bond_right
+        Damage of the bond itself in each of the two cells.
+    """
 
     left: Number
     right: Number
@@ -187,11 +295,11 @@ class Torn(NamedTuple):
 
 
 class TearsCells(Calibrated):
-    """A calibrated rule that works cell by cell, and computes itself what cells with broken and
-    softened bonds exert: forces that balance and that no rigid motion causes.
+    """A calibrated rule that works cell by cell and computes the forces of damaged cells.
 
-    Where bonds can break, a bond that is lost keeps its difference d; no fictitious point takes its
-    place, and models must not place one that would pull.
+    The forces balance, and no rigid motion causes any. If bonds can break, a broken bond keeps its
+    difference d; fictitious points are not used, and a fracture model must not place one that
+    pulls.
     """
 
     @staticmethod
@@ -199,81 +307,130 @@ class TearsCells(Calibrated):
     def torn(
         d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters
     ) -> tuple[Vector | Number, ...]:
-        """The contributions of one neighbour, as `gather` returns them, with the damage t beside
-        the bond; those of `gather`, to the last bit, where t is zero."""
+        """Return the contributions of one neighbour beside damage, elementwise.
+
+        Parameters
+        ----------
+        d, r, w, p
+            As in `FollowerRule.gather`.
+        t : Torn
+            Damage beside the bond. Where it is zero, the result is that of `gather` to the last
+            bit.
+        """
 
 
 class MixesCells(Calibrated):
-    """A calibrated rule that works cell by cell, of whatever material each cell is: its numbers may
-    then differ from cell to cell."""
+    """A calibrated rule that works cell by cell, with a material for each cell."""
 
     @abstractmethod
     def cell_weights(self, slot: Slot, setting: Setting, c: Stiffness) -> dict[str, float]:
-        """The weights of a slot, as `weights`, were the cells of stiffness c over the modulus of
-        the rule: linear in c."""
+        """Return the weights of a slot for cells of another stiffness.
+
+        Parameters
+        ----------
+        slot, setting
+            As in `FollowerRule.weights`.
+        c : Stiffness
+            Stiffness of the cells over the modulus of the rule; the weights are linear in it.
+        """
 
     def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """The weights that act in torn cells alone, the others 0; by default there are none. They
-        are not linear in the stiffness of a cell: cells of another have `spring_share` of them."""
+        """Return the weights that act in torn cells alone, the others 0; by default there are none.
+
+        They are not linear in the stiffness of a cell: see `spring_share`.
+        """
         return {}
 
     def spring_share(self, c: Floats, setting: Setting) -> Floats:
-        """(cell,): how many times the `spring_weights` cells have, for their stiffness c over
-        Young's modulus, (cell, 3, 3) in the components xx, yy, xy."""
+        """Return the factor of `spring_weights` for cells of other stiffnesses.
+
+        Parameters
+        ----------
+        c : (cell, 3, 3)
+            Stiffness over Young's modulus, in the components xx, yy, xy.
+        setting : Setting
+            Lattice and body.
+
+        Returns
+        -------
+        (cell,)
+            Factor of each cell.
+        """
         return np.zeros(len(c))
 
 
 class RenewsParticles(Remembers):
-    """A rule of which some remembered numbers change from step to step."""
+    """A rule with remembered numbers that change from step to step."""
 
     @staticmethod
     @abstractmethod
     def remember(total: tuple[Any, ...], here: Here, p: Parameters) -> tuple[Number, ...]:
-        """The new values of the numbers that change, in their order, from what `apply` is given.
+        """Return the new values of the numbers that change, in their order, elementwise.
 
-        Leaders remember as followers do; who has no neighbour keeps its numbers.
+        Leaders remember as followers do. A particle without neighbours keeps its numbers.
+
+        Parameters
+        ----------
+        total, here, p
+            As in `FollowerRule.apply`.
         """
 
 
 class SharesParticles(Remembers):
-    """A rule whose particles see what is remembered of each other: its `gather` is given two
-    arguments more. Frame points and fictitious ones remember nothing, so that it goes with neither
-    a frame nor bonds that break."""
+    """A rule that reads the remembered numbers of both particle and neighbour.
+
+    Frame points and fictitious points remember nothing, so that it can be combined neither with a
+    frame nor with bonds that break.
+    """
 
     @staticmethod
     @abstractmethod
     def gather(
         d: Vector, r: Vector, w: Weights, p: Parameters, own: Numbers, there: Numbers
     ) -> tuple[Vector | Number, ...]:
-        """The contributions of one neighbour, elementwise. ``own.name`` is what is remembered of
-        the particle, ``there.name`` what is remembered of the neighbour, both before the step."""
+        """Return the contributions of one neighbour, elementwise.
+
+        Parameters
+        ----------
+        d, r, w, p
+            As in `FollowerRule.gather`.
+        own : Numbers
+            Numbers remembered of the particle before the step.
+        there : Numbers
+            Numbers remembered of the neighbour before the step.
+        """
 
 
 class TurnsParticles(RenewsParticles):
-    """A rule whose particles have directions: some remembered numbers are rotations, each by its
-    cosine and sine. Leaders that are clamped prescribe them, and turn with their motion."""
+    """A rule with directions of particles: some remembered numbers are rotations.
+
+    Each is stored by its cosine and sine. Clamped leaders prescribe them, and turn with their
+    motion.
+    """
 
     @abstractmethod
     def rotations(self) -> tuple[tuple[str, str], ...]:
-        """The names of the cosine and the sine of each rotation from the reference, which is
-        counterclockwise."""
+        """Return the names of cosine and sine of each rotation, counterclockwise from the
+        reference."""
 
 
 class AppliesTwice(ABC):
-    """A rule that works on the moves of another, for operators that are applied twice: `gather` and
-    `apply` are given its moves z, of followers and leaders alike, in place of displacements:
-    d = z_k - z_j and here.u = z_j."""
+    """A rule that works on the moves of an inner rule, for operators that are applied twice.
+
+    `gather` and `apply` receive the inner moves z, of followers and leaders alike, in place of
+    displacements: d = z_k - z_j and here.u = z_j.
+    """
 
     @abstractmethod
     def inner(self) -> FollowerRule:
-        """The rule whose moves this rule works on."""
+        """Return the inner rule."""
 
 
 def shares_particles(rule: object) -> bool:
-    """Whether neighbours see what is remembered of each other."""
+    """Return whether a rule reads the remembered numbers of neighbours."""
     return isinstance(rule, SharesParticles)
 
 
 def material_of(rule: FollowerRule) -> Stiffness | None:
-    """The material that a rule is calibrated to, if it is."""
+    """Return the material to which a rule is calibrated, or None."""
     return rule.elasticity() if isinstance(rule, Calibrated) else None

@@ -25,7 +25,7 @@ COURSE = "course"
 WORD = "a number or 'auto'"
 """Form of a number that can be selected automatically in messages."""
 FORMS = (PLAIN, COURSE, WORD)
-"""All forms of a number."""
+"""Forms of numbers in messages."""
 
 
 class Course(Strict, Generic[Value]):
@@ -145,7 +145,7 @@ def last(number: float | Course[float]) -> float:
 
 
 class ForceCourse(Course[Annotated[float, FORCE]]):
-    """Time-dependent force."""
+    """Force that depends on time."""
 
 
 class BodyForceCourse(Course[Annotated[float, BODY_FORCE]]):

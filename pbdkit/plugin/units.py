@@ -85,23 +85,23 @@ class Quantity:
 
 
 LENGTH = Quantity("length", "lattice unit", "mm", length=1)
-"""Length."""
+"""Quantity of lengths."""
 PER_LENGTH = Quantity("number per length", "1 / lattice unit", "1/mm", length=-1)
-"""Inverse length."""
+"""Quantity of inverse lengths."""
 AREA = Quantity("area", "lattice unit^2", "mm^2", length=2)
-"""Area."""
+"""Quantity of areas."""
 STRESS = Quantity("stress", "stress unit", "MPa", youngs_modulus=1)
-"""Stress."""
+"""Quantity of stresses."""
 FORCE = Quantity(
     "force", "stress unit * thickness unit * lattice unit", "N",
     length=1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
-"""Force."""
+"""Quantity of forces."""
 ENERGY = Quantity(
     "energy", "stress unit * thickness unit * lattice unit^2", "mJ",
     length=2, youngs_modulus=1, thickness=1,
 )  # fmt: skip
-"""Energy."""
+"""Quantity of energies."""
 FRACTURE_ENERGY = Quantity(
     "fracture energy", "stress unit * lattice unit", "N/mm",
     length=1, youngs_modulus=1, also=LENGTH,
@@ -111,7 +111,7 @@ BODY_FORCE = Quantity(
     "force per area", "stress unit * thickness unit / lattice unit", "N/mm^2",
     length=-1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
-"""Force per area."""
+"""Quantity of forces per area."""
 QUANTITIES = {q.lattice: q for q in (LENGTH, AREA, STRESS, FORCE, ENERGY, BODY_FORCE)}
 """Quantities by their unit in datasets."""
 

@@ -1,7 +1,7 @@
-"""Vectors, and the functions in which elementwise functions are written.
+"""Vectors, and functions for elementwise code.
 
-A rule's functions are called with whole arrays, with single numbers or with probes, always one
-value a component. They use + - * /, the functions of numpy, and choose with `where`.
+The functions of a rule are called with whole arrays, single numbers or probes, one value for each
+component. They use + - * /, the functions of numpy, and `where` for choices.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from typing_extensions import TypeVar
 
 Number: TypeAlias = float | NDArray[np.floating[Any]]
-"""A value of an elementwise function: one number, or an array with one for each place."""
+"""Value of an elementwise function: a number, or an array with one for each place."""
 Condition: TypeAlias = bool | NDArray[np.bool_]
-"""A comparison of such values."""
+"""Comparison of such values."""
 
 T = TypeVar("T", covariant=True, default=Number)
 V = TypeVar("V", bound="Vector[Any]")
@@ -61,9 +61,9 @@ class Vector(_Plane[T]):
     __slots__ = ()
     __array_ufunc__ = None  # array * vector is then computed by the vector
 
-    def each(self, function: Callable[..., Any], *others: Iterable[Any]) -> Self:
-        """Return the vector of function(component, ...), component by component."""
-        return self._of([function(*parts) for parts in zip(self, *others, strict=True)])
+    def each(self, function: Callable[..., Any], *vectors: Iterable[Any]) -> Self:
+        """Return the vector of function(component, ...) for each component."""
+        return self._of([function(*parts) for parts in zip(self, *vectors, strict=True)])
 
     def _of(self, components: list[Any]) -> Self:
         return tuple.__new__(type(self), components)
@@ -100,11 +100,17 @@ class SpaceVector(_Space[T], Vector[T]):
 
 
 KINDS: dict[int, type[Vector[Any]]] = {2: Vector, 3: SpaceVector}
-"""The kind of vector by its number of components."""
+"""Class of vectors by number of components."""
 
 
 def vector(components: Iterable[Any]) -> Any:
-    """Return the vector with these components; ValueError unless there are two or three."""
+    """Return the vector with two or three components.
+
+    Raises
+    ------
+    ValueError
+        For another number of components.
+    """
     values = tuple(components)
     if len(values) not in KINDS:
         raise ValueError(f"a vector has two or three components, not {len(values)}")
@@ -139,27 +145,29 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def dot(a: Vector[T], b: Vector[T]) -> T:
-    """Return a·b = a_x b_x + a_y b_y."""
-    products: list[Any] = [one * other for one, other in zip(a, cast(Any, b), strict=True)]
+    """Return a·b = a_x b_x + a_y b_y, elementwise."""
+    products: list[Any] = [
+        component * factor for component, factor in zip(a, cast(Any, b), strict=True)
+    ]
     # No name of a type here: the kernel cache keys functions by what they refer to.
     total: T = sum(products[1:], products[0])
     return total
 
 
 def squared_length(v: Vector[T]) -> T:
-    """Return v·v; the same to the last bit for v and -v."""
+    """Return v·v, equal to the last bit for v and -v."""
     return dot(v, v)
 
 
 def length(v: Vector[T]) -> T:
-    """Return √(v·v)."""
+    """Return √(v·v), elementwise."""
     square: Any = squared_length(v)
     root: T = np.sqrt(square)
     return root
 
 
 class Numbers:
-    """Named numbers that an elementwise function sees as attributes; named tuples at run time."""
+    """Named numbers that an elementwise function reads as attributes; a named tuple at run time."""
 
     if TYPE_CHECKING:
 
@@ -167,12 +175,12 @@ class Numbers:
 
 
 class Parameters(Numbers):
-    """The parameters of a component, seen as ``p.name``."""
+    """Parameters of a component, read as ``p.name``."""
 
 
 class Weights(Numbers):
-    """The constants of a slot that a rule declares, seen as ``w.name``."""
+    """Constants of a slot that a rule declares, read as ``w.name``."""
 
 
 class Constants(Numbers):
-    """The constants of a slot, and what is remembered of the bond, seen as ``c.name``."""
+    """Constants of a slot and remembered numbers of the bond, read as ``c.name``."""

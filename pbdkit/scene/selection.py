@@ -14,7 +14,7 @@ from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.lattice.raster import FOLLOWER, NOWHERE, Raster, distinct
 from pbdkit.model.bodies import Body
 from pbdkit.plugin import Pair
-from pbdkit.plugin.particles import Selection
+from pbdkit.plugin.operation import Selection
 from pbdkit.scene.constants import signed_distance
 
 COLLINEAR_RTOL = 1e-9

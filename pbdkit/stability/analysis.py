@@ -566,7 +566,7 @@ class StabilityEstimate:
 
 
 def verdict_of(found: Any) -> list[tuple[str, str]]:
-    """Return what an Analysis or a Forecast says of stability, as names and texts."""
+    """Return the statements of an Analysis or a Forecast on stability, as names and texts."""
     if found.spectral_radius is None:
         return [("stability", "not known of this scene")]
     near = "" if found.exact else ", linearised at the start"

@@ -338,8 +338,8 @@ def remembered(subject: Subject, scene: Scene) -> tuple[Remembered, ...]:
     """
     if numbers := numbers_of(subject.component, scene):
         return numbers
-    whose = "particles" if isinstance(subject.component, FollowerRule) else "bonds"
-    raise NotApplicableError(f"it remembers nothing of {whose}")
+    owners_name = "particles" if isinstance(subject.component, FollowerRule) else "bonds"
+    raise NotApplicableError(f"it remembers nothing of {owners_name}")
 
 
 @property_of(FollowerRule, FractureModel, is_needed=True)

@@ -140,8 +140,7 @@ def examine(component: Component | type[Component], **parts: Any) -> Report:
         Component, or a class, of which the first example is tested.
     **parts
         Parts of experiments (``lattice=...``, ``neighbours=...``) that replace the usual ones, for
-        a
-        component that requires them.
+        a component that requires them.
 
     Returns
     -------
@@ -198,8 +197,7 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
     """Return a test function of pytest with a case for each property of each component.
 
     Skipped properties are skipped in pytest with their reason. After the last property of a
-    component
-    a line summarises what ran.
+    component a line summarises what ran.
 
     Parameters
     ----------

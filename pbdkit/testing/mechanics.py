@@ -110,8 +110,7 @@ def pulls_at_rest(scene: Scene, state: State) -> bool:
     """Return whether particles at rest exert forces.
 
     This is so if fictitious points are displaced: these turn with the body, so that a rotation
-    changes
-    the forces.
+    changes the forces.
     """
     u = np.zeros_like(state.u, dtype=float)
     return bool(np.abs(SlotFollowers(scene).forces(u, state)).max() > 0.0)
@@ -192,11 +191,10 @@ class NoSolidError(Exception):
 
 @dataclass(frozen=True)
 class Solid:
-    """A scene whose rule knows forces and whose edges are free, and its stiffness.
+    """A scene with known forces and free edges, and its stiffness.
 
     The stiffness is that with all bonds, after random displacements with some bonds broken, and
-    with
-    further bonds broken.
+    with further bonds broken.
     """
 
     scene: Scene
@@ -277,8 +275,7 @@ def _parts(component: Component) -> list[dict[str, Any]]:
 
 def _is_tied(scene: Scene) -> bool:
     """Return whether a fictitious neighbour is fixed in space, so that translations of the body
-    change
-    forces.
+    change forces.
     """
     model, slot = scene.experiment.fracture, scene.neighbourhood.slots[0][0]
     u, p = vector([0.1] * scene.axes), scene.constants.fracture

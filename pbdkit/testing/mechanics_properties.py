@@ -178,15 +178,15 @@ def _even_scene(experiment: Experiment) -> Scene | None:
 
 
 def _images(X: Floats, matrix: Floats) -> Any:
-    """Return the particle at whose position each particle is mapped."""
+    """Return the particle at the image of each position."""
     middle = X.mean(axis=0)
     images = (X - middle) @ matrix.T + middle
     return np.abs(images[:, None] - X[None]).max(axis=2).argmin(axis=1)
 
 
 LINEAR, NEARLY = 1e-11, 1e-8
-"""Tolerances relative to the largest stiffness: of linear rules, and of others, whose stiffness is
-a difference of forces."""
+"""Tolerances relative to the largest stiffness: of linear rules, and of others, for which the
+stiffness is a difference of forces."""
 
 
 @property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)

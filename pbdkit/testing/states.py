@@ -47,7 +47,7 @@ def displacements(scene: Scene, seed: int, share: float = 0.2) -> Floats:
 
 
 def state_with(scene: Scene, u: Any) -> State:
-    """Return the state of step 1 at rest whose body has displacements u, (particle, axis).
+    """Return the state of step 1 at rest with displacements u of the body, (particle, axis).
 
     The frame follows by its map. It is not the state of step 0, which engines may replace by the
     experiment's initial state.
@@ -158,11 +158,11 @@ def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
         states.append(Stepper(scene).advance(start, 2))
     pools = []
     for moment in (StateMoment(state, Tables(scene)) for state in states):
-        whose = moment.body if isinstance(part, FollowerRule) else moment.broken_step() < 0
-        pools.append([moment.remembered(number.name)[whose] for number in numbers])
+        rows = moment.body if isinstance(part, FollowerRule) else moment.broken_step() < 0
+        pools.append([moment.remembered(number.name)[rows] for number in numbers])
     columns = [np.concatenate(values) for values in zip(*pools, strict=True)]
-    rows = np.random.default_rng(seed + 2).integers(0, len(columns[0]), SHAPE)
-    return tuple(column[rows] for column in columns)
+    sample = np.random.default_rng(seed + 2).integers(0, len(columns[0]), SHAPE)
+    return tuple(column[sample] for column in columns)
 
 
 def shared(scene: Scene, own: tuple[Any, ...]) -> list[Any]:
@@ -191,8 +191,7 @@ class Shown:
     """A moment, its cells or its forces with replaced tables or permuted particles.
 
     Row n contains what row order[n] of the inner object does. Values that have no order of
-    particles
-    are unchanged.
+    particles are unchanged.
     """
 
     OWN = ("displacement", "previous_displacement", "reference")

@@ -1,5 +1,5 @@
-"""Properties of whole steps with a component, of rules that take loads, and of rules whose
-particles have directions."""
+"""Properties of whole steps with a component, of rules that take loads, and of particles with
+directions."""
 
 from __future__ import annotations
 
@@ -172,12 +172,12 @@ def _free(subject: Subject) -> list[Scene]:
         if not rule.uses_reference and not anchored:
             free.append(scene)
     if not free:
-        reason = f"{_whose(subject)} declares `uses_reference`, or a frame anchors"
+        reason = f"{_rule_name(subject)} declares `uses_reference`, or a frame anchors"
         raise NotApplicableError(f"{reason}: where a body lies may count")
     return free
 
 
-def _whose(subject: Subject) -> str:
+def _rule_name(subject: Subject) -> str:
     return "it" if isinstance(subject.component, FollowerRule) else "the rule"
 
 
@@ -187,14 +187,14 @@ def superposes(subject: Subject) -> None:
     of the steps from each, up to rounding."""
     scenes = [scene for scene in subject.scenes if scene.experiment.rule.linear]
     if not scenes:
-        raise NotApplicableError(f"{_whose(subject)} does not declare `linear`")
+        raise NotApplicableError(f"{_rule_name(subject)} does not declare `linear`")
     for scene in scenes:
         first, second = displacements(scene, 2, share=0.5), displacements(scene, 3, share=0.5)
         starts = first + second, first, second, 0.0 * first
         both, a, b, none = (advanced(scene, u, STEPS) for u in starts)
         deviation = _apart((both - none)[-1], (a + b - 2 * none)[-1], np.array([both, a, b, none]))
         if not deviation <= STEP_ROUNDING:
-            remedy = "do not declare `linear`" if _whose(subject) == "it" else ""
+            remedy = "do not declare `linear`" if _rule_name(subject) == "it" else ""
             fault = f"displacements do not superpose, by {deviation:.3g} of the largest"
             raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
 
@@ -266,7 +266,7 @@ def is_the_same_compiled(subject: Subject) -> None:
         _refuse_difference(state, expected, "the compiled engine", scene)
 
 
-def _refuse_difference(state: State, expected: State, whose: str, scene: Scene) -> None:
+def _refuse_difference(state: State, expected: State, origin: str, scene: Scene) -> None:
     arrays, references = flat(state), flat(expected)
     for name in differing(references, arrays):
         difference = ""
@@ -274,7 +274,7 @@ def _refuse_difference(state: State, expected: State, whose: str, scene: Scene) 
         if array.shape == reference.shape:
             difference = f", by {np.abs(array.astype(float) - reference).max():.3g} at most,"
         where = f"at step {expected.step}, {place_of(scene.experiment)}"
-        raise PropertyError(f"{whose} gives another `{name}`{difference} {where}")
+        raise PropertyError(f"{origin} gives another `{name}`{difference} {where}")
 
 
 ROUNDING = 1e-11
@@ -284,8 +284,8 @@ ANGLE = 2.0
 
 @property_of(FollowerRule)
 def follows_rotations(subject: Subject) -> None:
-    """A body without frame whose particles have directions, rotated with them as a whole, moves as
-    the original, rotated, up to rounding."""
+    """A body without frame, rotated as a whole with the directions of its particles, moves as the
+    original, rotated, up to rounding."""
     anywhere = not subject.component.uses_reference
     if not isinstance(subject.component, TurnsParticles):
         raise NotApplicableError("its particles have no directions")

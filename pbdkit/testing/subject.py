@@ -138,8 +138,7 @@ def calls_of(component: Component, scene: Scene, seed: int) -> list[FunctionCall
 @calls_of.register
 def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[FunctionCall]:
     """Return calls of `gather` and `apply`, also with r + d = 0 along every slot, and of
-    `remember`,
-    `force`, `loaded` and `draw` if the rule has them.
+    `remember`, `force`, `loaded` and `draw` if the rule has them.
     """
     d, at, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
     contributions = gathered(scene, each(np.array, d))
@@ -326,8 +325,7 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
 
     Rules, frames and fracture models are combined with each of the five lattices and each of four
     neighbourhoods, lattices and neighbour metrics each with the other and two rules. Components
-    that
-    work cell by cell are combined with frames or rules that do.
+    that work cell by cell are combined with frames or rules that do.
 
     Parameters
     ----------
@@ -463,8 +461,7 @@ class Property:
         Function that raises PropertyError if the property does not hold.
     is_needed
         Whether later properties presuppose this one: if it fails they are skipped, so that a fault
-        is
-        reported once.
+        is reported once.
     """
 
     name: str
