@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import pbdkit
 from pbdkit.cli import program
-from pbdkit.cli.commands import own_commands
+from pbdkit.cli.commands import builtin_commands
 from pbdkit.model.reading import read_text
 
 ROOT = Path(__file__).parent.parent
@@ -235,7 +235,7 @@ def test_commands_that_are_not_run_here_could_be(page):
     """Their options are known, and they name files that are there."""
     for line in commands(page):
         words = shlex.split(line, comments=True)
-        if words[:1] == ["pbdkit"] and "||" not in words and words[1] in own_commands():
+        if words[:1] == ["pbdkit"] and "||" not in words and words[1] in builtin_commands():
             command = program.get_command(None, words[1])
             command.make_parser(Context(command)).parse_args(words[2:])
         if words[:1] == ["python"] and not words[1].startswith("-"):

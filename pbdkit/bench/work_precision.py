@@ -1,6 +1,6 @@
 """Work–precision measurements: solvers at several sizes, each in a process of its own.
 
-The rows are shown as a table, a JSON object and a picture. A measurement is one call of
+The rows are shown as a table, a JSON object and a picture. A measurement is a process
 ``python -m pbdkit.bench.work_precision ANSWER``, with the job as JSON on its input.
 """
 
@@ -53,13 +53,16 @@ if TYPE_CHECKING:
 
 
 def resized(experiment: Experiment, size: int) -> tuple[str, ...]:
-    """The settings that make about `size` sites lie along the body's longer side.
+    """Return the settings with which about `size` sites lie along the longer side of the body.
 
-    A grid gets `size` columns and rows in proportion; what is placed by coordinates keeps its
-    place relative to the body. Of any other body the lattice becomes finer, and with it the lengths
-    that count in lattice constants: thresholds and the radius of the neighbours.
+    A grid gets `size` columns and rows in proportion; positions keep their place relative to the
+    body. For any other body the lattice becomes finer, and with it lengths in lattice constants:
+    thresholds and the radius of neighbours.
 
-    Raises ExperimentError where leaders are chosen by number, for numbers change with the size.
+    Raises
+    ------
+    ExperimentError
+        If leaders are selected by number, since numbers change with the size.
     """
     for n, group in enumerate(experiment.leaders):
         if group.select.numbers is not None:
@@ -126,30 +129,50 @@ def _finer_lattice(experiment: Experiment, size: int) -> Iterator[tuple[str, Any
 
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 METHODS = ("lu", "multigrid", "conjugate-gradients")
-LARGEST_DIRECT = 2_000_000
+MAX_PARTICLES_LU = 2_000_000
 """Particles above which LU is left out: its factors take 1.4 GiB at a million, and grow faster."""
-PATIENCE_S = 60.0
-"""Steps that would take longer are not made: they are measured by the step and counted ahead."""
-LOOKS = 4
-"""At so many steps, evenly spread and the last among them, displacements are compared."""
-IN_MOTION = ("initial={type: noise, amplitude: 1e-3}", "steps=10000000")
-"""So that every particle moves in the steps that are timed, and the engine for long runs is taken;
-so many are not made."""
-RATE_AT = (2, 42)
+MAX_STEPPING_S = 60.0
+"""Duration in seconds above which steps are extrapolated from the rate instead of measured."""
+COMPARISONS = 4
+"""Number of steps, evenly spread up to the last, at which displacements are compared."""
+NOISY_START = ("initial={type: noise, amplitude: 1e-3}", "steps=10000000")
+"""Settings by which every particle moves in timed steps, with the engine for long runs."""
+TIMED_STEPS = (2, 42)
+"""Steps between which the rate is measured."""
 Job = Callable[..., dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method measured at a size, None as it is; with a `reason` one that could not be had.
+    """A method measured at a size.
 
-    `steps` made, or iterations of the linear solver. `setup_s` until an engine is ready,
-    `setup_first_s` when nothing had been compiled. `seconds` from the experiment to the
-    equilibrium, imports and compiling done; `cpu_s` of all processors together. Memory is above
-    that of the imports. `error` is, at most, the largest distance from the truth: a share of the
-    largest displacement, at equilibrium of the largest prescribed one, as `certified` and
-    `tolerance` are; infinite where a run left the finite numbers. `is_predicted`: of a step,
-    times their number.
+    Parameters
+    ----------
+    size
+        Sites along the longer side; None for the experiment's own size.
+    method, precision, threads
+        Solver or engine.
+    particles
+        Number of particles.
+    tolerance, certified, error
+        Tolerance, certified bound and upper bound of the error: the largest distance from the
+        reference, relative to the largest displacement; for equilibria to the largest prescribed
+        one. Infinite if a run diverged.
+    steps
+        Number of steps, or of iterations of the linear solver.
+    setup_first_s, setup_s
+        Seconds until an engine is ready, without and with compiled kernels in the cache.
+    ns_per_particle_step
+        Nanoseconds for each particle and step.
+    seconds, cpu_s
+        Duration from the experiment to the equilibrium without imports and compilation, and
+        processor time of all threads.
+    peak_memory_mib
+        Peak memory above that of the imports in MiB.
+    is_predicted
+        True if times are those of a step times their number.
+    reason
+        Reason for which there is no measurement.
     """
 
     size: int | None
@@ -172,15 +195,17 @@ class Row:
 
     @property
     def line(self) -> str:
-        """Return the fields that rows of one colour in a picture share."""
+        """Method and threads, which rows of one colour in a picture share."""
         return self.method + (f", {self.threads} threads" if (self.threads or 1) > 1 else "")
 
 
 def engines() -> list[tuple[str, str, int]]:
-    """Engine, precision and threads of all ways to step, the reference first."""
-    ways = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
-    ways += [] if what_is_missing() else [("gpu", 1)]
-    return [(name, kind, threads) for name, threads in ways for kind in ("float64", "float32")]
+    """Return engine, precision and threads of all ways to step, the reference first."""
+    combinations = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
+    combinations += [] if what_is_missing() else [("gpu", 1)]
+    return [
+        (name, kind, threads) for name, threads in combinations for kind in ("float64", "float32")
+    ]
 
 
 def methods_count(experiment: Experiment) -> int:
@@ -191,134 +216,166 @@ def methods_count(experiment: Experiment) -> int:
 
 
 def measure(
-    experiment: str, settings: tuple[str, ...], size: int | None, tell: Callable[[str], None]
+    experiment: str, settings: tuple[str, ...], size: int | None, report: Callable[[str], None]
 ) -> Iterator[Row]:
-    """The truth first, then a row a method: engines, precisions and threads against numpy's
-    float64; where the solver is `equilibrium` its methods, and the steps, over tolerances.
+    """Yield the row of the reference, then a row for each method.
 
-    Every measurement has a process of its own; nothing is recorded and no diagnostic taken. Raises
-    ExperimentError and PluginError where there is nothing to measure against.
+    For steps the methods are engines, precisions and threads, and the reference is numpy in
+    float64. If the solver is `equilibrium`, they are its methods and steps, at several tolerances.
+    Every measurement has a process of its own, without records and diagnostics.
+
+    Parameters
+    ----------
+    experiment
+        File or shipped name.
+    settings
+        Settings with which it is loaded.
+    size
+        Sites along the longer side; None for its own size.
+    report
+        Function that is called with a description after each measurement.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        If there is no reference.
     """
-    asked = load(experiment, settings=settings)
-    settings = (*settings, f"record={{every: {asked.steps}}}", "diagnostics=[]")
+    loaded = load(experiment, settings=settings)
+    settings = (*settings, f"record={{every: {loaded.steps}}}", "diagnostics=[]")
     if size is not None:
         settings += resized(load(experiment, settings=settings), size)
-    rows = _step_by_step if asked.solver.makes_steps else _to_equilibrium
+    rows = _rows_of_engines if loaded.solver.makes_steps else _rows_to_equilibrium
     with tempfile.TemporaryDirectory(prefix="pbdkit-bench-") as name:
 
-        def work(what: str, *more: str, cache: str = "shared", **job: Any) -> dict[str, Any]:
-            job |= {"what": what, "experiment": experiment, "settings": [*settings, *more]}
-            return _worked(job | {"truth": name}, Path(name), Path(name) / f"cache-{cache}")
+        def run_job(
+            task: str, *further: str, cache: str = "shared", **arguments: Any
+        ) -> dict[str, Any]:
+            arguments |= {"what": task, "experiment": experiment, "settings": [*settings, *further]}
+            return _run_in_process(
+                arguments | {"truth": name}, Path(name), Path(name) / f"cache-{cache}"
+            )
 
-        for row in rows(work, Row(size, ""), asked.steps):
-            tell(f"{row.line}, size {size or 'as it is'}")
+        for row in rows(run_job, Row(size, ""), loaded.steps):
+            report(f"{row.line}, size {size or 'as it is'}")
             yield row
 
 
-def _worked(job: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
-    """The result of a job (worker.py) in a fresh process, with a cache folder of its own."""
+def _run_in_process(job: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
+    """Return the result of a job in a new process, with a cache folder of its own."""
     (answer := folder / "answer.json").unlink(missing_ok=True)
-    call = [sys.executable, "-m", "pbdkit.bench.work_precision", str(answer)]
+    command = [sys.executable, "-m", "pbdkit.bench.work_precision", str(answer)]
     env = os.environ | {"PBDKIT_CACHE_DIR": str(cache)}
-    done = subprocess.run(call, env=env, input=json.dumps(job), capture_output=True, text=True)
-    if done.returncode:
-        ended = f"it ended with status {done.returncode} (out of memory?)"
-        why = (done.stderr.strip() or ended).splitlines()[-1]
-        raise ExperimentError(f"the measurement failed: {why}")
+    process = subprocess.run(
+        command, env=env, input=json.dumps(job), capture_output=True, text=True
+    )
+    if process.returncode:
+        ending = f"it ended with status {process.returncode} (out of memory?)"
+        reason = (process.stderr.strip() or ending).splitlines()[-1]
+        raise ExperimentError(f"the measurement failed: {reason}")
     return _without_fault(json.loads(answer.read_text("utf-8")))
 
 
 def _without_fault(result: dict[str, Any]) -> dict[str, Any]:
-    """The result of a job. Raises what went wrong with it."""
+    """Return the result of a job; raise the error that it contains, if any."""
     if "fault" in result:
         kind = PluginError if result["fault"] == "PluginError" else ExperimentError
         raise kind(result["message"])
     return result
 
 
-def _step_by_step(work: Job, base: Row, steps: int) -> Iterator[Row]:
-    looks = sorted({max(1, steps * n // LOOKS) for n in range(1, LOOKS + 1)})
+def _rows_of_engines(run_job: Job, base: Row, steps: int) -> Iterator[Row]:
+    steps_compared = sorted({max(1, steps * n // COMPARISONS) for n in range(1, COMPARISONS + 1)})
     for n, (engine, precision, threads) in enumerate(engines()):
         row = replace(base, method=engine, precision=precision, threads=threads)
-        chosen = {"engine": engine, "precision": precision, "threads": threads}
-        settings = [f"solver.{key}={value}" for key, value in chosen.items()]
+        choice = {"engine": engine, "precision": precision, "threads": threads}
+        settings = [f"solver.{key}={value}" for key, value in choice.items()]
         try:
             cache = row.line + precision
-            first, found = (work("step", *settings, at=at, cache=cache) for at in ([], looks))
+            first, measured = (
+                run_job("step", *settings, at=at, cache=cache) for at in ([], steps_compared)
+            )
         except (ExperimentError, PluginError) as error:
             if n == 0:
                 raise
             yield replace(row, reason=" ".join(str(error).split()))
             continue
-        same = {key: found[key] for key in ("particles", "setup_s", "peak_memory_mib")}
-        ns = 1e9 * (found["seconds"][-1] / steps / found["particles"])
-        share = _error(np.max(found["distances"]), np.max(found["sizes"]))
-        row = replace(row, **same, setup_first_s=first["setup_s"])
+        figures = {key: measured[key] for key in ("particles", "setup_s", "peak_memory_mib")}
+        ns = 1e9 * (measured["seconds"][-1] / steps / measured["particles"])
+        share = _error(np.max(measured["distances"]), np.max(measured["sizes"]))
+        row = replace(row, **figures, setup_first_s=first["setup_s"])
         yield replace(row, ns_per_particle_step=ns, error=share)
 
 
-def _error(distance: float, size: float, within: float = 0.0) -> float:
-    """At most, as a share: what it is measured against is known `within` a share itself."""
+def _error(distance: float, size: float, uncertainty: float = 0.0) -> float:
+    """Return an upper bound of the relative error for a reference with a relative uncertainty."""
     if not np.isfinite(distance) or not np.isfinite(size):
         return np.inf
-    return (float(distance / size) if distance else 0.0) + within
+    return (float(distance / size) if distance else 0.0) + uncertainty
 
 
-def _to_equilibrium(work: Job, base: Row, steps: int) -> Iterator[Row]:
+def _rows_to_equilibrium(run_job: Job, base: Row, steps: int) -> Iterator[Row]:
     tolerances = sorted(TOLERANCES, reverse=True)
-    exact = work("exact", f"solver.tolerance={tolerances[-1] / 100:g}", tolerances=tolerances)
+    exact = run_job("exact", f"solver.tolerance={tolerances[-1] / 100:g}", tolerances=tolerances)
     base = replace(base, particles=exact["particles"])
     yield replace(base, method=f"exact, by {exact['how']}", certified=exact["within"])
     for method in METHODS:
-        yield from _settled(work, replace(base, method=method), tolerances, exact)
-    yield from _stepped(work, replace(base, method="stepping"), exact, tolerances)
+        yield from _rows_of_method(run_job, replace(base, method=method), tolerances, exact)
+    yield from _rows_of_steps(run_job, replace(base, method="stepping"), exact, tolerances)
 
 
-def _settled(work: Job, base: Row, tolerances: list[float], exact: dict[str, Any]) -> Iterator[Row]:
+def _rows_of_method(
+    run_job: Job, base: Row, tolerances: list[float], exact: dict[str, Any]
+) -> Iterator[Row]:
     if base.method == "lu":  # it does not get faster with a looser tolerance
-        if (base.particles or 0) > LARGEST_DIRECT:
-            reason = f"left out above {LARGEST_DIRECT} particles: its factors take gibibytes"
+        if (base.particles or 0) > MAX_PARTICLES_LU:
+            reason = f"left out above {MAX_PARTICLES_LU} particles: its factors take gibibytes"
             yield replace(base, reason=reason)
             return
         tolerances = tolerances[-1:]
     try:
-        found = work("settle", f"solver.method={base.method}", tolerances=tolerances)
+        measured = run_job("settle", f"solver.method={base.method}", tolerances=tolerances)
     except (ExperimentError, PluginError) as error:
         yield replace(base, reason=" ".join(str(error).split()))
         return
-    made = found["rows"]
-    for tolerance, row in zip(tolerances, made, strict=False):
+    figures = measured["rows"]
+    for tolerance, row in zip(tolerances, figures, strict=False):
         share = _error(row.pop("distance"), exact["scale"], exact["within"])
-        memory = found["peak_memory_mib"]
+        memory = measured["peak_memory_mib"]
         yield replace(base, tolerance=tolerance, peak_memory_mib=memory, error=share, **row)
-    for tolerance in tolerances[len(made) :]:
-        reason = f"{made[-1]['seconds']:.0f} s for the tolerance before"
+    for tolerance in tolerances[len(figures) :]:
+        reason = f"{figures[-1]['seconds']:.0f} s for the tolerance before"
         yield replace(base, tolerance=tolerance, reason=reason)
 
 
-def _stepped(work: Job, base: Row, exact: dict[str, Any], tolerances: list[float]) -> Iterator[Row]:
-    """Steps that are made, then those that are predicted."""
+def _rows_of_steps(
+    run_job: Job, base: Row, exact: dict[str, Any], tolerances: list[float]
+) -> Iterator[Row]:
+    """Yield rows of steps that are measured, then of those that are extrapolated."""
 
-    def a_step(threads: int) -> tuple[float, float, int]:
-        found = work("step", *stepping, *IN_MOTION, f"solver.threads={threads}", at=RATE_AT)
-        made = RATE_AT[1] - RATE_AT[0]
-        return *((found[k][1] - found[k][0]) / made for k in ("seconds", "cpu_s")), threads
+    def time_of_step(threads: int) -> tuple[float, float, int]:
+        measured = run_job(
+            "step", *stepping, *NOISY_START, f"solver.threads={threads}", at=TIMED_STEPS
+        )
+        count = TIMED_STEPS[1] - TIMED_STEPS[0]
+        return *((measured[k][1] - measured[k][0]) / count for k in ("seconds", "cpu_s")), threads
 
     stepping = ("solver={type: stepping}",)
-    wall, cpu, threads = min(a_step(n) for n in dict.fromkeys((1, processors())))
+    wall, cpu, threads = min(time_of_step(n) for n in dict.fromkeys((1, processors())))
     needed = dict(zip(tolerances, exact["steps"], strict=True))
-    at = sorted({n for n in needed.values() if n and n * wall <= PATIENCE_S})
-    if at:
-        found = work("step", *stepping, f"solver.threads={threads}", f"steps={at[-1]}", at=at)
+    stops = sorted({n for n in needed.values() if n and n * wall <= MAX_STEPPING_S})
+    if stops:
+        measured = run_job(
+            "step", *stepping, f"solver.threads={threads}", f"steps={stops[-1]}", at=stops
+        )
     for tolerance, n in needed.items():
         row = replace(base, tolerance=tolerance, steps=n)
         if n is None:
-            rate = f"the largest eigenvalue is {exact['rate']:.6g}"
-            yield replace(row, reason=f"steps do not settle: {rate}")
-        elif n in at:
-            i, (built, built_cpu) = at.index(n), found["built"]
-            error = _error(found["distances"][i], exact["scale"], exact["within"])
-            seconds, cpu_s = built + found["seconds"][i], built_cpu + found["cpu_s"][i]
+            eigenvalue = f"the largest eigenvalue is {exact['rate']:.6g}"
+            yield replace(row, reason=f"steps do not settle: {eigenvalue}")
+        elif n in stops:
+            i, (built, built_cpu) = stops.index(n), measured["built"]
+            error = _error(measured["distances"][i], exact["scale"], exact["within"])
+            seconds, cpu_s = built + measured["seconds"][i], built_cpu + measured["cpu_s"][i]
             yield replace(row, seconds=seconds, cpu_s=cpu_s, error=error)
         else:
             predicted = replace(row, error=tolerance, is_predicted=True)
@@ -369,8 +426,8 @@ def _cell(row: Row, name: str) -> str:
     if name == "error":
         return "0" if value == 0 else f"{value:.1e}" if isfinite(value) else "not finite"
     missed = name == "certified" and row.tolerance is not None and value > row.tolerance
-    told = " (predicted)" * (name == "method" and row.is_predicted)
-    return format(value, COLUMNS[name][1]) + "*" * missed + told
+    remark = " (predicted)" * (name == "method" and row.is_predicted)
+    return format(value, COLUMNS[name][1]) + "*" * missed + remark
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
@@ -388,14 +445,17 @@ def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row])
     machine = {"processor": platform.processor() or platform.machine(), "processors": processors()}
     machine |= {"system": platform.system(), "python": sys.version.split()[0]}
     figures = [{k: v if v != inf else None for k, v in asdict(row).items()} for row in rows]
-    asked = {"experiment": name, "settings": list(settings), "steps": steps}
-    return asked | {"machine": machine, "rows": figures}
+    description = {"experiment": name, "settings": list(settings), "steps": steps}
+    return description | {"machine": machine, "rows": figures}
 
 
 def work_precision_figure(rows: Sequence[Row], title: str) -> Figure:
-    """Error against cost, both logarithmic: a panel a size, a colour a method (and its threads), a
-    marker each row. What was predicted is hollow, errors of exactly zero lie on a line of their own
-    at the bottom; runs that left the finite numbers are not drawn."""
+    """Return a figure of error against cost, on logarithmic axes.
+
+    It has a panel for each size, a colour for each method and number of threads, and a marker for
+    each row. Predicted rows are hollow, errors of exactly zero lie at the bottom, and runs that
+    diverged are omitted.
+    """
     from matplotlib.figure import Figure
 
     measured = [row for row in rows if row.error is not None and isfinite(row.error) and _x(row)]
@@ -403,13 +463,13 @@ def work_precision_figure(rows: Sequence[Row], title: str) -> Figure:
     kinds = list(dict.fromkeys(row.line for row in measured))
     across = min(2, len(sizes))
     down = -(-len(sizes) // across)
-    drawn = Figure(figsize=(1.6 + 3.6 * across, 1.0 + 2.9 * down), dpi=150, layout="constrained")
-    panels = drawn.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
+    figure = Figure(figsize=(1.6 + 3.6 * across, 1.0 + 2.9 * down), dpi=150, layout="constrained")
+    panels = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
     for ax, particles in zip(panels, sizes, strict=False):
         for kind, colour, marker in zip(kinds, cycle(COLOURS), cycle(MARKERS)):
-            some = [row for row in measured if row.line == kind and row.particles == particles]
-            x, y = [_x(row) for row in some], [max(row.error or 0.0, FLOOR) for row in some]
-            face = ["white" if row.is_predicted else colour for row in some]
+            series = [row for row in measured if row.line == kind and row.particles == particles]
+            x, y = [_x(row) for row in series], [max(row.error or 0.0, FLOOR) for row in series]
+            face = ["white" if row.is_predicted else colour for row in series]
             ax.plot(x, y, color=colour, linewidth=0.9, linestyle=":")
             ax.scatter(x, y, s=22, marker=marker, facecolor=face, edgecolor=colour, zorder=2)
             ax.scatter([], [], color=colour, marker=marker, label=kind)
@@ -425,11 +485,11 @@ def work_precision_figure(rows: Sequence[Row], title: str) -> Figure:
     by_step = any(row.ns_per_particle_step for row in measured)
     for ax in panels[-across:]:
         ax.set_xlabel("ns a particle and step" if by_step else "seconds of processor time")
-    drawn.supylabel("largest error, as a share", fontsize=8)
-    drawn.suptitle(title, fontsize=9)
-    named, ncols = panels[0].get_legend_handles_labels(), min(4, len(kinds) or 1)
-    drawn.legend(*named, loc="outside lower center", ncols=ncols, fontsize=7, frameon=False)
-    return drawn
+    figure.supylabel("largest error, as a share", fontsize=8)
+    figure.suptitle(title, fontsize=9)
+    legend, ncols = panels[0].get_legend_handles_labels(), min(4, len(kinds) or 1)
+    figure.legend(*legend, loc="outside lower center", ncols=ncols, fontsize=7, frameon=False)
+    return figure
 
 
 def _x(row: Row) -> float:
@@ -484,113 +544,119 @@ def show_work_precision(
 
 
 Task = dict[str, Any]
-REPEATS, TASK_PATIENCE_S = 7, 2.0
-"""A way is gone so often, unless that takes longer; the best counts."""
-LONGEST_S = 60.0
-"""After a tolerance that took longer, tighter ones are left out."""
+REPEATS, MAX_REPEATING_S = 7, 2.0
+"""Number of repetitions of a measurement, of which the fastest counts, and their duration."""
+MAX_SOLVING_S = 60.0
+"""Duration above which tighter tolerances are left out."""
 COMPILED = "pbdkit.stepping.numba_engine.engine"
 SOLVERS = ("scipy.sparse.linalg", "scipy.sparse.csgraph", "numba")
-TURNS, ROUGH = 12, 1e-3
-"""Of the inverse iteration for the slowest mode, and the accuracy of each."""
+INVERSE_ITERATIONS, INVERSE_ACCURACY = 12, 1e-3
+"""Number of inverse iterations for the slowest mode, and accuracy of each."""
 
 
 def main(answer: Path) -> None:
-    """Does the job on the input; the result goes into the file `answer`."""
+    """Run the job on standard input, and write its result to a file."""
     answer.write_text(json.dumps(result_of(json.load(sys.stdin))), encoding="utf-8")
 
 
 def result_of(job: Task) -> Task:
-    """Does the job; what is wrong with it goes into the result."""
+    """Run a job; an error becomes part of the result."""
     try:
-        return {"step": _step, "settle": _settle, "exact": _find_exact}[job["what"]](job)
+        return {"step": _step, "settle": _settle, "exact": _compute_exact}[job["what"]](job)
     except PbdkitError as error:
         return {"fault": type(error).__name__, "message": str(error)}
 
 
 def _import(*modules: str) -> int:
-    """Imports are no part of what is measured; peak memory after them."""
+    """Import modules, which are not part of the measurement, and return the peak memory."""
     for module in modules:
         if find_spec(module.split(".")[0]):
             import_module(module)
     return peak_memory()
 
 
-def _clock() -> Floats:
+def _times() -> Floats:
     return np.array([time.perf_counter(), time.process_time()])
 
 
-def _turns(spent: list[Floats]) -> Iterator[int]:
-    """Turns to go a way, until they are enough; each adds what it `spent`, (..., clock)."""
+def _repetitions(spent: list[Floats]) -> Iterator[int]:
+    """Yield repetitions until they suffice; each appends its `spent` times, (..., clock)."""
     for turn in range(REPEATS):
         yield turn
-        took = [float(one[..., 0].max(initial=0.0)) for one in spent]
-        if sum(took) + took[-1] > TASK_PATIENCE_S:
+        took = [float(times[..., 0].max(initial=0.0)) for times in spent]
+        if sum(took) + took[-1] > MAX_REPEATING_S:
             break
 
 
 def _step(job: Task) -> Task:
-    """Set-up, and for each number of steps `at`: the seconds to there, the best of several runs;
-    the largest distance from the truth in `sizes`, the largest displacements."""
+    """Measure set-up and steps.
+
+    For each number of steps `at`, the result contains the seconds to that step, the best of several
+    runs, the largest distance from the reference, and the largest displacement.
+    """
     experiment, at = load(job["experiment"], settings=job["settings"]), job["at"]
     compiles = experiment.stepping.engine == "compiled" and not obstacle()
     imports = _import(*[COMPILED] * compiles)
-    begun = _clock()
+    start = _times()
     scene = tuned(build_scene(experiment))
-    built = _clock() - begun
+    built = _times() - start
     engine, _ = make_engine(scene, choose(scene))
-    setup_s, _ = _clock() - begun
+    setup_s, _ = _times() - start
     runs: list[Floats] = []
-    there, memory = [], imports
-    for turn in _turns(runs):
+    comparisons, memory = [], imports
+    for turn in _repetitions(runs):
         state, spent = initial_state(scene), np.zeros((len(at), 2))
         for n, step in enumerate(at):
-            begun = _clock()
+            start = _times()
             state = engine.advance(state, step - state.step)
-            spent[n:] += _clock() - begun
+            spent[n:] += _times() - start
             if turn == 0:
-                there.append(_compared(scene, state, Path(job["truth"])))
+                comparisons.append(_compared(scene, state, Path(job["truth"])))
                 memory = peak_memory()
         runs.append(spent)
     seconds, cpu = np.min(runs, axis=0).T.tolist()
-    distances, sizes = np.reshape(there, (-1, 2)).T.tolist()
-    found = {"particles": scene.raster.count, "built": built.tolist(), "setup_s": setup_s}
-    found |= {"seconds": seconds, "cpu_s": cpu, "distances": distances, "sizes": sizes}
-    return found | {"peak_memory_mib": (memory - imports) / 2**20}
+    distances, sizes = np.reshape(comparisons, (-1, 2)).T.tolist()
+    result = {"particles": scene.raster.count, "built": built.tolist(), "setup_s": setup_s}
+    result |= {"seconds": seconds, "cpu_s": cpu, "distances": distances, "sizes": sizes}
+    return result | {"peak_memory_mib": (memory - imports) / 2**20}
 
 
-def _compared(scene: Scene, state: State, truth: Path) -> tuple[float, float]:
-    """(largest distance, largest displacement of the truth): of followers where the exact answer is
-    known; else of what the first who comes to a step leaves for the others."""
-    exact, u = truth / "exact.npy", state.u.reshape(len(state.u), -1).astype(float)
-    file = exact if exact.exists() else truth / f"{state.step}.npy"
+def _compared(scene: Scene, state: State, folder: Path) -> tuple[float, float]:
+    """Return the largest distance from the reference, and its largest displacement.
+
+    The reference is the equilibrium of the followers if it is in the folder; otherwise the state
+    that the first process saved at this step.
+    """
+    exact, u = folder / "exact.npy", state.u.reshape(len(state.u), -1).astype(float)
+    file = exact if exact.exists() else folder / f"{state.step}.npy"
     u = _of_followers(scene, state) if file == exact else u
     if not file.exists():
         np.save(file, u)
-    known = np.load(file)
+    reference = np.load(file)
     with np.errstate(all="ignore"):
-        return _longest(u - known), _longest(known)
+        return _largest_norm(u - reference), _largest_norm(reference)
 
 
-def _longest(u: Floats) -> float:
+def _largest_norm(u: Floats) -> float:
     return float(np.sqrt((u * u).sum(axis=0)).max(initial=0.0))
 
 
 def _settle(job: Task) -> Task:
-    """A row for each tolerance, the loosest first, until one takes too long."""
+    """Measure the solver for each tolerance, the loosest first, until one takes too long."""
     imports, rows = _import(*SOLVERS), []
     for tolerance in job["tolerances"]:
         settings = [*job["settings"], f"solver.tolerance={tolerance:g}"]
         experiment = load(job["experiment"], settings=settings)
         runs: list[Floats] = []
-        for _ in _turns(runs):
-            begun = _clock()
+        for _ in _repetitions(runs):
+            start = _times()
             scene, state, certificate = _equilibrium(experiment)
-            runs.append(_clock() - begun)
+            runs.append(_times() - start)
         seconds, cpu_s = np.min(runs, axis=0)
         distance, _ = _compared(scene, state, Path(job["truth"]))
-        told = {"steps": certificate.inner_iterations, "certified": certificate.share}
-        rows.append(told | {"seconds": seconds, "cpu_s": cpu_s, "distance": distance})
-        if seconds > LONGEST_S:
+        figures = {"steps": certificate.inner_iterations, "certified": certificate.share}
+        rows.append(figures | {"seconds": seconds, "cpu_s": cpu_s, "distance": distance})
+        if seconds > MAX_SOLVING_S:
             break
     return {"rows": rows, "peak_memory_mib": (peak_memory() - imports) / 2**20}
 
@@ -604,67 +670,74 @@ def _equilibrium(experiment: Experiment) -> tuple[Scene, State, Certificate]:
         return scene, state, error.certificate
 
 
-def _find_exact(job: Task) -> Task:
-    """The solver's own answer, as good as it gets, for the others to be compared with, and how many
-    steps lead to the tolerances."""
+def _compute_exact(job: Task) -> Task:
+    """Compute an accurate equilibrium, and the number of steps to each tolerance."""
     _import(*SOLVERS)
     experiment = load(job["experiment"], settings=job["settings"])
     if experiment.fracture.type != "none":
-        why = "speed against error is measured where no bond can break; set fracture={type: none}"
-        raise experiment.located(ExperimentError(why, ("fracture",)))
+        reason = (
+            "speed against error is measured where no bond can break; set fracture={type: none}"
+        )
+        raise experiment.located(ExperimentError(reason, ("fracture",)))
     scene, state, certificate = _equilibrium(experiment)
     exact = _of_followers(scene, state)
     np.save(Path(job["truth"]) / "exact.npy", exact)
     decay = decay_of(scene, exact)
-    known = {"how": certificate.method, "within": certificate.share, "rate": decay.rate}
+    result = {"how": certificate.method, "within": certificate.share, "rate": decay.rate}
     steps = [decay.steps_to(tolerance) for tolerance in job["tolerances"]]
     scale = scale_of(scene, initial_state(scene))
-    return known | {"particles": scene.raster.count, "scale": scale, "steps": steps}
+    return result | {"particles": scene.raster.count, "scale": scale, "steps": steps}
 
 
 @dataclass(frozen=True)
 class Decay:
-    """What is left of the way to equilibrium after n steps, as a share of the largest prescribed
-    displacement: `share` · `rate`ⁿ, in the end."""
+    """Decay of the distance to equilibrium in steps.
+
+    After n steps the distance is `share` · `rate`ⁿ of the largest prescribed displacement.
+    """
 
     share: float
     rate: float
 
     def steps_to(self, tolerance: float) -> int | None:
-        """Steps until less than `tolerance` is left; None where it never is."""
+        """Return the number of steps to a tolerance, or None if it is never reached."""
         if not 0.0 < self.rate < 1.0:
             return None
         return max(1, math.ceil(math.log(max(1.0, self.share / tolerance)) / -math.log(self.rate)))
 
 
 def followers_of(scene: Scene) -> NDArray[np.intp]:
-    """The flat places of those who follow in the last step."""
+    """Return the flat places of the followers of the last step."""
     kinds = kinds_at(scene.raster, scene.leading, scene.experiment.steps)
     return scene.raster.place_of(np.flatnonzero(kinds == FOLLOWER))
 
 
 def _of_followers(scene: Scene, state: State) -> Floats:
-    """Their displacements, (axis, follower)."""
+    """Return the displacements of followers, (axis, follower)."""
     return state.u.reshape(len(state.u), -1)[:, followers_of(scene)].astype(float)
 
 
 def decay_of(scene: Scene, exact: Floats) -> Decay:
-    """Of the slowest mode that the start excites, by inverse iteration from the way that is to go
-    to `exact`, (axis, follower): v ← A⁻¹ v, A = 1 - (step operator). Its share is the projection of
-    that way onto it."""
+    """Return the decay of the slowest mode that the start excites.
+
+    It is computed by inverse iteration from the distance to `exact`, (axis, follower): v ← A⁻¹ v
+    with A = 1 - (step operator). Its share is the projection of that distance onto the mode.
+    """
     start = initial_state(scene)
     steps, resting = scene.experiment.steps, initial_state(scene)
     resting.u[...] = 0.0
-    way = np.zeros_like(resting.u)
-    way.reshape(len(way), -1)[:, followers_of(scene)] = exact - _of_followers(scene, start)
-    if not way.any():
+    distance = np.zeros_like(resting.u)
+    distance.reshape(len(distance), -1)[:, followers_of(scene)] = exact - _of_followers(
+        scene, start
+    )
+    if not distance.any():
         return Decay(0.0, 0.0)
-    system, slowest = linearised(scene, resting, steps, "auto", Watch()), SlowMode(way, 1.0)
-    for _ in range(TURNS):
-        slowest = slowest.improved(system, ROUGH)
+    system, slowest = linearised(scene, resting, steps, "auto", Watch()), SlowMode(distance, 1.0)
+    for _ in range(INVERSE_ITERATIONS):
+        slowest = slowest.improved(system, INVERSE_ACCURACY)
     mode = slowest.planes
-    along = float((way * mode).sum() / (mode * mode).sum())
-    share = abs(along) * _longest(mode) / scale_of(scene, start)
+    projection = float((distance * mode).sum() / (mode * mode).sum())
+    share = abs(projection) * _largest_norm(mode) / scale_of(scene, start)
     return Decay(share, 1.0 - 1.0 / slowest.slowness)
 
 

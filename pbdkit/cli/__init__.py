@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from pbdkit import errors
-from pbdkit.cli.commands import CommandTable, own_commands
+from pbdkit.cli.commands import CommandTable, builtin_commands
 from pbdkit.cli.options import with_no_plugins
 from pbdkit.cli.streams import standard_streams
 from pbdkit.memory import refuse_little_memory
@@ -67,8 +67,8 @@ def _welcome() -> str:
     """Return the first commands to type, and all commands."""
     lines = [WELCOME, "Type this first:"]
     lines += [f"  {typed:<36} {does}" for typed, does in FIRST.items()]
-    for group, commands in groupby(own_commands().values(), key=lambda command: command.group):
-        lines += [f"\n{group}:", *(f"  {one.name:<12} {one.does}" for one in commands)]
+    for group, commands in groupby(builtin_commands().values(), key=lambda command: command.group):
+        lines += [f"\n{group}:", *(f"  {command.name:<12} {command.does}" for command in commands)]
     return "\n".join([*lines, "", MORE])
 
 
@@ -84,9 +84,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _exit_status(arguments: list[str] | None) -> int:
     """Run a command, and report how it failed where it did."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if debug := "--debug" in given:
-        given = [argument for argument in given if argument != "--debug"]
+    words = sys.argv[1:] if arguments is None else arguments
+    if debug := "--debug" in words:
+        words = [argument for argument in words if argument != "--debug"]
     # pydantic would look for plugins of its own, and stop at any torn distribution.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
@@ -98,7 +98,7 @@ def _exit_status(arguments: list[str] | None) -> int:
                 from pbdkit.cli.completion import register_bash
 
                 register_bash()
-            code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
+            code: Any = program.main(words, prog_name="pbdkit", standalone_mode=False)
         sys.stdout.flush()
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
         where = getattr(error.__cause__, "args", error.args)
@@ -132,8 +132,8 @@ def _report(error: BaseException) -> int:
     if isinstance(error, errors.PbdkitError):
         return error.exit_status if error.is_reported else _failed(str(error), error.exit_status)
     if _of_memory(error):
-        told = f"out of memory: {error}" if str(error) else "out of memory"
-        return _failed(f"{told}; `pbdkit check` estimates what an experiment needs", 6)
+        text = f"out of memory: {error}" if str(error) else "out of memory"
+        return _failed(f"{text}; `pbdkit check` estimates what an experiment needs", 6)
     if any(isinstance(e, KeyboardInterrupt) for e in _contexts(error)):
         return _failed("interrupted", 130)
     if isinstance(error, OSError) and error.errno in SYSTEM:

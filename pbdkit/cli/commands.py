@@ -30,7 +30,7 @@ from pbdkit.hooks import (
 )
 
 T = TypeVar("T")
-OWN_MODULES = ("pbdkit.cli.commands", "pbdkit.web", "pbdkit.bench")
+BUILTIN_MODULES = ("pbdkit.cli.commands", "pbdkit.web", "pbdkit.bench")
 """Modules of pbdkit that implement `pbdkit_commands`. The latter two are leaves: they import from
 here, and only this table names them."""
 GROUPS = ("Start", "Run", "Look", "Understand", "Vary and fit", "Extend")
@@ -102,11 +102,11 @@ def pbdkit_commands() -> list[Command]:
 
 
 @cache
-def own_commands() -> dict[str, Command]:
+def builtin_commands() -> dict[str, Command]:
     """Return the commands of pbdkit itself by name, in the order of the groups."""
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
-    for module in reversed(OWN_MODULES):  # pluggy calls the last that was registered first
+    for module in reversed(BUILTIN_MODULES):  # pluggy calls the last that was registered first
         manager.register(import_module(module))
     listed = [command for answer in manager.hook.pbdkit_commands() for command in answer]
     listed.sort(key=lambda command: GROUPS.index(command.group))
@@ -124,12 +124,12 @@ class CommandTable(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands, in the order of a first session."""
         added = [command.name for p in plugins_with_commands() for command in p.commands]
-        return list(dict.fromkeys([*own_commands(), *added]))
+        return list(dict.fromkeys([*builtin_commands(), *added]))
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         """Return the command of that name; a usage error names the nearest one."""
-        if own := own_commands().get(name):
-            command: click.Command = own.load()
+        if listed := builtin_commands().get(name):
+            command: click.Command = listed.load()
             return with_no_plugins(command)
         plugins = plugins_with_commands()
         offers = _offers(plugins).get(name, [])
@@ -157,7 +157,7 @@ class CommandTable(click.Group):
             raise
         except Exception as error:
             name = ctx.invoked_subcommand or ""
-            if name not in own_commands():
+            if name not in builtin_commands():
                 for plugin, offer in _offers(plugins_with_commands()).get(name, []):
                     raise _failure(plugin, offer, error) from error
             raise
@@ -175,14 +175,14 @@ DISABLE_ONE = f"name one of them in {DISABLE} to use the other"
 def _sections() -> dict[str, list[tuple[str, str]]]:
     """Return the lines of `pbdkit --help`: (command, sentence) by group."""
     sections: dict[str, list[tuple[str, str]]] = {group: [] for group in GROUPS}
-    for command in own_commands().values():
+    for command in builtin_commands().values():
         sections[command.group].append((command.name, command.does))
     plugins = plugins_with_commands()
     for name, offers in _offers(plugins).items():
         origin = " and ".join(str(plugin) for plugin, _ in offers)
         command = offers[0][1]
         does, group = f"{command.does} ({origin})", command.group
-        if name in own_commands():
+        if name in builtin_commands():
             does, group = f"Left out of {origin}: pbdkit has a command of this name.", "Plugins"
         elif len(offers) > 1:
             does, group = f"Left out of {origin}: {DISABLE_ONE}.", "Plugins"
@@ -207,8 +207,8 @@ def _no_command(name: str, plugins: list[Plugin]) -> str:
 
     run = f"; `pbdkit run {name}` runs it" * (name in shipped_names())
     meant = next((f"; {what}" for words, what in MEANT.items() if name in words), "")
-    known = [*own_commands(), *_offers(plugins)]
-    near = run or meant or did_you_mean(name, known) or "; `pbdkit` alone lists them"
+    names = [*builtin_commands(), *_offers(plugins)]
+    near = run or meant or did_you_mean(name, names) or "; `pbdkit` alone lists them"
     unusable = "".join(f"; {plugin} is {plugin.fault}" for plugin in plugins if plugin.fault)
     return f"there is no command '{name}'{near}{unusable}"
 

@@ -67,10 +67,8 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
     try:  # in the bytes of the file system, whatever the locale
         os.fsencode(path.absolute()).decode()
     except UnicodeDecodeError:
-        shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
-        raise ExperimentError(
-            f"{shown}: the name is not UTF-8; name another file with -o"
-        ) from None
+        text = os.fsencode(path.absolute()).decode(errors="backslashreplace")
+        raise ExperimentError(f"{text}: the name is not UTF-8; name another file with -o") from None
     with refusals_as(f"{str(path)[:80]}..."):
         kind, exists = kind_of(path), os.path.lexists(path)
     if not exists:

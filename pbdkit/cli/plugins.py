@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pbdkit import __version__
-from pbdkit.cli.commands import own_commands, plugins_with_commands
+from pbdkit.cli.commands import builtin_commands, plugins_with_commands
 from pbdkit.errors import ExperimentError, PluginError, did_you_mean
 from pbdkit.hooks import Plugin, canonical
 from pbdkit.io.atomic_file import write_folder
@@ -94,9 +94,9 @@ def _rows(plugin: Plugin) -> list[dict[str, str]]:
         interface = offer.interface.__name__ if offer.interface else ""
         rows.append((interface, offer.name, offer.state, offer.reason))
     for command in plugin.commands:
-        taken = command.name in own_commands()
-        reason = f"pbdkit has a command '{command.name}'" if taken else ""
-        rows.append(("command", command.name, "conflict" if taken else "ok", reason))
+        in_conflict = command.name in builtin_commands()
+        reason = f"pbdkit has a command '{command.name}'" if in_conflict else ""
+        rows.append(("command", command.name, "conflict" if in_conflict else "ok", reason))
     origin = {"distribution": plugin.distribution, "version": plugin.version}
     return [
         {"interface": kind, "type": name, **origin, "state": state, "reason": reason}

@@ -425,7 +425,7 @@ def remembers_nothing(subject: Subject) -> None:
         changes = sorted(n for n in names if reachable.get(n) != reachable_later.get(n))
         if differing(second, third) and (changes or not differing(first, second)):
             what = f", and keeps {_listed(changes)} from call to call" if changes else ""
-            fault = f"`{call.function}` answers the same call otherwise after another one"
+            fault = f"`{call.function}` returns another value after a call with other arguments"
             raise PropertyError(fault + what)
 
 
@@ -443,7 +443,7 @@ def answers_the_same(subject: Subject) -> None:
         random.setstate(saved[0])
         np.random.set_state(saved[1])
         if names:
-            fault = f"answers the same call otherwise the second time ({_listed(names)})"
+            fault = f"returns another value in the second of two equal calls ({_listed(names)})"
             cause = "it draws random numbers from a generator of its own, or reads a clock"
             raise PropertyError(f"`{call.function}` {fault}: {cause}")
         if final != initial:

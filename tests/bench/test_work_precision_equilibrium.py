@@ -58,7 +58,7 @@ def work_here(job, folder, cache):
 @pytest.fixture
 def quick(monkeypatch):
     """No processes, and fewer tolerances."""
-    monkeypatch.setattr(measurement, "_worked", work_here)
+    monkeypatch.setattr(measurement, "_run_in_process", work_here)
     monkeypatch.setattr(measurement, "METHODS", ("lu", "conjugate-gradients"))
     monkeypatch.setattr(measurement, "processors", lambda: 1)
     monkeypatch.setattr(measurement, "TOLERANCES", TOLERANCES)
@@ -117,8 +117,8 @@ def test_the_table_the_figures_and_the_picture(call, quick, monkeypatch, leaders
 
 def test_steps_that_take_too_long_are_counted_ahead(tmp_path, quick, monkeypatch):
     monkeypatch.setattr(measurement, "METHODS", ("lu",))
-    monkeypatch.setattr(measurement, "LARGEST_DIRECT", 10)
-    monkeypatch.setattr(measurement, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(measurement, "MAX_PARTICLES_LU", 10)
+    monkeypatch.setattr(measurement, "MAX_STEPPING_S", 0.0)
     file = tmp_path / "s.json"
     file.write_text(json.dumps(sheet(AFFINE)))
     _, none, *steps = measure(str(file), (), 12, lambda _: None)
@@ -141,7 +141,7 @@ def test_a_method_that_took_too_long_is_left_out_where_it_would_take_longer():
 
     base, exact = Row(None, "conjugate-gradients"), {"scale": 1.0, "within": 0.0}
     tolerances = list(measurement.TOLERANCES)
-    found = list(measurement._settled(work, base, tolerances, exact))
+    found = list(measurement._rows_of_method(work, base, tolerances, exact))
     assert [bool(row.reason) for row in found] == [False] + 4 * [True]
     assert (
         "left out: conjugate-gradients at size as it is, 1e-04: 99 s for the tolerance before"

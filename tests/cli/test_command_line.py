@@ -18,7 +18,7 @@ import xarray
 
 import pbdkit
 from pbdkit.cli import FIRST
-from pbdkit.cli.commands import GROUPS, MEANT, own_commands
+from pbdkit.cli.commands import GROUPS, MEANT, builtin_commands
 from pbdkit.model.shipped import shipped_text
 
 Call = Callable[..., Any]
@@ -39,17 +39,17 @@ PROBED = ("run", "e.json", "--set", "diagnostics=[{type: probe}]")
 
 def test_every_command_explains_itself(call: Call) -> None:
     listed = python("-m", "pbdkit", "--help").stdout
-    assert [c for c in own_commands() if c not in listed or call(c, "--help").code] == []
+    assert [c for c in builtin_commands() if c not in listed or call(c, "--help").code] == []
 
 
 def test_alone_it_says_what_to_type_first(call: Call) -> None:
     result = call()
     assert (result.code, result.err) == (0, "")
-    assert [name for name in own_commands() if f"\n  {name} " not in result.out] == []
+    assert [name for name in builtin_commands() if f"\n  {name} " not in result.out] == []
     for group in GROUPS:
         assert f"\n{group}:\n" in result.out
     assert max(map(len, result.out.splitlines())) <= 80
-    sentences = [one.does for one in own_commands().values()]
+    sentences = [one.does for one in builtin_commands().values()]
     assert [does for does in sentences if does[0].islower() or does[-1] != "."] == []
 
 
@@ -491,5 +491,5 @@ def test_an_exit_out_of_nowhere_is_not_silent(call: Call, monkeypatch: pytest.Mo
 
 def test_every_command_that_is_suggested_for_another_word_is_there():
     named = [word for told in MEANT.values() for word in re.findall(r"`pbdkit ([a-z]+)", told)]
-    assert {*named} <= {*own_commands()}
-    assert not {word for words in MEANT for word in words} & {*own_commands()}
+    assert {*named} <= {*builtin_commands()}
+    assert not {word for words in MEANT for word in words} & {*builtin_commands()}

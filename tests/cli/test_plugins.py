@@ -13,7 +13,7 @@ import pytest
 from plugin_sources import BROKEN, NEWER, listed, rule
 
 import pbdkit
-from pbdkit.cli.commands import own_commands
+from pbdkit.cli.commands import builtin_commands
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.plugin.registry import Registry
 from pbdkit.progress import Watch
@@ -65,7 +65,7 @@ def healthy(install: Install, call: Call) -> None:
 
 
 def test_every_command_is_tried() -> None:
-    assert {arguments[0] for arguments in EVERY_COMMAND.values()} == set(own_commands())
+    assert {arguments[0] for arguments in EVERY_COMMAND.values()} == set(builtin_commands())
 
 
 @pytest.mark.usefixtures("healthy")
