@@ -110,7 +110,7 @@ FAULTS = [
     (others.Contradicts, "finds-the-same-anew", "`nearness` finds other neighbours"),
     (operations.Kicks, "rests-as-declared", "moves a particle that rests"),
     (operations.Pins, "rests-as-declared", "holds a particle that the rule moves"),
-    (others.Alternates, "takes-every-point-alone", "follows other particles among fewer points"),
+    (others.Alternates, "takes-every-point-alone", "follows another particle if there are fewer"),
     (others.SaysItIsLocal, "follows-who-is-near", "leave out `local`"),
     (others.Shrinks, "follows-translations", "let the weights of each point sum to 1"),
     (others.SaysItAnchors, "follows-translations", "and follows every translation"),
