@@ -427,4 +427,4 @@ def check_plugins(**options: Any) -> int | None:
     Components of all plugins are checked by default. `pbdkit` is the distribution of the built-in
     components. The exit status is 3 if a property fails, or if a plugin does not load.
     """
-    return call("plugins:check", **options)
+    return call("plugins:check_plugins", **options)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from inspect import getsource
 from typing import Any
 
 import pytest
 from plugin_sources import rule
 
-from pbdkit.hooks import DISABLE
+from pbdkit.cli import interface, options
+from pbdkit.cli.commands import builtin_commands
+from pbdkit.hooks import DISABLE, import_object
 
 Install = Callable[..., None]
 Call = Callable[..., Any]
@@ -178,3 +182,19 @@ def test_modules_that_are_not_used_are_not_imported(
     assert loaded("run", "e.json") == "[]"
     assert loaded("--help") == "['pbdkit_shear']"
     assert loaded("shear") == "['pbdkit_shear', 'pbdkit_target']"
+
+
+SOURCE = getsource(interface) + getsource(options)
+TARGETS = sorted({*re.findall(r'(?:call|completed_by)\("([\w:]+)"', SOURCE)})
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_every_command_and_completer_has_its_function(target: str) -> None:
+    """The command line names them by texts, so that they are imported when they are called."""
+    assert callable(import_object(f"pbdkit.cli.{target}"))
+
+
+def test_every_command_is_declared_by_its_name() -> None:
+    for name, command in builtin_commands().items():
+        assert command.load().name == name
+    assert len(TARGETS) > len(builtin_commands())
