@@ -138,6 +138,13 @@ def interpreted() -> Iterator[None]:
 
 
 @pytest.fixture
+def compiled_at_length(request: pytest.FixtureRequest) -> None:
+    """Kernels are run by Python itself; in the profile `long` they are compiled."""
+    if settings().max_examples <= 100:
+        request.getfixturevalue("interpreted")
+
+
+@pytest.fixture
 def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Build:
     """The scene of an experiment file e.yaml with that text."""
     monkeypatch.chdir(tmp_path)

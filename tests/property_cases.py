@@ -5,6 +5,7 @@ from itertools import combinations, product
 from typing import Any
 
 import numpy as np
+from scene_strategies import AT_LENGTH
 
 import pbdkit
 from pbdkit import Experiment
@@ -33,8 +34,11 @@ LATTICES_AND_NEIGHBOURS = list(product(LATTICES, NEIGHBOURS))
 
 def all_pairs(*values: Iterable[Any]) -> list[tuple[Any, ...]]:
     """Cases for a parametrised test in which any two values of two arguments meet, and not any
-    three: about as many as the two longest lists have pairs, found greedily."""
+    three: about as many as the two longest lists have pairs, found greedily. The profile `long` has
+    the whole product."""
     given = [list(of_argument) for of_argument in values]
+    if AT_LENGTH:
+        return list(product(*given))
     cases = {
         case: frozenset(combinations(enumerate(case), 2))
         for case in product(*(range(len(of_argument)) for of_argument in given))

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from plugin_sources import BROKEN, NEWER, listed, rule
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.cli.commands import builtin_commands
@@ -96,7 +97,7 @@ def test_no_broken_plugin_stops_a_command(install: Install, call: Call, kind: st
     """A run, whose result others read, and a quarter of the other commands, each in its turn."""
     source, reason = BROKEN[kind]
     run, *others = CHEAP
-    tried = [run, *others[[*BROKEN].index(kind) % 4 :: 4]]
+    tried = [run, *in_turn(others, 4, first=[*BROKEN].index(kind) % 4)]
     install("pbdkit-broken", source, "0.3")
     Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
     assert {name: r for name in tried if (r := call(*EVERY_COMMAND[name])).code} == {}

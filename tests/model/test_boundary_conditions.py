@@ -72,15 +72,14 @@ def test_a_cut_before_the_first_step_is_a_crack(fracture):
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_kernels_cut_as_numpy_does(precision):
+def test_kernels_cut_as_numpy_does(precision, compiled_at_length):
     pytest.importorskip("numba")
     some = {"engine": "compiled", "precision": precision, "threads": 2}
     pulled = [moved("bottom", -0.9), moved("top", 0.9)]
     parts = {"cuts": [*cut(20), CUT | {"to": [5.0, 3.5], "at": 26}], "leaders": pulled}
     parts["fracture"] = {"type": "strain", "failure": 0.25}
     parts |= {"rule": {"type": "barycentre"}, "frame": {"type": "mean"}}
-    with interpreting():
-        found = run(**parts, solver={"type": "stepping"} | some)
+    found = run(**parts, solver={"type": "stepping"} | some)
     known = run(**parts, solver={"type": "stepping", "precision": precision, "engine": "numpy"})
     off = np.abs(found.u.values - known.u.values).max()
     assert off == 0.0 if precision == "float64" else off < 1e-6

@@ -165,7 +165,7 @@ def test_each_step_is_that_of_a_scene_with_the_numbers_at_its_end(name):
 
 
 @pytest.mark.parametrize("name", COMPILED)
-def test_kernels_follow_courses_to_the_bit(name, interpreted):
+def test_kernels_follow_courses_to_the_bit(name, compiled_at_length):
     """`stepping/numba_engine/test_engine` compiles one that has several."""
     parts = CHANGING[name]
     one = pbdkit.run(sheet(**parts), progress=False)

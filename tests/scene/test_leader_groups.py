@@ -59,7 +59,7 @@ BARYCENTRES = {
 def test_a_calibrated_rule_without_a_material_is_guided_as_a_plain_one(solver, request):
     """With ν = -1 nothing is left on the diagonals, and no force is known."""
     if solver.get("engine") == "compiled":
-        request.getfixturevalue("interpreted")
+        request.getfixturevalue("compiled_at_length")
     one, other = (run(sheet(solver=solver, **parts)) for parts in BARYCENTRES.values())
     assert np.abs(one.u.values[-1, :, 0]).max() > STRETCH
     np.testing.assert_allclose(one.u.values, other.u.values, rtol=0, atol=1e-7)
@@ -135,7 +135,7 @@ def test_both_engines_agree_to_the_bit(parts, precision, threads, request):
     """At the upper left corner too, where what pushes at the guide adds to the move. Single
     precision is compiled: Python would round otherwise."""
     if precision == "float64":
-        request.getfixturevalue("interpreted")
+        request.getfixturevalue("compiled_at_length")
     solver = {"type": "stepping", "relaxation": 0.8, "memory": 0.5, "precision": precision}
     data = sheet(initial={"type": "noise", "amplitude": 0.1}, solver=solver, **parts)
     data["leaders"][0] |= {"until": 9}

@@ -224,7 +224,7 @@ def test_several_steps_in_a_pass_to_the_last_bit(case: str) -> None:
         assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2))
 
 
-def test_threads_agree_to_the_last_bit(interpreted: None) -> None:
+def test_threads_agree_to_the_last_bit(compiled_at_length: None) -> None:
     scene = build_scene(pbdkit.Experiment(**CASES["memory"]))
     assert_bitwise_equal(scene, CompiledStepper(scene, 2))
 

@@ -33,7 +33,7 @@ BLOWN = {
 
 @pytest.mark.parametrize(("engine", "every"), [("numpy", 1), ("compiled", 7), ("numpy", 5000)])
 def test_a_run_that_diverges_is_stopped_within_a_hundred_steps_or_a_record(
-    engine, every, interpreted
+    engine, every, compiled_at_length
 ):
     solver = {"type": "stepping", "relaxation": 1.5, "engine": engine}
     given = BLOWN | {"solver": solver, "record": {"every": every}}
@@ -111,7 +111,7 @@ def diverged(**parts):
     ("growth", "kept_every"), [(1.5, 5000), (1.07, 100)], ids=["from the start", "from a copy"]
 )
 def test_the_last_good_state_of_a_run_that_diverges_is_kept(
-    engine, growth, kept_every, monkeypatch, interpreted
+    engine, growth, kept_every, monkeypatch, compiled_at_length
 ):
     """From the start again where the guard has copied no state yet."""
     begun = []
