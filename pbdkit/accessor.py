@@ -12,10 +12,8 @@ from pbdkit.io.layout import experiment_of, in_this_layout, indices_of, rows_at
 from pbdkit.io.members import member
 from pbdkit.io.physical import in_physical_units
 from pbdkit.io.save import save
-from pbdkit.plotting.configuration import compare, plot
-from pbdkit.plotting.crack import crack
-from pbdkit.plotting.curves import curve, history
-from pbdkit.plotting.movie import animate, animation
+from pbdkit.plotting import animate, animation, compare, crack, curve, history, plot
+from pbdkit.plotting.style import figure_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,8 +44,6 @@ def _with_figure(function: Callable[P, Axes | list[Axes]]) -> Callable[P, Axes |
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Axes | Figure:
         drawn = function(*args, **kwargs)
-        from pbdkit.plotting.style import figure_of  # needs matplotlib, which is there by now
-
         return figure_of(drawn[0]) if isinstance(drawn, list) else drawn
 
     return call

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pbdkit import plotting
 from pbdkit.cli.interface import CRACKS, HISTORY
 from pbdkit.cli.options import load_experiment
 from pbdkit.cli.output import refuse_output, refuse_unwritable, save
 from pbdkit.errors import ExperimentError
 from pbdkit.io.open import reading
 from pbdkit.io.other_files import is_experiment, refuse_other_file
-from pbdkit.plotting import configuration, crack, curves, movie
+from pbdkit.plotting.movie import refuse_no_movie
 from pbdkit.plotting.style import figure_of
 from pbdkit.progress import progress_bar
 
@@ -46,7 +47,7 @@ def plot(
     refuse_unwritable(path)
     with reading(file, at=at) as dataset:
         time = times if len(times) > 1 else times[0] if times else None
-        axes = configuration.plot(dataset, time=time, **look)
+        axes = plotting.plot(dataset, time=time, **look)
         save(path, figure_of(axes[0] if isinstance(axes, list) else axes), replace=force)
 
 
@@ -75,7 +76,7 @@ def _plot_set_up(
     path = output or Path(f"{experiment.name.replace('/', '-')}-setup.png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
-    axes = configuration.plot_experiment(experiment, figsize=figsize, dpi=dpi)
+    axes = plotting.plot_experiment(experiment, figsize=figsize, dpi=dpi)
     save(path, figure_of(axes), replace=force)
 
 
@@ -83,11 +84,11 @@ def animate(file: Path, output: Path | None, at: dict[str, str], force: bool, **
     """Make a movie of a result: every recorded step, with one colour scale."""
     refuse_other_file(file)
     path = output or file.with_suffix(".mp4")
-    movie.refuse_no_movie(path)
+    refuse_no_movie(path)
     refuse_output(path, force=force)
     refuse_unwritable(None, path)
     with reading(file, at=at) as dataset, progress_bar(sys.stderr.isatty()) as show:
-        movie.animate(dataset, file=path, show=show, replace=force, **look)
+        plotting.animate(dataset, file=path, show=show, replace=force, **look)
     click.echo(f"{path} written")
 
 
@@ -127,7 +128,7 @@ def _draw(
     if x is not None and y is None:
         raise ExperimentError(f"--x {x}: there is no variable to draw over it; add --y VARIABLE")
     if kind in CRACKS:
-        return crack.crack(dataset, kind=CRACKS[kind])
+        return plotting.crack(dataset, kind=CRACKS[kind])
     if kind == HISTORY or (kind is None and (particles or bond)):
-        return curves.history(dataset, y, particle=particles or None, bond=bond)
-    return curves.curve(dataset, x, y, kind=kind, **forces)
+        return plotting.history(dataset, y, particle=particles or None, bond=bond)
+    return plotting.curve(dataset, x, y, kind=kind, **forces)

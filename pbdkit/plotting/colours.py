@@ -7,21 +7,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap, Normalize
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
-from pbdkit.plotting.data import PlottedQuantity
+from pbdkit.plotting.data import PlottedQuantity, Snapshot
 from pbdkit.plotting.style import Look
-
-if TYPE_CHECKING:
-    from matplotlib.colors import Colormap, Normalize
-
-    from pbdkit.plotting.data import Snapshot
-
 
 KINDS = {
     int(FRAME): ("frame", "#F0E442"),
@@ -93,9 +90,6 @@ def scale_of(
     Where they have both signs, and zero is neutral, it reaches as far on either side, unless `look`
     has limits: neutral is zero even then. Raises ExperimentError for a map that is not there.
     """
-    from matplotlib.colors import BoundaryNorm, Normalize
-    from matplotlib.ticker import MaxNLocator
-
     low, high = values
     largest = max(abs(low), abs(high))
     diverging = quantity.is_signed and low < -NEARLY * largest and high > NEARLY * largest
@@ -133,9 +127,6 @@ def scale_of(
 
 def _map(name: str, about_zero: tuple[float, float] | None) -> Colormap:
     """Return the colour map of a name, cropped so that its middle is at zero in `about_zero`."""
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap
-
     if name not in colormaps:
         suggestion = did_you_mean(name, colormaps) or "; viridis, YlOrRd and RdBu_r are"
         raise ExperimentError(f"'{name}' is not a colour map{suggestion}")

@@ -1,4 +1,4 @@
-"""Pictures of configurations: one or several steps of a run, two runs, an experiment's set-up.
+"""Pictures of configurations: one or several steps of a run, or of two runs.
 
 Particles are drawn as dots, bonds as lines, a variable as a field of pixels, by what is legible at
 the distance of particles on the page.
@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.transforms import ScaledTranslation
 
-from pbdkit.errors import ExperimentError, refuse_no_matplotlib
+from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import in_this_layout
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale, palette_of, scale_of
 from pbdkit.plotting.data import (
@@ -46,70 +48,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pbdkit.model.experiment import Experiment
-
-
-def plot(
-    dataset: xarray.Dataset,
-    color: str | None = None,
-    time: float | Iterable[float | None] | None = None,
-    *,
-    filled: bool | None = None,
-    contours: bool = False,
-    bonds: bool | None = None,
-    broken: bool = False,
-    outline: bool = False,
-    numbers: bool = False,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    cmap: str | None = None,
-    figsize: tuple[float, float] | None = None,
-    dpi: int = 200,
-    ax: Axes | Sequence[Axes] | None = None,
-) -> Axes | list[Axes]:
-    """Draw recorded steps with the same limits and one scale of colours.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The result of one run.
-    color : str, optional
-        A variable of particles or bonds: its values, the length of a vector, or a component as
-        `u_x`. By default the kinds of particles.
-    time : float or iterable of float, optional
-        A recorded step, or several, a panel each. By default the last.
-    filled : bool, optional
-        True draws the variable as a field over the body, False as dots; by default a field where
-        dots would hide one another.
-    contours : bool
-        Draw the field in steps at round levels.
-    bonds, broken : bool
-        Draw bonds (by default where there is room), and broken ones too, dashed.
-    outline : bool
-        Draw the outline of the body at rest.
-    numbers : bool
-        Write the numbers of the particles, as many as there is room for.
-    vmin, vmax : float, optional
-        The lower and the upper limit of the colours. By default those of all panels, and where
-        there are both signs the same on both sides of zero.
-    cmap : str, optional
-        A colour map of matplotlib.
-    figsize : (float, float), optional
-        Width and height of the figure in inches.
-    dpi : int
-        Pixels an inch.
-    ax : Axes or sequence of Axes, optional
-        Axes to draw into, one for each step. By default a new figure is made.
-
-    Returns the axes: one, or a list where `time` is iterable. Raises ExperimentError for a step
-    that was not recorded, for no step at all, for a variable that cannot be drawn, for options
-    that make no picture, and where matplotlib is missing.
-    """
-    look = Look(
-        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
-    )  # fmt: skip
-    return draw(dataset, color, time, look, ax)
-
 
 def draw(
     dataset: xarray.Dataset,
@@ -119,8 +57,6 @@ def draw(
     ax: Axes | Sequence[Axes] | None = None,
 ) -> Axes | list[Axes]:
     """Draw recorded steps as `plot` does, with the options in `look`."""
-    refuse_no_matplotlib()
-
     recording = Trajectory(dataset, color or "kind")
     is_list = isinstance(time, Iterable)
     rows = [recording.row(step) for step in _listed(time)]
@@ -142,85 +78,20 @@ def draw(
     return sheet.axes if is_list else sheet.axes[0]
 
 
-def plot_experiment(
-    experiment: Experiment,
-    *,
-    ax: Axes | None = None,
-    figsize: tuple[float, float] | None = None,
-    dpi: int = 200,
-) -> Axes:
-    """Draw the set-up of an experiment before it runs, and return the axes.
-
-    The picture shows the body with its frame and regions, supports and leaders, loads, obstacles,
-    cracks and cuts. Arrows are as long in proportion to each other as motions and forces are.
-    Coordinates are in mm where the experiment has `units`. `ax` are axes to draw into; without them
-    a figure is made, of that `figsize` in inches, with so many `dpi`.
-
-    Raises ExperimentError where there is no such scene, where space is no plane, and where
-    matplotlib is missing.
-    """
-    refuse_no_matplotlib()
-    from pbdkit.plotting.scene_figure import draw_on_axes
-    from pbdkit.scene.scene import build_scene
-
-    look, scene = Look(figsize=figsize, dpi=dpi), build_scene(experiment)
-    if scene.axes != 2:
-        raise ExperimentError(f"pictures are of the plane, and this lattice has {scene.axes} axes")
-    return draw_on_axes(scene, look, ax)
-
-
 def _listed(time: Any) -> list[Any]:
     return [*time] if isinstance(time, Iterable) and not isinstance(time, str) else [time]
 
 
-def compare(
+def draw_comparison(
     first: xarray.Dataset,
     second: xarray.Dataset,
-    color: str | None = None,
-    time: float | None = None,
+    color: str | None,
+    time: float | None,
+    look: Look,
     *,
-    difference: bool = False,
-    filled: bool | None = None,
-    contours: bool = False,
-    bonds: bool | None = None,
-    broken: bool = False,
-    outline: bool = False,
-    numbers: bool = False,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    cmap: str | None = None,
-    figsize: tuple[float, float] | None = None,
-    dpi: int = 200,
+    difference: bool,
 ) -> Axes | list[Axes]:
-    """Draw one step of two datasets side by side, with the same limits and one scale of colours.
-
-    Parameters
-    ----------
-    first, second : xarray.Dataset
-        Results of one run each.
-    color : str, optional
-        What is drawn, as in `plot`; of a `difference` by default the distance of positions.
-    time : float, optional
-        A recorded step, by default the last of each.
-    difference : bool
-        Draw in one panel `color` of the second less that of the first, at the places that the
-        second has at rest; particles are joined by number.
-
-    The other parameters are those of `plot`.
-
-    Returns
-    -------
-    list of Axes, or Axes
-        Both axes; of a `difference` its own.
-
-    Raises
-    ------
-    ExperimentError
-        As `plot` does, and where no particle is in both.
-    """
-    look = Look(
-        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
-    )  # fmt: skip
+    """Draw one step of two datasets, or their difference, as `pbdkit.plotting.compare` does."""
     first, second = in_this_layout(first), in_this_layout(second)
     if difference:
         changed, name = difference_of(first, second, color or "position", time)
@@ -231,8 +102,6 @@ def compare(
 def _side_by_side(
     datasets: list[xarray.Dataset], color: str | None, time: float | None, look: Look
 ) -> list[Axes]:
-    refuse_no_matplotlib()
-
     recordings = [Trajectory(dataset, color or "kind") for dataset in datasets]
     snapshots = [next(r.snapshots([r.row(time)])) for r in recordings]
     extent = combine(
@@ -507,8 +376,6 @@ class Sheet:
             page.arrange(scale, text, handles, self._larger)
             return
         if scale:
-            from matplotlib.cm import ScalarMappable
-
             bar_of = self.figure.colorbar(
                 ScalarMappable(scale.norm, scale.colours), ax=self.axes, extend=scale.extend
             )
@@ -526,8 +393,6 @@ class Sheet:
 
     def _add_legend(self, palette: Palette) -> None:
         """Add a legend below axes passed by the caller."""
-        from matplotlib.transforms import ScaledTranslation
-
         below = self.axes[0].transAxes + ScaledTranslation(0, -0.45, self.figure.dpi_scale_trans)
         handles = legend_handles(palette, set(self._extent.kinds | self._extent.classes))
         self.axes[0].legend(

@@ -10,23 +10,25 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import xarray
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Array, Floats
-from pbdkit.errors import ExperimentError, refuse_no_matplotlib
+from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import INDICES, rows_at, scene_of
 from pbdkit.io.members import TEXT, type_alone
 from pbdkit.plotting.data import CHOSEN_BY, OF_A_RUN, SUM_BLOCK_BYTES, in_units, scalar, variable
+from pbdkit.plotting.figure_layout import new_figure
 from pbdkit.plotting.style import in_its_units, label, plain
 from pbdkit.scene.scene import Scene
-
-if TYPE_CHECKING:
-    import xarray
-    from matplotlib.axes import Axes
-
 
 FORCE_OF = {"load": "load_resultant", "obstacle": "contact_force", "leader_group": "reaction"}
 """Variables of forces, by the dimension of the bodies that exert them."""
@@ -92,8 +94,6 @@ def _greatest(values: Any, dim: str) -> Floats:
 def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
     """Return the mean displacement, (time, group, axis), of the particles or obstacles that exert
     the force, with units."""
-    import xarray
-
     if dim == "load":
         return in_units(dataset["load_displacement"])
     if extra_dims := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:
@@ -170,18 +170,12 @@ class Line:
 
 def new_axes(width: float = SIZE_IN[0], height: float = SIZE_IN[1]) -> Axes:
     """Return the axes of a new figure of a size in inches."""
-    refuse_no_matplotlib()
-    from pbdkit.plotting.style import new_figure
-
     return new_figure(figsize=(width, height), dpi=DPI, layout="constrained").add_subplot()
 
 
 def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
     """Draw lines with a legend, or with a colour bar labelled `hues` where they are too many for
     one."""
-    from matplotlib import colormaps
-    from matplotlib.ticker import MaxNLocator
-
     order = {hue: n for n, hue in enumerate(dict.fromkeys(line.hue for line in lines))}
     shares = _shares(lines, order)
     for line in lines:
@@ -239,10 +233,6 @@ def _range(lines: Sequence[Line], order: dict[int, int]) -> tuple[float, float]:
 
 
 def _scale(ax: Axes, lines: Sequence[Line], order: dict[int, int], hues: str) -> None:
-    from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import ListedColormap, Normalize
-
     cmap = ListedColormap(colormaps[MANY](np.linspace(0.0, 0.9, 256)))
     colours = ScalarMappable(Normalize(*_range(lines, order)), cmap)
     ax.figure.colorbar(colours, ax=ax, aspect=25).set_label(label(hues, width=BROAD))
@@ -262,8 +252,6 @@ def hues_of(values: Any) -> str:
 def lines_of(dataset: xarray.Dataset, x: Any, y: Any) -> list[Line]:
     """Return the lines of y over x, DataArrays with one dimension of a run between them; each is
     named by the parameters of its member and contains no NaN."""
-    import xarray
-
     across, drawn = xarray.broadcast(x, y)
     dims = member_dims(drawn)
     across, drawn = (values.transpose(*dims, ...) for values in (across, drawn))
@@ -308,30 +296,15 @@ NEEDED_DIAGNOSTICS = {
 }
 
 
-def curve(
+def draw_curve(
     dataset: xarray.Dataset,
-    x: str | None = None,
-    y: str | None = None,
-    *,
-    kind: Kind | None = None,
-    group: int | None = None,
-    load: int | None = None,
-    obstacle: int | None = None,
-    ax: Axes | None = None,
+    x: str | None,
+    y: str | None,
+    kind: Kind | None,
+    chosen: dict[str, int | None],
+    ax: Axes | None,
 ) -> Axes:
-    """Draw a curve and return its axes.
-
-    `kind` is which, by default the first that the dataset has. `curve(y)` draws a variable over
-    the time instead and `curve(x, y)` one over another, one number a step each: a component as
-    `reaction_x`, and of what particles have the sum or mean. `group`, `load` and `obstacle` choose
-    the one whose forces are drawn; without them it is the one that goes farthest. Lengths, forces
-    and energies are in mm, N and mJ where the dataset has their scale. A dataset of a sweep has a
-    line a member.
-
-    Raises ExperimentError for what is not there, with the diagnostic that it takes, and where
-    matplotlib is missing.
-    """
-    chosen = {"group": group, "load": load, "obstacle": obstacle}
+    """Draw a curve as `pbdkit.plotting.curve` does, of the `chosen` group, load or obstacle."""
     if y is None:
         x, y = None, x
     if y is not None and kind is not None:
@@ -409,28 +382,15 @@ MOST_LINES = 200
 Numbers = int | Iterable[int]
 
 
-def history(
+def draw_history(
     dataset: xarray.Dataset,
-    name: str | None = None,
-    *,
-    particle: Numbers | None = None,
-    i: int | None = None,
-    j: int | None = None,
-    bond: Sequence[int] | None = None,
-    ax: Axes | None = None,
+    name: str | None,
+    particle: Numbers | None,
+    site: tuple[int | None, int | None],
+    bond: Sequence[int] | None,
+    ax: Axes | None,
 ) -> Axes:
-    """Draw a variable of particles over the steps and return the axes.
-
-    The particles are selected by number, one or several, or by their site indices: `i` and `j` are
-    one particle, one of them alone is a line of them. `name` is any variable of particles, a vector
-    (its first component is drawn through, the others dashed) or a component as `u_x`; by default
-    the displacement `u`, made of positions where it was not recorded. `track` shows every step.
-    `bond` names a bond by the numbers of its two particles: its strain, or a variable of bonds.
-    Only what is drawn is read.
-
-    Raises ExperimentError for what is not there, for more than 200 lines, and where matplotlib is
-    missing.
-    """
+    """Draw a variable of particles or of a bond over time as `pbdkit.plotting.history` does."""
     if not isinstance(name, str | None):
         raise ExperimentError(
             f"history: expected the name of a variable first, such as 'u', got {name!r}; a "
@@ -439,7 +399,7 @@ def history(
     if bond is not None:
         drawn = [_of_bond(dataset, name or "strain", bond)]
     else:
-        numbers = _numbers(dataset, particle, i, j)
+        numbers = _numbers(dataset, particle, *site)
         drawn = _of_particles(dataset, name or "u", numbers)
     alone = len(drawn) == 1
     lines = [line for n, series in enumerate(drawn) for line in _lines(dataset, series, n, alone)]

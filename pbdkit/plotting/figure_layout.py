@@ -7,27 +7,33 @@ around what is drawn: nothing is clipped, and nothing lies over anything else.
 from __future__ import annotations
 
 import math
+import sys
 import textwrap
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, MaxNLocator
+from matplotlib.transforms import Bbox
 
 from pbdkit.errors import ExperimentError
 from pbdkit.plotting.colours import Palette, Scale
 from pbdkit.plotting.layers import INK
-from pbdkit.plotting.style import new_figure, renderer_of
+from pbdkit.plotting.style import renderer_of
+from pbdkit.progress import in_notebook
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from matplotlib.axes import Axes
     from matplotlib.legend import Legend
-    from matplotlib.lines import Line2D
     from matplotlib.text import Text
     from matplotlib.ticker import Locator
-    from matplotlib.transforms import Bbox
-
 PAGE_WIDTH_IN = 7.2
 """Width of a page."""
 PAGE_HEIGHT_IN = 8.0
@@ -53,6 +59,26 @@ CHARACTERS_PER_IN = 14.5
 HEADING_PT, TEXT_PT, TICK_PT = 10.0, 9.0, 8.0
 
 
+PYPLOT = "matplotlib.pyplot"
+
+
+def new_figure(*, standalone: bool = False, **options: Any) -> Figure:
+    """Return a new figure with these arguments of matplotlib.
+
+    Where pyplot is in use, or in a notebook, pyplot manages it, unless it is to be `standalone`, to
+    be shown or saved by the caller.
+    """
+    if not standalone and (PYPLOT in sys.modules or in_notebook()):
+        pyplot = import_module(PYPLOT)
+        figure: Figure = pyplot.figure(**options)
+        if hasattr(figure.canvas, "get_renderer"):
+            return figure
+        pyplot.close(figure)  # of a backend that cannot measure text
+    figure = Figure(**options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def style_bar(bar: Any, scale: Scale) -> None:
     """Label the ticks of a colour bar without the power of ten that is in its label."""
     ten = 10.0**scale.exponent
@@ -74,8 +100,6 @@ def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
 
 def handle(name: str, colour: str) -> Line2D:
     """Return a dot with a name."""
-    from matplotlib.lines import Line2D
-
     return Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)
 
 
@@ -194,8 +218,6 @@ class Page:
 
     def _place_panels(self) -> None:
         """Set the size of the figure, and place panels, heading and labels of the axes."""
-        from matplotlib.transforms import Bbox
-
         grid, (width, height) = self._grid, self._grid.size
         smallest = self._before + self._after + (width, height)
         page = np.array(self._size or smallest)
@@ -235,8 +257,6 @@ class Page:
 
     def _bar(self, scale: Scale, text: str) -> Any:
         """Return the colour bar; it stands beside panels that are tall enough for its label."""
-        from matplotlib.cm import ScalarMappable
-
         width, height = self._grid.size
         broad = int(min(height, BAR_LENGTH_IN) * CHARACTERS_PER_IN)
         lines = textwrap.wrap(text, max(1, broad), break_long_words=False)
@@ -286,8 +306,6 @@ class Page:
 
     def _drawn(self, artists: Iterable[Any], **options: Any) -> Bbox:
         """Return the box around artists with all that belongs to them, in inches."""
-        from matplotlib.transforms import Bbox
-
         renderer = renderer_of(self.figure)
         boxes = [box for artist in artists if (box := artist.get_tightbbox(renderer, **options))]
         return Bbox(Bbox.union(boxes).get_points() / self.figure.dpi)
@@ -309,8 +327,6 @@ class Page:
 
 def _locator(low: float, high: float, length: float, distance: float) -> Locator:
     """Return a locator of ticks at a distance in inches at least; of one tick on short axes."""
-    from matplotlib.ticker import FixedLocator, MaxNLocator
-
     if length < SHORT_AXIS_IN:
         return FixedLocator([0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.1g}")])
     return MaxNLocator(max(1, int(length / distance)), steps=[1, 2, 5, 10])

@@ -33,7 +33,7 @@ def draw_fit(fitted: Fitted) -> Figure:
     ExperimentError where matplotlib is missing.
     """
     refuse_no_matplotlib()
-    from pbdkit.plotting.style import new_figure
+    from pbdkit.plotting.figure_layout import new_figure
 
     count = 3 + len(fitted.values)
     kinds = [observation.kind for observation in fitted.problem.observations]

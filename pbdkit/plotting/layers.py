@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.colors import ListedColormap, Normalize
 
 from pbdkit.array_types import Array
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale
@@ -18,7 +20,6 @@ from pbdkit.plotting.style import figure_of
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-    from matplotlib.collections import PathCollection
     from matplotlib.image import AxesImage
 
 
@@ -187,8 +188,6 @@ class Classes(Layer):
     """Classes of particles that are too many for dots, as pixels."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, palette: Palette) -> None:
-        from matplotlib.colors import ListedColormap, Normalize
-
         self._body, self._grid, self._palette = body, grid, palette
         colours = ListedColormap([colour for _, colour in palette.colours.values()])
         self._image = ax.imshow(
@@ -246,8 +245,6 @@ class BondLines(Layer):
     def __init__(
         self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False
     ) -> None:
-        from matplotlib.collections import LineCollection
-
         self._body, self._broken = body, broken
         style: dict[str, Any] = {"colors": LINE, "zorder": 1}
         if broken:
@@ -266,8 +263,6 @@ class BondValues(Layer):
     """A quantity of bonds, as the colours of lines; bonds without a value are not drawn."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, width: float, scale: Scale) -> None:
-        from matplotlib.collections import LineCollection
-
         self._body = body
         self._lines = LineCollection(
             [], linewidths=width, cmap=scale.colours, norm=scale.norm, zorder=2, capstyle="round"
@@ -285,8 +280,6 @@ class BondValues(Layer):
 
 def draw_outline(ax: Axes, sides: Array) -> None:
     """Draw static segments, (side, end, axis)."""
-    from matplotlib.collections import LineCollection
-
     lines = LineCollection(list(sides), colors=REST, linewidths=0.7, zorder=2.5)
     ax.add_collection(lines, autolim=False)
 

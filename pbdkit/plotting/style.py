@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import sys
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +13,11 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError, one_line
 from pbdkit.io.physical import FACTOR, UNITS
-from pbdkit.progress import in_notebook
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.backend_bases import RendererBase
     from matplotlib.figure import Figure
-
-PYPLOT = "matplotlib.pyplot"
 
 
 def figure_of(ax: Axes) -> Figure:
@@ -37,26 +32,6 @@ def renderer_of(figure: Figure) -> RendererBase:
     canvas: Any = figure.canvas
     renderer: RendererBase = canvas.get_renderer()
     return renderer
-
-
-def new_figure(*, standalone: bool = False, **options: Any) -> Figure:
-    """Return a new figure with these arguments of matplotlib.
-
-    Where pyplot is in use, or in a notebook, pyplot manages it, unless it is to be `standalone`, to
-    be shown or saved by the caller.
-    """
-    if not standalone and (PYPLOT in sys.modules or in_notebook()):
-        pyplot = import_module(PYPLOT)
-        figure: Figure = pyplot.figure(**options)
-        if hasattr(figure.canvas, "get_renderer"):
-            return figure
-        pyplot.close(figure)  # of a backend that cannot measure text
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(**options)
-    FigureCanvasAgg(figure)
-    return figure
 
 
 LONGEST = 200

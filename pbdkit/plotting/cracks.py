@@ -8,9 +8,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.ticker import MaxNLocator
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from pbdkit.array_types import Array
-from pbdkit.errors import ExperimentError, refuse_no_matplotlib
+from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import OF_BODY, rows_of
 from pbdkit.plotting.curves import BROAD, TALL, Line, draw_lines, member_dims, new_axes
 from pbdkit.plotting.style import in_its_units, label
@@ -18,7 +25,6 @@ from pbdkit.plotting.style import in_its_units, label
 if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
-
 
 Kind = Literal["map", "length", "bonds"]
 KINDS: tuple[Kind, ...] = ("map", "length", "bonds")
@@ -39,20 +45,10 @@ DIRECTIONS = 180
 4e-5."""
 
 
-def crack(dataset: xarray.Dataset, kind: Kind = "map", *, ax: Axes | None = None) -> Axes:
-    """Draw broken bonds and return the axes.
-
-    `map` shows the broken bonds on the body at rest, coloured by step of breaking; `length` the
-    length of the longest crack over the steps, measured as the largest distance between the middles
-    of its bonds; `bonds` the number of broken bonds. Bonds that were cut, or broken from the start,
-    count; bonds to the frame do not.
-
-    Raises ExperimentError where bonds could not break, for several runs, and where matplotlib is
-    missing.
-    """
+def draw_crack(dataset: xarray.Dataset, kind: Kind, ax: Axes | None) -> Axes:
+    """Draw broken bonds as `pbdkit.plotting.crack` does."""
     if kind not in KINDS:
         raise ExperimentError(f"there is no picture '{kind}' of a crack; take {', '.join(KINDS)}")
-    refuse_no_matplotlib()
     broken, values = _broken(dataset), np.empty(0)
     title = str(dataset.attrs.get("title", ""))
     if kind == "map":
@@ -114,10 +110,6 @@ def _broken(dataset: xarray.Dataset) -> CrackBonds:
 def _lengths(broken: CrackBonds) -> Array:
     """Return the length of the longest crack after each bond has broken, (bond,). Bonds within
     APART lengths of each other belong to one crack."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
     count = len(broken.middle)
     longest = np.linalg.norm(broken.ends[:, 1] - broken.ends[:, 0], axis=1).max()
     pairs = KDTree(broken.middle).query_pairs(APART * longest, output_type="ndarray")
@@ -142,8 +134,6 @@ def _extents(middle: Array) -> Array:
 
 
 def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | None) -> Axes:
-    from matplotlib.collections import LineCollection
-
     body = dataset["reference"].values[dataset["role"].values == OF_BODY]
     is_new, ax = ax is None, ax or _axes_around(body)
     dots = body[:: 1 + len(body) // POINTS]
@@ -195,11 +185,6 @@ def _axes_around(body: Array) -> Axes:
 def _coloured(ax: Axes, broken: CrackBonds, *, below: bool) -> None:
     """Add the bonds that broke during the run, coloured by step, with a colour bar beside or below
     the body."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.collections import LineCollection
-    from matplotlib.colors import Normalize
-    from matplotlib.ticker import MaxNLocator
-
     later = broken.step > 0
     scale = Normalize(broken.step[later].min(), broken.step[later].max())
     lines = LineCollection([*broken.ends[later]], cmap=COLOURS, norm=scale, linewidths=1.8)
