@@ -292,6 +292,8 @@ class _Followers:
         """Return the totals of one number or vector, given by slot."""
         if isinstance(by_slot[0], Vector):
             return vector(self._total(along, common) for along in zip(*by_slot, strict=True))
+        if all(np.ndim(values) < 2 for values in by_slot):
+            return sum(by_slot)  # weights, which no step changes
         shape = (2 * common - 1, self._shape[1])
         by_slot = [
             values if np.shape(values) == shape else np.broadcast_to(values, shape)

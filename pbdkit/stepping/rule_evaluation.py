@@ -88,8 +88,11 @@ class Evaluator:
     def contribution(self, d: Vector, u: Vector, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
         seen = d if self.tears else self.seen(d, u, to)
-        parts = (self._of_weights(seen, to, w) for w in (to.w, *to.more))
-        return summed((as_values(part, "gather"), None) for part in parts)
+        part = as_values(self._of_weights(seen, to, to.w), "gather")
+        for w in to.more:
+            other = as_values(self._of_weights(seen, to, w), "gather")
+            part = tuple(a + b for a, b in zip(part, other, strict=True))
+        return part
 
     def _of_weights(self, d: Vector, to: Neighbour, w: Any) -> Any:
         """What the rule makes of a difference with some weights."""
@@ -222,8 +225,9 @@ def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
 
 
 def _masked(value: Any, present: Mask) -> Any:
-    zero = vector([0.0] * len(value)) if isinstance(value, Vector) else 0.0
-    return where(present, value, zero)
+    if isinstance(value, Vector):
+        return value.each(lambda component: np.where(present, component, 0.0))
+    return np.where(present, value, 0.0)
 
 
 BLOCK_CELLS = 16384

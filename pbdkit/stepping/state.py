@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -86,7 +85,7 @@ class State:
         """The same state in arrays of its own, or in those of a state of the same scene that
         nobody needs any more: memory that is new costs several times as much as what is copied."""
         if over is None:
-            return deepcopy(self)
+            return replace(self, **{name: _copied(part) for name, part in vars(self).items()})
         for mine, others in zip(self.arrays(), over.arrays(), strict=True):
             np.copyto(others, mine)
         return replace(over, step=self.step, starts=self.starts)
@@ -101,6 +100,12 @@ class State:
         bonds = (self.broken_step, self.broken_length, *self.bond_values)
         carried = (self.u, self.previous, *bonds, *self.particle_values)
         return [array for array in carried if array is not None]
+
+
+def _copied(part: Any) -> Any:
+    if isinstance(part, tuple):
+        return tuple(map(_copied, part))
+    return part.copy() if isinstance(part, np.ndarray) else part
 
 
 def unmoved_state(scene: Scene, cells: Sequence[int]) -> State:
