@@ -433,7 +433,7 @@ def fit(
     --------
     >>> print(pbdkit.fit("plate-with-hole"))
     """
-    from pbdkit.equilibrium.certificate import UnconvergedError
+    from pbdkit.equilibrium.error_bound import UnconvergedError
     from pbdkit.fitting.fit import fit_experiment
     from pbdkit.fitting.fit_file import Fit, is_strength_fit, read_fit
 
@@ -479,7 +479,7 @@ def fit_strength(
     DivergedError
         Where a specimen has no equilibrium.
     """
-    from pbdkit.equilibrium.certificate import UnconvergedError
+    from pbdkit.equilibrium.error_bound import UnconvergedError
     from pbdkit.fitting.fit_file import StrengthFit, read_fit
     from pbdkit.fitting.strength import fit_strength_of
 

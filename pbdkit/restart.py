@@ -49,7 +49,7 @@ def restore(
         if checkpoint:
             experiment, classes = driver.scene.experiment, dict[str, type]()
             if experiment.stepping.settle:
-                from pbdkit.equilibrium.certificate import Pace
+                from pbdkit.equilibrium.error_bound import Pace
 
                 classes["Pace"] = Pace
             parts = checkpoint.parts(initial, experiment.steps, classes)

@@ -36,8 +36,8 @@ from pbdkit.stepping.state import State, initial_state, unmoved_state
 if TYPE_CHECKING:
     import xarray
 
-    from pbdkit.equilibrium.certificate import Certificate, Pace, SteadyStateMonitor
-    from pbdkit.equilibrium.solve import Way
+    from pbdkit.equilibrium.error_bound import Certificate, Pace, SteadyStateMonitor
+    from pbdkit.equilibrium.load_stepping import Way
     from pbdkit.model.experiment import Experiment
     from pbdkit.model.loading import ComponentClasses, ExperimentLike
     from pbdkit.model.reading import Settings
@@ -136,7 +136,7 @@ class SteppingDriver(Driver):
         self.guard = Guard.of(scene, state)
         self.monitor: SteadyStateMonitor | None = None
         if tolerance := scene.experiment.stepping.settle:
-            from pbdkit.equilibrium.certificate import SteadyStateMonitor
+            from pbdkit.equilibrium.error_bound import SteadyStateMonitor
 
             self.monitor = SteadyStateMonitor(scene, tolerance, state, watch)
         self.recorded_step = -1
@@ -312,8 +312,8 @@ class EquilibriumDriver(Driver):
 
         If it is interrupted or finds no equilibrium, its last state is the last one reached.
         """
-        from pbdkit.equilibrium.certificate import UnconvergedError
-        from pbdkit.equilibrium.solve import SeparatedError
+        from pbdkit.equilibrium.error_bound import UnconvergedError
+        from pbdkit.equilibrium.load_stepping import SeparatedError
 
         state = self.state
         yield state
@@ -338,7 +338,7 @@ class EquilibriumDriver(Driver):
 
     def _way(self, state: State) -> Way:
         """Follow the load from a state to equilibrium."""
-        from pbdkit.equilibrium.solve import increments
+        from pbdkit.equilibrium.load_stepping import increments
 
         return increments(self.scene, state, self.watch, self.moment, stops=self._stops)
 
@@ -550,8 +550,8 @@ class Simulation:
         ExperimentError
             If no equilibrium exists.
         """
-        from pbdkit.equilibrium.certificate import UnconvergedError
-        from pbdkit.equilibrium.solve import settle_at_step
+        from pbdkit.equilibrium.error_bound import UnconvergedError
+        from pbdkit.equilibrium.load_stepping import settle_at_step
 
         if not self.experiment.solver.makes_steps:
             self.run()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium.certificate import Pace
+from pbdkit.equilibrium.error_bound import Pace
 from pbdkit.io.sinks import MemorySink
 from pbdkit.model.solver import Equilibrium, Solver
 from pbdkit.progress import Watch

@@ -31,10 +31,10 @@ from pbdkit.api import load
 from pbdkit.array_types import Floats
 from pbdkit.cli.output import refuse_output, refuse_unwritable, save
 from pbdkit.cli.tables import SIMPLE_HEAD, Table, add_rows, show_table
-from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, scale_of
+from pbdkit.equilibrium.error_bound import Certificate, UnconvergedError, scale_of
 from pbdkit.equilibrium.lattice_system import SlowMode
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.solve import settle
+from pbdkit.equilibrium.load_stepping import settle
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
 from pbdkit.io.atomic_file import write
 from pbdkit.lattice.raster import FOLLOWER

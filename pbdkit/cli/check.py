@@ -107,7 +107,7 @@ def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator
         count = loaded.record_count - 1
         equilibria = f" of each of {count} recorded steps" if count > 1 else ""
         yield "solver", f"goes straight to the equilibrium{equilibria}, to where steps would lead"
-        from pbdkit.equilibrium.solve import changes
+        from pbdkit.equilibrium.load_stepping import changes
 
         if steps_of_changes := changes(scene, loaded.steps):
             listed = ", ".join(map(str, steps_of_changes[:MAX_LISTED]))

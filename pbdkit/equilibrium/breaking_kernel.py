@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.array_types import Floats, Indices
-from pbdkit.equilibrium.certificate import LINEAR
+from pbdkit.equilibrium.error_bound import LINEAR
 from pbdkit.equilibrium.sparse import SOFT
 from pbdkit.equilibrium.system import ROUNDING
 from pbdkit.errors import PluginError

@@ -16,7 +16,8 @@ from functools import cached_property
 import numpy as np
 
 from pbdkit.array_types import Floats
-from pbdkit.equilibrium.certificate import (
+from pbdkit.equilibrium.contact_system import ContactSystem
+from pbdkit.equilibrium.error_bound import (
     FIRST_ORDER,
     LINEAR,
     UNKNOWN,
@@ -25,7 +26,6 @@ from pbdkit.equilibrium.certificate import (
     UnconvergedError,
     spacing_of,
 )
-from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.linearise import linearised, mismatch_at_rest
 from pbdkit.equilibrium.sparse import MatrixSystem
 from pbdkit.equilibrium.system import (

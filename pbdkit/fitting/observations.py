@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats, Indices
 from pbdkit.components.diagnostics import reactions
-from pbdkit.equilibrium.certificate import UnconvergedError
+from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting, scene_like

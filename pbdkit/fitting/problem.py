@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats
-from pbdkit.equilibrium.certificate import UnconvergedError
+from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.equilibrium.system import Moves
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.observations import FieldObservation, NearbyPrediction, Observation, Prediction

@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 
 from pbdkit.array_types import Floats
-from pbdkit.equilibrium.certificate import Certificate, spacing_of
+from pbdkit.equilibrium.error_bound import Certificate, spacing_of
 from pbdkit.equilibrium.linearise import linearised
+from pbdkit.equilibrium.load_stepping import finder_of, settle
 from pbdkit.equilibrium.newton import Finder
-from pbdkit.equilibrium.solve import finder_of, settle
 from pbdkit.equilibrium.system import Moves, System, one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.parameter import STEP, WEIGHTS, Parameter

@@ -34,7 +34,7 @@ import numpy as np
 
 from pbdkit.array_types import Floats, Mask
 from pbdkit.components.diagnostics import reactions
-from pbdkit.equilibrium.solve import finder_of, increments, moments
+from pbdkit.equilibrium.load_stepping import finder_of, increments, moments
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.fit_file import Peaks, StrengthFit

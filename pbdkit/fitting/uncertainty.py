@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats
-from pbdkit.equilibrium.certificate import UnconvergedError
+from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.errors import ExperimentError, refuse_without
 from pbdkit.fitting.fit_file import Force
 from pbdkit.fitting.observations import FieldPrediction, GroupReaction

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats
-from pbdkit.equilibrium.certificate import Certificate, SteadyStateMonitor
-from pbdkit.equilibrium.solve import Way
+from pbdkit.equilibrium.error_bound import Certificate, SteadyStateMonitor
+from pbdkit.equilibrium.load_stepping import Way
 from pbdkit.equilibrium.system import Rows, Strip, StuckError
 from pbdkit.errors import NotSharedError
 from pbdkit.model.solver import Settle
@@ -347,7 +347,7 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         super().load_state_dict(self._division.scattered(parts))
 
     def _way(self, state: State) -> Way:
-        from pbdkit.equilibrium.solve import finder_of, increments
+        from pbdkit.equilibrium.load_stepping import finder_of, increments
 
         scene, start = self.scene, self._start or initial_state(self.scene)
         try:

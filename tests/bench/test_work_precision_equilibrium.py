@@ -19,7 +19,7 @@ from pbdkit.bench.work_precision import (
     table,
     work_precision_figure,
 )
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.scene.scene import build_scene
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

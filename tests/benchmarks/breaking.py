@@ -17,7 +17,7 @@ import numpy as np
 
 import pbdkit
 from pbdkit.equilibrium import breaking_kernel
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import State
 

@@ -23,7 +23,7 @@ from finite_elements.varying import VARYING, modulus, reference
 from peers import python_with
 
 import pbdkit
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import Simulation
 from pbdkit.stepping.state import State

@@ -28,7 +28,7 @@ from finite_elements.problems import BAR, CANTILEVER, FINEST, Problem
 from threadpoolctl import threadpool_limits
 
 import pbdkit
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.scene.scene import build_scene
 
 CELLS = (10, 20, 40, 80, 160, 320, 640)

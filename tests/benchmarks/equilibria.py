@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 
 import pbdkit
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.solve import settle
+from pbdkit.equilibrium.load_stepping import settle
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state

@@ -338,7 +338,7 @@ NEEDED = {
     "run paper/aa": (set(), {"pbdkit.plugin", "pbdkit.components", "pbdkit.model.experiment"}),
     "run e.json --set rul=1": ({"numpy", "pydantic"}, {"pbdkit.scene.scene", "pbdkit.stepping"}),
     "check e.json": ({"numpy", "pydantic"}, {"pbdkit.io.netcdf", "pbdkit.restart"}),
-    "run e.json": ({"h5py", "numpy", "pydantic"}, {"pbdkit.equilibrium.solve"}),
+    "run e.json": ({"h5py", "numpy", "pydantic"}, {"pbdkit.equilibrium.load_stepping"}),
     "run e.json --quiet": (
         {"h5py", "numpy", "pydantic"},
         {"pbdkit.equilibrium", "pbdkit.stability.lag"},

@@ -10,9 +10,9 @@ import pytest
 from interpreted_kernels import interpreting
 
 import pbdkit
-from pbdkit.equilibrium import breaking_kernel as choice, solve as increments
+from pbdkit.equilibrium import breaking_kernel as choice, load_stepping as increments
 from pbdkit.equilibrium.breaking_kernel import Settler
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state

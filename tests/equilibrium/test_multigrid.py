@@ -13,10 +13,10 @@ import pbdkit
 from pbdkit.equilibrium import (
     linear_solver,
     linearise as linearisation,
-    solve as increments,
+    load_stepping as increments,
     system as moves,
 )
-from pbdkit.equilibrium.solve import settle
+from pbdkit.equilibrium.load_stepping import settle
 from pbdkit.equilibrium.stencil_matrix import kernels
 from pbdkit.plugin import FollowerRule, Vector
 from pbdkit.scene import memory_estimate as solver_sizes

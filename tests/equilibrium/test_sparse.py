@@ -188,7 +188,7 @@ def test_an_iteration_hears_of_it():
 
 
 def test_progress_is_told_in_phases_and_shares(monkeypatch):
-    from pbdkit.equilibrium.solve import settle
+    from pbdkit.equilibrium.load_stepping import settle
     from pbdkit.scene.scene import build_scene
     from pbdkit.stepping.state import initial_state
 

@@ -13,7 +13,7 @@ from property_cases import body_of
 from scene_strategies import in_turn
 
 import pbdkit
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.linear.operator import step_operator
 from pbdkit.linear.spectrum import modes, slowest_swing, spectrum
 from pbdkit.model.shipped import shipped_names

@@ -25,7 +25,7 @@ from finite_elements.stepping import setting_up, stepped
 from finite_elements.timing import Seconds, best
 
 import pbdkit
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.scene.scene import build_scene
 
 PICTURE = Path(__file__).parents[2] / "docs/pictures/finite-elements.png"

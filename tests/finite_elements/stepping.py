@@ -11,7 +11,7 @@ from finite_elements.problems import Problem
 from finite_elements.timing import Seconds, best
 
 import pbdkit
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.engine_choice import choose, make_engine
 from pbdkit.stepping.state import initial_state

@@ -13,7 +13,7 @@ from thread_ranks import on_ranks
 
 import pbdkit
 from pbdkit.components.elasticity import Elastic, StrainGradient
-from pbdkit.equilibrium.solve import moments
+from pbdkit.equilibrium.load_stepping import moments
 from pbdkit.errors import NotSharedError
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting, scene_like

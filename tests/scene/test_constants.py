@@ -251,7 +251,7 @@ def test_bonds_that_never_come_to_rest_are_no_equilibrium(monkeypatch, interpret
         def update(d, r, c, p):
             return c.damage, c.visits + 1
 
-    monkeypatch.setattr("pbdkit.equilibrium.solve.MOST_SETTLINGS", 5)
+    monkeypatch.setattr("pbdkit.equilibrium.load_stepping.MOST_SETTLINGS", 5)
     given = SHEET | {"fracture": Restless(), "solver": {"type": "equilibrium"}}
     with pytest.raises(pbdkit.DivergedError, match="bonds still change after 5 equilibria"):
         pbdkit.run(given, progress=False)

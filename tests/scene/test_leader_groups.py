@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.linear.operator import step_operator
 from pbdkit.scene.scene import build_scene
 from pbdkit.stability.forecast import forecast

@@ -10,7 +10,7 @@ from turning_frame import Turning
 
 import pbdkit
 from pbdkit.equilibrium import system as moves_of
-from pbdkit.equilibrium.solve import moments
+from pbdkit.equilibrium.load_stepping import moments
 from pbdkit.linear.operator import step_operator
 from pbdkit.model.boundary_conditions import Load
 from pbdkit.scene.scene import build_scene

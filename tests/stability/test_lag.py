@@ -18,7 +18,7 @@ from property_cases import (
 )
 
 import pbdkit
-from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium import solve as increments
+from pbdkit.equilibrium import load_stepping as increments
 from pbdkit.equilibrium.contact_system import NO_FACE, hold
 from pbdkit.scene.obstacles import outlines_at
 from pbdkit.scene.scene import build_scene

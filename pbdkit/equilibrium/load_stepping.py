@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import (
+from pbdkit.equilibrium.error_bound import (
     Certificate,
     RoundingError,
     UnconvergedError,

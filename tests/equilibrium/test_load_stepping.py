@@ -10,7 +10,7 @@ from scene_strategies import experiments, samples
 
 import pbdkit
 from pbdkit.cli import program
-from pbdkit.equilibrium.solve import changes
+from pbdkit.equilibrium.load_stepping import changes
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state

@@ -9,9 +9,9 @@ from hypothesis import given, strategies as st
 from scene_strategies import samples
 
 import pbdkit
-from pbdkit.equilibrium.certificate import ErrorBound
+from pbdkit.equilibrium.error_bound import ErrorBound
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.solve import events, moments, settle
+from pbdkit.equilibrium.load_stepping import events, moments, settle
 from pbdkit.equilibrium.system import Moves
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
