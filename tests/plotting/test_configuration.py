@@ -1,6 +1,10 @@
 """Pictures of bodies: nothing is clipped or overprinted, whatever their shape; what colours say."""
 
+import re
+from dataclasses import fields
+from inspect import Parameter, signature
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +19,10 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from pbdkit.plotting import compare, plot
+from pbdkit.plotting import animate, animation, compare, plot
 from pbdkit.plotting.data import cells_of, distance_from, outline, whole
 from pbdkit.plotting.layers import PixelGrid
+from pbdkit.plotting.style import Look
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 SIDEWAYS = {"type": "velocity", "velocity": [0.3, 0.1], "steps": 10}
@@ -572,3 +577,19 @@ def test_where_pyplot_is_in_use_figures_are_its_own(tmp_path):
     assert ds.pbd.history(particle=67).figure.number in plt.get_fignums()
     ds.pbd.animate(file=tmp_path / "a.gif", every=2, dpi=40)
     assert len(plt.get_fignums()) == before + 2
+
+
+@pytest.mark.parametrize("verb", [plot, compare, animate, animation], ids=lambda v: v.__name__)
+def test_pictures_share_their_options_as_documented_keywords(verb):
+    """An editor completes them, with types; `numbers` is not legible in movies."""
+    options = {part.name: part.type for part in fields(Look)}
+    if verb in (animate, animation):
+        del options["numbers"]
+    parameters = signature(verb).parameters
+    assert {n: p.annotation for n, p in parameters.items() if n in options} == options
+    assert all(parameters[name].kind is Parameter.KEYWORD_ONLY for name in options)
+    assert all(p.kind is not Parameter.VAR_KEYWORD for p in parameters.values())
+    page = (Path(__file__).parents[2] / "docs" / "pictures.md").read_text()
+    assert not [name for name in options if f"--{name}" not in page and f"{name}=" not in page]
+    sections = re.findall(r"^    ([a-z, ]+) : ", plot.__doc__, re.M)
+    assert not {*options} - {name for names in sections for name in names.split(", ")}

@@ -1,0 +1,57 @@
+"""Components written with the types of `pbdkit.plugin` are checked by mypy --strict."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+RULE = """
+from typing import Literal
+
+from pbdkit.plugin import FollowerRule, Here, Number, Parameters, Setting, Slot, Vector, Weights
+
+
+class Growing(FollowerRule):
+    type: Literal["growing"] = "growing"
+    growth: float = 2.0
+
+    def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
+        return {"share": self.growth**slot.shell}
+
+    @staticmethod
+    def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> tuple[Vector, Number]:
+        return w.share * d, w.share
+
+    @staticmethod
+    def apply(total: tuple[Vector, Number], here: Here, p: Parameters) -> Vector:
+        return total[0] / total[1]
+
+
+class Wrong(Growing):
+    @staticmethod
+    def apply(total: tuple[Vector, Number], here: Here, p: Parameters) -> Vector:
+        return total  # return-value
+
+    def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
+        return {"share": slot.shell_number}  # attr-defined
+
+
+length: float = Vector(3.0, 4.0).x
+corner: Vector[float] = 2.0 * Vector(1.0, 2.0) - Vector(0.5, 0.0)
+text: Vector[str] = corner  # assignment
+depth = corner.z  # attr-defined
+"""
+
+
+def test_a_typed_rule_is_checked(tmp_path):
+    api = pytest.importorskip("mypy.api")
+    file = tmp_path / "growing.py"
+    file.write_text(RULE)
+    options = ["--strict", "--config-file", str(ROOT / "pyproject.toml")]
+    cache = ["--cache-dir", str(ROOT / ".mypy_cache")]  # shared with the check of the package
+    output, errors, _ = api.run([*options, *cache, str(file)])
+    messages = re.findall(r"growing\.py:(\d+): error: .*\[(.+)\]", output)
+    marks = (re.search(r"  # ([a-z-]+)$", line) for line in RULE.splitlines())
+    expected = [(str(n), mark[1]) for n, mark in enumerate(marks, 1) if mark]
+    assert messages == expected, output + errors
