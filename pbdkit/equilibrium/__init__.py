@@ -1,6 +1,6 @@
 """Equilibria of a scene: the states in which no follower moves.
 
-`solve` steps through the load and breaks bonds, `newton` computes one equilibrium, `certificate`
+`load_stepping` follows the load and breaks bonds, `newton` computes one equilibrium, `error_bound`
 bounds its error. The linear systems are matrices (`sparse`, `linear_solver`, `amg`) or stencils on
 the lattice (`lattice_system`, `stencil_matrix`, `krylov`, `multigrid`, `grid_kernels`);
 `contact_system` adds obstacles. `breaking_kernel` computes equilibria of linear rules with breaking

@@ -104,10 +104,10 @@ class ContactSystem(System):
         return ", ".join(sorted({part.name for _, part in self._parts})) or "nothing to solve"
 
     @property
-    def how(self) -> str:
+    def bound_kind(self) -> str:
         """Kind of the bound: by the solution; that of its rounding by the inverse itself if it is
         available."""
-        ways = {part.how for _, part in self._parts}
+        ways = {part.bound_kind for _, part in self._parts}
         return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
 
     @property

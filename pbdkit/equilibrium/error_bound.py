@@ -249,7 +249,7 @@ class ErrorBound:
             residual=float(np.abs(moves).max(initial=0.0)),
             distance=distance,
             share=distance / self._scale,
-            bound=CORRECTION + system.how,
+            bound=CORRECTION + system.bound_kind,
             linearised=anew,
         )
         return PredictedEquilibrium(ahead, certificate, obstacle)

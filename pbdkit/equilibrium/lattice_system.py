@@ -184,7 +184,7 @@ class LatticeSystem(System):
         return f"multigrid, {self._solver.name}"
 
     @property
-    def how(self) -> str:
+    def bound_kind(self) -> str:
         """Kind of the bound: by energy for a symmetric matrix, else by the iteration."""
         return "energy" if self._symmetric else "iteration"
 

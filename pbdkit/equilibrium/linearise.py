@@ -154,9 +154,9 @@ class _Replaceable(System):
         return self._system.is_stuck
 
     @property
-    def how(self) -> str:
+    def bound_kind(self) -> str:
         """Kind of the bound of the current system."""
-        return self._system.how
+        return self._system.bound_kind
 
     @property
     def amplification(self) -> float:

@@ -173,8 +173,8 @@ class Search(ABC):
         self._finder, self._state, self._moment = finder, state, moment
         self._linearisations = self._inner = 0
         self._system = self._linearised(at, what)
-        self._left = self._moves()
-        self._known: tuple[float, Floats | None, System | None] = math.inf, None, None
+        self._residual = self._moves()
+        self._last_distance: tuple[float, Floats | None, System | None] = math.inf, None, None
         """The last distance, with the moves and the system to which it belongs."""
 
     @abstractmethod
@@ -193,14 +193,14 @@ class Search(ABC):
     def _floor(self) -> float:
         """Return the distance caused by rounding of the moves alone."""
         with suppress(StuckError):
-            nothing = np.zeros_like(self._left)
+            nothing = np.zeros_like(self._residual)
             distance = self._system.distance(nothing, self._rounding())
             return distance * (1.0 if self._linear else FIRST_ORDER)
         return 0.0
 
     def _is_rounding(self, share: float) -> bool:
         """Return whether rounding, as a relative distance, prevents the tolerance."""
-        finite = math.isfinite(self._finder.rows.max_norm(self._left))
+        finite = math.isfinite(self._finder.rows.max_norm(self._residual))
         return (
             finite
             and not self._system.is_stuck
@@ -212,16 +212,16 @@ class Search(ABC):
             method=self._system.methods,
             iterations=self._linearisations,
             inner_iterations=self._inner + self._system.iterations,
-            residual=self._finder.rows.max_norm(self._left),
+            residual=self._finder.rows.max_norm(self._residual),
             distance=distance,
             share=distance / self._finder.scale,
-            bound=self._system.how,
+            bound=self._system.bound_kind,
             linearised=not self._linear,
         )
 
     def _why(self, best: float) -> str:
         finder = self._finder
-        if not math.isfinite(finder.rows.max_norm(self._left)):
+        if not math.isfinite(finder.rows.max_norm(self._residual)):
             return "displacements are not finite"
         if self._system.is_stuck:
             return (
@@ -244,17 +244,17 @@ class Search(ABC):
     def _shift(self, correction: Floats) -> None:
         self._state.u += correction
         self._finder.rows.exchange_halo(self._state.u)
-        self._left = self._moves()
+        self._residual = self._moves()
 
     def _moves(self) -> Floats:
         with self._finder.rows.communicator.raise_together():
             return self._finder.moves.at(self._state, self._moment)
 
     def _distance(self) -> float:
-        distance, of, by = self._known
-        if of is not self._left or by is not self._system:
-            distance = self._system.distance(self._left, self._rounding())
-            self._known = distance, self._left, self._system
+        distance, of, by = self._last_distance
+        if of is not self._residual or by is not self._system:
+            distance = self._system.distance(self._residual, self._rounding())
+            self._last_distance = distance, self._residual, self._system
         return (
             math.inf if math.isnan(distance) else distance * (1.0 if self._linear else FIRST_ORDER)
         )
@@ -291,33 +291,33 @@ class _Linear(Search):
 
     def _linearised(self, at: State, what: str) -> System:
         """Return the system, which is factorised once for the same roles, parameters and bonds."""
-        system = self._finder.at_rest
-        if system and self._finder.rest:
-            rest = Rest.of(self._finder, at, self._moment, system[0].methods)
+        systems = self._finder.at_rest
+        if systems and self._finder.rest:
+            rest = Rest.of(self._finder, at, self._moment, systems[0].methods)
             if self._finder.rest[0].serves(rest):
-                self._linearisations, self._inner = 1, -system[0].iterations
-                return system[0]
+                self._linearisations, self._inner = 1, -systems[0].iterations
+                return systems[0]
         return super()._linearised(at, what)
 
     def run(self) -> Certificate:
         """Correct until the tolerance is reached."""
         self._linear = True
-        start = self._left, self._state.u, self._state.previous
+        start = self._residual, self._state.u, self._state.previous
         if self._finder.rows.communicator.any(any(planes.any() for planes in start)):
             self._correct()  # else nothing is prescribed but rest
         return self._certified()
 
     def _correct(self) -> None:
         for n in range(MOST_CORRECTIONS):
-            moves, previous = self._left, self._finder.rows.norm(self._left)
+            moves, previous = self._residual, self._finder.rows.norm(self._residual)
             correction = self._system.solve(moves, self._wanted, self._owed, self._rounding())
             self._shift(correction)
             self._owed = None
-            norm = self._finder.rows.norm(self._left)
-            floor = self._rounding() * math.sqrt(self._finder.rows.size(self._left))
+            norm = self._finder.rows.norm(self._residual)
+            floor = self._rounding() * math.sqrt(self._finder.rows.size(self._residual))
             if n == 0 and previous > 1e3 * floor:
-                off = self._system.mismatch(correction, moves, self._left)
-                if not off <= LINEAR + floor / previous:
+                mismatch = self._system.mismatch(correction, moves, self._residual)
+                if not mismatch <= LINEAR + floor / previous:
                     raise UnconvergedError(NOT_LINEAR, self._certificate(self._distance()))
             if not norm <= 0.5 * previous or self._distance() <= self._finder.tolerance:
                 return
@@ -328,8 +328,8 @@ class _Newton(Search):
 
     def __init__(self, finder: Finder, state: State, moment: float, before: State) -> None:
         super().__init__(finder, state, moment, before, "following the load")
-        self._before, self._led = before, state.u - before.u
-        self._way = float(np.abs(self._led).max())
+        self._before, self._leader_change = before, state.u - before.u
+        self._load_change = float(np.abs(self._leader_change).max())
         """Change of the displacements of leaders, or, under loads, of followers."""
 
     def run(self) -> Certificate:
@@ -348,37 +348,40 @@ class _Newton(Search):
         """Predict the equilibrium at the end of the increment from the previous one, by the moves
         for a small part of the increment."""
         nudge = NUDGE * self._finder.scene.neighbourhood.nudge_unit
-        moves, part = self._finder.moves, min(1.0, nudge / self._way) if self._way else 1.0
+        moves, part = (
+            self._finder.moves,
+            min(1.0, nudge / self._load_change) if self._load_change else 1.0,
+        )
         moves_before = moves.at(self._before, self._moment)
-        nudged = replace(self._before, u=self._before.u + part * self._led)
+        nudged = replace(self._before, u=self._before.u + part * self._leader_change)
         pull = moves_before + (moves.at(nudged, self._moment) - moves_before) / part
-        wanted = max(self._wanted, NEAR * self._way)
+        wanted = max(self._wanted, NEAR * self._load_change)
         correction = self._system.solve(pull, wanted, None, self._rounding() / part)
         if self._finder.scene.loads:
-            self._way = max(self._way, float(np.abs(correction).max(initial=0.0)))
+            self._load_change = max(self._load_change, float(np.abs(correction).max(initial=0.0)))
         self._shift(correction)
 
     def _correct(self) -> None:
-        far, size, farther = math.inf, math.inf, self._way
+        distance, size, previous_distance = math.inf, math.inf, self._load_change
         for _ in range(MOST_CORRECTIONS):
-            if far > SERVES * farther:
+            if distance > SERVES * previous_distance:
                 self._system = self._linearised(self._state, "following the load")
-                self._system.refuse_moving_floats(self._left, self._rounding())
-                far = self._distance()
-            if far <= self._finder.tolerance or not math.isfinite(far):
+                self._system.refuse_moving_floats(self._residual, self._rounding())
+                distance = self._distance()
+            if distance <= self._finder.tolerance or not math.isfinite(distance):
                 return
             # Solved as well as it is linear (Eisenstat and Walker).
-            share = min(NEAR, (far / farther) ** 2) if farther else NEAR
-            wanted = max(self._wanted, share * far)
-            correction = self._system.solve(self._left, wanted, None, self._rounding())
+            share = min(NEAR, (distance / previous_distance) ** 2) if previous_distance else NEAR
+            wanted = max(self._wanted, share * distance)
+            correction = self._system.solve(self._residual, wanted, None, self._rounding())
             previous, size = size, float(np.abs(correction).max(initial=0.0))
-            if not size <= CONTRACTION * min(previous, self._way or math.inf):
+            if not size <= CONTRACTION * min(previous, self._load_change or math.inf):
                 if size <= self._floor():
                     return  # of rounding
                 reason = "corrections do not become smaller"
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
-            farther, far = far, self._distance()
+            previous_distance, distance = distance, self._distance()
 
 
 class _Relaxing(Search):
@@ -404,16 +407,16 @@ class _Relaxing(Search):
 
         Raises UnconvergedError if moves do not decay or the result is not stable.
         """
-        leap, size = LEAP * spacing_of(self._finder.scene), self._finder.rows.norm(self._left)
+        leap, size = LEAP * spacing_of(self._finder.scene), self._finder.rows.norm(self._residual)
         for _ in range(MOST_IMPLICIT_STEPS):
             if self._is_near():
                 break
-            correction = self._system.solve(self._left, self._wanted, None, self._rounding())
+            correction = self._system.solve(self._residual, self._wanted, None, self._rounding())
             longest = float(np.abs(correction).max(initial=0.0))
             if not math.isfinite(longest):
                 break
             self._shift(correction * min(1.0, leap / longest if longest else 1.0))
-            previous, size = size, self._finder.rows.norm(self._left)
+            previous, size = size, self._finder.rows.norm(self._residual)
             share = size / previous if previous and longest <= leap else 1.0
             share = max(FASTEST, FALL * share) if share < 1.0 else min(SLOWEST, share)
             self._damping = min(1.0, max(LEAST_DAMPING, self._damping * share))
@@ -425,7 +428,7 @@ class _Relaxing(Search):
 
     def _is_near(self) -> bool:
         """Return whether the tolerance is reached except for motions of hardly any stiffness."""
-        longest, tolerance = self._finder.rows.max_norm(self._left), self._finder.tolerance
+        longest, tolerance = self._finder.rows.max_norm(self._residual), self._finder.tolerance
         if longest > MUCH * NEXT_TO_NOTHING * tolerance:
             return False
         self._damping = NEXT_TO_NOTHING
@@ -466,31 +469,33 @@ class _ContactSearch(Search):
         contacts, size, went_loose = None, math.inf, False
         system = self._newest()
         for _ in range(MOST_SETS):
-            loose = system.is_loose(self._left, self._rounding())
+            loose = system.is_loose(self._residual, self._rounding())
             if not loose and not self._finder.tolerance < self._distance() < math.inf:
                 break
-            same, contacts = (
-                contacts is not None and np.array_equal(contacts, system.held),
-                system.held,
-            )
+            same = contacts is not None and np.array_equal(contacts, system.held)
+            contacts = system.held
             if loose:
                 went_loose = True
-                correction = system.solve_loose(self._left, spacing_of(self._finder.scene))
+                correction = system.solve_loose(self._residual, spacing_of(self._finder.scene))
             else:
-                correction = system.solve(self._left, self._wanted, None, self._rounding())
+                correction = system.solve(self._residual, self._wanted, None, self._rounding())
             previous, size = size, float(np.abs(correction).max(initial=0.0))
             if same and not loose and not size <= CONTRACTION * previous:
                 break
             self._go(correction)
             part, system = 1.0, self._newest()
-            while not loose and part > LEAST_PART and system.is_loose(self._left, self._rounding()):
+            while (
+                not loose
+                and part > LEAST_PART
+                and system.is_loose(self._residual, self._rounding())
+            ):
                 part /= 2.0  # farther on what was held would come off again
                 self._go(-part * correction)
                 system = self._newest()
         if went_loose:
             system.refuse_floats()
         # What is held stands on its outline, as after a step, and not beside it by what is left.
-        self._shift(system.of_held(self._left))
+        self._shift(system.of_held(self._residual))
         certificate = self._certified()
         if not system.is_stable():
             raise UnconvergedError(UNSTABLE, certificate)
@@ -499,7 +504,7 @@ class _ContactSearch(Search):
     def _go(self, correction: Floats) -> None:
         system = self._newest()
         self._shift(correction)
-        self._shift(system.of_held(self._left))
+        self._shift(system.of_held(self._residual))
         self._system = self._linearised(self._state, "finding the contact")
 
     def _newest(self) -> ContactSystem:

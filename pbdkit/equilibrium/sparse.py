@@ -117,7 +117,7 @@ class Subsystem(ABC):
         return distance + (self._spread * rounding if rounding else 0.0)
 
     @property
-    def how(self) -> str:
+    def bound_kind(self) -> str:
         """Kind of the bound."""
         return "inverse" if isinstance(self._solver, Dense) else "solution"
 
@@ -398,12 +398,12 @@ class MatrixSystem(System):
         return ", ".join(sorted(names)) or "nothing to solve"
 
     @property
-    def how(self) -> str:
+    def bound_kind(self) -> str:
         """Kind of the bound: by the solution; that of its rounding by the inverse itself if it is
         available."""
         if self._damping:
             return "damped"
-        ways = {part.how for block in self._blocks for _, part in block.parts}
+        ways = {part.bound_kind for block in self._blocks for _, part in block.parts}
         return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
 
     @property
@@ -563,13 +563,11 @@ class MatrixSystem(System):
         has_leader[label[leader_entries.rows[leader_entries.values != 0.0]]] = True
         # What leaders move directly or not is solved together, each part that floats by itself.
         groups = [np.flatnonzero((has_leader & ~alone)[label])] if has_leader.any() else []
+        groups += [np.flatnonzero(label == n) for n in np.flatnonzero(~has_leader & ~alone)]
         block = DiagonalBlock(axes, [])
-        for members in groups + [
-            np.flatnonzero(label == n) for n in np.flatnonzero(~has_leader & ~alone)
-        ]:
-            part = self._part(
-                _within(matrix, members), axes, members, bool(has_leader[label[members[0]]])
-            )
+        for members in groups:
+            held = bool(has_leader[label[members[0]]])
+            part = self._part(_within(matrix, members), axes, members, held)
             block.parts.append((members, part))
         return block
 

@@ -302,8 +302,8 @@ class System(ABC):
 
     @property
     @abstractmethod
-    def how(self) -> str:
-        """Kind of the bound on the distance from the solution, a key of `certificate.WAYS`."""
+    def bound_kind(self) -> str:
+        """Kind of the bound on the distance from the solution, a key of `error_bound.WAYS`."""
 
     @property
     @abstractmethod

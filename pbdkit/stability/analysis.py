@@ -562,7 +562,7 @@ class StabilityEstimate:
         smallest = (
             max(waves.smallest, -largest) if waves.smallest >= -1.0 - NEUTRAL else waves.smallest
         )
-        return spectrum_of(np.array([smallest, largest], complex), system.how == "energy")
+        return spectrum_of(np.array([smallest, largest], complex), system.bound_kind == "energy")
 
 
 def verdict_of(found: Any) -> list[tuple[str, str]]:

@@ -284,7 +284,7 @@ def _ends(scene: Scene, rest: State, place: NDArray[np.intp]) -> tuple[Complex, 
         start = np.random.default_rng(0).uniform(-1.0, 1.0, scene.axes * len(place))
         fastest = _largest(rule_operator, start, MOVES) * (1.0 + MARGIN)
         slowest = 1.0 / _largest(inverse, rule_operator(start), SOLUTIONS) / (1.0 + MARGIN)
-    is_sure = system.how == "energy" or _is_reciprocal(scene, rest)
+    is_sure = system.bound_kind == "energy" or _is_reciprocal(scene, rest)
     return np.array([1.0 - fastest, 1.0 - slowest]), is_sure
 
 

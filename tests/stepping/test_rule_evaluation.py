@@ -145,7 +145,7 @@ MISTAKES = {
     Array: ("Diagnostic 'array' failed at step 0: `measure` returned ndarray", TUPLE),
     Alone: ("Diagnostic 'alone' failed", "`variables` returned Variable", TUPLE),
     Misspelt: ("no attribute 'displacment'; did you mean 'displacement'?", "evaluation.py, line "),
-    Infinite: ("q of particle 1 at step 0", "displacements are finite, but a recorded variable is not"),
+    Infinite: ("q of particle 1 at step 0", "finite, but a recorded variable is not"),
 }  # fmt: skip
 
 
