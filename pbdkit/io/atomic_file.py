@@ -105,7 +105,8 @@ def sync_folder(folder: Path) -> None:
 
 
 class NewFile(io.RawIOBase):
-    """A file on the disk that is written completely, or whose first fault is recorded.
+    """A file on the disk that is written completely; its first fault is recorded instead of
+    raised.
 
     HDF5 would try a failed write again when the process ends, and crash it; other libraries drop
     what a short write left. Here every write is complete and none raises: after the first fault

@@ -1,8 +1,8 @@
 """Checkpoints: all that determines how a run continues, as JSON facts and named arrays.
 
 ========== ====================================================================================
-``about``  what was asked for and stays: the experiment with its name and number of steps, the
-           versions of pbdkit and of plugins, and the `origin`, what the command was called with
+``about``  constant data: the experiment with its name and number of steps, the versions of pbdkit
+           and of plugins, and the `origin`, the arguments of the command
 ``facts``  ``run``: the state of the driver (of the solver `stepping` the displacements and all
            else that `State` has, the divergence guard, and how far a run has settled; of
            `equilibrium` the state and the load parameter); ``seen``: the last recorded steps;
@@ -68,8 +68,8 @@ class Checkpoint:
         chosen: Sequence[str] = (),
         rate: float = 0.0,
     ) -> Checkpoint:
-        """Return the checkpoint of a run whose driver has the state `run`; its arrays are not
-        copied. `rate` is in steps a second."""
+        """Return the checkpoint of a run from the state `run` of its driver; arrays are not copied.
+        `rate` is in steps a second."""
         arrays = Arrays()
         facts = {
             "run": pack(dict(run), "run", arrays),
@@ -107,9 +107,12 @@ class Checkpoint:
     def parts(
         self, like: Mapping[str, Any], steps: int, classes: Mapping[str, type]
     ) -> dict[str, Any]:
-        """Return the parts of the driver's state, and the recorded steps under ``seen``, for a run
-        of so many `steps` whose driver has the state `like` before its first step. `classes` may
-        occur besides. Raises StorageError where the checkpoint is damaged or of another scene."""
+        """Return the parts of the driver's state, and the recorded steps under ``seen``.
+
+        `like` is the state of the driver before its first step, `steps` the number of steps of the
+        run, and `classes` are further classes that may occur. Raises StorageError where the
+        checkpoint is damaged or of another scene.
+        """
         try:
             facts = {**self.facts["run"], "seen": self.facts["seen"]}
         except (KeyError, TypeError) as error:

@@ -142,7 +142,7 @@ def base_columns(axes: int = 2) -> list[Column]:
 
 
 def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
-    """Return the CF attributes of a variable whose values are codes."""
+    """Return the CF attributes of a variable of codes."""
     values = np.array([*meanings.values()], np.int8)
     return {"flag_values": values, "flag_meanings": " ".join(meanings)}
 
@@ -205,7 +205,7 @@ def diagnostic_column(variable: Variable, diagnostic: Diagnostic | type[Diagnost
 
 
 def own_coordinate(diagnostic: Diagnostic | type[Diagnostic]) -> Column:
-    """Return the coordinate of a dimension whose length is only known at the end."""
+    """Return the coordinate of a dimension with a length that is known only at the end."""
     name = diagnostic.own_dimension
     return coordinate(name, name.replace("_", " "), when=When.END, comment="counted from 1")
 
@@ -234,8 +234,8 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
 
 
 def makers_of(names: set[str]) -> list[str]:
-    """Return the built-in diagnostics that make a variable of one of these names, or whose name
-    begins with one and `_`, as an experiment names them."""
+    """Return, as an experiment names them, the built-in diagnostics that make a variable of one of
+    these names, or of a name that begins with one and `_`."""
     prefixes = tuple(f"{name}_" for name in names if name)
     spellings = []
     for each, types in Registry().spellings(Diagnostic, installed=False).items():

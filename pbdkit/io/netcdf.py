@@ -305,7 +305,7 @@ class NetcdfSink(KeepingSink):
         self._next = time.perf_counter() + EVERY_S
 
     def conclude(self, unfinished: UnfinishedRun) -> None:
-        """Complete a run that has finished but whose result has no name yet."""
+        """Complete a finished run that has no result file yet."""
         self.unfinished, self._temporary = unfinished, unfinished.records
         file, status = unfinished.file(read_only=False), unfinished.facts["finished"]
         with self._storing():

@@ -241,8 +241,8 @@ def _overlaps(
 
 
 class PiecedArray:
-    """An array of given shape and dtype whose `pieces` are generated in memory order. It can be
-    read only once."""
+    """An array of given shape and dtype, generated as `pieces` in memory order. It can be read only
+    once."""
 
     def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any], pieces: Iterable[Array]):
         self.shape, self.dtype, self.ndim = shape, dtype, len(shape)

@@ -89,7 +89,7 @@ class Physical:
 
 
 def _with_comment(column: Column) -> Column:
-    """Return a column whose comment names the given quantity that defines its units."""
+    """Add the given quantities that define the units of a column to its comment."""
     notes = [
         f"{unit}: that of {n} as it is given"
         for n, unit in OF_GIVEN.items()

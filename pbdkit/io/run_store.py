@@ -560,7 +560,7 @@ class UnfinishedRun:
         waiting: Mapping[str, list[NDArray[Any]]],
         written: Mapping[str, int],
     ) -> None:
-        """Commit a checkpoint and the file, whose pages hold all but the buffered entries."""
+        """Commit a checkpoint and the file, with all but the buffered entries in its pages."""
         batches = {f"waiting.{n}": np.stack(v) for n, v in waiting.items() if v}
         arrays = batches | checkpoint.arrays
         types = {n: [a.dtype.str, list(a.shape)] for n, a in arrays.items()}

@@ -68,7 +68,7 @@ def digest(data: Any) -> int:
 class SealedFile(io.RawIOBase):
     """The content of a sealed file; each extent is verified before its first byte is returned.
 
-    Raises OSError, and BrokenSealError as soon as bytes are asked for that have changed.
+    Raises OSError, and BrokenSealError when changed bytes are read.
     """
 
     def __init__(self, path: Path, file: io.FileIO | None = None) -> None:

@@ -50,7 +50,7 @@ def is_database(path: Path) -> bool:
 
 
 def connect(path: Path, mode: str) -> sqlite3.Connection:
-    """Open a database whose schema is not to be trusted; `mode` is ro, rw, or rwc to make it.
+    """Open a database without trusting its schema; `mode` is ro, rw, or rwc to create it.
 
     Raises sqlite3.Error.
     """

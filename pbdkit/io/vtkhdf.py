@@ -1,8 +1,8 @@
 """Export to ParaView: VTKHDF, the format of VTK in HDF5, written without VTK; the body as vertices,
 lines and polygons.
 
-The format is described at docs.vtk.org, "VTKHDF file format", version 2: an UnstructuredGrid whose
-points and data follow each other step by step, with the beginning of each step in `Steps`.
+The format is described at docs.vtk.org, "VTKHDF file format", version 2: an UnstructuredGrid with
+points and data that follow each other step by step, and the beginning of each step in `Steps`.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ NEEDED_FORCES = (
 
 @dataclass(frozen=True)
 class LoadCurve:
-    """`force` over `displacement`, DataArrays along time whose names contain the axis."""
+    """`force` over `displacement`, DataArrays along time with the axis in their names."""
 
     displacement: Any
     force: Any
@@ -359,11 +359,11 @@ def _energies(dataset: xarray.Dataset) -> list[str]:
 
 
 def _draw(dataset: xarray.Dataset, x: Any, drawn: list[Any], ax: Axes | None) -> Axes:
-    is_list = len(drawn) > 1
+    has_several = len(drawn) > 1
     lines = []
     for n, y in enumerate(drawn):
         for line in lines_of(dataset, x, y):
-            parts = [line.name, y.attrs["long_name"]] if is_list else [line.name]
+            parts = [line.name, y.attrs["long_name"]] if has_several else [line.name]
             hue = line.hue if member_dims(y) else n
             name = ", ".join(filter(None, parts))
             lines.append(replace(line, name=name, hue=hue, dashed=n > 0))
@@ -371,7 +371,7 @@ def _draw(dataset: xarray.Dataset, x: Any, drawn: list[Any], ax: Axes | None) ->
         raise ExperimentError(f"'{drawn[0].name}' has no value that could be drawn")
     ax = ax or new_axes()
     ax.set_xlabel(label(x.attrs["long_name"], x.attrs["units"], width=BROAD))
-    common = "pseudo-energy" if is_list else drawn[0].attrs["long_name"]
+    common = "pseudo-energy" if has_several else drawn[0].attrs["long_name"]
     ax.set_ylabel(label(common, drawn[0].attrs["units"], width=TALL))
     draw_lines(ax, lines, str(dataset.attrs.get("title", "")), hues_of(drawn[0]))
     return ax

@@ -187,7 +187,7 @@ def refuse_no_movie(path: Path) -> None:
 
 
 class MovieSheet:
-    """A sheet of one panel whose layers show step after step, over a background drawn once."""
+    """A sheet of one panel with layers that show step after step, over a background drawn once."""
 
     def __init__(
         self,

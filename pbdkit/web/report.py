@@ -965,13 +965,13 @@ def numbers(dataset: xarray.Dataset, grid: list[str]) -> Iterator[dict[str, Any]
         values = values.reshape(-1, *values.shape[len(grid) :])
         words = f"{meaning_of(variable)}{f' ({u})' if (u := units_of(variable)) else ''}"
         if name == "broken_step":
-            numbers = np.where(np.isnan(values).all(axis=1), np.nan, (values >= 0).sum(axis=1))
-            yield {"name": "broken bonds", "values": packed(numbers, "f8")}
+            summary = np.where(np.isnan(values).all(axis=1), np.nan, (values >= 0).sum(axis=1))
+            yield {"name": "broken bonds", "values": packed(summary, "f8")}
             continue
-        for statistic, numbers in _statistics(values, rest):
+        for statistic, summary in _statistics(values, rest):
             yield {
                 "name": f"{words}: {statistic}" if statistic else words,
-                "values": packed(numbers, "f8"),
+                "values": packed(summary, "f8"),
             }
 
 

@@ -93,7 +93,7 @@ class Hand(Motion):
 NEVER = 2**62 - 1
 """Last step of a session without end."""
 MADE = "-live"
-"""Suffix of the names of saved sessions, whose results are separate files."""
+"""Suffix of the names of saved sessions, so that their results are separate files."""
 Parts = dict[str, Any]
 
 

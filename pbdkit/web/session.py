@@ -200,7 +200,8 @@ def _chosen(scene: Scene) -> Choice:
 
 
 def fitted(state: State, scene: Scene) -> State:
-    """Adapt a state to a scene with more or fewer groups, or whose bonds have become breakable."""
+    """Adapt a state to a scene with more or fewer groups, or with bonds that have become
+    breakable."""
     missing = len(scene.leading) - len(state.starts)
     if missing:
         starts = (*state.starts, *(None,) * missing)[: len(scene.leading)]
@@ -228,7 +229,7 @@ class History:
 
     @property
     def steps(self) -> list[int]:
-        """Return the steps whose states are kept."""
+        """Return the steps of the kept states."""
         return [state.step for state in self._states]
 
     def keep(self, state: State) -> None:
