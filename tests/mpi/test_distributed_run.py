@@ -434,7 +434,7 @@ class Alone:
 
 
 @needs_mpi
-def test_a_sample_of_the_long_trial_on_random_scenes():
+def test_a_sample_of_the_long_trial_on_random_scenes(compiled_at_length):
     script = Path(__file__).parents[1] / "reliability" / "rank_runs.py"
     command = [MPIEXEC, "-n", "2", sys.executable, script, "--trials", "2"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
