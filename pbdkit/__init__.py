@@ -19,17 +19,17 @@ def _public_names() -> dict[str, str]:
     lines = (line for line in stub.splitlines() if not line.startswith("#"))
     words = " ".join(lines).replace("(", " ").replace(")", " ").replace(",", " ").split()
     names, module = dict[str, str](), ""
-    for before, word in pairwise(words):
-        if before == "from":
+    for previous, word in pairwise(words):
+        if previous == "from":
             module = word
-        elif before == "as":
+        elif previous == "as":
             names[word] = module
     return names
 
 
 _MODULE_OF = _public_names()
 _RENAMED = {"Components": "Vector"}
-"""Names of `pbdkit.plugin` by those that they had here."""
+"""Present names in `pbdkit.plugin` by the former names in this module."""
 
 
 def __getattr__(name: str) -> object:
@@ -38,7 +38,7 @@ def __getattr__(name: str) -> object:
 
         return version("pbdkit")
     if name not in _MODULE_OF:
-        raise AttributeError(f"module 'pbdkit' has no attribute '{name}'{_elsewhere(name)}")
+        raise AttributeError(f"module 'pbdkit' has no attribute '{name}'{_hint(name)}")
     module = _MODULE_OF[name]
     return (
         import_module(f"pbdkit.{name}")
@@ -47,13 +47,13 @@ def __getattr__(name: str) -> object:
     )
 
 
-def _elsewhere(name: str) -> str:
+def _hint(name: str) -> str:
     """Return where a name is that authors of components need; empty for any other name."""
     if name.startswith("_"):
         return ""
-    found = _RENAMED.get(name, name)
-    there = found in import_module("pbdkit.plugin").__all__
-    return f"; write `from pbdkit.plugin import {found}`" if there else ""
+    present_name = _RENAMED.get(name, name)
+    is_public = present_name in import_module("pbdkit.plugin").__all__
+    return f"; write `from pbdkit.plugin import {present_name}`" if is_public else ""
 
 
 def __dir__() -> list[str]:

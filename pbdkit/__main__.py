@@ -15,12 +15,12 @@ it look hundreds of times while a command is loaded, when nothing can be freed."
 def main() -> None:
     """Run `pbdkit.cli.main`, without a traceback where it is interrupted while it is loaded."""
     # An exception can be lost in what libraries do as they are imported; nothing is to be undone.
-    before = signal.signal(signal.SIGINT, _end)
+    previous = signal.signal(signal.SIGINT, _end)
     gc.set_threshold(COLLECT_AFTER)
     try:
         from pbdkit.cli import main as program
 
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
         program()
     except KeyboardInterrupt:
         _end()

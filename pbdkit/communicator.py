@@ -45,15 +45,15 @@ class Communicator(ABC):
         return any(self.allgather(bool(value)))
 
     def first(self, value: Any) -> Any:
-        """Return the value of the lowest rank that has not None; None where all have."""
-        return next((one for one in self.allgather(value) if one is not None), None)
+        """Return the value of the lowest rank with a value that is not None, or None."""
+        return next((item for item in self.allgather(value) if item is not None), None)
 
     def sum(self, value: Any) -> Any:
         """Return the sum over all processes."""
         return sum(self.allgather(value))
 
     def largest(self, value: float) -> float:
-        """Return the largest number of all processes; not a number where one is none."""
+        """Return the largest number of all processes; NaN if one is NaN."""
         import numpy as np  # a command that ends before a scene is built needs none
 
         return float(np.max(self.allgather(value)))
@@ -65,7 +65,7 @@ class Communicator(ABC):
         return np.asarray(np.min(self.allgather(numbers), axis=0))
 
     def processes_on_machine(self) -> int:
-        """Return how many processes share the machine of this one."""
+        """Return the number of processes on the machine of this one."""
         name = node()
         return self.allgather(name).count(name)
 
@@ -91,4 +91,4 @@ class SerialCommunicator(Communicator):
 
 
 SERIAL: Final = SerialCommunicator()
-"""The default wherever a communicator is taken."""
+"""Default communicator."""

@@ -14,7 +14,6 @@ from typing import Any
 
 from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
-from pbdkit.execution import Execution
 from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import SCHEMA_VERSION, Column, Values, When
 from pbdkit.io.netcdf import FINAL_STATE, NetcdfSink
@@ -30,7 +29,7 @@ from pbdkit.model.shipped import read_experiment
 from pbdkit.plugin.discovery import refuse_retired
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.simulation import Driver, RunReport, Simulation, record
+from pbdkit.simulation import Driver, Execution, RunReport, Simulation, record
 from pbdkit.stability.relaxation import with_solver
 
 

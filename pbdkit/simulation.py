@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import DivergedError, ExperimentError, warn_caller
 from pbdkit.hooks import worded
 from pbdkit.io.checkpoint import Checkpoint
@@ -702,6 +703,30 @@ class Simulation:
         repeats = bool(self.waves) and "solver.relaxation" in " ".join(self.warnings)
         warnings = outlook(self.scene)
         return [w for w in warnings if not (repeats and w.startswith("solver.relaxation"))]
+
+
+class Execution:
+    """Executes runs: in one process, or, in `pbdkit.mpi.distributed_run`, on all ranks of a
+    communicator, which call each method together."""
+
+    def __init__(self, communicator: Communicator = SERIAL) -> None:
+        self.communicator = communicator
+
+    def scene(self, experiment: Experiment) -> Scene:
+        """Return the part of an experiment's scene that this process needs."""
+        return build_scene(experiment)
+
+    def tuned(self, scene: Scene) -> Scene:
+        """Return the scene with numbers in place of `auto`."""
+        return tuned(scene)
+
+    def by_root(self, work: Callable[[], int]) -> int:
+        """Return the result of work that the root does alone."""
+        return work()
+
+    def run(self, scene: Scene, watch: Watch) -> Simulation:
+        """Return the run of a scene."""
+        return Simulation.of_scene(scene, watch=watch)
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 an HDF5 file declares and refers to.
 
 A file of some kilobytes can declare arrays of terabytes, refer to the bytes of other files, and
-name filters that HDF5 loads as programs; on changed bytes the libraries can crash the process or
-loop. There nothing is lost. A seal is no protection: anyone can make one.
+name filters that HDF5 loads as programs. On damaged bytes the libraries can crash the process or
+never return, which does no harm in a separate one. A seal is no protection: anyone can create one.
 """
 
 from __future__ import annotations
@@ -46,15 +46,18 @@ LARGEST_TEXTS = 2**28
 FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32"}
 """The filters of HDF5 that are applied; others would be loaded as programs."""
 NO_VARIABLE = b"This is a netCDF dimension but not a netCDF variable"
-"""Begins the attribute NAME of datasets that are dimensions only, whose values nobody reads."""
+"""Beginning of the attribute NAME of datasets that are dimensions only and have no values."""
 
 
 def check_declared(content: h5py.File, size: int) -> None:
-    """Check what an open file of `size` bytes declares, and that all of it is in the file.
+    """Check the declarations of an open file of `size` bytes, and that all data is in the file.
 
-    Raises StorageError, without the name of the file, for links that lead elsewhere, external
-    storage, virtual datasets, groups in a circle, filters other than `FILTERS`, and for variables,
-    attributes and texts larger than a file of that size can hold.
+    Raises
+    ------
+    StorageError
+        For links to other files, external storage, virtual datasets, cyclic groups, filters other
+        than `FILTERS`, and for variables, attributes and texts larger than a file of that size can
+        hold. The message does not contain the name of the file.
     """
     from h5py import h5a, h5d, h5g, h5l, h5o
 
@@ -78,15 +81,15 @@ def check_declared(content: h5py.File, size: int) -> None:
         if not is_hard:
             raise StorageError(f"its link '{_text(name)}' leads elsewhere; {_REMEDY}")
     for name in objects:
-        found = h5o.open(content.id, name)
-        if (count := h5a.get_num_attrs(found)) > MOST_OBJECTS:
+        item = h5o.open(content.id, name)
+        if (count := h5a.get_num_attrs(item)) > MOST_OBJECTS:
             raise StorageError(f"'{_text(name)}' has {count} attributes")
         for n in range(count):
-            _check_attribute(h5a.open(found, index=n), size)
-        if isinstance(found, h5g.GroupID) and h5o.get_info(found).rc > 1:
+            _check_attribute(h5a.open(item, index=n), size)
+        if isinstance(item, h5g.GroupID) and h5o.get_info(item).rc > 1:
             raise StorageError(f"its group '{_text(name)}' lies in several groups; {_REMEDY}")
-        if isinstance(found, h5d.DatasetID):
-            _check_dataset(found, _text(name), size)
+        if isinstance(item, h5d.DatasetID):
+            _check_dataset(item, _text(name), size)
 
 
 _REMEDY = "copy the data into one netCDF-4 file, for instance by xarray: open_dataset, to_netcdf"
@@ -97,7 +100,8 @@ def _text(name: bytes) -> str:
 
 
 def _check_attribute(attribute: Any, size: int) -> None:
-    """Elements of variable length may all be the same large one."""
+    """Refuse attributes with many elements of variable length, which may all refer to one large
+    text."""
     if _is_ragged(attribute.get_type()):
         count = math.prod(attribute.shape or ())
         if count > max(64, LARGEST_TEXTS // size):
@@ -114,11 +118,11 @@ def _is_ragged(kind: Any) -> bool:
 def _check_dataset(dataset: Any, name: str, size: int) -> None:
     from h5py import h5d, h5ds
 
-    created, kind = dataset.get_create_plist(), dataset.get_type()
-    if created.get_layout() == h5d.VIRTUAL or created.get_external_count():
+    properties, kind = dataset.get_create_plist(), dataset.get_type()
+    if properties.get_layout() == h5d.VIRTUAL or properties.get_external_count():
         raise StorageError(f"the values of its variable '{name}' lie in other files; {_REMEDY}")
-    for n in range(created.get_nfilters()):
-        number, *_, word = created.get_filter(n)
+    for n in range(properties.get_nfilters()):
+        number, *_, word = properties.get_filter(n)
         if number not in FILTERS:
             raise StorageError(
                 f"its variable '{name}' is stored by the filter {number} ({_text(word)}); "
@@ -130,8 +134,8 @@ def _check_dataset(dataset: Any, name: str, size: int) -> None:
     declared = math.prod(shape) * kind.get_size()
     if declared > max(DENSEST * stored, SPARSEST * size) + EMPTY:
         raise StorageError(f"it cannot hold the {declared:.3g} bytes that '{name}' declares")
-    if created.get_layout() == h5d.CHUNKED:
-        chunk = math.prod(created.get_chunk()) * kind.get_size()
+    if properties.get_layout() == h5d.CHUNKED:
+        chunk = math.prod(properties.get_chunk()) * kind.get_size()
         if chunk > DENSEST * stored + LARGEST_CHUNK:
             raise StorageError(f"it cannot hold the chunks of {chunk:.3g} bytes of '{name}'")
     if h5ds.is_scale(dataset) and declared > machine_memory() // 4:
@@ -147,12 +151,12 @@ def _is_dimension_only(dataset: Any) -> bool:
         return False
     import h5py
 
-    said = h5py.Dataset(dataset).attrs["NAME"]
-    return isinstance(said, bytes) and said.startswith(NO_VARIABLE)
+    name = h5py.Dataset(dataset).attrs["NAME"]
+    return isinstance(name, bytes) and name.startswith(NO_VARIABLE)
 
 
 def _check_texts(dataset: Any, name: str, size: int) -> None:
-    """Read texts of variable length, some at a time: together they are in the file, once each."""
+    """Read texts of variable length in blocks; each is stored once in the file."""
     import h5py
 
     texts, total = h5py.Dataset(dataset), 0
@@ -167,70 +171,77 @@ def _check_texts(dataset: Any, name: str, size: int) -> None:
 def _blocks(texts: Any, size: int) -> Iterator[Any]:
     if not texts.shape or not texts.size:
         return
-    each = size * math.prod(texts.shape[1:])
-    step = max(1, LARGEST_TEXTS // each)
+    row_size = size * math.prod(texts.shape[1:])
+    step = max(1, LARGEST_TEXTS // row_size)
     for start in range(0, len(texts), step):
         yield texts[start : start + step]
 
 
 MODULE, ENGINE = "netCDF4", "NetCDF4BackendEntrypoint"
-"""What reads files without seal: the module, which the trial asks as it is loaded sooner, and the
-class by which xarray asks the same. By their names xarray would go through all distributions, and
-stop at one whose metadata are torn."""
+"""Module that reads files without a seal, and the class by which xarray uses it.
+
+By their names xarray would search all distributions, and stop at one with damaged metadata.
+"""
 BEGINNINGS = (b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"CDF\x02", b"CDF\x05")
-"""Of netCDF files of any kind."""
+"""First bytes of netCDF files of any kind."""
 PATIENCE_S = 10.0
-"""In so many seconds a piece is read, or never."""
+"""Time limit in seconds for reading one piece."""
 PIECE = 2**26
 """Bytes read at once, if an entry along the first dimension is not larger."""
 FAULT = 9
-"""The exit status of a child that found one and printed it."""
+"""Exit status of a child process that has printed a fault."""
 
 
 def refuse_no_result(path: Path) -> None:
-    """Raises StorageError where a file does not even begin as netCDF files do, and OSError."""
+    """Raise StorageError if a file does not begin as netCDF files do.
+
+    An OSError is raised if it cannot be read.
+    """
     with path.open("rb") as file:
         if not file.read(8).startswith(BEGINNINGS):
             raise StorageError(f"{path}: is no result of pbdkit: it begins as no netCDF file does")
 
 
 def try_reading(path: Path) -> None:
-    """Raises StorageError where the file is no netCDF file, or reading it fails, crashes or comes
-    to no end."""
+    """Raise StorageError if a file is no netCDF file, or if reading it fails, crashes or does not
+    end."""
     refuse_no_result(path)
     read_apart(path)
 
 
 def read_apart(path: Path, *arguments: str) -> bytes:
-    """Return what a module prints that reads a file in a process of its own; see `answer`.
+    """Return the output of this module when it reads a file in a separate process; see `answer`.
 
-    Raises StorageError, which names the file, where that fails, crashes or comes to no end.
+    Raises
+    ------
+    StorageError
+        If reading fails, crashes or does not end. The message names the file.
     """
     # What is imported here is imported there, from wherever either runs.
     paths = os.pathsep.join([*filter(None, sys.path), str(Path(__file__).parents[1])])
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-P", "-m", __name__, str(path.absolute()), *arguments],
         env={**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"},
         stdin=subprocess.DEVNULL,
         capture_output=True,
     )
-    if done.returncode == 0:
-        return done.stdout
-    if done.returncode == FAULT:
-        raise StorageError(f"{path}: {done.stdout.decode(errors='replace').strip()}")
-    told = done.stderr.decode(errors="replace").strip().splitlines() or [""]
-    how = f"ends its process (status {done.returncode}: {told[-1][:200]})"
-    if told[0].startswith("Timeout"):
-        how = f"comes to no end ({PATIENCE_S:g} s)"
-    elif done.returncode < 0:
-        how = f"ends its process ({signal.strsignal(-done.returncode)})"
-    raise StorageError(f"{path}: is damaged, or was changed: to read it {how}")
+    if process.returncode == 0:
+        return process.stdout
+    if process.returncode == FAULT:
+        raise StorageError(f"{path}: {process.stdout.decode(errors='replace').strip()}")
+    messages = process.stderr.decode(errors="replace").strip().splitlines() or [""]
+    ending = f"ends its process (status {process.returncode}: {messages[-1][:200]})"
+    if messages[0].startswith("Timeout"):
+        ending = f"comes to no end ({PATIENCE_S:g} s)"
+    elif process.returncode < 0:
+        ending = f"ends its process ({signal.strsignal(-process.returncode)})"
+    raise StorageError(f"{path}: is damaged, or was changed: to read it {ending}")
 
 
 def answer(read: Callable[..., None]) -> None:
-    """In the process that `read_apart` starts, read the file with bounds on memory and time.
+    """Read the file in the process that `read_apart` starts, with bounds on memory and time.
 
-    Exits with FAULT, and prints what is wrong, where something is.
+    If there is a fault, print it and exit with `FAULT`.
     """
     _bound_memory()
     path, *arguments = sys.argv[1:]
@@ -239,8 +250,8 @@ def answer(read: Callable[..., None]) -> None:
     except StorageError as error:
         _exit_with(str(error))
     except Exception as error:
-        told = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        _exit_with(f"cannot be read as netCDF-4: {told}")
+        text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        _exit_with(f"cannot be read as netCDF-4: {text}")
 
 
 def _exit_with(fault: str) -> None:
@@ -249,12 +260,12 @@ def _exit_with(fault: str) -> None:
 
 
 def bound_time() -> None:
-    """End this process with a traceback unless this is called again within the patience."""
+    """End this process with a traceback unless this is called again within `PATIENCE_S`."""
     faulthandler.dump_traceback_later(PATIENCE_S, exit=True)
 
 
 def opened_unsealed(path: Path) -> xarray.Dataset:
-    """The dataset in a file without seal, as it is. Raises whatever the libraries do."""
+    """Return the dataset in a file without a seal. Errors of the libraries are not converted."""
     import xarray
 
     # Times are steps: nothing is to be decoded as a date.
@@ -262,7 +273,7 @@ def opened_unsealed(path: Path) -> xarray.Dataset:
 
 
 def check_hdf5(path: Path) -> None:
-    """Raises StorageError where an HDF5 file declares or refers to what it should not."""
+    """Raise StorageError if an HDF5 file has declarations or references that are not acceptable."""
     if path.open("rb").read(4) != BEGINNINGS[0][:4]:
         return
     import h5py
@@ -272,7 +283,7 @@ def check_hdf5(path: Path) -> None:
 
 
 def _read(path: Path) -> None:
-    """Reads all of it, a piece at a time, and ends the process where a piece takes too long."""
+    """Read all of a file in pieces, with a time limit for each."""
     library = import_module(MODULE)
     bound_time()
     check_hdf5(path)
@@ -286,14 +297,14 @@ def _read(path: Path) -> None:
             if size > limit:
                 raise StorageError(f"it cannot hold the {size:.3g} bytes that it declares")
             entries = variable.shape[0] if variable.ndim else 1
-            each = max(1, PIECE * entries // max(1, size))
-            for first in range(0, entries, each):
-                _ = variable[first : first + each] if variable.ndim else variable[()]
+            rows = max(1, PIECE * entries // max(1, size))
+            for first in range(0, entries, rows):
+                _ = variable[first : first + rows] if variable.ndim else variable[()]
                 bound_time()
 
 
 def _bound_memory() -> None:
-    """To half of the machine's, where the system can."""
+    """Limit the memory of this process to half of the machine's, if the system supports it."""
     with suppress(ImportError, ValueError, OSError):
         from resource import RLIMIT_AS, RLIMIT_CORE, setrlimit
 
@@ -302,17 +313,20 @@ def _bound_memory() -> None:
 
 
 VALUES = "values"
-"""The name under which the values are printed."""
+"""Name of the values in the output."""
 SHOWN = 10
 """Maximum number of names in a message."""
 PACKING = ("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned")
-"""Attributes that change what stored numbers mean (CF conventions)."""
+"""Attributes that change the meaning of stored numbers (CF conventions)."""
 
 
 def _print(path: Path, variable: str, most_values: str) -> None:
-    """Print the variable, (x, y), and its coordinates as they are stored, as an npz archive.
+    """Print a variable over (x, y) and its coordinates, as stored, as an npz archive.
 
-    Raises StorageError, without the name of the file, for what is no field.
+    Raises
+    ------
+    StorageError
+        If it is no field. The message does not contain the name of the file.
     """
     import h5netcdf
     import h5py
@@ -326,13 +340,13 @@ def _print(path: Path, variable: str, most_values: str) -> None:
         check_declared(content, path.stat().st_size)
         with h5netcdf.File(content, "r") as file:
             field = _field(file, variable, int(most_values))
-            found = {VALUES: field, "x": file["x"], "y": file["y"]}
-            arrays = {name: each[...] for name, each in found.items()}
+            variables = {VALUES: field, "x": file["x"], "y": file["y"]}
+            arrays = {name: stored[...] for name, stored in variables.items()}
             if field.dimensions == ("y", "x"):
                 arrays[VALUES] = arrays[VALUES].T
-            for name, each in found.items():
-                known = {key: each.attrs[key] for key in PACKING if key in each.attrs}
-                arrays |= {f"{name}.{key}": np.asarray(value) for key, value in known.items()}
+            for name, stored in variables.items():
+                attributes = {key: stored.attrs[key] for key in PACKING if key in stored.attrs}
+                arrays |= {f"{name}.{key}": np.asarray(value) for key, value in attributes.items()}
     np.savez(sys.stdout.buffer, **arrays)
 
 
@@ -340,13 +354,13 @@ def _field(file: Any, variable: str, most_values: int) -> Any:
     if variable not in file.variables:
         names = ", ".join(islice(file.variables, SHOWN)) or "none"
         raise StorageError(f"has no variable '{variable}'; it has: {names}")
-    found = file.variables[variable]
-    if {*found.dimensions} != {"x", "y"} or not {"x", "y"} <= {*file.variables}:
+    field = file.variables[variable]
+    if {*field.dimensions} != {"x", "y"} or not {"x", "y"} <= {*file.variables}:
         raise StorageError(
             f"'{variable}' should be over x and y, with a coordinate for each; it is over "
-            f"{', '.join(found.dimensions) or 'nothing'}"
+            f"{', '.join(field.dimensions) or 'nothing'}"
         )
-    if (count := math.prod(found.shape)) > most_values:
+    if (count := math.prod(field.shape)) > most_values:
         raise StorageError(f"'{variable}' has {count} values, more than {most_values}")
     for name in (variable, "x", "y"):
         if file.variables[name].dtype.kind not in "fiu":
@@ -354,7 +368,7 @@ def _field(file: Any, variable: str, most_values: int) -> Any:
     for name in ("x", "y"):
         if file.variables[name].dimensions != (name,):
             raise StorageError(f"'{name}' should be a coordinate: numbers over {name} alone")
-    return found
+    return field
 
 
 if __name__ == "__main__":

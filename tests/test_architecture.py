@@ -33,7 +33,6 @@ ORDER = [
     "equilibrium",
     "stability",
     "simulation",
-    "execution",
     "restart",
     "mpi",
     "sweeps",

@@ -34,7 +34,7 @@ def list_(as_json: bool) -> None:
     registry = Registry()
     rows = [row for plugin in registry.plugins for row in _rows(plugin)]
     rows += [row for plugin in plugins_with_commands() for row in _rows(plugin)]
-    for warning in registry.doubts():
+    for warning in registry.warnings():
         click.echo(f"warning: {warning}", err=True)
     if as_json:
         click.echo(json.dumps(rows))

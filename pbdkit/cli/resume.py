@@ -15,9 +15,9 @@ from pbdkit.cli.run import (
     warn,
 )
 from pbdkit.communicator import Communicator
-from pbdkit.execution import Execution
 from pbdkit.mpi.launch import execution_of
 from pbdkit.restart import resumption
+from pbdkit.simulation import Execution
 
 
 def resume(

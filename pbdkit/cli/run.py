@@ -14,7 +14,6 @@ import click
 
 from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, NotSharedError
-from pbdkit.execution import Execution
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.io.recorder import RunOutcome
 from pbdkit.io.run_store import make_room
@@ -23,7 +22,7 @@ from pbdkit.mpi.launch import execution_of
 from pbdkit.progress import Stop, Watch, progress_bar, stop_on_signals
 from pbdkit.scene.memory_estimate import MIB, sizes_of
 from pbdkit.scene.scene import Scene
-from pbdkit.simulation import RunReport, Simulation, peak_memory, record
+from pbdkit.simulation import Execution, RunReport, Simulation, peak_memory, record
 
 SUCCESSFUL = ("complete", "settled")
 """Status of runs that ended as intended."""

@@ -208,15 +208,15 @@ def slow_waves(stencil: Primitive) -> SlowWaves | str:
             f"{'xy'[worst[0] % 2]} a step"
         )
     u, sizes, _ = np.linalg.svd(rest)
-    left = u[:, -2:].T
+    left_vectors = u[:, -2:].T
     if len(rest) > 2 and sizes[-3] <= ZERO * scale:
         return "the sublattices can move against each other at no rate at all: not one body"
-    overlap = left @ translations
+    overlap = left_vectors @ translations
     if abs(np.linalg.det(overlap)) < ZERO:
         return "the sublattices keep moving once they are shifted, ever faster"
-    left = np.linalg.inv(overlap) @ left
-    bordered = np.block([[rest, translations], [left, np.zeros((2, 2))]])
-    return SlowWaves(stencil, left.astype(complex), np.linalg.inv(bordered).astype(complex))
+    left_vectors = np.linalg.inv(overlap) @ left_vectors
+    bordered = np.block([[rest, translations], [left_vectors, np.zeros((2, 2))]])
+    return SlowWaves(stencil, left_vectors.astype(complex), np.linalg.inv(bordered).astype(complex))
 
 
 def operator(stencil: Primitive, k: Floats) -> Complex:

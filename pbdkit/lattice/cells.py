@@ -184,8 +184,8 @@ class WeighedCells:
         sides = [side for slot in slots for side in self.tiling.beside[slot]]
         cells = {(side.kind, side.first): side for side in sides}
         weights = {key: _seen(values, side, where, precision) for key, side in cells.items()}
-        beside = [weights[side.kind, side.first] for side in sides]
-        return list(zip(beside[::2], beside[1::2], strict=True))
+        shares_beside = [weights[side.kind, side.first] for side in sides]
+        return list(zip(shares_beside[::2], shares_beside[1::2], strict=True))
 
 
 def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:

@@ -74,33 +74,45 @@ def experiment_of_source(
 
 
 def as_experiment(
-    given: ExperimentLike, components: ComponentClasses = (), settings: Settings = ()
+    experiment: ExperimentLike, components: ComponentClasses = (), settings: Settings = ()
 ) -> Experiment:
-    """Return the experiment that is given in one of these ways, with the settings.
+    """Return an experiment from an object, a mapping of its parts, a file or a shipped name.
 
-    Raises ExperimentError and PluginError.
+    Parameters
+    ----------
+    experiment
+        Experiment in one of these forms.
+    components
+        Component classes in addition to the installed ones.
+    settings
+        Values to change.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        If the experiment is invalid, or a component is missing or fails.
     """
-    if isinstance(given, Experiment):
+    if isinstance(experiment, Experiment):
         Registry(components)  # what is handed over is checked, needed or not
-        given.refuse_unvalidated()
-        return given.with_settings(settings) if settings else given
-    if isinstance(given, str | Path):
-        return load_experiment(str(given), settings, components)
-    if _is_dataset(given) or not isinstance(given, Mapping):
-        raise ExperimentError(f"expected an experiment, {but_got(given)}")
-    source = Source(data=dict(given), files=OF_PROGRAM)
+        experiment.refuse_unvalidated()
+        return experiment.with_settings(settings) if settings else experiment
+    if isinstance(experiment, str | Path):
+        return load_experiment(str(experiment), settings, components)
+    if _is_dataset(experiment) or not isinstance(experiment, Mapping):
+        raise ExperimentError(f"expected an experiment, {but_got(experiment)}")
+    source = Source(data=dict(experiment), files=OF_PROGRAM)
     return experiment_of_source(source, settings, components)
 
 
-def but_got(given: Any) -> str:
-    """Return what was given in place of an experiment, and what takes or makes it."""
-    if _is_dataset(given):
+def but_got(value: Any) -> str:
+    """Return the end of a message: the value in place of an experiment, and the remedy."""
+    if _is_dataset(value):
         return (
             "got a dataset, which is a result: `pbdkit.rerun(ds)` runs its experiment again, and "
             "`ds.pbd.experiment()` returns it"
         )
-    kind = "a class" if isinstance(given, type) else f"an object of type {type(given).__name__}"
-    if isinstance(given, Mapping) or hasattr(given, "refuse_unvalidated"):
+    kind = "a class" if isinstance(value, type) else f"an object of type {type(value).__name__}"
+    if isinstance(value, Mapping) or hasattr(value, "refuse_unvalidated"):
         return f"got {kind}, which needs no loading: `pbdkit.run` takes it as it is"
     return (
         f"got {kind}; give a file, the name of a shipped experiment as 'paper/a', a dict "
@@ -108,8 +120,8 @@ def but_got(given: Any) -> str:
     )
 
 
-def _is_dataset(given: Any) -> bool:
-    return hasattr(given, "data_vars")
+def _is_dataset(value: Any) -> bool:
+    return hasattr(value, "data_vars")
 
 
 def _an_experiment(value: Any) -> Any:

@@ -48,7 +48,7 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
             part["items"] = {"oneOf": choice} if choice else False
         else:
             default = {k: v for k, v in part.items() if k == "default"}
-            choice += [_deprecated(one) for one in RETIRED if one.field == field]
+            choice += [_deprecated(retired) for retired in RETIRED if retired.field == field]
             top["properties"][field] = {"oneOf": choice} | default
     everything = json.dumps([top, definitions], ensure_ascii=False)
     used = sorted(name for name in definitions if f'"#/$defs/{name}"' in everything)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Floats
 from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, PbdkitError
-from pbdkit.execution import Execution
 from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import Column, Values, When, when_measured
 from pbdkit.io.paged_file import PiecedArray
@@ -49,7 +48,7 @@ from pbdkit.plugin.discovery import blaming
 from pbdkit.progress import Watch
 from pbdkit.scene.memory_estimate import TooLargeError
 from pbdkit.scene.scene import Ground, Scene, build_scene
-from pbdkit.simulation import Driver, Simulation
+from pbdkit.simulation import Driver, Execution, Simulation
 from pbdkit.stability.forecast import prediction, quick_warnings
 from pbdkit.stability.relaxation import tuned, with_solver
 from pbdkit.stepping.state import State

@@ -11,7 +11,7 @@ from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError, refuse_without
 
 if TYPE_CHECKING:
-    from pbdkit.execution import Execution
+    from pbdkit.simulation import Execution
 
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
 """How many processes launchers of MPI programs say in the environment that there are."""
@@ -58,7 +58,7 @@ def launched() -> Iterator[Communicator]:
 def execution_of(communicator: Communicator) -> Execution:
     """Return what carries out the runs of the processes of a communicator."""
     if communicator is SERIAL:
-        from pbdkit.execution import Execution
+        from pbdkit.simulation import Execution
 
         return Execution()
     from pbdkit.mpi.communicator import MPICommunicator

@@ -137,7 +137,7 @@ class Registry:
         names = (self._name_in(p, o) for p, o in offers if o.component is type(component))
         return next(names, component.type_name())
 
-    def doubts(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Return warnings about disabled names that no installed plugin has."""
         plugins = [*self._found, *installed_plugins(COMMAND_GROUP)]
         names = {name for p in plugins for name in (p.distribution, p.name)}

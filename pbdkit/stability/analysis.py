@@ -254,7 +254,7 @@ class Analysis:
     def left_out(self) -> list[str]:
         """Return messages about results that would take too long, with the reason."""
         messages, solver = self.spectra.left_out, self.scene.experiment.stepping
-        if types := dict.fromkeys(f"'{one.operation.type}'" for one in self.scene.operations):
+        if types := dict.fromkeys(f"'{part.operation.type}'" for part in self.scene.operations):
             messages.append(
                 f"operations: the analysis leaves out {', '.join(types)}; eigenvalues, steps and "
                 "lag are those of the rule alone"

@@ -153,11 +153,10 @@ def _wait(ranks: DistributedExecution) -> None:
 
 def memory(ranks: DistributedExecution | None) -> float:
     """Bytes that a run of a large body takes in this process beyond one of a small body."""
-    from pbdkit.execution import Execution
     from pbdkit.io.netcdf import NetcdfSink
     from pbdkit.model.experiment import Experiment
     from pbdkit.progress import Watch
-    from pbdkit.simulation import record
+    from pbdkit.simulation import Execution, record
 
     held = []
     for size in (SMALL, HELD):

@@ -24,14 +24,13 @@ from scene_strategies import calibrated_experiments, experiments, pulled_apart, 
 from thread_ranks import on_ranks
 
 import pbdkit
-from pbdkit.execution import Execution
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.io.run_store import has_committed, status_of
 from pbdkit.mpi.partition import subdomains
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import record
+from pbdkit.simulation import Execution, record
 from tests.test_restart import contents
 
 BESIDE = Path(sys.executable).parent

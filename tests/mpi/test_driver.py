@@ -16,11 +16,11 @@ import pbdkit
 from pbdkit.equilibrium import multigrid as parted_grids, system
 from pbdkit.equilibrium.lattice_system import LatticeSystem
 from pbdkit.equilibrium.system import StuckError
-from pbdkit.execution import Execution
 from pbdkit.mpi.driver import deep_subdomains, strip_of
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Execution
 from tests.equilibrium.test_multigrid import Skew
 from tests.mpi.test_distributed_run import (
     assert_same,

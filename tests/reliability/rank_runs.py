@@ -22,13 +22,12 @@ from trials import differences, row
 from scene_strategies import calibrated_experiments, experiments, pulled_apart  # beside trials
 
 from pbdkit.errors import PbdkitError
-from pbdkit.execution import Execution
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.model.experiment import Experiment
 from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.mpi.distributed_run import DistributedExecution
 from pbdkit.progress import Watch
-from pbdkit.simulation import record
+from pbdkit.simulation import Execution, record
 
 Parts = dict[str, Any]
 ENGINES = st.sampled_from(["numpy", "numpy", "numpy", "compiled"])
