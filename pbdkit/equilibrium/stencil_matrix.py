@@ -301,7 +301,8 @@ class _Assembly:
         numbers, rows = frame_rows
         kind = answers.kind.astype(np.int32)
         kind[numbers] = len(stencils) + np.arange(len(numbers))
-        kind[(stencils[answers.kind, OWN] == 0.0).all(axis=(1, 2))] = -1
+        is_empty = (stencils[:, OWN] == 0.0).all(axis=(1, 2))
+        kind[is_empty[answers.kind]] = -1
         self._code[place] = np.where(kind >= 0, self._count + kind, -1)
         self._stencils += [stencils, rows]
         self._scale += [scale, scale[answers.kind[numbers]]]
@@ -533,19 +534,14 @@ def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: 
 
     bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
     pattern_entries = np.logical_or.reduce(rows.communicator.allgather(bonds.any(axis=0)))
-    if rows.communicator.any(
-        any(_apart(matrix, bonds, s) for s in np.flatnonzero(pattern_entries).tolist())
-    ):
+    entries, places = np.flatnonzero(pattern_entries).tolist(), np.nonzero(matrix.code > 0)
+    if rows.communicator.any(any(_apart(matrix, bonds, places, s) for s in entries)):
         return False
     pattern = (pattern_entries | pattern_entries[::-1]).reshape(3, 3)
     parts, count = label(matrix.kind == FREE, structure=pattern)
-    for axis in range(2):
-        is_leader = binary_dilation(matrix.kind == LED, structure=pattern)
-        if held is not None:
-            is_leader |= held[axis]
-        if not _reached(parts, count, is_leader, rows):
-            return False
-    return True
+    near_leader = binary_dilation(matrix.kind == LED, structure=pattern)
+    supports = [near_leader] if held is None else [near_leader | component for component in held]
+    return all(_reached(parts, count, is_support, rows) for is_support in supports)
 
 
 def _reached(parts: Any, count: int, led: Any, rows: Rows) -> bool:
@@ -564,12 +560,17 @@ def _reached(parts: Any, count: int, led: Any, rows: Rows) -> bool:
         led = reached_places | extended
 
 
-def _apart(matrix: StencilMatrix, bonds: NDArray[np.bool_], s: int) -> bool:
-    """Return whether there are separated neighbours along place s of the stencils."""
-    row, place = np.nonzero(matrix.code > 0)
+def _apart(
+    matrix: StencilMatrix, bonds: NDArray[np.bool_], places: tuple[Indices, ...], s: int
+) -> bool:
+    """Return whether some of the particles with a stencil of their own are separated from their
+    neighbour along place s of it."""
+    row, place = places
     down, along = s // 3 - 1, s % 3 - 1
     is_present = matrix.kind[row + down, place + along] != OUTSIDE
     pairs = np.flatnonzero(is_present & ~bonds[matrix.code[row, place], s])
+    if not len(pairs):
+        return False
     first = matrix.code[row[pairs], place[pairs]]
     second = matrix.code[row[pairs] + down, place[pairs] + along]
     linked = second < 0  # a leader: nothing moves it
