@@ -212,6 +212,24 @@ def test_a_part_that_is_pushed_on_for_ever_is_refused_by_name():
     assert certificate(held)["distance"] < 1e-8
 
 
+class Limited(Pushed):
+    """A barycentre that fails at large displacements."""
+
+    type: str = "limited"
+
+    @staticmethod
+    def apply(total, here, p):
+        if np.max(np.abs(here.u.x)) > 2.0:
+            raise OverflowError("displacements exceed 2")
+        return total[0] / 4
+
+
+def test_an_error_of_a_rule_names_the_rule_and_the_step():
+    leaders = [LEFT, pulled(3.0)]
+    with pytest.raises(pbdkit.PluginError, match=r"'limited'.* at step 60: .*exceed 2"):
+        run(sheet(4, 3, rule=Limited(type="limited"), leaders=leaders))
+
+
 def test_a_tolerance_below_rounding_is_not_reached_and_says_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
