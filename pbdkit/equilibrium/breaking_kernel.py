@@ -335,7 +335,7 @@ ROWS = "int64(0)", "int64(kind.shape[1])"
 
 
 def write_settling(plan: Plan) -> tuple[str, list[str]]:
-    """Return the source of a module with ``run(given, step, tolerance, slack, most)``.
+    """Return the source of a module with ``run(arrays, step, tolerance, slack, most)``.
 
     It makes at most `most` equilibria, within the length `tolerance`, and ignores changes of bonds
     within the share `slack`; it returns the number of changes of bonds and the result.
@@ -349,7 +349,7 @@ def write_settling(plan: Plan) -> tuple[str, list[str]]:
     moves, derive = _write_moves(plan, follow, general), _write_derivative(plan, general)
     judge, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
     update, settle = _write_known(plan, derive), _write_settle(plan, follow, moves)
-    run = Function(plan.shared, "run", "given", "step", "tolerance", "slack", "most")
+    run = Function(plan.shared, "run", "arrays", "step", "tolerance", "slack", "most")
     run.add(0, "for n in range(most):", f"    {mark.call()}")
     run.add(1, f"if not {update.call()} or not {settle.call('tolerance')}:")
     run.add(2, f"return n, {FAILED}")

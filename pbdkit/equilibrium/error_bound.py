@@ -27,7 +27,8 @@ from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaking import Fracturing
 from pbdkit.stepping.divergence import way_of
-from pbdkit.stepping.leaders import bends_of, is_cut_short, last_event
+from pbdkit.stepping.leaders import is_cut_short
+from pbdkit.stepping.program import bends_of, last_event
 from pbdkit.stepping.state import State
 
 WAYS = {

@@ -32,7 +32,8 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaking import Fracturing
 from pbdkit.stepping.divergence import Guard, most_of, size_of, way_of
 from pbdkit.stepping.engine_choice import chosen_engine, obstacle
-from pbdkit.stepping.leaders import bends_of, last_event, place, prescribe
+from pbdkit.stepping.leaders import place, prescribe
+from pbdkit.stepping.program import bends_of, last_event
 from pbdkit.stepping.state import State, cut_bonds, initial_state
 
 

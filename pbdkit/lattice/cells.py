@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats, Indices, Mask
-from pbdkit.lattice.raster import FOLLOWER, Block, Raster, Where
+from pbdkit.lattice.raster import FOLLOWER, Block, Raster, Restriction, Where
 from pbdkit.plugin import Cell, Offset, Slot, Vector
 from pbdkit.plugin.lattice import CellPolygon, Index, Side, Tiling
 
@@ -146,6 +146,18 @@ class WeighedCells:
     weights: tuple[dict[Slot, Any], ...] = ()
     phase: NDArray[np.int64] | None = None
     names: tuple[str, ...] = ()
+
+    def restrict(self, to: Restriction) -> WeighedCells:
+        """Return the cells of some rows."""
+        share = None if self.share is None else to.cut(self.share)
+        is_shared = share is not None and self.weight is self.share
+        return replace(
+            self,
+            share=share,
+            weight=share if share is not None and is_shared else to.cut(self.weight),
+            mixed=tuple(map(to.cut, self.mixed)),
+            phase=None if self.phase is None else to.cut(self.phase),
+        )
 
     def of(self, patch: Patch) -> Floats | float:
         """Return the shares of the cells of a patch."""

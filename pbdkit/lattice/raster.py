@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.array_types import Indices, Mask
+from pbdkit.array_types import Array, Indices, Mask
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.plugin import Cell, Lattice, Offset, Slot
 from pbdkit.plugin.lattice import Index
@@ -497,6 +497,64 @@ class Raster:
         """Return the smallest block with all particles of the body of a sublattice, or None."""
         ends = bounds(self.kind[sublattice] == FOLLOWER)
         return Block(sublattice, *ends) if ends else None
+
+
+@dataclass(frozen=True)
+class Restriction:
+    """Rows of repeat cells of a raster on a raster of their own.
+
+    Features of a scene have a method `restrict` that returns what is theirs of these rows.
+
+    Parameters
+    ----------
+    whole
+        The raster.
+    part
+        The raster of the rows.
+    low
+        First row, in the whole.
+    present, moving
+        Rows with particles, and rows whose particles have all their neighbours, as (first,
+        last + 1) in the whole.
+    """
+
+    whole: Raster
+    part: Raster
+    low: int
+    present: tuple[int, int]
+    moving: tuple[int, int]
+
+    def is_between(self, place: Indices, rows: tuple[int, int]) -> Mask:
+        """Return which flat places of the whole lie in rows."""
+        row = np.unravel_index(place, self.whole.shape)[1]
+        return np.asarray((row >= rows[0]) & (row < rows[1]))
+
+    def is_present(self, place: Indices) -> Mask:
+        """Return which flat places of the whole are places of the part."""
+        return self.is_between(place, self.present)
+
+    def is_moving(self, place: Indices) -> Mask:
+        """Return which flat places of the whole have all their neighbours in the part."""
+        return self.is_between(place, self.moving)
+
+    def places(self, place: Indices) -> Indices:
+        """Return the flat places of the part for those of the whole."""
+        s, row, *rest = np.unravel_index(place, self.whole.shape)
+        return np.ravel_multi_index((s, row - self.low, *rest), self.part.shape)
+
+    def rows(self, rows: Indices) -> Indices:
+        """Return the rows of the table of the part for those of the whole."""
+        return rows - self.part.particle_offset + self.whole.particle_offset
+
+    def cut(self, planes: Array) -> Array:
+        """Return a copy of the rows of an array whose last axes are those of cells."""
+        axes = len(self.whole.shape) - 1
+        return row_view(planes, axes, slice(self.low, self.low + self.part.shape[1])).copy()
+
+
+def row_view(array: Array, axes: int, rows: slice) -> Array:
+    """Return a view of rows of an array whose last `axes` are those of cells."""
+    return array[(*(slice(None),) * (array.ndim - axes), rows)]
 
 
 def positions(cell: Cell, s: int | Indices, *cells: Indices) -> Any:

@@ -174,6 +174,31 @@ class Driven(Strict):
         """Return the last step of a run of `steps` in which the motion is active."""
         return steps if self.until is None else min(self.until, steps)
 
+    def next_change(self, step: int, foreseeable: bool = False) -> float:
+        """Return the first step after `step` in which the motion begins or ends, or goes on unless
+        it is `foreseeable`; infinity if there is none.
+
+        A motion by Newton's law is not foreseeable.
+        """
+        last = math.inf if self.until is None else self.until
+        if step < self.from_:
+            return self.from_
+        if step > last:
+            return math.inf
+        rests = self.motion.rests_after()
+        is_moving = rests is None or step - self.from_ + 1 < rests
+        if is_moving and (isinstance(self.motion, Newton) or not foreseeable):
+            return step + 1
+        return last + 1
+
+    def events(self, steps: int) -> list[int]:
+        """Return the steps of a run in which the motion begins, comes to rest and has ended."""
+        first, last = self.from_, self.last(steps)
+        if first > steps:
+            return []
+        rests = self.motion.rests_after() or 0
+        return [first, min(last, first - 1 + rests), *([last + 1] if last < steps else [])]
+
 
 class LeaderGroup(Driven):
     """Particles that lead from step `from` to step `until`, both included, and follow otherwise.

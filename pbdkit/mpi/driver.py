@@ -37,10 +37,8 @@ from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import SECONDS_A_VALUE, Driver, EquilibriumDriver, SteppingDriver
 from pbdkit.stepping.divergence import EVERY, Guard, most_of, size_of
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
-from pbdkit.stepping.leaders import steady_steps
-from pbdkit.stepping.numba_engine.time_skewing import Skew
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.program import hindrance
+from pbdkit.stepping.program import hindrance, program_of, reach_of, steady_steps
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.stepping.step import Mode
 
@@ -53,7 +51,7 @@ class DividedStepper(Engine):
         self, ranks: MPICommunicator, scene: Scene, engine: Engine, halo: Halo, steps: int
     ) -> None:
         self.name, self.threads = engine.name, engine.threads
-        self._ranks, self._scene, self._engine = ranks, scene, engine
+        self._ranks, self._engine, self._program = ranks, engine, program_of(scene)
         self._halo, self._steps = halo, steps
 
     def advance(self, state: State, steps: int = 1) -> State:
@@ -61,7 +59,7 @@ class DividedStepper(Engine):
         end = state.step + steps
         while state.step < end:
             most = min(self._steps, end - state.step)
-            count = steady_steps(self._scene, state.step + 1, most, moving=True)
+            count = steady_steps(self._program, state.step + 1, most, foreseeable=True)
             error: Exception | None = None
             try:
                 state = self._engine.advance(state, count)
@@ -211,7 +209,7 @@ class DistributedSteppingDriver(SteppingDriver):
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
-        refuse_steps(ranks, scene)
+        refuse_operations(ranks, scene, Mode.RANKS)
         start, anew = division.begun(scene)
         Driver.__init__(self, division.scene, start, DistributedWatch(ranks, watch))
         self._engine, self.choice = division.stepper(ranks.bcast(choose(scene)))
@@ -235,10 +233,10 @@ class DistributedSteppingDriver(SteppingDriver):
         super().load_state_dict(self._division.scattered(parts))
 
 
-def refuse_steps(ranks: MPICommunicator, scene: Scene) -> None:
-    """Raises NotSharedError in all processes for an operation that any of them cannot divide."""
-    found = [one for one in ranks.allgather(hindrance(scene, Mode.RANKS)) if one]
-    refuse(scene, [(True, (one.field,), one.reason) for one in found])
+def refuse_operations(ranks: MPICommunicator, scene: Scene, mode: Mode) -> None:
+    """Raise NotSharedError in all processes for an operation that any of them cannot share."""
+    reasons = [reason for reason in ranks.allgather(hindrance(scene, mode)) if reason]
+    refuse(scene, [(True, (reason.field,), reason.reason) for reason in reasons])
 
 
 def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> None:
@@ -318,7 +316,7 @@ def _depth(parts: int) -> int:
 def _margin(scene: Scene) -> int:
     """The outermost rows of a part that are empty, that stand still, and whose particles see those,
     or frame points that follow them."""
-    return 3 * Skew(scene).axes[0].reach + farthest_apart(scene)
+    return 3 * reach_of(scene, 0).reach + farthest_apart(scene)
 
 
 STUCK = "the iteration that several processes share gets nowhere; run it in one process"
@@ -330,8 +328,9 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
-        refuse_steps(ranks, scene)
-        _refuse(scene)
+        for mode in (Mode.RANKS, Mode.RANKS_AT_REST):
+            refuse_operations(ranks, scene, mode)
+        _refuse_solver(scene)
         start, anew = division.begun(scene)
         super().__init__(division.scene, start, DistributedWatch(ranks, watch))
         self._start = None if anew else start.copy()
@@ -372,20 +371,16 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
             yield reached
 
 
-def _refuse(scene: Scene) -> None:
+def _refuse_solver(scene: Scene) -> None:
     from pbdkit.equilibrium.stencil_matrix import PrimitiveRaster
 
-    experiment, rule = scene.experiment, f"the equilibrium of rule '{scene.experiment.rule.type}'"
-    method, grid = experiment.solver.equilibrium.method, PrimitiveRaster.of(scene)
+    experiment, grid = scene.experiment, PrimitiveRaster.of(scene)
+    method = experiment.solver.equilibrium.method
     refuse(
         scene,
         [
-            (scene.has_fracture, ("fracture",), "an equilibrium with bonds that break"),
-            (bool(scene.barriers), ("obstacles",), "an equilibrium before obstacles"),
-            (not experiment.rule.linear, ("rule",), f"{rule}, which is not linear"),
-            (scene.inner is not None, ("rule",), f"{rule}, which applies twice"),
             (
-                bool(experiment.neighbours.nearness()) or grid is None,
+                grid is None,
                 ("neighbours",),
                 "an equilibrium whose neighbours lie farther away than in the next cell",
             ),

@@ -23,18 +23,23 @@ from pbdkit.array_types import Array, Bytes, Indices, Mask
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
 from pbdkit.io.paged_file import PiecedArray, as_bytes
-from pbdkit.lattice.cells import WeighedCells
 from pbdkit.lattice.fill import Lines, framed, window
-from pbdkit.lattice.raster import EMPTY, FOLLOWER, FRAME, LeftOut, Raster, RowLayout, Stretch, hull
+from pbdkit.lattice.raster import (
+    EMPTY,
+    FOLLOWER,
+    FRAME,
+    LeftOut,
+    Raster,
+    Restriction,
+    RowLayout,
+    Stretch,
+    hull,
+    row_view,
+)
 from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.plugin.lattice import Index
-from pbdkit.scene.constants import SceneConstants
-from pbdkit.scene.frame import Frame
-from pbdkit.scene.leader_groups import Leading
-from pbdkit.scene.loads import Loads
-from pbdkit.scene.operations import Operated
 from pbdkit.scene.scene import Ground, Scene
-from pbdkit.stepping.numba_engine.time_skewing import Skew
+from pbdkit.stepping.program import program_of, reach_of
 from pbdkit.stepping.state import State
 
 BLOCK = 2**23
@@ -123,7 +128,7 @@ class Subdomain:
 
     def cut(self, array: Array, axes: int) -> Array:
         """The part of an array whose last `axes` are those of cells, in memory of its own."""
-        return rows_of(array, axes, slice(self.low, self.high)).copy()
+        return row_view(array, axes, slice(self.low, self.high)).copy()
 
     def seen(self, rows: int) -> tuple[int, int]:
         """The rows of a lattice of so many that are not empty."""
@@ -138,24 +143,16 @@ class Subdomain:
         return low, self.high - edge if self.high < rows else rows
 
 
-def rows_of(array: Array, axes: int, rows: slice) -> Array:
-    """Some rows of an array whose last `axes` are those of cells, as a view."""
-    return array[(*(slice(None),) * (array.ndim - axes), rows)]
-
-
 def reaches(scene: Scene) -> tuple[int, int]:
-    """How many rows a step reaches, and its neighbours."""
-    skew, levels, below = Skew(scene).axes[0], 1, scene.inner
-    while below:
-        levels, below = levels + 1, below.inner
-    # Masses see their neighbours before these see where the masses have gone.
-    levels += any(leading.share is not None for leading in scene.leading)
-    return levels * (skew.reach + farthest_apart(scene)), skew.reach
+    """Return the number of rows that a step reaches, and that of its neighbours."""
+    sweeps = sum(operation.sweeps() for operation in program_of(scene))
+    reach = reach_of(scene, 0).reach
+    return sweeps * (reach + farthest_apart(scene)), reach
 
 
 def farthest_apart(scene: Scene) -> int:
-    """How many rows at most a frame point lies apart from those whom it follows."""
-    return int(max(scene.raster.communicator.allgather(Skew(scene).axes[0].apart)))
+    """Return the largest number of rows from a frame point to the particles that it follows."""
+    return int(max(scene.raster.communicator.allgather(reach_of(scene, 0).apart)))
 
 
 def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
@@ -218,155 +215,55 @@ class SubdomainScene:
 
 
 def part_of(scene: Scene, subdomain: Subdomain) -> SubdomainScene:
-    """That part of a scene that has these rows and more around them, or all."""
-    window = _Window(scene.raster, subdomain)
-    places = [each.place[window.leads(each)] for each in scene.leading]
-    ours, early = map(window.has_own, places), map(window.comes_before, places)
-    return SubdomainScene(
-        subdomain,
-        window.scene(scene),
-        tuple(ours),
-        tuple(int(these.sum()) for these in early),
-        window.own_rows,
+    """Return the part of a scene with the rows of a subdomain; the raster of the scene has these
+    rows and more around them, or all."""
+    to, rows = restriction(scene.raster, subdomain)
+    places = [each.place[each.is_in(to)] for each in scene.leading]
+    begin = to.low + subdomain.own.start
+    ours = [to.is_between(place, (begin, to.low + subdomain.own.stop)) for place in places]
+    early = [int(to.is_between(place, (0, begin)).sum()) for place in places]
+    return SubdomainScene(subdomain, scene.restrict(to), tuple(ours), tuple(early), rows)
+
+
+def restriction(raster: Raster, subdomain: Subdomain) -> tuple[Restriction, slice]:
+    """Return the restriction of a raster to the rows of a subdomain, and the rows of the table of
+    the part that are the subdomain's own particles."""
+    offset = raster.extent.row_offset if raster.extent else 0
+    subdomain = subdomain.after(offset)
+    period = raster.cell.period[0]
+    lines = raster.sites.shape[0]
+
+    def line(row: int) -> int:
+        """Return the first line of sites of a row of cells, in the table."""
+        return int(np.clip((raster.first[0] + row) * period - raster.low[0], 0, lines))
+
+    low, high = line(subdomain.low), line(subdomain.high)
+    sites, kind = raster.sites[low:high].copy(), subdomain.cut(raster.kind, len(raster.shape) - 1)
+    present, moving = (of(raster.shape[1]) for of in (subdomain.seen, subdomain.inner))
+    for rows, old, new in ((moving, FOLLOWER, FRAME), (present, FRAME, EMPTY)):
+        planes = np.moveaxis(kind, 1, 0)
+        for array, (a, b), at in (
+            (sites, map(line, rows), low),
+            (planes, rows, subdomain.low),
+        ):
+            for outside in (array[: a - at], array[b - at :]):
+                outside[outside == old] = new
+    counts = np.cumsum([0, *np.count_nonzero(raster.sites != EMPTY, axis=_others(sites))])
+    part = replace(
+        raster,
+        shape=kind.shape,
+        first=(raster.first[0] + subdomain.low, *raster.first[1:]),
+        kind=kind,
+        low=(raster.low[0] + low, *raster.low[1:]),
+        sites=sites,
+        particle_offset=raster.particle_offset + int(counts[line(present[0])]),
+        extent=RowLayout(raster.row_counts, offset + subdomain.low),
+        communicator=SERIAL,
+        row_range=None,
     )
-
-
-class _Window:
-    """The rows of a part on a raster that has more, of the whole or of its surroundings."""
-
-    def __init__(self, raster: Raster, subdomain: Subdomain) -> None:
-        before = raster.extent.row_offset if raster.extent else 0
-        self._whole, self._sub = raster, (subdomain := subdomain.after(before))
-        self._axes = len(raster.shape) - 1
-        period = raster.cell.period[0]
-        lines = raster.sites.shape[0]
-
-        def line(row: int) -> int:
-            """The first line of sites of a row of cells, in the table."""
-            return int(np.clip((raster.first[0] + row) * period - raster.low[0], 0, lines))
-
-        low, high = line(subdomain.low), line(subdomain.high)
-        sites, kind = raster.sites[low:high].copy(), subdomain.cut(raster.kind, self._axes)
-        seen, inner = (of(raster.shape[1]) for of in (subdomain.seen, subdomain.inner))
-        for rows, before, after in ((inner, FOLLOWER, FRAME), (seen, FRAME, EMPTY)):
-            moved = np.moveaxis(kind, 1, 0)
-            for of, (a, b), at in ((sites, map(line, rows), low), (moved, rows, subdomain.low)):
-                for outside in (of[: a - at], of[b - at :]):
-                    outside[outside == before] = after
-        counts = np.cumsum([0, *np.count_nonzero(raster.sites != EMPTY, axis=_others(sites))])
-        first = (raster.first[0] + subdomain.low, *raster.first[1:])
-        self.raster = replace(
-            raster,
-            shape=kind.shape,
-            first=first,
-            kind=kind,
-            low=(raster.low[0] + low, *raster.low[1:]),
-            sites=sites,
-            particle_offset=raster.particle_offset + int(counts[line(seen[0])]),
-            extent=RowLayout(raster.row_counts, before + subdomain.low),
-            communicator=SERIAL,
-            row_range=None,
-        )
-        ends = (subdomain.begin, subdomain.end)
-        begin, end = (counts[line(row)] - counts[line(seen[0])] for row in ends)
-        self.own_rows = slice(int(begin), int(end))
-
-    def scene(self, scene: Scene) -> Scene:
-        """The part of a scene on it."""
-        frame, inner = scene.frame, scene.inner
-        return replace(
-            scene,
-            raster=self.raster,
-            constants=self._constants(scene.constants),
-            frame=self._frame(frame) if frame else None,
-            cells=self._cells(scene.cells) if scene.cells else None,
-            inner=self.scene(inner) if inner else None,
-            leading=tuple(map(self._leading, scene.leading)),
-            loads=self._loads(scene.loads) if scene.loads else None,
-            operations=tuple(map(self._operated, scene.operations)),
-        )
-
-    def leads(self, leading: Leading) -> Mask:
-        """Which particles of a group the part has; masses only where their neighbours are known."""
-        masses = leading.share is not None
-        rows = (self._sub.inner if masses else self._sub.seen)(self._whole.shape[1])
-        return self._between(leading.place, *rows)
-
-    def moves(self, place: Indices) -> Mask:
-        """Which places of the whole lie in rows of the part that do not stand still."""
-        return self._between(place, *self._sub.inner(self._whole.shape[1]))
-
-    def has_own(self, place: Indices) -> Mask:
-        """Which lie in its own rows."""
-        return self._between(place, self._sub.begin, self._sub.end)
-
-    def comes_before(self, place: Indices) -> Mask:
-        """Which lie in rows before these."""
-        return self._between(place, 0, self._sub.begin)
-
-    def _between(self, place: Indices, low: int, high: int) -> Mask:
-        row = np.unravel_index(place, self._whole.shape)[1]
-        return np.asarray((row >= low) & (row < high))
-
-    def _places(self, place: Indices) -> Indices:
-        """The same places on the raster of the part."""
-        s, row, *rest = np.unravel_index(place, self._whole.shape)
-        return np.ravel_multi_index((s, row - self._sub.low, *rest), self.raster.shape)
-
-    def _cut(self, planes: Array) -> Array:
-        return self._sub.cut(planes, self._axes)
-
-    def _constants(self, constants: SceneConstants) -> SceneConstants:
-        kinds = constants.by_particle, constants.by_bond
-        cut = [{name: self._cut(planes) for name, planes in kind.items()} for kind in kinds]
-        return replace(constants, by_particle=cut[0], by_bond=cut[1])
-
-    def _leading(self, leading: Leading) -> Leading:
-        some = self.leads(leading)
-        return replace(
-            leading,
-            rows=leading.rows[some] - self.raster.particle_offset + self._whole.particle_offset,
-            place=self._places(leading.place[some]),
-            reference=leading.reference[some],
-            share=None if leading.share is None else leading.share[some],
-        )
-
-    def _frame(self, frame: Frame) -> Frame | None:
-        """The points whom the part can let follow; the others are renewed with the halo."""
-        counts, follow = len(frame.place), frame.map
-        known = self._between(frame.body_place, *self._sub.seen(self._whole.shape[1]))
-        some = self.moves(frame.place) & (np.bincount(follow.point[~known], minlength=counts) == 0)
-        if not some.any():
-            return None
-        entries = some[follow.point]
-        point = (np.cumsum(some) - 1)[follow.point[entries]]
-        body = follow.body[entries] - self.raster.particle_offset + self._whole.particle_offset
-        cut = replace(follow, point=point, body=body, weight=follow.weight[entries])
-        place = self._places(frame.place[some])
-        return Frame(place, cut, self._places(frame.body_place[entries]))
-
-    def _cells(self, cells: WeighedCells) -> WeighedCells:
-        share = None if cells.share is None else self._cut(cells.share)
-        weight = (
-            share if cells.weight is cells.share and share is not None else self._cut(cells.weight)
-        )
-        phase = None if cells.phase is None else self._cut(cells.phase)
-        mixed = tuple(map(self._cut, cells.mixed))
-        return replace(cells, share=share, weight=weight, mixed=mixed, phase=phase)
-
-    def _operated(self, operated: Operated) -> Operated:
-        some = self.moves(operated.place)
-        rows = operated.rows[some] - self.raster.particle_offset + self._whole.particle_offset
-        return replace(operated, rows=rows, place=self._places(operated.place[some]))
-
-    def _loads(self, loads: Loads) -> Loads:
-        each = []
-        for one in loads.each:
-            some = self.moves(one.place)
-            rows = one.rows[some] - self.raster.particle_offset + self._whole.particle_offset
-            place, share = self._places(one.place[some]), one.share[some]
-            each.append(replace(one, rows=rows, place=place, share=share))
-        return Loads(tuple(each), self.raster.shape, loads.held_at)
+    ends = (subdomain.begin, subdomain.end)
+    begin, end = (int(counts[line(row)] - counts[line(present[0])]) for row in ends)
+    return Restriction(raster, part, subdomain.low, present, moving), slice(begin, end)
 
 
 def _others(sites: Array) -> Sequence[int]:
@@ -464,7 +361,7 @@ class Halo:
 
         def whole(array: Array) -> Any:
             axis = array.ndim - self._axes
-            return joined(self._ranks, rows_of(array, self._axes, own), axis, rows)
+            return joined(self._ranks, row_view(array, self._axes, own), axis, rows)
 
         starts = tuple(
             None if start is None else joined(self._ranks, start[:, ours], 1, counts)

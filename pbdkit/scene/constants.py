@@ -26,7 +26,7 @@ from pbdkit.errors import AccuracyWarning, ExperimentError, PluginError, of_cate
 from pbdkit.lattice.cells import patches
 from pbdkit.lattice.fill import rounding_of
 from pbdkit.lattice.neighbourhood import Neighbourhood, bonds_in, plane_block
-from pbdkit.lattice.raster import FRAME, Raster, Where
+from pbdkit.lattice.raster import FRAME, Raster, Restriction, Where
 from pbdkit.model.bodies import Body, Sites
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
@@ -306,6 +306,12 @@ class SceneConstants:
     of_particle: Any
     by_particle: Planes = field(default_factory=dict)
     by_bond: Planes = field(default_factory=dict)
+
+    def restrict(self, to: Restriction) -> SceneConstants:
+        """Return the constants of some rows."""
+        by_particle = {name: to.cut(planes) for name, planes in self.by_particle.items()}
+        by_bond = {name: to.cut(planes) for name, planes in self.by_bond.items()}
+        return replace(self, by_particle=by_particle, by_bond=by_bond)
 
     @property
     def shared(self) -> list[float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import add
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats, Indices
 from pbdkit.errors import ExperimentError
-from pbdkit.lattice.raster import FOLLOWER, FRAME, Raster, bounds, distinct
+from pbdkit.lattice.raster import FOLLOWER, FRAME, Raster, Restriction, bounds, distinct
 from pbdkit.plugin import FollowerRule, FrameMap, FramePolicy, FrameSites
 
 
@@ -44,6 +44,20 @@ class Frame:
         weighted = weight * u if weight.ndim == 1 else np.einsum("eab,be->ae", weight, u)
         for plane, values in zip(out, weighted, strict=True):
             plane[self.place] = np.bincount(self.map.point, values, len(self.place))
+
+    def restrict(self, to: Restriction) -> Frame | None:
+        """Return the points of some rows that follow particles of these rows alone; None if there
+        are none."""
+        missing = self.map.point[~to.is_present(self.body_place)]
+        has_missing = np.bincount(missing, minlength=len(self.place)) > 0
+        is_resolved = to.is_moving(self.place) & ~has_missing
+        if not is_resolved.any():
+            return None
+        entries = is_resolved[self.map.point]
+        point = (np.cumsum(is_resolved) - 1)[self.map.point[entries]]
+        body, weight = to.rows(self.map.body[entries]), self.map.weight[entries]
+        part = replace(self.map, point=point, body=body, weight=weight)
+        return Frame(to.places(self.place[is_resolved]), part, to.places(self.body_place[entries]))
 
 
 def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Frame | None:

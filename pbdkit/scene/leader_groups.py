@@ -7,14 +7,14 @@ others (rollers) are called guided. Leaders can also have prescribed directions.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.lattice.raster import FOLLOWER, LEADER, Raster, distinct
+from pbdkit.lattice.raster import FOLLOWER, LEADER, Raster, Restriction, distinct
 from pbdkit.model.boundary_conditions import LeaderGroup
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Measured, Newton, Rotation
@@ -103,6 +103,22 @@ class Leading:
     reference: Floats
     axes: tuple[int, ...]
     share: Floats | None = None
+
+    def is_in(self, to: Restriction) -> Mask:
+        """Return which particles a part of the lattice has; of masses, which move by the forces of
+        their neighbours, those with all neighbours."""
+        return (to.is_present if self.share is None else to.is_moving)(self.place)
+
+    def restrict(self, to: Restriction) -> Leading:
+        """Return the group with the particles of some rows."""
+        is_in = self.is_in(to)
+        return replace(
+            self,
+            rows=to.rows(self.rows[is_in]),
+            place=to.places(self.place[is_in]),
+            reference=self.reference[is_in],
+            share=None if self.share is None else self.share[is_in],
+        )
 
     def offset(self, n: float) -> Floats:
         """Return the displacement of the motion, (particle or 1, lead axis)."""

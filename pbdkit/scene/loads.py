@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Floats, Indices
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.cells import WeighedCells, patches
-from pbdkit.lattice.raster import Raster
+from pbdkit.lattice.raster import Raster, Restriction
 from pbdkit.model.boundary_conditions import Load
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin.lattice import Tiling, signed_area
@@ -42,6 +42,12 @@ class Loading:
     place: Indices
     share: Floats
 
+    def restrict(self, to: Restriction) -> Loading:
+        """Return the load on the particles of some rows."""
+        is_moving = to.is_moving(self.place)
+        rows, place = to.rows(self.rows[is_moving]), to.places(self.place[is_moving])
+        return replace(self, rows=rows, place=place, share=self.share[is_moving])
+
 
 @dataclass
 class Loads:
@@ -61,6 +67,11 @@ class Loads:
     shape: tuple[int, ...]
     held_at: float | None = None
     _last: tuple[Any, Planes] | None = field(default=None, repr=False)
+
+    def restrict(self, to: Restriction) -> Loads:
+        """Return the loads on the particles of some rows."""
+        each = tuple(loading.restrict(to) for loading in self.each)
+        return Loads(each, to.part.shape, self.held_at)
 
     def at(self, moment: float, dtype: Any) -> Planes:
         """Return the forces at the end of a step, or at a moment within it, as a shared array."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import namedtuple
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pbdkit.array_types import Indices
-from pbdkit.lattice.raster import Raster
+from pbdkit.lattice.raster import Raster, Restriction
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import ParticleOperation
 from pbdkit.plugin.discovery import blaming
@@ -22,6 +22,12 @@ class Operated:
     rows: Indices
     place: Indices
     parameters: Any
+
+    def restrict(self, to: Restriction) -> Operated:
+        """Return the operation on the particles of some rows."""
+        is_moving = to.is_moving(self.place)
+        rows, place = to.rows(self.rows[is_moving]), to.places(self.place[is_moving])
+        return replace(self, rows=rows, place=place)
 
 
 def build_operations(raster: Raster, experiment: Experiment) -> tuple[Operated, ...]:

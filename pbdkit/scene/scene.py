@@ -6,8 +6,9 @@ Only the parts that the experiment uses are built.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from pbdkit.lattice.neighbourhood import (
     missing_segments,
     setting_of,
 )
-from pbdkit.lattice.raster import LeftOut, Raster, RowLayout, RowRange, distinct
+from pbdkit.lattice.raster import LeftOut, Raster, Restriction, RowLayout, RowRange, distinct
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
     AppliesTwice,
@@ -277,6 +278,18 @@ class Scene:
         if not (self.barriers or self.operations):
             return self
         return replace(self, barriers=(), operations=())
+
+    def restrict(self, to: Restriction) -> Scene:
+        """Return the scene of some rows, of features that have a method `restrict` with what is
+        theirs of these rows."""
+
+        def part(value: Any) -> Any:
+            if type(value) is tuple:
+                return tuple(map(part, value))
+            return value.restrict(to) if hasattr(value, "restrict") else value
+
+        values = {each.name: part(getattr(self, each.name)) for each in fields(self)}
+        return replace(self, **values | {"raster": to.part})
 
     @property
     def has_fracture(self) -> bool:

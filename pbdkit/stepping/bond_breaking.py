@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.lattice.neighbourhood import bonds_in, plane_block
-from pbdkit.plugin import CellStress, FractureModel, SoftensCells, Vector, length
+from pbdkit.plugin import CellStress, FractureModel, RenewsBonds, SoftensCells, Vector, length
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers
@@ -20,23 +20,23 @@ from pbdkit.stepping.cell_stress import CellStresses
 from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.rule_evaluation import BLOCK_CELLS, Evaluator
 from pbdkit.stepping.state import State, cut_bonds
-from pbdkit.stepping.step import Hindrance, Mode, Operation, Step
+from pbdkit.stepping.step import Call, Hindrance, Mode, Operation, Reach, Step
 
 Home = tuple[Any, ...]
-"""Where bonds are kept: plane and cells."""
+"""Type of the index of bonds in planes: plane and cells."""
 DIRECTIONS = 8
 TIE = 1e-6
-"""Cells begin to soften together whose loads differ by no more than this share."""
+"""Relative difference of loads up to which cells begin to soften together."""
 CALM = 1e-3
-"""Other cells begin once none that has begun changes its damage by more."""
+"""Change of damage up to which further cells may begin to soften."""
 
 
 class Fracturing:
-    """The fracture model of a scene on its planes of bonds."""
+    """Fracture model of a scene on its planes of bonds."""
 
     @classmethod
     def of(cls, scene: Scene) -> Self | None:
-        """None where the model breaks nothing."""
+        """Return the fracture of a scene; None if the model breaks no bonds."""
         return cls(scene) if scene.experiment.fracture.can_break else None
 
     def __init__(self, scene: Scene) -> None:
@@ -56,32 +56,32 @@ class Fracturing:
     def break_bonds(
         self, m: NDArray[Any], state: State, step: int, *, in_turn: bool = False
     ) -> None:
-        """Renews, in place, what is remembered of the bonds in the intermediate configuration m,
-        and marks those that break, with their length.
+        """Renew the remembered numbers of bonds in the intermediate configuration m in place, and
+        mark bonds that break, with their length.
 
-        Of cells that would begin to soften the most loaded begin if they are to do so `in_turn`,
-        and none before those that have begun are nearly settled.
+        If cells begin to soften `in_turn`, only those with the largest load begin, and none before
+        those that have begun are nearly settled.
         """
         assert state.broken_step is not None
         assert state.broken_length is not None
         when = f"at step {step}"
         renewed: Iterable[_Renewed] = self._renewed(m, state, when)
         if in_turn and self._cells:
-            before = [value.copy() for value in state.bond_values]
+            old = [value.copy() for value in state.bond_values]
             renewed = list(renewed)
-            self._hold_back(before, renewed)
+            self._hold_back(old, renewed)
         for part in renewed:
             breaks = self._breaks(part, when)
             if breaks.any():
                 state.broken_step[part.home][breaks] = step
-                now = part.r + part.d.each(lambda values, where=breaks: values[where])
-                state.broken_length[part.home][breaks] = length(now)
+                current = part.r + part.d.each(lambda values, where=breaks: values[where])
+                state.broken_length[part.home][breaks] = length(current)
 
     def may_break(self, u: NDArray[Any], state: State, within: float) -> bool:
-        """Whether any bond breaks at u, or at a configuration in which one of its ends is less than
-        `within` away from there as seen from the other.
+        """Return whether any bond breaks at u, or at a configuration in which the relative
+        displacement of its ends differs by less than `within`.
 
-        Looked for in eight directions, so far out that the octagon takes in the circle.
+        Eight directions are tested, on an octagon around the circle.
         """
         radius = within / np.cos(np.pi / DIRECTIONS)
         angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
@@ -95,62 +95,64 @@ class Fracturing:
     def _renewed(
         self, m: NDArray[Any], state: State, when: str, nudge: Vector | None = None
     ) -> Iterator[_Renewed]:
-        """Part by part the bonds of each slot where they are kept. What is remembered is renewed in
-        place; not where d is nudged, all alike, to see."""
+        """Generate the bonds of each slot, part by part. Remembered numbers are renewed in place,
+        or in copies if all differences are changed by a nudge."""
         assert state.broken_step is not None
         for n, slot, block, breakable in self._breakable:
-            there, here = block.seen_through(slot).of(m), block.of(m)
-            d, r = vector(there) - vector(here), slot.rest
+            target, source = block.seen_through(slot).of(m), block.of(m)
+            d, r = vector(target) - vector(source), slot.rest
             intact = breakable & (block.within(state.broken_step[n]) < 0)
-            own = [block.within(value[n]) for value in state.bond_values]
+            numbers = [block.within(value[n]) for value in state.bond_values]
             if nudge:
-                d, own = d + nudge, [value.copy() for value in own]
+                d, numbers = d + nudge, [value.copy() for value in numbers]
             with np.errstate(all="ignore"), blaming(self._model, when):
                 limits = self._constants.limits_at(slot, n, block)
                 cells = self._cells.of(m, slot, block) if self._cells else ()
-                self._evaluator.renew_bonds(d, r, limits, own, intact, cells)
-            yield _Renewed((n, *block.slices()[1:]), d, r, limits, own, intact, cells)
+                self._evaluator.renew_bonds(d, r, limits, numbers, intact, cells)
+            yield _Renewed((n, *block.slices()[1:]), d, r, limits, numbers, intact, cells)
 
     def _breaks(self, part: _Renewed, when: str) -> NDArray[np.bool_]:
-        """Which of some bonds break."""
+        """Return which bonds break."""
         with np.errstate(all="ignore"), blaming(self._model, when):
             return np.asarray(
                 part.intact & self._evaluator.breaks(part.d, part.r, part.limits, part.own)
             )
 
-    def _hold_back(self, before: list[NDArray[Any]], parts: Sequence[_Renewed]) -> None:
-        """Leaves cells as they were `before` that would begin to soften, all but the most loaded,
-        or all as long as what has begun to soften still changes."""
-        changed, most = 0.0, 0.0
+    def _hold_back(self, previous: list[NDArray[Any]], parts: Sequence[_Renewed]) -> None:
+        """Restore the numbers of cells that would begin to soften, except those with the largest
+        load; all of them as long as cells that have begun still change."""
+        change, largest = 0.0, 0.0
         sides = [[name.endswith(side) for name in self._numbers] for side in ("_left", "_right")]
         waiting = []
         for part in parts:
             for n, numbers in enumerate(sides):
-                old = [value[part.home] for value, its in zip(before, numbers, strict=True) if its]
+                old = [
+                    value[part.home] for value, its in zip(previous, numbers, strict=True) if its
+                ]
                 new = [value for value, its in zip(part.own, numbers, strict=True) if its]
                 begins = np.all([value == 0.0 for value in old], axis=0)
                 ways = (abs(b - a) / np.maximum(1.0, abs(a)) for a, b in zip(old, new, strict=True))
-                changed = max(changed, *(float(way[~begins].max(initial=0.0)) for way in ways))
+                change = max(change, *(float(way[~begins].max(initial=0.0)) for way in ways))
                 begins &= np.any([value != 0.0 for value in new], axis=0)
                 if begins.any():
                     load = self._load(part, n)
-                    most = max(most, float(load[begins].max()))
+                    largest = max(largest, float(load[begins].max()))
                     waiting.append((begins, load, old, new))
-        least = most * (1.0 - TIE) if changed <= CALM else math.inf
+        threshold = largest * (1.0 - TIE) if change <= CALM else math.inf
         for begins, load, old, new in waiting:
             for a, b in zip(old, new, strict=True):
-                np.copyto(b, a, where=begins & (load < least))
+                np.copyto(b, a, where=begins & (load < threshold))
 
     def _load(self, part: _Renewed, side: int) -> NDArray[Any]:
-        """The load of the cells on a side of some bonds, or of those on the other where they have
-        none there."""
+        """Return the load of the cells on one side of bonds, or on the other side where there is
+        none."""
         loads = [self._evaluator.load(cell, part.limits, part.own) for cell in part.cells]
-        found: NDArray[Any] = np.where(part.cells[side].share > 0.0, loads[side], loads[1 - side])
-        return np.broadcast_to(found, part.intact.shape)
+        load: NDArray[Any] = np.where(part.cells[side].share > 0.0, loads[side], loads[1 - side])
+        return np.broadcast_to(load, part.intact.shape)
 
 
 class _Renewed(NamedTuple):
-    """Some bonds along a slot where they are kept, with what is remembered of them."""
+    """Bonds along a slot with their remembered numbers."""
 
     home: Home
     d: Vector
@@ -161,20 +163,48 @@ class _Renewed(NamedTuple):
     cells: tuple[CellStress, ...]
 
 
+BREAKS_AT_REST = Hindrance("an equilibrium with bonds that break", "fracture")
+"""Reason why ranks do not share an equilibrium."""
+
+
 class CutBonds(Operation):
     """Make the cuts of the beginning of a step."""
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
-        """Where the experiment cuts bonds."""
+        """Return whether the experiment cuts bonds."""
         return bool(scene.experiment.cuts)
 
     def apply(self, step: Step) -> None:
-        """Before leaders are placed."""
+        """Make them before leaders are placed."""
         cut_bonds(self.scene, step.state.broken_step, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Nothing: no kernel goes on beyond a step that begins with a cut."""
+        """Write nothing: a call ends before a step that begins with a cut."""
+
+    def reads(self, state: State) -> bool:
+        """Return whether the next step begins with a cut."""
+        return state.step + 1 in self._steps
+
+    def prepare(self, call: Call) -> None:
+        """Make the cuts of the first step of a call."""
+        call.has_cuts = cut_bonds(self.scene, call.state.broken_step, call.step)
+
+    def next_change(self, step: int, foreseeable: bool = False) -> float:
+        """Return the next step that begins with a cut."""
+        return min((at for at in self._steps if at > step), default=math.inf)
+
+    def events(self, steps: int) -> list[int]:
+        """Return the steps that begin with a cut."""
+        return self._steps
+
+    def hindrance(self, mode: Mode) -> Hindrance | None:
+        """Ranks share no equilibrium with bonds that break."""
+        return BREAKS_AT_REST if mode is Mode.RANKS_AT_REST else None
+
+    @property
+    def _steps(self) -> list[int]:
+        return [cut.at for cut in self.scene.experiment.cuts]
 
 
 class BreakBonds(Operation):
@@ -186,19 +216,31 @@ class BreakBonds(Operation):
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
-        """Where the fracture model can break bonds."""
+        """Return whether the fracture model can break bonds."""
         return scene.experiment.fracture.can_break
 
     def apply(self, step: Step) -> None:
-        """Before particles move."""
+        """Break them before particles move."""
         self._fracturing.break_bonds(step.u, step.state, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Before particles move, or with them."""
+        """Write the pass over bonds, or leave it to the sweep."""
         kernel.judge_bonds()
 
+    def reach(self, axis: int) -> Reach:
+        """Return distances if bonds are judged before particles move, because moves read the
+        result."""
+        scene, fracture = self.scene, self.scene.experiment.fracture
+        if not (isinstance(fracture, RenewsBonds) or scene.tears):
+            return Reach()
+        backward, forward = (home[axis] for home in scene.neighbourhood.home_reach)
+        back, ahead = (home[axis] for home in scene.home_reach)
+        return Reach(back=back, ahead=ahead, below=forward, above=backward)
+
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """The stress of cells takes in particles farther away than a pass knows."""
+        """The stress of cells depends on particles beyond the reach of a pass."""
+        if mode is Mode.RANKS_AT_REST:
+            return BREAKS_AT_REST
         softens = isinstance(self.scene.experiment.fracture, SoftensCells)
         if mode is Mode.PASSES and softens:
             return Hindrance("bonds soften by the stress of cells", "fracture")

@@ -1,4 +1,4 @@
-"""The stress of the cells beside bonds, for fracture models that soften cells by it."""
+"""Stress of the cells beside bonds, for fracture models that soften cells by it."""
 
 from __future__ import annotations
 
@@ -20,28 +20,36 @@ from pbdkit.stepping.state import shown
 
 @dataclass(frozen=True)
 class CellBeside:
-    """A cell on one side of the bonds along a slot: the way from their start to each corner, a
-    sublattice and a step of repeat cells; and the `rates` that make the mean gradient of the
-    displacement, Σ_k (u_k - u_0) ⊗ rates_k, of the corners but the first."""
+    """Cell on one side of the bonds along a slot.
+
+    `corners` are the differences from the start of a bond to each corner, a sublattice and a step
+    of repeat cells; `rates` give the mean gradient of the displacement, Σ_k (u_k - u_0) ⊗ rates_k,
+    over the corners but the first.
+    """
 
     corners: tuple[tuple[int, Index], ...]
     rates: tuple[Vector, ...]
     side: Side
 
     def gradient(self, u: NDArray[Any], home: Block) -> list[Any]:
-        """Of the bonds that start at some places: xx, xy, yx, yy, the component first."""
-        first, *others = (Vector(*shown(self._at(corner, home).of(u))) for corner in self.corners)
-        d = [other - first for other in others]
+        """Return the gradient at bonds that start at places of a block: xx, xy, yx, yy, the
+        component first."""
+        first, *corners = (Vector(*shown(self._at(corner, home).of(u))) for corner in self.corners)
+        d = [other - first for other in corners]
         return [
             sum_in_order(
-                [getattr(one, a) * getattr(g, b) for one, g in zip(d, self.rates, strict=True)]
+                [
+                    getattr(difference, a) * getattr(g, b)
+                    for difference, g in zip(d, self.rates, strict=True)
+                ]
             )
             for a in "xy"
             for b in "xy"
         ]
 
     def way(self, corner: tuple[int, Index], slot: Slot, shape: tuple[int, ...]) -> int:
-        """From the flat place of the start of a bond along a slot to that of a corner."""
+        """Return the difference of flat places from the start of a bond along a slot to a
+        corner."""
         step = corner[0] - slot.source
         for size, cells in zip(shape[1:], corner[1], strict=True):
             step = step * size + cells
@@ -54,13 +62,13 @@ class CellBeside:
 
 
 def sum_in_order(terms: list[Any]) -> Any:
-    """As kernels add them up."""
+    """Return the sum in the order of kernels."""
     return sum(terms[1:], terms[0])
 
 
 class CellStresses:
-    """The cells beside the bonds of a scene whose fracture model softens cells. Their `ratios` are
-    the stiffness over the own Young's modulus of the cell."""
+    """Cells beside the bonds of a scene with a fracture model that softens cells. `ratios` are the
+    stiffnesses over Young's modulus of the cell."""
 
     def __init__(self, scene: Scene) -> None:
         assert scene.cells
@@ -68,7 +76,7 @@ class CellStresses:
 
     @cached_property
     def ratios(self) -> Stiffness:
-        """Those of the rule's material."""
+        """The ratios of the rule's material."""
         rule: Any = self._scene.experiment.rule
         material = material_of(rule)
         assert material is not None
@@ -77,7 +85,7 @@ class CellStresses:
 
     @cached_property
     def ratios_by_cell(self) -> Stiffness:
-        """Those of each cell, (kind, sublattice, cell, cell), where cells are of several
+        """The ratios of each cell, (kind, sublattice, cell, cell), if cells are of several
         stiffnesses; those of the rule where there is none."""
         rule: Any = self._scene.experiment.rule
         base: Any = material_of(rule)
@@ -85,33 +93,38 @@ class CellStresses:
         for name, plane in zip(self._cells.names, self._cells.mixed, strict=True):
             if name in planes:
                 planes[name] = planes[name] + plane
-        some = planes["xx"] > 0.0
-        planes = {n: np.where(some, v, getattr(base, n)) for n, v in planes.items()}
+        has_stiffness = planes["xx"] > 0.0
+        planes = {n: np.where(has_stiffness, v, getattr(base, n)) for n, v in planes.items()}
         # In plane strain xy over xx is ν / (1 - ν), and σ_zz over σ_xx + σ_yy is ν.
-        share = planes["xy"] / planes["xx"] if rule.through_thickness() else np.zeros(some.shape)
-        alike = dict(planes)
+        share = (
+            planes["xy"] / planes["xx"]
+            if rule.through_thickness()
+            else np.zeros(has_stiffness.shape)
+        )
+        components = dict(planes)
         if base.xx == base.yy:  # cells that a border cuts count the same whichever axis is x
-            alike["xx"] = alike["yy"] = (planes["xx"] + planes["yy"]) / 2.0
-        modulus = Stiffness(**alike).own_modulus(share / (1.0 + share))
+            components["xx"] = components["yy"] = (planes["xx"] + planes["yy"]) / 2.0
+        modulus = Stiffness(**components).own_modulus(share / (1.0 + share))
         return Stiffness(**{name: plane / modulus for name, plane in planes.items()})
 
     @property
     def stress(self) -> Any:
-        """The function that makes stress of a gradient and the ratios."""
+        """The function that computes the stress from a gradient and the ratios."""
         return linear_stress if self._scene.experiment.rule.linear else turned_stress
 
     def beside(self, slot: Slot) -> tuple[CellBeside, CellBeside]:
-        """The cells to the left and to the right of a slot."""
+        """Return the cells to the left and to the right of a slot."""
         left, right = (_beside(self._scene, slot, side) for side in self.tiling.beside[slot])
         return left, right
 
     @property
     def tiling(self) -> Any:
-        """The cells of the lattice."""
+        """Cells of the lattice."""
         return self._scene.neighbourhood.tiling
 
     def of(self, u: NDArray[Any], slot: Slot, home: Block) -> tuple[CellStress, CellStress]:
-        """Of the bonds along a slot that start at some places, the cells to the left and right."""
+        """Return the cells to the left and right of the bonds along a slot that start at places of
+        a block."""
         precision = self._scene.experiment.stepping.precision
         shares = self._cells.beside(slot, home, precision, self._cells.share)
         ratios = [self.ratios] * 2
@@ -119,8 +132,8 @@ class CellStresses:
             parts = (self._cells.beside(slot, home, precision, p) for p in self.ratios_by_cell)
             ratios = [Stiffness(*side) for side in zip(*parts, strict=True)]
         left, right = (
-            self._stressed(one.gradient(u, home), c, share)
-            for one, c, share in zip(self.beside(slot), ratios, shares, strict=True)
+            self._stressed(cell.gradient(u, home), c, share)
+            for cell, c, share in zip(self.beside(slot), ratios, shares, strict=True)
         )
         return left, right
 
@@ -140,7 +153,8 @@ def _beside(scene: Scene, slot: Slot, side: Side) -> CellBeside:
 
 
 def _rates(polygon: CellPolygon) -> tuple[Vector, ...]:
-    """Of the mean gradient of a polygon (Green): ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area."""
+    """Return the rates of the mean gradient of a polygon (Green): ½ (y_k+1 - y_k-1, x_k-1 - x_k+1)
+    over its area."""
     r, twice = polygon.rest, 2.0 * float(signed_area(polygon.rest))
     ends = [(r[(k + 1) % len(r)], r[k - 1]) for k in range(1, len(r))]
     return tuple(
@@ -150,12 +164,12 @@ def _rates(polygon: CellPolygon) -> tuple[Vector, ...]:
 
 
 def linear_stress(xx: Any, xy: Any, yx: Any, yy: Any, c: Any) -> Any:
-    """The stress under a gradient of the displacement that is small."""
+    """Return the stress under a small gradient of the displacement."""
     return _elastic(xx, yy, xy + yx, c)
 
 
 def turned_stress(xx: Any, xy: Any, yx: Any, yy: Any, c: Any) -> Any:
-    """The stress of the strain of Green and Lagrange, of which rotations are no part."""
+    """Return the stress of the Green–Lagrange strain, which excludes rotations."""
     along_x, along_y = xx + 0.5 * (xx * xx + yx * yx), yy + 0.5 * (xy * xy + yy * yy)
     return _elastic(along_x, along_y, xy + yx + (xx * xy + yx * yy), c)
 
@@ -169,6 +183,6 @@ def _elastic(xx: Any, yy: Any, shear: Any, c: Any) -> Any:
 
 
 def tried(model: object, ones: Any) -> tuple[CellStress, ...]:
-    """Cells to try a model's functions with, as many as it is given."""
+    """Return cells for a test of a model's functions, as many as it receives."""
     stress = CellStress(ones, 0.5 * ones, 0.25 * ones, ones)
     return (stress, stress) if isinstance(model, SoftensCells) else ()

@@ -30,7 +30,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
 from pbdkit.stepping.state import State, unmoved_state
-from pbdkit.stepping.step import PUSHED_BY_COURSES, Hindrance, Mode, Operation, Step
+from pbdkit.stepping.step import PUSHED_BY_COURSES, Call, Cells, Hindrance, Mode, Operation, Step
 
 NUDGE = 0.01
 """Distance by which a particle is moved to measure what pulls it back, in lattice constants."""
@@ -44,44 +44,43 @@ def stiffnesses(scene: Scene, place: Indices) -> Floats:
     """Return S of the particles at some flat places, (particle, axis, axis), with no bond broken;
     zero where a particle does not move."""
     each = scene.raster.kind.size // len(scene.raster.kind)
-    found = np.zeros((len(place), scene.axes, scene.axes))
+    S = np.zeros((len(place), scene.axes, scene.axes))
     for s in np.unique(place // each).tolist():
         rows = np.flatnonzero(place // each == s)
         for first in range(0, len(rows), PARTICLES):
-            some = rows[first : first + PARTICLES]
-            found[some] = _stiffnesses(scene, place[some], s)
-    return found
+            part = rows[first : first + PARTICLES]
+            S[part] = _stiffnesses(scene, place[part], s)
+    return S
 
 
 def _stiffnesses(scene: Scene, place: Indices, sublattice: int) -> Floats:
-    """The same of particles of one sublattice: the mean of nudges to both sides, so that mirrored
-    scenes have mirrored matrices."""
+    """Return S of particles of one sublattice: the mean of nudges in opposite directions, so that
+    mirrored scenes have mirrored matrices."""
     rest, evaluator = unmoved_state(scene, scene.raster.shape[1:]), Evaluator(scene)
     around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
     if scene.constants.by_particle:
         evaluator = evaluator.given(around.parameters)
-    neighbours, here = around.neighbours(rest), around.here(rest.u, rest)
+    neighbours, values = around.neighbours(rest), around.here(rest.u, rest)
     size = NUDGE * length(scene.raster.cell.vectors[0])
     sizes = (size,) if scene.experiment.rule.linear else (size, -size)
-    found = np.zeros((len(place), scene.axes, scene.axes))
+    S = np.zeros((len(place), scene.axes, scene.axes))
     for nudge in sizes:
         answers = []
         for e in np.eye(scene.axes):
             u = vector(np.full(len(place), nudge * c) for c in e)
             parts = [(evaluator.contribution(-u, u, to), to.present) for to in neighbours]
-            total, at = summed(parts), here._replace(u=u)
+            total, at = summed(parts), values._replace(u=u)
             both = evaluator.move(total, at), evaluator.force(total, at)
-            answers.append([[np.broadcast_to(c, len(place)) for c in one] for one in both])
+            answers.append([[np.broadcast_to(c, len(place)) for c in columns] for columns in both])
         move, force = np.array(answers).transpose(1, 3, 2, 0)
-        found += force @ np.linalg.pinv(move) / len(sizes)
-    return found
+        S += force @ np.linalg.pinv(move) / len(sizes)
+    return S
 
 
 def compliance(scene: Scene) -> Floats | None:
     """Return C = S⁻¹ of every particle, up to a factor of each: (xx xy yy, sublattice, cell, cell).
 
-    None where C is 1 everywhere: for rules that know no forces, whose particles count as giving way
-    alike along all directions, and for those of which S is a multiple of 1.
+    None if C is a multiple of 1 everywhere. For rules without forces C is 1.
     """
     if material_of(scene.experiment.rule) is None:
         return None
@@ -90,26 +89,26 @@ def compliance(scene: Scene) -> Floats | None:
     xx, xy, yy = S[:, 0, 0], (S[:, 0, 1] + S[:, 1, 0]) / 2, S[:, 1, 1]
     mean = (xx + yy) / 2
     differs = np.maximum(abs(xx - yy), abs(xy)) > SAME * mean
-    some = np.flatnonzero(differs & (xx * yy > xy * xy))
-    if not len(some):
+    rows = np.flatnonzero(differs & (xx * yy > xy * xy))
+    if not len(rows):
         return None
-    found = np.ones((3, *scene.raster.shape))
-    found[1] = 0.0
-    found.reshape(3, -1)[:, place[some]] = np.stack([yy, -xy, xx])[:, some] / mean[some]
-    return found
+    C = np.ones((3, *scene.raster.shape))
+    C[1] = 0.0
+    C.reshape(3, -1)[:, place[rows]] = np.stack([yy, -xy, xx])[:, rows] / mean[rows]
+    return C
 
 
 Touching = list[tuple[Indices, Floats]]
-"""Of each obstacle some rows, and the normals there, (row, axis)."""
+"""Type of the rows at each obstacle, with the normals there, (row, axis)."""
 FREE, ALL_LED = 0, 3
-"""Codes of particles that follow along both axes, and along none; 1 and 2 are led along x, y."""
+"""Codes of particles that follow along both axes, and along none; 1 and 2 lead along x and y."""
 
 
 class Contact:
-    """The obstacles of a scene and the particles of its body.
+    """Obstacles of a scene and the particles of its body.
 
-    Only those are looked at that can be in an obstacle's box, as far as displacements reach. The
-    order of the obstacles does not matter.
+    Particles that cannot reach the box of an obstacle with their displacements are not evaluated.
+    The order of the obstacles does not matter.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -118,17 +117,17 @@ class Contact:
         self._inverse = np.linalg.inv(self._vectors)
         ends = [end for block in self._blocks() for end in self._ends(block)]
         self.reach = float(np.abs(ends).max())
-        """How far any particle rests from the lattice's site (0, 0), along an axis."""
+        """Largest distance of a particle at rest from the lattice's site (0, 0), along an axis."""
         self._led: dict[tuple[bool, ...], NDArray[np.int8]] = {}
 
     @cached_property
     def compliance(self) -> Floats | None:
-        """How particles give way along different directions; None where alike."""
+        """Directional response C of the particles; None if it is the same along all directions."""
         return compliance(self._scene)
 
     def led(self, step: int) -> NDArray[np.int8] | None:
-        """(sublattice, cell, cell): the code of the axes along which particles lead in a step; None
-        where none can be guided."""
+        """Return the code of the axes along which particles lead in a step, (sublattice, cell,
+        cell); None if none can be guided."""
         scene = self._scene
         if not has_guides(scene.leading):
             return None
@@ -142,31 +141,32 @@ class Contact:
         return self._led[roles]
 
     def push_out(self, u: Floats, moment: float) -> None:
-        """Put the body's particles out of the obstacles as they are at the end of a step, or at a
-        moment within it; `u` are planes, with guided particles where they are led to. Particles
-        that lead along both axes may be moved, too."""
-        outlines, found = self._outlines(moment), [np.empty(0, np.intp)]
+        """Push the body's particles out of the obstacles at the end of a step, or at a moment
+        within it; `u` are planes, with guided particles placed along their led axes. Particles that
+        lead along both axes may be moved, too."""
+        outlines, places = self._outlines(moment), [np.empty(0, np.intp)]
         for outline in outlines:
             for block in self._blocks():
                 near = self._near(block, block.of(u), outline.box)
                 if near is not None:
                     i, j = np.nonzero(self._inside(near, u, outline))
                     at = near.sublattice, i + near.start[0], j + near.start[1]
-                    found.append(np.ravel_multi_index(at, self._scene.raster.shape))
-        place = distinct(np.concatenate(found))
+                    places.append(np.ravel_multi_index(at, self._scene.raster.shape))
+        place = distinct(np.concatenate(places))
         if len(place):
             flat = u.reshape(len(u), -1)
             flat[:, place] = flat[:, place] + self.ways(u, place, moment)
 
     def ways(self, u: Floats, place: Indices, moment: float) -> Floats:
-        """(axis, place): the ways of particles at flat places to where obstacles let them be."""
+        """Return the displacements that push particles at flat places out of the obstacles, (axis,
+        place)."""
         codes = self.led(math.ceil(moment))
-        led = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
-        return self._ways(self.positions(u, place), self.compliance_at(place), led, moment)
+        codes_at = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
+        return self._ways(self.positions(u, place), self.compliance_at(place), codes_at, moment)
 
     def ways_of_masses(self, u: Floats, place: Indices, moment: float) -> Floats:
-        """The same of particles that give way alike along all directions, at displacements u,
-        (axis, place)."""
+        """Return those of particles with the same response along all directions, at displacements
+        u, (axis, place)."""
         X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
         at = np.stack([a + b for a, b in zip(X, u, strict=True)])
         return self._ways(at, _alike(len(place)), np.zeros(len(place), np.int8), moment)
@@ -174,14 +174,14 @@ class Contact:
     def _ways(self, at: Floats, C: Floats, led: NDArray[np.int8], moment: float) -> Floats:
         outlines = self._outlines(moment)
         walls, way, size = Walls.of(outlines), np.zeros(at.shape), at.shape[1]
-        count, one = np.zeros(size, np.intp), np.zeros(size, np.intp)
+        count, obstacle = np.zeros(size, np.intp), np.zeros(size, np.intp)
         with np.errstate(all="ignore"):
             for n, outline in enumerate(outlines):
                 inside = outline.facing(*at)[0] < 0.0
-                count, one = count + inside, np.where(inside, n, one)
+                count, obstacle = count + inside, np.where(inside, n, obstacle)
             for n, outline in enumerate(outlines):
-                some = np.flatnonzero((count == 1) & (led == FREE) & (one == n))
-                way[:, some] = outline.way_out(at[:, some], C[:, some])
+                single = np.flatnonzero((count == 1) & (led == FREE) & (obstacle == n))
+                way[:, single] = outline.way_out(at[:, single], C[:, single])
             x, y = at + way
             alone = (count == 1) & (led == FREE) & (walls.clearance(x, y) >= 0.0)
             for k in np.flatnonzero((count > 0) & (led != ALL_LED) & ~alone).tolist():
@@ -189,19 +189,21 @@ class Contact:
         return way
 
     def positions(self, u: Floats, place: Indices) -> Floats:
-        """(axis, place): where particles at flat places are, from the lattice's site (0, 0)."""
+        """Return the positions of particles at flat places, from the lattice's site (0, 0), (axis,
+        place)."""
         X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
         return np.stack([a + b for a, b in zip(X, u.reshape(len(u), -1)[:, place], strict=True)])
 
     def compliance_at(self, place: Indices) -> Floats:
-        """C of particles at flat places, (xx xy yy, place)."""
+        """Return C of particles at flat places, (xx xy yy, place)."""
         if self.compliance is None:
             return _alike(len(place))
-        found: Floats = self.compliance.reshape(3, -1)[:, place]
-        return found
+        C: Floats = self.compliance.reshape(3, -1)[:, place]
+        return C
 
     def touched_at_rest(self, moment: float) -> Iterator[tuple[NDArray[np.intp], ...]]:
-        """The cells of particles that would be pushed where they rest, index by index."""
+        """Generate the cells of particles that are pushed where they rest, one array for each
+        axis."""
         still = np.zeros((2, *self._scene.raster.shape))
         for _, outline in outlines_at(self._scene.barriers, moment):
             for block in self._blocks():
@@ -211,10 +213,12 @@ class Contact:
                     yield tuple(n + a for n, a in zip(np.nonzero(inside), near.start, strict=True))
 
     def touching(self, state: State, moment: float) -> Touching:
-        """The rows of the followers on each obstacle's outline, as the state has them at a moment,
-        and the normals there, (row, axis): within what rounding allows, and 1e-9 of a lattice
-        constant. Guided particles are among them. Where two faces of an obstacle meet a row stands
-        twice."""
+        """Return the rows of the followers on the outline of each obstacle at a moment, guided
+        particles included, and the normals there, (row, axis).
+
+        The tolerance is the rounding error and 1e-9 of a lattice constant. Rows at which two faces
+        meet occur twice.
+        """
         scene, raster, step = self._scene, self._scene.raster, math.ceil(moment)
         kinds = kinds_at(raster, scene.leading, step)
         if has_guides(scene.leading):
@@ -223,17 +227,17 @@ class Contact:
         at = self.positions(state.u, raster.place_of(rows))
         digits = 16.0 * float(np.finfo(state.u.dtype).eps) * self.reach
         slack = SLACK * math.hypot(*self._vectors[0]) + digits
-        found: Touching = [(rows[:0], np.zeros((0, 2)))] * len(scene.barriers)
+        touching: Touching = [(rows[:0], np.zeros((0, 2)))] * len(scene.barriers)
         for n, outline in outlines_at(scene.barriers, moment):
             near = np.flatnonzero(np.abs(outline.facing(*at)[0]) <= slack)
             faces = list(outline.faces(*at[:, near]))
             on = [face.distance <= slack for face in faces]
-            normals = [face.normal[:, own] for face, own in zip(faces, on, strict=True)]
-            found[n] = (
-                np.concatenate([rows[near[own]] for own in on]),
+            normals = [face.normal[:, is_on] for face, is_on in zip(faces, on, strict=True)]
+            touching[n] = (
+                np.concatenate([rows[near[is_on]] for is_on in on]),
                 np.concatenate(normals, axis=1).T,
             )
-        return found
+        return touching
 
     def _outlines(self, moment: float) -> Sequence[Outline]:
         return [outline for _, outline in outlines_at(self._scene.barriers, moment)]
@@ -243,7 +247,8 @@ class Contact:
         return [block for block in blocks if block]
 
     def _near(self, block: Block, u: Floats, box: Floats) -> Block | None:
-        """The part of a block whose particles can be in the box; u are its displacements."""
+        """Return the part of a block whose particles may lie in the box; u are its
+        displacements."""
         raster = self._scene.raster
         low, high = np.array([[np.fmin.reduce(p, axis=None) for p in u],
                               [np.fmax.reduce(p, axis=None) for p in u]])  # fmt: skip
@@ -263,7 +268,7 @@ class Contact:
         return Block(block.sublattice, tuple(first.tolist()), tuple(last.tolist()))
 
     def _inside(self, block: Block, u: Floats, outline: Outline) -> Mask:
-        """Which of the body's particles in a block are inside."""
+        """Return which of the body's particles in a block are inside."""
         X, low = self._scene.raster.reference_planes(block), outline.box
         x, y = (a + b for a, b in zip(X, block.of(u), strict=True))
         near = (x >= low[0]) & (y >= low[1]) & (x <= low[2]) & (y <= low[3])
@@ -273,7 +278,7 @@ class Contact:
         return inside
 
     def _ends(self, block: Block) -> tuple[Floats, Floats]:
-        """(low, high) of the places of a block's sites, from site (0, 0)."""
+        """Return (low, high) of the positions of a block's sites, from site (0, 0)."""
         corners = product(*((a, b - 1) for a, b in zip(block.start, block.stop, strict=True)))
         sites = np.array(list(corners)) + self._scene.raster.first
         at = self._scene.raster.cell.basis[block.sublattice]
@@ -282,43 +287,76 @@ class Contact:
 
 
 def _alike(count: int) -> Floats:
-    """C of particles that give way alike along all directions, (xx xy yy, particle)."""
+    """Return C of particles with the same response along all directions, (xx xy yy, particle)."""
     return np.repeat([[1.0], [0.0], [1.0]], count, axis=1)
 
 
 class PushOut(Operation):
-    """Put particles out of obstacles."""
+    """Push particles out of obstacles."""
 
     @cached_property
     def contact(self) -> Contact:
-        """The obstacles, and the particles that they push."""
+        """The obstacles and the particles that they push."""
         return Contact(self.scene)
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
-        """Where there are obstacles."""
+        """Return whether there are obstacles."""
         return bool(scene.barriers)
 
     def apply(self, step: Step) -> None:
-        """After particles have moved, guided ones where they are led to."""
+        """Push particles after they have moved and guided ones have been placed."""
         self.contact.push_out(step.new, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Rows whose particles reach no obstacle's box, as far as their displacements go, are
-        passed over."""
+        """Write a function of rows that skips those that reach no box of an obstacle."""
         kernel.over_rows("push_out", lambda out: self._write(kernel, out))
 
     def functions(self) -> dict[str, Callable[..., Any]]:
-        """The way of a particle out of all obstacles."""
+        """Return the displacement of a particle out of all obstacles."""
         return {"leave": leave}
 
+    def arrays(self, call: Call) -> dict[str, Any]:
+        """Return the outlines of the obstacles, with points and boxes step by step, the response of
+        particles, and the axes along which they lead."""
+        moments = [[o for _, o in outlines_at(self.scene.barriers, step)] for step in call.moments]
+        walls = [Walls.of(outlines) for outlines in moments]
+        boxes = np.array([[outline.box for outline in outlines] for outlines in moments])
+        arrays = {
+            "wall_kind": walls[0].kinds,
+            "wall_first": walls[0].first,
+            "wall_points": np.array([each.points for each in walls]),
+            "wall_radii": np.array([each.radii for each in walls]),
+            "wall_box": boxes.reshape(len(moments), -1, 4),
+        }
+        compliance, codes = self.contact.compliance, self.contact.led(call.step)
+        arrays |= {} if compliance is None else {"compliance": compliance}
+        return arrays | ({} if codes is None else {"led_axes": codes})
+
+    def disturbances(self, call: Call) -> Iterator[Cells]:
+        """Generate the cells of particles that are pushed where they rest."""
+        for step in call.moments:
+            yield from self.contact.touched_at_rest(step)
+
+    def next_change(self, step: int, foreseeable: bool = False) -> float:
+        """Return the next change of any obstacle."""
+        return min(each.group.next_change(step, foreseeable) for each in self.scene.barriers)
+
+    def events(self, steps: int) -> list[int]:
+        """Return the events of all obstacles."""
+        return [at for each in self.scene.barriers for at in each.group.events(steps)]
+
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """How particles give way is known for the numbers at the beginning."""
-        reasons = {Mode.GPU: "obstacles push", Mode.COURSES: PUSHED_BY_COURSES}
+        """The response of particles is computed from the numbers at the beginning."""
+        reasons = {
+            Mode.GPU: "obstacles push",
+            Mode.COURSES: PUSHED_BY_COURSES,
+            Mode.RANKS_AT_REST: "an equilibrium before obstacles",
+        }
         return Hindrance(reasons[mode], "obstacles") if mode in reasons else None
 
     def _write(self, kernel: KernelWriter, out: Function) -> None:
-        """The function that pushes the particles of some rows."""
+        """Write the lines that push the particles of rows."""
         out.add(0, "m = min(moment, wall_box.shape[0] - 1)")
         out.add(0, "points, edges, radii = wall_points[m], wall_box[m], wall_radii[m]")
         out.add(0, "j0, j1 = max(0, box[2]), min(kind.shape[2], box[3])", "width = j1 - j0")
@@ -339,16 +377,16 @@ class PushOut(Operation):
         compliance = ["1.0", "0.0", "1.0"]
         if kernel.is_given("compliance"):
             compliance = [f"compliance[{n}, s, i, j0 + j]" for n in range(3)]
-        led = "led_axes[s, i, j0 + j]" if has_guides(self.scene.leading) else "0"
-        particle = ", ".join([*compliance, led])
+        axes = "led_axes[s, i, j0 + j]" if has_guides(self.scene.leading) else "0"
+        particle = ", ".join([*compliance, axes])
         walls = "wall_kind, points, wall_first, radii"
         out.add(3, f"{', '.join(kernel.each('w@'))} = leave(px, py, {particle}, {walls})")
         out.add(3, *kernel.each("o@[j] = o@[j] + w@"))
 
 
 def _each_near(low: str, high: str) -> Lines:
-    """A loop over the obstacles that notes whether what lies from one place to the other may be in
-    the box of one; it does not where it is not a number."""
+    """Return a loop over the obstacles that sets `near` if the range between two positions may
+    overlap the box of one; not if it is not a number."""
     return [
         "for w in range(wall_kind.size):",
         f"    if {low}x > edges[w, 2] or {high}x < edges[w, 0] or "
@@ -359,6 +397,6 @@ def _each_near(low: str, high: str) -> Lines:
 
 
 def _places(kernel: KernelWriter, name: str) -> Lines:
-    """The reference position of particle j of a row."""
+    """Return lines for the reference position of particle j of a row."""
     pairs = zip(kernel.each("@"), kernel.places("s"), strict=True)
     return [f"{name}{axis} = {place}" for axis, place in pairs]

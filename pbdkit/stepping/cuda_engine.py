@@ -1,18 +1,16 @@
-"""The GPU engine (numba-cuda): kernels that make many steps a launch, and the state on the device.
+"""GPU engine (numba-cuda): kernels that make many steps in a launch, and the state on the device.
 
-A thread moves one particle after the other with the lines that rows are swept with, on flat arrays.
-Every place has a group: 0 where nobody follows, then a number for each sublattice and kind of row
-whose particles have all their neighbours, then one for each sublattice where something may be
-missing. Between operations of a step all threads wait for each other: what one writes, none reads
-before the next.
+A thread moves one particle after the other with the lines of row sweeps, on flat arrays. Every
+place has a group: 0 without a follower, then a number for each sublattice and kind of row whose
+particles have all their neighbours, then one for each sublattice where neighbours may be missing.
+Threads are synchronised between the operations of a step, so that none reads what another writes.
 
-The state stays on the device and is fetched at the end of a call. Kernels are kept from contracting
-products and sums (written against numba-cuda 0.30; see `_uncontracted`).
+The state stays on the device and is fetched at the end of a call. Kernels do not contract products
+and sums (written against numba-cuda 0.30; see `_uncontracted`).
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,17 +32,16 @@ from pbdkit.plugin import Slot
 from pbdkit.plugin.discovery import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, Lines
-from pbdkit.stepping.leaders import prescribe, steady_steps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
     bits_for,
+    call_arrays,
     changing_arrays,
     constant_arrays,
     kinds_of,
     lost_bits,
     state_arrays,
 )
-from pbdkit.stepping.numba_engine.boundary import foreseen, held, leading_arrays
 from pbdkit.stepping.numba_engine.cache import with_helpers_ready, words
 from pbdkit.stepping.numba_engine.emitter import module_text
 from pbdkit.stepping.numba_engine.plan import (
@@ -70,18 +67,18 @@ from pbdkit.stepping.numba_engine.sweeps import (
     write_whole,
 )
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.program import program_of
-from pbdkit.stepping.state import State, cut_bonds, unmoved_state
-from pbdkit.stepping.step import Led
+from pbdkit.stepping.program import foresee, prepare, program_of
+from pbdkit.stepping.state import State, unmoved_state
+from pbdkit.stepping.step import Call
 
 THREAD = ("me", "threads")
-"""What functions are given: the number of a thread, and of how many."""
+"""Arguments of functions: the number of the thread, and the number of threads."""
 Whole = Sequence[tuple[int, int]]
-"""The sublattice and kind of the groups that have all their neighbours."""
+"""Type of the groups of particles that have all neighbours, as (sublattice, kind)."""
 
 
 def find_groups(plan: Plan) -> tuple[NDArray[Any], Whole]:
-    """The group of each place of the rasters, and which groups come first."""
+    """Return the group of each place of the rasters, and the groups with all neighbours."""
     raster, whole = plan.scene.raster, list[tuple[int, int]]()
     groups = np.zeros(raster.shape, np.int64)
     blocks = [raster.body_block(s) for s in range(raster.shape[0])]
@@ -98,18 +95,18 @@ def find_groups(plan: Plan) -> tuple[NDArray[Any], Whole]:
 
 
 def breakable_bonds(plan: Plan) -> NDArray[np.uint8]:
-    """1 where a bond is that may break, as planes of bonds lie."""
+    """Return 1 where a bond may break, in planes of bonds."""
     planes, shape = plan.scene.neighbourhood.planes, plan.scene.raster.shape
-    found = np.zeros((len(planes), *shape[1:]), np.uint8)
+    breakable = np.zeros((len(planes), *shape[1:]), np.uint8)
     for n, plane in enumerate(planes):
         if block := plane_block(plan.scene.raster, plane, inside=plan.softens_cells):
             too = plan.model.breaks_frame_bonds()
-            block.within(found[n])[...] = bonds_in(plan.scene.raster, block, plane, too)
-    return found
+            block.within(breakable[n])[...] = bonds_in(plan.scene.raster, block, plane, too)
+    return breakable
 
 
 def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None) -> Function:
-    """The function by which a thread moves its particles, one after the other."""
+    """Return the function by which a thread moves its particles, one after the other."""
     out = Function(plan.shared, f"sweep{level.number}", *THREAD)
     out.add(0, *parameters(plan, level), "base = 0", *_aliases(plan, level))
     for s, kind in whole:
@@ -137,15 +134,15 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
 
 
 def write_bonds(plan: Plan) -> Function:
-    """The function by which a thread renews its bonds and breaks them, plane after plane."""
+    """Return the function by which a thread renews its bonds and breaks them, plane after plane."""
     out = Function(plan.shared, "judge_bonds", *THREAD)
     out.add(0, parameters(plan, plan.levels[-1])[-1])
     out.add(0, "cells = flat_broken.size // len(ends)", "for n in range(len(ends)):")
     out.add(1, f"r = {plan.vector('end_rests[n, #]')}")
-    kept = {"since": "broken", "ways": "lengths", "may": "breakable"}
-    kept |= {f"b{m}": f"bond{m}" for m in range(plan.bonds)}
-    kept |= {f"x{m}": f"limit{m}" for m in range(plan.limits)}
-    out.add(1, *(f"{name} = flat_{of}[n * cells:(n + 1) * cells]" for name, of in kept.items()))
+    rows = {"since": "broken", "ways": "lengths", "may": "breakable"}
+    rows |= {f"b{m}": f"bond{m}" for m in range(plan.bonds)}
+    rows |= {f"x{m}": f"limit{m}" for m in range(plan.limits)}
+    out.add(1, *(f"{name} = flat_{of}[n * cells:(n + 1) * cells]" for name, of in rows.items()))
     out.add(1, f"for j in {plan.over('cells')}:", "    if may[j] and since[j] < 0:")
     out.add(3, "here = ends[n, 0] * cells + j", "there = here + end_steps[n]")
     out.add(3, *judging(plan, "flat_u_@[there] - flat_u_@[here]", "here").write)
@@ -154,7 +151,7 @@ def write_bonds(plan: Plan) -> Function:
 
 
 def _aliases(plan: Plan, level: Level) -> list[str]:
-    """The names by which lines know the rows of a particle, for the whole arrays."""
+    """Return lines that alias the rows of a particle to the whole arrays."""
     n = level.number
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
@@ -167,16 +164,17 @@ def _aliases(plan: Plan, level: Level) -> list[str]:
 
 
 def _cells(plan: Plan) -> list[str]:
-    """The cell indices of place j, the last one as `j + j0`."""
-    lines, within = ["j0 = j % extent[-1] - j"], "j // extent[-1]"
+    """Return lines for the cell indices of place j, the last one as `j + j0`."""
+    lines, index = ["j0 = j % extent[-1] - j"], "j // extent[-1]"
     for axis, name in reversed(list(enumerate(plan.lead, 1))):
-        lines.append(f"{name} = {within} % extent[{axis}]")
-        within += f" // extent[{axis}]"
+        lines.append(f"{name} = {index} % extent[{axis}]")
+        index += f" // extent[{axis}]"
     return lines
 
 
 def _steps(plan: Plan, kind: int, s: int, k: int, slot: Slot) -> list[str]:
-    """The way in flat arrays to a neighbour, to the home of its bond and to the cells beside it."""
+    """Return lines for the differences in flat arrays to a neighbour, to the home of its bond and
+    to the cells beside it."""
     lines = [f"w{s}_{k} = away[{s}, {k}]"]
     if plan.bonds or plan.limits or plan.bonds_first:
         lines.append(f"v{s}_{k} = bonds_away[{s}, {k}]")
@@ -186,11 +184,11 @@ def _steps(plan: Plan, kind: int, s: int, k: int, slot: Slot) -> list[str]:
 
 
 def _words(plan: Plan, level: Level, kind: int, s: int, k: int) -> Words:
-    there, home = f"j + w{s}_{k}", f"j + v{s}_{k}"
+    place, home = f"j + w{s}_{k}", f"j + v{s}_{k}"
     shares = [f"flat_share[j + q{s}_{k}_{side}]" for side in (0, 1)] if kind == WITH_CELLS else []
     return Words(
-        f"flat_{level.source}_@[{there}]",
-        [f"flat_{array}[{there}]" for array in plan.shown],
+        f"flat_{level.source}_@[{place}]",
+        [f"flat_{array}[{place}]" for array in plan.shown],
         shares,
         f"flat_bond{{n}}[{home}]",
         f"flat_limit{{n}}[{home}]",
@@ -202,22 +200,22 @@ PLANES = re.compile(
     r"kind|share|body|ratios|mixed|broken|lengths|lost|torn|groups|breakable"
     r"|(u|v|z\d+|load)_[xyz]|(bond|own|was|field|limit)\d+"
 )
-"""Names of arrays that have a value for every place."""
+"""Names of arrays with a value at every place."""
 
 
 def steady_arrays(plan: Plan) -> tuple[Arrays, Whole]:
-    """What does not change from step to step, and which groups of places have all neighbours."""
+    """Return the constant arrays, and the groups with all neighbours."""
     shape, planes = plan.scene.raster.shape, plan.scene.neighbourhood.planes
     groups, whole = find_groups(plan)
-    found = constant_arrays(plan) | {"groups": groups, "extent": np.array(shape, np.int64)}
-    found["end_steps"] = np.array([slot_step(shape, plane.slot) for plane in planes], np.int64)
+    arrays = constant_arrays(plan) | {"groups": groups, "extent": np.array(shape, np.int64)}
+    arrays["end_steps"] = np.array([slot_step(shape, plane.slot) for plane in planes], np.int64)
     if plan.bonds_first:
-        found["breakable"] = breakable_bonds(plan)
-    return found, whole
+        arrays["breakable"] = breakable_bonds(plan)
+    return arrays, whole
 
 
 def flattened(arrays: Arrays) -> Arrays:
-    """The same as kernels know them; what they write into planes is written into these."""
+    """Return the arrays as kernels receive them; planes are flat views."""
     return {
         f"flat_{name}" if PLANES.fullmatch(name) else name: (
             array.reshape(-1) if PLANES.fullmatch(name) else array
@@ -226,48 +224,38 @@ def flattened(arrays: Arrays) -> Arrays:
     }
 
 
-def without_doubles(led: Led) -> Led:
-    """Every leader once, where the last group puts it: threads place them all at once."""
-    found: Led = []
-    later = np.empty(0, np.intp)
-    for each in reversed(led):
-        fresh = ~np.isin(each.place, later)
-        found.insert(0, each._replace(place=each.place[fresh], u=each.u[:, fresh]))
-        later = np.concatenate([later, each.place])
-    return found
-
-
 class ThreadWriter(PlanWriter):
-    """Writes what one of many threads does in a step. All wait for each other between operations
-    that go by different places: what one writes, none reads before the next."""
+    """Writer of what one of many threads does in a step. Threads are synchronised between
+    operations on different places."""
 
     _list = ""
-    """The list that places have gone by since all have waited."""
+    """List of particles that lines have gone through since the last synchronisation."""
 
     def __init__(self, plan: Plan, out: Function, passes: Passes, wait: str) -> None:
         super().__init__(plan, out, passes)
         self._wait = wait
 
     def begin(self) -> None:
-        """Where leaders are held, and what was remembered before the step."""
-        self.out.add(1, *(held(end, "made") for end in self.plan.leads))
+        """Write the opening lines of operations, and copy remembered numbers as they are before the
+        step."""
+        self.out.add(1, *self.plan.opening("moment"))
         for m in self.plan.kept:
             self.out.add(1, f"for e in {self.plan.over(f'flat_own{m}.size')}:")
             self.out.add(2, f"flat_was{m}[e] = flat_own{m}[e]")
 
     def end(self) -> None:
-        """What was after the step is before the next one."""
+        """Exchange the displacements before and after the step."""
         u, v = (", ".join(self.each(f"flat_{name}_@")) for name in "uv")
         self.out.add(1, f"{u}, {v} = {v}, {u}")
 
     def wait(self) -> None:
-        """For all threads, unless nothing was done since."""
+        """Synchronise all threads, unless nothing was done since."""
         if not self.out.lines[-1].endswith(self._wait):
             self.out.add(1, self._wait)
         self._list = ""
 
     def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
-        """Its share."""
+        """Write the thread's part."""
         if self._list not in ("", name):
             self.wait()
         self._list = name
@@ -275,16 +263,16 @@ class ThreadWriter(PlanWriter):
         self.out.add(2, *lines)
 
     def judge_bonds(self) -> None:
-        """Its share."""
+        """Write the thread's part."""
         if self.passes.judge:
             self._call(self.passes.judge)
 
     def sweep(self, level: int) -> None:
-        """Its share."""
+        """Write the thread's part."""
         self._call(self.passes.sweeps[level])
 
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Its share."""
+        """Write the thread's part."""
         self.wait()
         self.out.add(1, f"for f in {self.plan.over('points.size')}:")
         self.out.add(2, *mapped("flat_u" if lag else planes))
@@ -292,7 +280,7 @@ class ThreadWriter(PlanWriter):
         self.wait()
 
     def over_rows(self, name: str, write: Callable[[Function], None]) -> None:
-        """There are no rows here."""
+        """Raise NotImplementedError: there are no rows."""
         raise NotImplementedError(f"{name} on a GPU")
 
     def _call(self, function: Function) -> None:
@@ -302,9 +290,9 @@ class ThreadWriter(PlanWriter):
 
 
 def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]:
-    """The source of a module with ``run(step, count, ...)``, which takes the scene `count` steps
-    further, and the names of the arrays that follow these two. A block that is `alone` waits for
-    its own threads only, which takes much less time."""
+    """Return the source of a module with ``run(step, count, ...)``, which makes `count` steps, and
+    the names of the arrays that follow these two. A block that is `alone` synchronises its own
+    threads only, which takes much less time."""
     events = write_events(plan) if plan.judged else None
     judge = write_bonds(plan) if plan.bonds_first else None
     sweeps = [write_sweep(plan, level, whole, events) for level in plan.levels]
@@ -313,7 +301,7 @@ def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]
     run.add(0, "me, threads = cuda.grid(1), cuda.gridsize(1)")
     if not alone:
         run.add(0, "everyone = cuda.cg.this_grid()")
-    run.add(0, "for made in range(count):", "    step += 1")
+    run.add(0, "for moment in range(count):", "    step += 1")
     wait = "cuda.syncthreads()" if alone else "everyone.sync()"
     writer = ThreadWriter(plan, run, Passes(judge, sweeps), wait)
     writer.begin()
@@ -325,14 +313,15 @@ def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]
 
 
 ALONE = 4096
-"""Places up to which one block makes all steps, whose threads wait for each other in no time
-(estimated, not measured)."""
+"""Number of places up to which one block makes all steps (estimated, not measured)."""
 
 
 @dataclass(frozen=True)
 class GpuKernel:
-    """A kernel that is not yet compiled: `names` are those of the arrays that it takes, and `alone`
-    says whether it is for one block."""
+    """Kernel that is not compiled.
+
+    `names` are those of the arrays that it takes, and `alone` is true if it is for one block.
+    """
 
     plan: Plan
     source: str
@@ -342,7 +331,7 @@ class GpuKernel:
 
 
 def kernel_of(scene: Scene) -> GpuKernel:
-    """The kernel that steps a scene."""
+    """Return the kernel that steps a scene."""
     plan = Plan(scene, levels_of(scene), parallel=False, gpu=True)
     steady, whole = steady_arrays(plan)
     start = unmoved_state(scene, scene.raster.shape[1:])
@@ -353,29 +342,27 @@ def kernel_of(scene: Scene) -> GpuKernel:
         arrays["lost"] = np.zeros(scene.raster.shape, bits_for(scene))
     if plan.tears:
         arrays["torn"] = np.zeros(scene.raster.shape, np.uint8)
-    if scene.loads:
-        arrays |= dict.fromkeys(plan.each("load_@"), np.zeros(scene.raster.shape, start.u.dtype))
-    found = flattened(steady | arrays) | changing_planes(plan, start)
-    found |= leading_arrays(plan, [[]], {}, start.u.dtype)
+    named = flattened(steady | arrays) | changing_planes(plan, start)
+    named |= flattened(call_arrays(plan, plan.program, Call(start), by_rows=False))
     alone = scene.raster.kind.size <= ALONE
-    source, names = write_kernel(replace(plan, shared=("step", *found)), whole, alone)
-    return GpuKernel(plan, source, names, {name: found[name] for name in names}, alone)
+    source, names = write_kernel(replace(plan, shared=("step", *named)), whole, alone)
+    return GpuKernel(plan, source, names, {name: named[name] for name in names}, alone)
 
 
 def changing_planes(plan: Plan, state: State) -> Arrays:
-    """What steps change of a state, where its arrays are."""
-    held = state_arrays(plan, state.u, state.previous, state)
-    return flattened({name: array for name, array in held.items() if array is not None})
+    """Return the arrays of a state that steps change."""
+    planes = state_arrays(plan, state.u, state.previous, state)
+    return flattened({name: array for name, array in planes.items() if array is not None})
 
 
 DeviceFunction = Callable[..., Any]
 UNROUNDED = re.compile(r"\b(add|sub|mul)\.f(32|64)\b")
-"""What the driver may still contract, in the text of a kernel."""
+"""Pattern of operations that the driver may contract, in the text of a kernel."""
 
 
 def make_kernel(source: str, functions: Mapping[str, DeviceFunction], threads: int) -> Any:
-    """The function `run` of a kernel with this source, compiled when it is first launched; for
-    blocks of so many threads at most."""
+    """Return the function `run` of a source, compiled when it is first launched, for blocks of at
+    most `threads` threads."""
     scope = vars(ModuleType("kernel"))
     scope |= words(_on_device) | {name: _on_device(of) for name, of in functions.items()}
     # Linked at once: what links later would contract after all.
@@ -386,9 +373,9 @@ def make_kernel(source: str, functions: Mapping[str, DeviceFunction], threads: i
 
 
 def text_of(run: Any, arguments: tuple[Any, ...], device: tuple[int, int]) -> str:
-    """The kernel as a text of PTX for arguments of these types, on devices of a compute capability.
+    """Return the kernel as PTX for arguments of these types, on devices of a compute capability.
 
-    Raises PbdkitError where products and sums could be contracted.
+    Raises PbdkitError if products and sums could be contracted.
     """
     with _uncontracted():
         text, _ = cuda.compile(run.py_func, arguments, device=False, abi="numba", cc=device)
@@ -396,8 +383,10 @@ def text_of(run: Any, arguments: tuple[Any, ...], device: tuple[int, int]) -> st
 
 
 def first_launch(run: Any, arguments: tuple[Any, ...]) -> None:
-    """One launch on one thread, which compiles the kernel. Raises PbdkitError where products and
-    sums could be contracted."""
+    """Launch the kernel once on one thread, which compiles it.
+
+    Raises PbdkitError if products and sums could be contracted.
+    """
     with _uncontracted():
         launcher(run, 1, 1)(*arguments)
     if not is_simulated():
@@ -406,25 +395,25 @@ def first_launch(run: Any, arguments: tuple[Any, ...]) -> None:
 
 
 def launcher(run: Any, blocks: int, threads: int) -> Any:
-    """What launches a kernel. That few blocks use little of a GPU is no news."""
+    """Return a function that launches a kernel, without warnings about few blocks."""
     with catch_warnings():
         simplefilter("ignore", NumbaPerformanceWarning)
         return run[blocks, threads]
 
 
 def most_blocks(run: Any, threads: int) -> int:
-    """How many blocks of so many threads are on the device at once."""
+    """Return the number of blocks of `threads` threads that are on the device at once."""
     (kernel,) = run.overloads.values()
     return int(kernel.max_cooperative_grid_blocks(threads))
 
 
 def is_simulated() -> bool:
-    """Whether numba runs kernels in Python: NUMBA_ENABLE_CUDASIM."""
+    """Return whether numba runs kernels in Python: NUMBA_ENABLE_CUDASIM."""
     return bool(cuda.config.ENABLE_CUDASIM)
 
 
 def _on_device(function: DeviceFunction) -> Any:
-    """A function that kernels call, made part of them."""
+    """Return a device function that kernels inline."""
     if is_simulated():
         return function
     _complete_ufuncs()
@@ -433,9 +422,9 @@ def _on_device(function: DeviceFunction) -> Any:
 
 @contextmanager
 def _uncontracted() -> Iterator[None]:
-    """While this lasts kernels are compiled so that a product and a sum are rounded each, as numpy
-    rounds them: libNVVM's option fma=0, which numba-cuda 0.30 has no switch for. Whether it has
-    been heard the text of the kernel tells."""
+    """Compile kernels in this context without contracting products and sums, as numpy rounds:
+    libNVVM's option fma=0, for which numba-cuda 0.30 has no switch. The text of a kernel shows
+    whether it has an effect."""
     if is_simulated():
         yield
         return
@@ -460,46 +449,48 @@ def _checked(text: str) -> str:
 
 @cache
 def _complete_ufuncs() -> None:
-    """Functions of numpy that numba-cuda 0.30 does not know in kernels, as `np.sqrt`: as the
-    device's library has them, else as numba has them elsewhere."""
+    """Add functions of numpy that numba-cuda 0.30 lacks in kernels, such as `np.sqrt`, from the
+    library of the device, or else from numba."""
     from numba.cuda import mathimpl, ufuncs
     from numba.cuda.np import ufunc_db
 
-    known = ufuncs.ufunc_db()
-    missing = [function for function in ufunc_db.get_ufuncs() if function not in known]
+    functions = ufuncs.ufunc_db()
+    missing = [function for function in ufunc_db.get_ufuncs() if function not in functions]
     library = {of.__name__: of for *_, of in mathimpl.unarys}
     for function in missing:
-        known[function] = ufunc_db.get_ufunc_info(function)
+        functions[function] = ufunc_db.get_ufunc_info(function)
         if of := library.get(function.__name__):
             lower = partial(_lowered, mathimpl.get_unary_impl_for_fn_and_ty, of)
-            known[function] = {"f->f": lower, "d->d": lower}
+            functions[function] = {"f->f": lower, "d->d": lower}
 
 
 def _lowered(
     find: DeviceFunction, of: DeviceFunction, context: Any, builder: Any, sign: Any, own: Any
 ) -> Any:
-    """The call of a function of the device's library, as numba asks for it."""
+    """Return the call of a function of the device's library, with the signature that numba
+    expects."""
     return find(of, sign.args[0])(context, builder, sign, own)
 
 
 THREADS, MOST_THREADS, SIMULATED_THREADS = 256, 1024, 8
-"""Of a block where there are several, of one that is alone, and of the simulator."""
+"""Number of threads of a block if there are several, of a single one, and of the simulator."""
 
 
 class GpuStepper(Engine):
-    """Steps a scene with a kernel made for it, on the first GPU that there is.
+    """Engine that steps a scene with its own kernel on the first GPU.
 
-    What a state holds is sent there where it does not come from here, and is fetched at the end of
-    a call. Everything is looked at in every step.
+    A state that does not come from this engine is sent to the device, and the state is fetched at
+    the end of a call. All particles are moved in every step.
     """
 
     name = "gpu"
 
     def __init__(self, scene: Scene) -> None:
         self._scene = self._numbered = scene
+        self._program = program_of(scene)
         self._last: State | None = None
-        self._load_changes = -math.inf
-        """The step at which other loads act than those that were sent."""
+        self._sent: Arrays = {}
+        """Arrays of operations that the device has."""
         kernel = kernel_of(scene)
         self._plan, self._names = kernel.plan, kernel.names
         self._device: Arrays = {}
@@ -513,7 +504,7 @@ class GpuStepper(Engine):
         self._launch = launcher(self._run, *self._blocks(kernel.alone))
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """As many steps a launch as it is known beforehand where the leaders are."""
+        """Return the state after `steps` steps, as many in a launch as operations foresee."""
         if state is not self._last:
             self._begin(state)
         end = state.step + steps
@@ -524,11 +515,11 @@ class GpuStepper(Engine):
         return state
 
     def renewed(self, state: State, rows: slice) -> None:
-        """The device gets the state anew."""
+        """Send the state to the device at the next call."""
         self._last = None
 
     def _blocks(self, alone: bool) -> tuple[int, int]:
-        """How many blocks of how many threads take part."""
+        """Return the numbers of blocks and of threads of each."""
         size = self._scene.raster.kind.size
         if is_simulated():
             return 1, SIMULATED_THREADS
@@ -537,67 +528,51 @@ class GpuStepper(Engine):
         return min(most_blocks(self._run, THREADS), -(-size // THREADS)), THREADS
 
     def _begin(self, state: State) -> None:
-        """Sends all that steps change, from a state that did not come from here."""
-        self._load_changes = -math.inf
-        held = changing_planes(self._plan, state)
+        """Send all that steps change."""
+        planes = changing_planes(self._plan, state)
         if self._plan.judged:
-            held |= flattened({"lost": lost_bits(self._scene, state)})
+            planes |= flattened({"lost": lost_bits(self._scene, state)})
         if self._plan.tears:
-            held |= flattened({"torn": torn_marks(self._scene, state)})
-        self._send(held)
+            planes |= flattened({"torn": torn_marks(self._scene, state)})
+        self._send(planes)
 
     def _fetch(self, state: State) -> None:
-        """Writes what steps have changed over the arrays of a state."""
+        """Write what steps have changed over the arrays of a state."""
         for name, array in changing_planes(self._plan, state).items():
             if name in self._device:
                 self._device[name].copy_to_host(array)
 
     def _some_steps(self, state: State, end: int) -> State:
-        scene, step = self._scene, state.step + 1
-        is_cut = any(cut.at == step for cut in scene.experiment.cuts)
-        begins = any(
-            begun is None and leading.group.leads(step)
-            for leading, begun in zip(scene.leading, state.starts, strict=True)
-        )
-        if is_cut or begins:  # where bodies and bonds are is needed here
+        step = state.step + 1
+        if any(operation.reads(state) for operation in self._program):
             self._fetch(state)
-        if cut_bonds(scene, state.broken_step, step):
+        call = prepare(self._program, state)
+        if call.has_cuts:
             self._begin(state)
-        self._renumber(scene.at(step))
-        led, starts = prescribe(scene, state, step)
-        steady, ways = steady_steps(scene, step, end - state.step), [led]
-        if steady == 1:
-            ways += foreseen(scene, replace(state, starts=starts), led, end)
-        self._send(self._leading(ways, state) | flattened(self._loads(step, state)))
-        count = max(steady, len(ways))
-        with blaming(scene.experiment.rule, f"at step {step}"):
+        self._renumber(self._scene.at(step))
+        count = foresee(self._program, call, end)
+        self._send_call(call)
+        with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._launch(*self._given(state.step, count))
         if count % 2:
             for u, v in zip(*(self._plan.each(f"flat_{side}_@") for side in "uv"), strict=True):
                 self._device[u], self._device[v] = self._device[v], self._device[u]
-        return replace(state, step=state.step + count, starts=starts)
+        return replace(state, step=state.step + count, starts=call.starts or state.starts)
 
     def _renumber(self, scene: Scene) -> None:
         if scene is not self._numbered:
             self._send(changing_arrays(self._plan.renumbered(scene)))
             self._numbered = scene
 
-    def _leading(self, ways: list[Led], state: State) -> Arrays:
-        if self._scene.leaders_overlap:
-            ways = [without_doubles(way) for way in ways]
-        return leading_arrays(self._plan, ways, {}, state.u.dtype)
-
-    def _loads(self, step: int, state: State) -> Arrays:
-        """What acts in a step, where it is not there already."""
-        loads = self._scene.loads
-        if loads is None or step < self._load_changes:
-            return {}
-        self._load_changes = loads.next_change(step)
-        load = loads.at(step, state.u.dtype)
-        return dict(zip(self._plan.each("load_@"), load, strict=True))
+    def _send_call(self, call: Call) -> None:
+        """Send what operations read in a call, unless it is the array that was sent last."""
+        arrays = call_arrays(self._plan, self._program, call, by_rows=False)
+        changed = {name: a for name, a in arrays.items() if self._sent.get(name) is not a}
+        self._sent |= changed
+        self._send(flattened(changed))
 
     def _send(self, arrays: Arrays) -> None:
-        """Those that the kernel takes."""
+        """Send the arrays that the kernel takes."""
         self._device |= {
             name: cuda.to_device(array) for name, array in arrays.items() if name in self._names
         }

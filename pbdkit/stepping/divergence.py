@@ -1,5 +1,4 @@
-"""Notices a run that leaves all bounds, within a hundred steps of where it does, and finds the last
-state that was good."""
+"""Detection of runs that diverge, within a hundred steps, and the last good state before."""
 
 from __future__ import annotations
 
@@ -15,21 +14,23 @@ from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state
 
 EVERY = 100
-"""The multiples of so many steps are looked at; recorded steps are, too."""
+"""Interval of checks in steps; recorded steps are checked, too."""
 KEPT_EVERY = 5000
-"""Steps between two copies of the state, at least; what comes after is stepped once more."""
+"""Minimum number of steps between two copies of the state; later steps are repeated to find the
+last good one."""
 BEYOND = 1e6
-"""How many times the size of the body, its start and its leaders' ways a displacement may be."""
+"""Ratio of a displacement to the size of the body, its start and its leaders' motions above which a
+run diverges."""
 SAMPLES = 64
 
 
 @dataclass
 class Guard:
-    """Looks at states, at two passes over the displacements a look.
+    """Check of states, which takes two passes over the displacements.
 
-    A state is good where no displacement is larger than `size`: the body, its start and its
-    leaders' ways together. `next_look` is the step at which to look at the latest, `good_step` the
-    last that was found good, `kept` a copy of a good state.
+    A state is good if no displacement exceeds `size`: that of the body, its start and its leaders'
+    motions together. `next_look` is the step of the next check at the latest, `good_step` the last
+    good step, `copy` a copy of a good state.
     """
 
     size: float
@@ -39,34 +40,34 @@ class Guard:
 
     @classmethod
     def of(cls, scene: Scene, start: State) -> Guard:
-        """The guard of a run from that state."""
-        kept = start.copy() if start.step else None
-        return cls(size_of(scene) + most_of(start), start.step, next_multiple(start.step), kept)
+        """Create the guard of a run from a state."""
+        copy = start.copy() if start.step else None
+        return cls(size_of(scene) + most_of(start), start.step, next_multiple(start.step), copy)
 
     def look(self, scene: Scene, state: State, *, note: bool = True) -> None:
-        """Raises FloatingPointError, with particle and step, where a displacement is not finite or
-        beyond all bounds. A look at which longer runs make none is not to be noted."""
-        most = self.most(state)
+        """Raise FloatingPointError, with particle and step, if a displacement is not finite or
+        beyond all bounds. A check that longer runs do not make does not `note` the result."""
+        largest = self.most(state)
         if note:
             self.next_look = next_multiple(state.step)
-            self._note(state, most)
-        if most <= BEYOND * self.size:
+            self._note(state, largest)
+        if largest <= BEYOND * self.size:
             return
         worst = self.worst(scene, state)
         raise FloatingPointError(f"particle {worst}, found at step {state.step},")
 
-    def _note(self, state: State, most: float) -> None:
-        if most <= self.size:
+    def _note(self, state: State, largest: float) -> None:
+        if largest <= self.size:
             self.good_step = state.step
             if state.step >= KEPT_EVERY + (self.kept.step if self.kept else 0):
                 self.kept = state.copy(self.kept)
 
     def most(self, state: State) -> float:
-        """The largest displacement along an axis."""
+        """Return the largest displacement along an axis."""
         return most_of(state)
 
     def worst(self, scene: Scene, state: State) -> int:
-        """The number of the particle that has it."""
+        """Return the number of the particle with the largest displacement."""
         table = scene.raster.table(state.u)
         return (
             scene.raster.particle_offset + int(np.argmax(np.abs(table).max(axis=1))) + 1
@@ -75,8 +76,8 @@ class Guard:
     def last_good(
         self, scene: Scene, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]
     ) -> State | None:
-        """The last good state before a step, found by stepping once more, `patience` steps a call,
-        from where the guard kept a copy; None where `stopping` says so meanwhile."""
+        """Return the last good state before a step, by repeating steps from the copy, at most
+        `patience` in a call; None if `stopping` becomes true."""
         state, self.kept = self.kept or initial_state(scene), None
         while state.step < self.good_step and not stopping():
             state = engine.advance(state, min(patience, self.good_step - state.step))
@@ -90,27 +91,27 @@ class Guard:
 
 
 def next_multiple(step: int) -> int:
-    """The first multiple of `EVERY` after a step."""
+    """Return the first multiple of `EVERY` after a step."""
     return (step // EVERY + 1) * EVERY
 
 
 def size_of(scene: Scene) -> float:
-    """That of the body and its leaders' ways together."""
+    """Return the size of the body and its leaders' motions together."""
     ends = scene.raster.body_ends()
     spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
-    own = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
-    ways: list[float] = np.max(scene.raster.communicator.allgather(own), axis=0).tolist()
+    local = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
+    ways: list[float] = np.max(scene.raster.communicator.allgather(local), axis=0).tolist()
     width = float(np.abs(ends[1] - ends[0]).max())
     return width + float(spacing) + sum(ways)
 
 
 def most_of(state: State) -> float:
-    """The largest displacement along an axis."""
+    """Return the largest displacement along an axis."""
     return max(float(state.u.max()), -float(state.u.min()))
 
 
 def way_of(leading: Leading | Barrier, steps: int) -> float:
-    """How far a group gets from where it starts, looked at here and there."""
+    """Return the largest distance of a group from its start, at some moments."""
     group = leading.group
     last, rests = group.last(steps) - group.from_ + 1, group.motion.rests_after()
     last = last if rests is None else min(last, rests)  # the same however long the run is

@@ -1,6 +1,5 @@
-"""The choice of the engine that steps a scene, on how many threads, and why; and what stands in
-the way of the others, found without loading them.
-"""
+"""Choice of the engine that steps a scene and of its threads, with the reason, without loading
+engines that are not chosen."""
 
 from __future__ import annotations
 
@@ -11,15 +10,14 @@ from importlib.util import find_spec
 
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.leaders import last_event
 from pbdkit.stepping.numba_engine.time_skewing import exceeds_cache, single_steps
 from pbdkit.stepping.numpy_engine import Engine, Stepper
-from pbdkit.stepping.program import reason_against
+from pbdkit.stepping.program import last_event, reason_against
 from pbdkit.stepping.step import Mode
 
 
 def what_is_missing() -> str:
-    """The package, the compiler or the device that is not there; empty where all are."""
+    """Return the package, compiler or device that a GPU engine lacks; empty if it lacks none."""
     install = "pip install 'pbdkit[gpu]'"
     if not (find_spec("numba") and find_spec("numba_cuda")):
         return f"numba-cuda is not installed: {install}"
@@ -33,24 +31,27 @@ def what_is_missing() -> str:
 
 
 def what_gpus_lack(scene: Scene) -> str:
-    """Why a scene cannot be stepped on a GPU; empty where it can."""
+    """Return the reason why a scene cannot be stepped on a GPU; empty if it can."""
     return reason_against(scene, Mode.GPU)
 
 
 PATIENCE_S = 3.0
-"""Compiling pays where the numpy engine would take longer than about this (measured: importing
-numba and loading a kernel .5 s, making a new one 1 to 5 s)."""
+"""Time of the numpy engine above which compiling takes less (measured: importing numba and loading
+a kernel .5 s, compiling a new one 1 to 5 s)."""
 CALL_S, VALUE_S = 25e-6, 2.5e-9
-"""What the numpy engine takes a step and slot, and a step, slot and particle (measured)."""
+"""Time of the numpy engine for each step and slot, and for each step, slot and particle
+(measured)."""
 KERNEL_S = 2e-9
-"""What kernels take a step and particle (measured: 1 to 2, with 4 or 8 neighbours in motion)."""
+"""Time of kernels for each step and particle (measured: 1 to 2 ns, with 4 or 8 neighbours in
+motion)."""
 TWO_THREADS_PAY = 100_000
-"""Particles from which a second thread pays, with a margin (measured: from 40 000)."""
+"""Number of particles from which a second thread takes less time, with a margin (measured: 40
+000)."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The engine's name, its threads, and the reason in words."""
+    """Name of an engine, its threads, and the reason in words."""
 
     engine: str
     threads: int
@@ -58,10 +59,10 @@ class Choice:
 
 
 def choose(scene: Scene) -> Choice:
-    """What the experiment asks for, or what serves it best.
+    """Return the engine that the experiment requests, or the fastest.
 
-    `auto` never takes the GPU: how fast that is has not been measured. Raises ExperimentError where
-    an engine is asked for that cannot be had.
+    `auto` never selects the GPU, whose speed has not been measured. Raises ExperimentError if a
+    requested engine is not available.
     """
     solver = scene.experiment.stepping
     if solver.engine == "gpu":
@@ -91,14 +92,14 @@ def _refuse(scene: Scene, refusal: str) -> None:
 
 
 def seconds_of(scene: Scene, choice: Choice) -> float:
-    """About what the steps take at most, with neither compiling nor recording."""
+    """Estimate the time of the steps at most, without compiling and recording."""
     if choice.engine == "numpy":
         return _numpy_seconds(scene)
     return KERNEL_S * scene.raster.total * _most_steps(scene) / choice.threads
 
 
 def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
-    """The engine, and what it came to: where `auto` meets a rule that does not compile, numpy."""
+    """Return the engine, and the choice: numpy if `auto` finds a rule that does not compile."""
     if choice.engine == "numpy":
         return Stepper(scene), choice
     if choice.engine == "gpu":
@@ -117,59 +118,40 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
 
 
 def chosen_engine(scene: Scene) -> Engine:
-    """The engine that serves a scene."""
+    """Return the engine that is chosen for a scene."""
     return make_engine(scene, choose(scene))[0]
 
 
 def obstacle() -> str:
-    """Why the compiled engine cannot be had; empty where it can."""
+    """Return the reason why the compiled engine is not available; empty if it is."""
     return "" if find_spec("numba") else "numba is not installed: pip install 'pbdkit[fast]'"
 
 
 def what_kernels_lack(scene: Scene) -> str:
-    """Why no kernel can follow the courses of a scene's numbers; empty where one can, and where
-    there are none."""
-    experiment, constants = scene.experiment, scene.constants
-    changing = {field for field, _ in experiment.courses}
-    if changing <= {"solver"}:
-        return reason_against(scene, Mode.SOLVER_COURSES) if changing else ""
-    if reason := reason_against(scene, Mode.COURSES):
-        return reason
-    if constants.by_particle or constants.by_bond or (scene.cells and scene.cells.mixed):
-        return "numbers differ from place to place and others change in time"
-    for moment in sorted({bend for course in experiment.courses.values() for bend in course.bends}):
-        if _differ_in_kernels(scene, scene.at(moment)):
-            return "numbers change in time that are written into kernels"
-    return ""
-
-
-def _differ_in_kernels(scene: Scene, now: Scene) -> bool:
-    """Whether a scene with other numbers has other constants in its kernels, inner rules
-    included."""
-    one, other = scene.constants, now.constants
-    if (one.weights, one.fracture) != (other.weights, other.fracture):
-        return True
-    if scene.inner is None or now.inner is None:
-        return False
-    return _differ_in_kernels(scene.inner, now.inner)
+    """Return the reason why no kernel follows the time-dependent numbers of a scene; empty if one
+    does, or there are none."""
+    fields = {field for field, _ in scene.experiment.courses}
+    mode = Mode.SOLVER_COURSES if fields == {"solver"} else Mode.COURSES
+    return reason_against(scene, mode) if fields else ""
 
 
 def _about_passes(scene: Scene) -> str:
-    """Why each step goes over the memory by itself, where several in a pass would gain."""
+    """Return the reason why each step is a pass over the memory, if several in a pass would be
+    faster."""
     why = exceeds_cache(scene) and single_steps(scene)
     return f"; one step a pass over the memory: {why}" if why else ""
 
 
 def _numpy_seconds(scene: Scene) -> float:
-    """What the numpy engine takes at most."""
+    """Estimate the time of the numpy engine at most."""
     slots = sum(map(len, scene.neighbourhood.slots)) * (2 if scene.has_fracture else 1)
     a_step = slots * (CALL_S + VALUE_S * scene.raster.total / len(scene.neighbourhood.slots))
     return a_step * _most_steps(scene)
 
 
 def _most_steps(scene: Scene) -> float:
-    """Those asked for. A run that is to settle makes no more steps than a plain barycentre on a
-    body of n cells that is held at one end, (2n)² (2/π)² ln(1 / tolerance)."""
+    """Return the largest number of steps: those of the run or, until it is settled, those of a
+    plain barycentre on a body of n cells with one fixed end, (2n)² (2/π)² ln(1 / tolerance)."""
     steps, settle = float(scene.experiment.steps), scene.experiment.stepping.settle
     if settle is None:
         return steps
@@ -182,7 +164,7 @@ def _about(seconds: float) -> str:
 
 
 def processors() -> int:
-    """Those that this process may use."""
+    """Return the number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

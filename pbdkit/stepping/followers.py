@@ -1,8 +1,9 @@
-"""Followers: a rule's move, then relaxation and memory. Their neighbours stay as they are, or are
-found anew at every step, by distance (model.md, section 4)."""
+"""Followers in a step: the move of the rule, relaxation and memory, with constant neighbours or
+with neighbours that are re-evaluated by distance (model.md, section 4)."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,7 +17,7 @@ from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.lattice.neighbourhood import Neighbourhood
 from pbdkit.lattice.raster import positions
 from pbdkit.model.solver import Stepping
-from pbdkit.plugin import Here, StoresEnergy, Vector
+from pbdkit.plugin import FollowerRule, Here, StoresEnergy, Vector
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
@@ -31,45 +32,47 @@ from pbdkit.stepping.rule_evaluation import (
     blocks,
 )
 from pbdkit.stepping.state import State, shown
-from pbdkit.stepping.step import Hindrance, Mode, Operation, Step
+from pbdkit.stepping.step import Call, Cells, Hindrance, Mode, Operation, Reach, Step
 
 REAL = "fiub"
-"""The kinds of numpy's types that are numbers a particle can move by."""
+"""Kinds of numpy types that are real numbers."""
 
 
 class Followers(ABC):
-    """The followers of a scene, and how they find their neighbours."""
+    """Followers of a scene with their neighbours."""
 
     @abstractmethod
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Writes the displacements of all body particles into `new`, from the intermediate
-        configuration m; `new` comes holding those of the step before. Particles without any
-        neighbour stay. What it writes for leaders is overwritten. Of the state, at the end of the
-        step before, it takes what bonds and particles remember, and renews, in place, what
-        particles do."""
+        """Write the displacements of all body particles into `new`, from the intermediate
+        configuration m.
+
+        `new` contains those of the step before at the beginning. Particles without neighbours stay,
+        and values of leaders are overwritten later. `state` is that at the end of the step before;
+        the remembered numbers of particles are renewed in place.
+        """
 
 
-def target(here: Any, move: Any, before: Any, solver: Stepping) -> Any:
-    """u + relaxation · move + memory · (u - before), elementwise for one component.
+def target(u: Any, move: Any, before: Any, solver: Stepping) -> Any:
+    """Return u + relaxation · move + memory · (u - before) of one component, elementwise.
 
-    Raises ValueError where the move is not one real number a particle.
+    Raises ValueError if the move is not one real number for each particle.
     """
-    if np.shape(move) not in ((), np.shape(here)):
+    if np.shape(move) not in ((), np.shape(u)):
         raise ValueError(
-            f"it returned the shape {np.shape(move)} for particles of shape {np.shape(here)}: "
+            f"it returned the shape {np.shape(move)} for particles of shape {np.shape(u)}: "
             "it is not elementwise"
         )
     if not isinstance(move, float) and np.asarray(move).dtype.kind not in REAL:
         raise ValueError(f"it returned values of {np.asarray(move).dtype}, not real numbers")
-    there = here + (move if solver.relaxation == 1.0 else solver.relaxation * move)
-    return there + solver.memory * (here - before) if solver.memory != 0.0 else there
+    place = u + (move if solver.relaxation == 1.0 else solver.relaxation * move)
+    return place + solver.memory * (u - before) if solver.memory != 0.0 else place
 
 
 Summed = tuple[Surroundings, Evaluator, Contributions, Here]
 
 
 class SlotFollowers(Followers):
-    """Moves the followers of a scene whose neighbours stay as they are."""
+    """Followers of a scene with constant neighbours."""
 
     def __init__(self, scene: Scene, solver: Stepping | None = None) -> None:
         self._scene = scene
@@ -83,48 +86,49 @@ class SlotFollowers(Followers):
         ]
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Every block from m alone: their order does not matter."""
+        """Move every block from m alone, so that their order does not matter."""
         loads = self._scene.loads
         acting = loads.at(state.step + 1, m.dtype) if loads else None
-        for around, evaluator, total, here in self._summed(m, state):
+        for around, evaluator, total, values in self._summed(m, state):
             load = None if acting is None else vector(shown(around.where.of(acting)))
-            moved = evaluator.move(total, here, load)
+            moved = evaluator.move(total, values, load)
             planes = around.where.of(m), moved, around.where.of(new)
             for u, move, plane in zip(*planes, strict=True):
                 _write(plane, target(u, move, plane, self._solver), around.movable, u)
-            evaluator.renew_particles(total, here, around.own(state), around.movable)
+            evaluator.renew_particles(total, values, around.own(state), around.movable)
 
     def moves(self, m: Floats, state: State) -> Floats:
-        """The rule's moves, leaders' too; zero where nobody can move."""
+        """Return the moves of the rule, of leaders too; zero for particles without neighbours."""
         return self._of_all(Evaluator.move, m, state)
 
     def forces(self, m: Floats, state: State) -> Floats:
-        """The rule's forces on body particles, leaders too, over Young's modulus and thickness;
-        zero where there is no neighbour."""
+        """Return the forces of the rule on body particles, leaders too, over Young's modulus and
+        thickness; zero for particles without neighbours."""
         return self._of_all(Evaluator.force, m, state)
 
     def _of_all(self, function: Callable[..., Any], m: Floats, state: State) -> Floats:
-        """What a function makes of the sums of contributions, zero where there is none."""
+        """Return a function of the sums of contributions, zero for particles without neighbours."""
         out = np.zeros_like(m)
-        for around, evaluator, total, here in self._summed(m, state):
-            values = function(evaluator, total, here)
+        for around, evaluator, total, arguments in self._summed(m, state):
+            values = function(evaluator, total, arguments)
             for value, plane in zip(values, around.where.of(out), strict=True):
                 _write(plane, value, around.movable, 0.0)
         return out
 
     def energy(self, m: Floats, state: State) -> float:
-        """The strain energy over Young's modulus and thickness: the rule's own, or -½ Σ u·force."""
+        """Return the strain energy over Young's modulus and thickness: that of the rule, or -½ Σ
+        u·force."""
         if not isinstance(self._scene.experiment.rule, StoresEnergy):
             return self._work(m, self.forces(m, state))
-        seen, out = self._seen(m, state), np.zeros_like(m[0])
+        planes, out = self._seen(m, state), np.zeros_like(m[0])
         for around, evaluator in zip(self._blocks, self._evaluators, strict=True):
-            (value,) = around.sums(evaluator.energy, seen, state)
+            (value,) = around.sums(evaluator.energy, planes, state)
             _write(around.where.of(out), value, around.movable, 0.0)
         return float(out.sum())
 
     def _work(self, u: Floats, forces: Floats) -> float:
-        """-½ Σ u·force over the body. Where the forces have no resultant, u counts from its mean,
-        so that no digit depends on where the body has gone."""
+        """Return -½ Σ u·force over the body. If the forces have no resultant, u counts from its
+        mean, so that the result does not depend on rigid displacements."""
         place = self._scene.raster.place_of(self._scene.raster.body_rows)
         u, forces = u.reshape(len(u), -1)[:, place], forces.reshape(len(u), -1)[:, place]
         if self._scene.frame is None:
@@ -132,7 +136,7 @@ class SlotFollowers(Followers):
         return -0.5 * float((u * forces).sum())
 
     def _seen(self, m: Floats, state: State) -> Floats:
-        """What the rule works on: displacements, or the moves of its inner rule."""
+        """Return the vectors on which the rule works: displacements, or moves of its inner rule."""
         if self._inner is None:
             return m
         z = self._inner.moves(m, state)
@@ -142,14 +146,16 @@ class SlotFollowers(Followers):
         return z
 
     def _summed(self, m: Floats, state: State) -> Iterator[Summed]:
-        """Every block with the sums of its neighbours' contributions and what stands there."""
-        seen, before = self._seen(m, state), state
+        """Generate every block with the sums of contributions and the values at its particles."""
+        planes, previous = self._seen(m, state), state
         if shares_particles(self._scene.experiment.rule):
             # Neighbours see what was before the step, also where a block has been renewed.
-            before = replace(state, particle_values=tuple(v.copy() for v in state.particle_values))
+            previous = replace(
+                state, particle_values=tuple(v.copy() for v in state.particle_values)
+            )
         for around, evaluator in zip(self._blocks, self._evaluators, strict=True):
-            total = around.sums(evaluator.contribution, seen, before)
-            yield around, evaluator, total, around.here(seen, state)
+            total = around.sums(evaluator.contribution, planes, previous)
+            yield around, evaluator, total, around.here(planes, state)
 
 
 def _write(plane: Floats, value: Any, where_: Mask | None, otherwise: Any) -> None:
@@ -157,11 +163,11 @@ def _write(plane: Floats, value: Any, where_: Mask | None, otherwise: Any) -> No
 
 
 class GatheringFollowers(Followers):
-    """Moves the followers of a scene in which neighbours come and go.
+    """Followers of a scene with re-evaluated neighbours.
 
-    The same `gather` and `apply` run on tables: a row a pair of neighbours, a row a particle.
-    Neighbours of the reference configuration are summed first, in the order of their slots and with
-    the rest offsets of these, so that a body at rest stays as it is, exactly.
+    The same `gather` and `apply` run on tables with a row for each pair of neighbours and each
+    particle. Neighbours of the reference configuration are summed first, in the order of their
+    slots and with the rest offsets of these, so that a body at rest stays exactly at rest.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -181,34 +187,34 @@ class GatheringFollowers(Followers):
         self._radius = near.radius * (1 + 1e-9)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Bonds do not last here, so that none can be broken."""
+        """Move all from m; there are no bonds that could be broken."""
         flat, count = new.reshape(len(new), -1), len(self.place)
-        u, before = m.reshape(len(m), -1)[:, self.place], flat[:, self.place]
+        u, previous = m.reshape(len(m), -1)[:, self.place], flat[:, self.place]
         j, k, rest = self.pairs(m)
-        own = [value.ravel()[self.place] for value in state.particle_values]
+        numbers = [value.ravel()[self.place] for value in state.particle_values]
         of_particle = self._scene.constants.of_particle
         shared: tuple[Any, ...] = ()
         if shares_particles(self._evaluator.rule):
-            shared = tuple(of_particle(*(value[rows] for value in own)) for rows in (j, k))
+            shared = tuple(of_particle(*(value[rows] for value in numbers)) for rows in (j, k))
         to = Neighbour(vector(rest), self._none, shared=shared)
         d = vector(u[:, k] - u[:, j])
         parts = self._evaluator.contribution(d, vector(u[:, j]), to)
         total = tuple(_summed(part, j, count) for part in parts)
-        here = Here(vector(u), self._at, self._centred, of_particle(*own))
-        move = self._evaluator.move(total, here)
+        arguments = Here(vector(u), self._at, self._centred, of_particle(*numbers))
+        move = self._evaluator.move(total, arguments)
         movable = self.body[np.bincount(j, minlength=count)[self.body] > 0]
         place = self.place[movable]
-        self._evaluator.renew_particles(total, here, own, None)
-        for values, renewed in zip(state.particle_values, own, strict=True):
+        self._evaluator.renew_particles(total, arguments, numbers, None)
+        for values, renewed in zip(state.particle_values, numbers, strict=True):
             values.reshape(-1)[place] = renewed[movable]
         flat[:, self.place[self.body]] = u[:, self.body]
         solver = self._scene.experiment.stepping
-        for plane, here_, step, was in zip(flat, u, move, before, strict=True):
+        for plane, here_, step, was in zip(flat, u, move, previous, strict=True):
             plane[place] = target(here_, step, was, solver)[movable]
 
     def pairs(self, m: Floats) -> tuple[Indices, Indices, Floats]:
-        """(j, k, rest): in the configuration m every body particle j with each of its neighbours k
-        and the rest offset, (axis, pair), sorted by j, by slot and by k."""
+        """Return (j, k, rest) in the configuration m: every body particle j with each of its
+        neighbours k and the rest offset, (axis, pair), sorted by j, slot and k."""
         from scipy.spatial import cKDTree
 
         x = self.X + m.reshape(len(m), -1)[:, self.place]
@@ -222,22 +228,22 @@ class GatheringFollowers(Followers):
         return j[order], k[order], rest[:, order]
 
     def _of_slots(self, j: Indices, k: Indices) -> tuple[Indices, Floats]:
-        """The number of each pair's slot, the largest of all where it is none, and the rest offset,
-        (axis, pair)."""
+        """Return the number of each pair's slot, the largest of all if it has none, and the rest
+        offset, (axis, pair)."""
         s, *cells = self._site
         sizes = np.array(self._rank.shape[2:])[:, None]
         step = np.stack([n[k] - n[j] for n in cells]) + sizes // 2
         near = ((step >= 0) & (step < sizes)).all(axis=0)
         rank, rest = np.full(len(j), len(self._rest[0])), self.X[:, k] - self.X[:, j]
         rank[near] = self._rank[(s[j[near]], s[k[near]], *step[:, near])]
-        known = rank < len(self._rest[0])
-        rest[:, known] = self._rest[:, rank[known]]
+        has_slot = rank < len(self._rest[0])
+        rest[:, has_slot] = self._rest[:, rank[has_slot]]
         return rank, rest
 
 
 def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
-    """The number of a slot by (sublattice, sublattice, step of cells along each axis), the count of
-    slots where there is none; and the rest offset by that number, (axis, slot)."""
+    """Return the number of a slot by (sublattice, sublattice, step of cells along each axis), the
+    count of slots if there is none; and the rest offset by that number, (axis, slot)."""
     slots = [slot for own in neighbourhood.slots for slot in own]
     reach, size = neighbourhood.reach_in_cells, len(neighbourhood.slots)
     rank = np.full((size, size, *(2 * n + 1 for n in reach)), len(slots))
@@ -247,20 +253,22 @@ def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
 
 
 def _summed(part: Any, owner: Indices, count: int) -> Any:
-    """Σ over the pairs of each owner, in their order."""
+    """Return the sum over the pairs of each owner, in their order."""
     if isinstance(part, Vector):
         return part.each(lambda values: _summed(values, owner, count))
     return np.bincount(owner, np.broadcast_to(part, owner.shape), count)
 
 
 class MoveFollowers(Operation):
-    """Move the particles of the body by the rule, leaders and guided particles too."""
+    """Move the particles of the body by the rule, including leaders and guided particles."""
 
     makes_moves = True
 
     def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
         super().__init__(scene)
         self._known = followers
+        self._last_load: Floats | None = None
+        self._loads: dict[str, Any] = {}
 
     @cached_property
     def _followers(self) -> Followers:
@@ -268,24 +276,84 @@ class MoveFollowers(Operation):
         return self._known or (GatheringFollowers if nearness else SlotFollowers)(self.scene)
 
     def apply(self, step: Step) -> None:
-        """From the intermediate configuration. What leaves the finite numbers is found at
-        recording."""
+        """Move them from the intermediate configuration. Numbers that are not finite are reported
+        when they are recorded."""
         quiet = np.errstate(all="ignore", invalid=step.invalid)
         with quiet, blaming(self.scene.experiment.rule, f"at step {step.number}"):
             self._followers.move(step.u, step.new, step.state)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """A sweep for each rule that works on the moves of another, and for these."""
-        level, scene = 0, self.scene
-        while inner := scene.inner:
+        """Write a sweep for each rule, the innermost first."""
+        for level in range(self.sweeps() - 1):
             kernel.sweep(level)
             for frame in FollowFrame.of(self.scene):
                 frame.emit_for(kernel, f"flat_z{level}")
-            level, scene = level + 1, inner
-        kernel.sweep(level)
+        kernel.sweep(self.sweeps() - 1)
+
+    def sweeps(self) -> int:
+        """Return the number of rules, inner ones included."""
+        return len(list(_levels(self.scene)))
+
+    def reach(self, axis: int) -> Reach:
+        """Return the distance of neighbours. Moves of an inner rule are made before particles
+        move."""
+        reach = self.scene.neighbourhood.reach_in_cells[axis]
+        if not self.scene.inner:
+            return Reach(reach)
+        far = reach + max(
+            (each.reach(axis).apart for each in FollowFrame.of(self.scene)), default=0
+        )
+        return Reach(reach, far, far, reach, reach)
+
+    def carries(self) -> Indices:
+        """Return the differences along all slots."""
+        return np.array([slot.cell for slots in self.scene.neighbourhood.slots for slot in slots])
+
+    def arrays(self, call: Call) -> dict[str, Any]:
+        """Return the load on each particle, axis by axis."""
+        load = self._load(call)
+        if load is not self._last_load:
+            self._last_load = load
+            self._loads = {} if load is None else {f"load_{c}": load[a] for a, c in self._axes}
+        return self._loads
+
+    @property
+    def _axes(self) -> Iterator[tuple[int, str]]:
+        return enumerate("xyz"[: self.scene.axes])
+
+    def disturbances(self, call: Call) -> Iterator[Cells]:
+        """Generate the cells of particles under a load."""
+        load = self._load(call)
+        if load is not None:
+            yield np.nonzero((load != 0.0).any(axis=(0, 1)))
+
+    def _load(self, call: Call) -> Floats | None:
+        """Return the forces in the steps of a call."""
+        loads = self.scene.loads
+        return loads.at(call.step, call.state.u.dtype) if loads else None
+
+    def next_change(self, step: int, foreseeable: bool = False) -> float:
+        """Return the next change of a load or a number."""
+        courses = self.scene.experiment.courses.values()
+        changes = [course.next_change(step) for course in courses]
+        changes += [self.scene.loads.next_change(step)] if self.scene.loads else []
+        return min(changes, default=math.inf)
+
+    def events(self, steps: int) -> list[int]:
+        """Return the steps in which loads begin and cease to act."""
+        return self.scene.loads.changes(steps) if self.scene.loads else []
+
+    def bends(self, steps: int) -> list[int]:
+        """Return the bends of numbers, and of loads while they act."""
+        courses = self.scene.experiment.courses.values()
+        spans = [(course, 0, steps) for course in courses]
+        for loading in self.scene.loads.each if self.scene.loads else ():
+            load = loading.load
+            spans += [(course, load.from_, load.last(steps)) for course in load.courses]
+        return [bend for course, *span in spans for bend in course.bends_within(*span)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Neighbours found anew are a list that is made on the host in every step."""
+        """Lists of re-evaluated neighbours are made on the host in every step."""
         if self.scene.experiment.neighbours.nearness():
             changing = "numbers change in time, and neighbours are found anew"
             reasons = {
@@ -294,6 +362,50 @@ class MoveFollowers(Operation):
                 Mode.SOLVER_COURSES: changing,
             }
             return Hindrance(reasons.get(mode, "neighbours are found anew"), "neighbours")
-        if mode is Mode.PASSES and self.scene.inner and self.scene.inner.inner:
+        if mode is Mode.PASSES and self.sweeps() > 2:
             return Hindrance("the rule moves by the moves of one that moves by another's", "rule")
+        if mode is Mode.RANKS_AT_REST and (self.scene.inner or not self._rule.linear):
+            reason = "applies twice" if self._rule.linear else "is not linear"
+            text = f"the equilibrium of rule '{self._rule.type}', which {reason}"
+            return Hindrance(text, "rule")
+        return self._hindrance_of_courses() if mode is Mode.COURSES else None
+
+    def _hindrance_of_courses(self) -> Hindrance | None:
+        """Kernels read numbers that change in time from arrays that all particles share."""
+        scene = self.scene
+        courses = scene.experiment.courses
+        fields = [field for field, _ in courses if field != "solver"]
+        if not fields:
+            return None
+        if scene.constants.by_particle or scene.constants.by_bond or _is_mixed(scene):
+            reason = "numbers differ from place to place and others change in time"
+            return Hindrance(reason, str(fields[0]))
+        for moment in sorted({bend for course in courses.values() for bend in course.bends}):
+            if _differ_in_kernels(scene, scene.at(moment)):
+                reason = "numbers change in time that are written into kernels"
+                return Hindrance(reason, str(fields[0]))
         return None
+
+    @property
+    def _rule(self) -> FollowerRule:
+        return self.scene.experiment.rule
+
+
+def _is_mixed(scene: Scene) -> bool:
+    return scene.cells is not None and bool(scene.cells.mixed)
+
+
+def _levels(scene: Scene) -> Iterator[Scene]:
+    """Generate the scene and those of its inner rules, the innermost last."""
+    yield scene
+    if scene.inner:
+        yield from _levels(scene.inner)
+
+
+def _differ_in_kernels(scene: Scene, changed: Scene) -> bool:
+    """Return whether scenes that differ in numbers differ in constants that kernels contain."""
+    return any(
+        (one.constants.weights, one.constants.fracture)
+        != (other.constants.weights, other.constants.fracture)
+        for one, other in zip(_levels(scene), _levels(changed), strict=False)
+    )

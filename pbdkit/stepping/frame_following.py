@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import cached_property
+from itertools import chain
 
+import numpy as np
+
+from pbdkit.array_types import Indices
+from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter, Lines
-from pbdkit.stepping.step import Hindrance, Mode, Operation, Step
+from pbdkit.stepping.step import Hindrance, Mode, Operation, Reach, Step
 
 
 class FollowFrame(Operation):
@@ -15,22 +21,76 @@ class FollowFrame(Operation):
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
-        """Where the body has a frame."""
+        """Return whether the body has a frame."""
         return scene.frame is not None
 
     def apply(self, step: Step) -> None:
-        """After all particles stand where they go."""
+        """Let points follow after all particles have been placed."""
         frame = self.scene.frame
         assert frame
         body, axes = step.u if frame.map.lag else step.new, len(step.u)
         frame.follow(body.reshape(axes, -1), step.new.reshape(axes, -1))
 
     def emit(self, kernel: KernelWriter) -> None:
-        """After all particles stand where they go."""
+        """Let points follow after all particles have been placed."""
         kernel.follow(self.mapped(kernel), "flat_v", self.scene.lag)
 
+    def reach(self, axis: int) -> Reach:
+        """Return the distance of its points from the particles that they follow."""
+        axis = 0 if axis == 0 else 1
+        return Reach(apart=int(self._spans[axis].max()))
+
+    def carries(self) -> Indices:
+        """Return the differences over a point that follows one particle and is a neighbour of
+        another."""
+        frame, kinds = self.scene.frame, self.scene.raster.kind
+        assert frame
+        places = frame.place[frame.map.point], frame.body_place
+        at, body = (np.stack(np.unravel_index(p, kinds.shape)[1:], axis=1) for p in places)
+        steps = [np.zeros((0, self.scene.axes), np.intp)]
+        for slot in chain(*self.scene.neighbourhood.slots):
+            # The particle at `neighbour` has the frame point along this slot.
+            neighbour = at - slot.cell
+            inside = ((neighbour >= 0) & (neighbour < kinds.shape[1:])).all(axis=1)
+            follows = kinds[(slot.source, *neighbour[inside].T)] == FOLLOWER
+            steps.append((neighbour - body)[inside][follows])
+        return np.concatenate(steps)
+
+    @cached_property
+    def last_moved(self) -> Indices:
+        """Row and column of the last particle that each point follows, (2, point)."""
+        return np.maximum.reduceat(self._body, self._first, axis=1)
+
+    @cached_property
+    def first_moved(self) -> Indices:
+        """Row and column of the first particle that each point follows, (2, point)."""
+        return np.minimum.reduceat(self._body, self._first, axis=1)
+
+    @cached_property
+    def _spans(self) -> Indices:
+        """Rows and columns over which each point and its particles extend, (2, point)."""
+        assert self.scene.frame
+        point = self._cells(self.scene.frame.place)
+        return np.maximum(self.last_moved, point) - np.minimum(self.first_moved, point)
+
+    @cached_property
+    def _body(self) -> Indices:
+        assert self.scene.frame
+        return self._cells(self.scene.frame.body_place)
+
+    @property
+    def _first(self) -> Indices:
+        """The first entry of each point in the map."""
+        assert self.scene.frame
+        return np.searchsorted(self.scene.frame.map.point, np.arange(len(self.scene.frame.place)))
+
+    def _cells(self, place: Indices) -> Indices:
+        """Rows and columns of flat places, (2, place)."""
+        index = np.unravel_index(place, self.scene.raster.shape)
+        return np.stack([index[1], index[-1]])
+
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """A map that is made anew is an array of the host, and of a whole lattice."""
+        """A map that changes is an array on the host, and of a whole lattice."""
         reasons = {
             Mode.COURSES: "numbers change in time by which the frame follows",
             Mode.RANKS: "a frame whose map follows numbers of the rule that change in time",
@@ -43,7 +103,8 @@ class FollowFrame(Operation):
         kernel.follow(self.mapped(kernel), planes)
 
     def mapped(self, kernel: KernelWriter) -> Callable[[str], Lines]:
-        """Return what gives the lines that compute t_@ of the frame point f from some planes."""
+        """Return a function that returns the lines that compute t_@ of the frame point f from
+        planes."""
 
         def lines(planes: str) -> Lines:
             start = kernel.each(f"t_@ = {kernel.number(0.0)}")
@@ -53,12 +114,12 @@ class FollowFrame(Operation):
         return lines
 
     def _terms(self, kernel: KernelWriter, planes: str) -> Iterator[tuple[str, str]]:
-        """By axis what an entry of the map adds."""
+        """Generate each axis with the term of an entry of the map."""
         frame = self.scene.frame
         assert frame
         for a, c in enumerate(kernel.each("@")):
-            term = f"mapped[e] * {planes}_{c}[bodies[e]]"
+            term = f"frame_weights[e] * {planes}_{c}[bodies[e]]"
             if frame.map.weight.ndim == 3:
-                terms = kernel.each(f"mapped[e, {a}, #] * {planes}_@[bodies[e]]")
+                terms = kernel.each(f"frame_weights[e, {a}, #] * {planes}_@[bodies[e]]")
                 term = f"({' + '.join(terms)})"
             yield c, term

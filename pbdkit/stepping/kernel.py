@@ -16,8 +16,8 @@ Lines = list[str]
 
 
 class Function:
-    """A function of a kernel: its lines, and the arguments of its own before those that all
-    functions share and that its lines turn out to use."""
+    """Function of a kernel: its lines and its own arguments, followed by those of the arguments
+    shared by all functions that its lines use."""
 
     def __init__(self, shared: Sequence[str], name: str, *own: str) -> None:
         self.shared, self.name, self.own = shared, name, own
@@ -25,18 +25,18 @@ class Function:
         self.lines: list[str] = []
 
     def add(self, depth: int, *lines: str) -> None:
-        """Adds lines at a depth of indentation, counted from `self.depth`."""
+        """Add lines at a depth of indentation, counted from `self.depth`."""
         self.lines += ["    " * (self.depth + depth) + line for line in lines]
 
     @property
     def used(self) -> list[str]:
-        """Those of the shared names that its lines use, as they are or flat."""
+        """Shared names that its lines use, as they are or flat."""
         words = self._words() - set(self.own)
         return [name for name in self.shared if {name, f"flat_{name}"} & words]
 
     @property
     def source(self) -> list[str]:
-        """Its lines, with a head."""
+        """Lines of the function with its head."""
         head = f"def {self.name}({', '.join([*self.own, *self.used])}):"
         words = self._words()
         flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.used if f"flat_{n}" in words]
@@ -44,7 +44,7 @@ class Function:
         return ["", "", "@part", head, *lines]
 
     def call(self, *own: str) -> str:
-        """A call with these values of its own arguments."""
+        """Return a call with values of its own arguments."""
         return f"{self.name}({', '.join([*own, *self.used])})"
 
     def _words(self) -> set[str]:
@@ -61,7 +61,7 @@ class KernelWriter(ABC):
     """
 
     keeps_before: ClassVar[bool] = True
-    """Whether each step has to leave the displacements before it as it found them."""
+    """True if each step leaves the displacements before it unchanged."""
 
     @abstractmethod
     def each(self, pattern: str, axes: str = "") -> Lines:
@@ -69,7 +69,7 @@ class KernelWriter(ABC):
 
     @abstractmethod
     def vector(self, pattern: str) -> str:
-        """Return a vector whose components have this pattern."""
+        """Return a vector of components that follow the pattern."""
 
     @abstractmethod
     def number(self, value: float) -> str:

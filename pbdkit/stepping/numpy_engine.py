@@ -1,4 +1,4 @@
-"""The engine interface, and the numpy engine: the oracle of every faster one."""
+"""Interface of engines, and the numpy engine: the reference of all others."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from pbdkit.stepping.step import Step
 
 
 class Engine(ABC):
-    """Steps the states of one scene. All engines give the same numbers, to the last bit where
-    rules keep to + - × ÷ and square roots."""
+    """Base class of engines, which step the states of one scene. All engines give the same numbers,
+    to the last bit if rules use only + - × ÷ and square roots."""
 
     name: str
     threads: int = 1
 
     @abstractmethod
     def advance(self, state: State, steps: int = 1) -> State:
-        """The state so many steps on. It takes over the arrays of `state`, which is void
-        afterwards."""
+        """Return the state after a number of steps. It takes over the arrays of `state`, which is
+        invalid afterwards."""
 
     def renewed(self, state: State, rows: slice) -> None:
-        """Takes note that somebody has written these rows of cells of the state that it gave out
-        last; an engine that keeps nothing beside the state has nothing to do."""
+        """Update what the engine stores beside the last state after rows of its cells were
+        written."""
         return
 
 
 class Stepper(Engine):
-    """The numpy engine: it applies the operations of a step, and holds no state."""
+    """Engine that applies the operations of a step by numpy and stores no state."""
 
     name = "numpy"
 
     def __init__(
         self, scene: Scene, sweep: MoveFollowers | None = None, *, strict: bool = False
     ) -> None:
-        """With `strict` the first operation of the rule that gives NaN raises
+        """Create the engine; if `strict`, the first operation of the rule that gives NaN raises
         FloatingPointError."""
         self._scene = scene
         self._invalid: Literal["raise", "ignore"] = "raise" if strict else "ignore"
         self._program = program_of(scene, sweep)
         self._now = self
-        """With the numbers of the last step."""
+        """Engine with the numbers of the last step."""
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """One step after the other, each with the numbers that hold at its end."""
+        """Make one step after the other, each with the numbers at its end."""
         for _ in range(steps):
             now = self._scene.at(state.step + 1)
             if now is not self._scene and now is not self._now._scene:

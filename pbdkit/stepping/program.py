@@ -1,6 +1,8 @@
-"""The program of a scene: the operations of a step, in their order."""
+"""Program of a scene: the operations of a step, in their order."""
 
 from __future__ import annotations
+
+from itertools import chain
 
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaking import BreakBonds, CutBonds
@@ -17,9 +19,11 @@ from pbdkit.stepping.leaders import (
     TurnDirections,
 )
 from pbdkit.stepping.particle_operation import OperateOnParticles
-from pbdkit.stepping.step import Hindrance, Mode, Operation
+from pbdkit.stepping.state import State
+from pbdkit.stepping.step import Call, Hindrance, Mode, Operation, Reach
 
 Program = tuple[Operation, ...]
+"""Type of the operations of a step, in their order."""
 ORDER: tuple[type[Operation], ...] = (
     CutBonds,
     PlaceLeaders,
@@ -36,15 +40,72 @@ ORDER: tuple[type[Operation], ...] = (
     FollowFrame,
 )
 """The order of a step: it stands here, and nowhere else."""
+MAX_FORESEEN, MAX_VALUES = 64, 2**20
+"""Maximum number of steps for which the places of leaders are computed in advance, and of their
+displacements."""
 
 
 def program_of(scene: Scene, sweep: MoveFollowers | None = None) -> Program:
-    """Return the operations that a scene needs, in the order of a step; of a feature that it does
-    not have there is none. `sweep` takes the place of the one that moves its followers."""
-    found: list[Operation] = []
+    """Return the operations that a scene needs, in the order of a step. `sweep` replaces the one
+    that moves the followers."""
+    operations: list[Operation] = []
     for kind in ORDER:
-        found += [sweep] if sweep and kind is MoveFollowers else kind.of(scene)
-    return tuple(found)
+        operations += [sweep] if sweep and kind is MoveFollowers else kind.of(scene)
+    return tuple(operations)
+
+
+def prepare(program: Program, state: State) -> Call:
+    """Prepare a call of a kernel with the step after a state."""
+    call = Call(state)
+    for operation in program:
+        operation.prepare(call)
+    return call
+
+
+def foresee(program: Program, call: Call, end: int) -> int:
+    """Prepare a call for the steps up to `end` that go on in the same way; return their number."""
+    step, most = call.step, end - call.state.step
+    steady = steady_steps(program, step, most)
+    if steady > 1:
+        return steady
+    values = sum(leaders.u.size for leaders in call.leaders[0])
+    most = min(steady_steps(program, step, most, foreseeable=True), MAX_FORESEEN)
+    for later in range(step + 1, step + min(most, max(1, MAX_VALUES // max(1, values)))):
+        if not all(operation.is_foreseeable(later) for operation in program):
+            break
+        for operation in program:
+            operation.foresee(call, later)
+    return len(call.leaders)
+
+
+def reach_of(scene: Scene, axis: int) -> Reach:
+    """Return the distances along an axis at which any operation reads what others write."""
+    distances = (operation.reach(axis) for operation in program_of(scene))
+    return Reach(*map(max, zip(Reach(), *distances, strict=True)))
+
+
+def steady_steps(program: Program, step: int, most: int, foreseeable: bool = False) -> int:
+    """Return how many steps from `step` on are alike, from 1 to `most`: leaders and obstacles stay,
+    loads and numbers do not change, and bonds are cut at most at the beginning of the first.
+
+    Leaders may move if their motion is `foreseeable`.
+    """
+    change = min(operation.next_change(step, foreseeable) for operation in program)
+    return int(min(most, change - step))
+
+
+def last_event(scene: Scene) -> int:
+    """Return the last step of the run, at least 1, in which leaders or obstacles move, roles, loads
+    or numbers change or bonds are cut."""
+    events = (operation.events(scene.experiment.steps) for operation in program_of(scene))
+    return max([1, *chain(*events), *bends_of(scene)])
+
+
+def bends_of(scene: Scene) -> list[int]:
+    """Return the moments of the run between which numbers and forces change linearly; its end is
+    one where they still change there. The course of a load counts while the load acts."""
+    bends = (operation.bends(scene.experiment.steps) for operation in program_of(scene))
+    return [*chain(*bends)]
 
 
 def moves_of(scene: Scene, sweep: MoveFollowers) -> Program:
@@ -53,13 +114,12 @@ def moves_of(scene: Scene, sweep: MoveFollowers) -> Program:
 
 
 def hindrance(scene: Scene, mode: Mode) -> Hindrance | None:
-    """Return the first reason for which the steps of a scene cannot be made in a mode; None where
-    they can."""
+    """Return the first reason why the steps of a scene do not support a mode; None if they do."""
     reasons = (operation.hindrance(mode) for operation in program_of(scene))
     return next(filter(None, reasons), None)
 
 
 def reason_against(scene: Scene, mode: Mode) -> str:
-    """Return that reason in words; empty where there is none."""
-    found = hindrance(scene, mode)
-    return found.reason if found else ""
+    """Return that reason in words; empty if there is none."""
+    reason = hindrance(scene, mode)
+    return reason.reason if reason else ""

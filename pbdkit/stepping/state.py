@@ -32,20 +32,20 @@ from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 
 BrokenSteps = NDArray[np.integer[Any]]
-"""The step at which each bond broke, (plane, cell, cell), -1 where it has not."""
+"""Type of the step at which each bond broke, (plane, cell, cell); -1 for intact bonds."""
 
 
 def break_crossed(
     scene: Scene, segments: Iterable[Segment], broken: BrokenSteps, step: int
 ) -> None:
-    """Marks, in place, the bonds that cross a segment and are whole as broken at a step."""
+    """Mark the intact bonds that cross a segment as broken at a step, in place."""
     for n, block, crossed in crossed_bonds(scene.raster, scene.neighbourhood, segments):
-        there = block.within(broken[n])
-        there[crossed & (there < 0)] = step
+        steps = block.within(broken[n])
+        steps[crossed & (steps < 0)] = step
 
 
 def cut_bonds(scene: Scene, broken: BrokenSteps | None, step: int) -> bool:
-    """Makes, in place, the cuts of the beginning of a step; whether there are any."""
+    """Make the cuts of the beginning of a step in place; return whether there are any."""
     segments = [cut.segment for cut in scene.experiment.cuts if cut.at == step]
     if segments:
         assert broken is not None
@@ -54,7 +54,7 @@ def cut_bonds(scene: Scene, broken: BrokenSteps | None, step: int) -> bool:
 
 
 Values = tuple[Array, ...]
-"""One array a number that is remembered, in the order in which the part declares them."""
+"""Type of the remembered numbers, one array each, in the order of their declarations."""
 
 
 @dataclass
@@ -82,21 +82,21 @@ class State:
     particle_values: Values = ()
 
     def copy(self, over: State | None = None) -> State:
-        """The same state in arrays of its own, or in those of a state of the same scene that
-        nobody needs any more: memory that is new costs several times as much as what is copied."""
+        """Return a copy, written over another state of the same scene if one is given: new memory
+        costs several times as much as copying."""
         if over is None:
             return replace(self, **{name: _copied(part) for name, part in vars(self).items()})
-        for mine, others in zip(self.arrays(), over.arrays(), strict=True):
-            np.copyto(others, mine)
+        for mine, target in zip(self.arrays(), over.arrays(), strict=True):
+            np.copyto(target, mine)
         return replace(over, step=self.step, starts=self.starts)
 
     def fits(self, other: State) -> bool:
-        """Whether both can be of one scene, by the kinds and shapes of their arrays."""
+        """Return whether both can belong to one scene, by the types and shapes of their arrays."""
         layouts = [[(a.dtype, a.shape) for a in state.arrays()] for state in (self, other)]
         return layouts[0] == layouts[1] and len(self.starts) == len(other.starts)
 
     def arrays(self) -> list[Array]:
-        """What steps are written into."""
+        """Return the arrays that steps write."""
         bonds = (self.broken_step, self.broken_length, *self.bond_values)
         carried = (self.u, self.previous, *bonds, *self.particle_values)
         return [array for array in carried if array is not None]
@@ -109,28 +109,29 @@ def _copied(part: Any) -> Any:
 
 
 def unmoved_state(scene: Scene, cells: Sequence[int]) -> State:
-    """The state at time 0 on rasters of so many cells: nothing is displaced, broken or drawn."""
+    """Return a state at time 0 on rasters of the given number of cells, without displacements,
+    broken bonds or random numbers."""
     experiment, sites = scene.experiment, (scene.raster.shape[0], *cells)
     bonds, precision = (len(scene.neighbourhood.planes), *cells), experiment.stepping.precision
     u, previous = (np.zeros((scene.axes, *sites), precision) for _ in range(2))
     broken, lengths = None, None
     if scene.has_fracture:
         broken, lengths = np.full(bonds, -1, np.int32), np.zeros(bonds, precision)
-    kept = bond_numbers(experiment), particle_numbers(experiment)
-    values = (started(scene, *of) for of in zip(kept, (bonds, sites), strict=True))
+    numbers = bond_numbers(experiment), particle_numbers(experiment)
+    values = (started(scene, *of) for of in zip(numbers, (bonds, sites), strict=True))
     return State(0, u, previous, broken, lengths, (None,) * len(scene.leading), *values)
 
 
 def started(scene: Scene, numbers: Sequence[Remembered], shape: Sequence[int]) -> Values:
-    """Arrays of remembered numbers at their `initial`."""
+    """Return arrays of remembered numbers at their `initial`."""
     precision = scene.experiment.stepping.precision
     dtypes = [precision if number.dtype == "f8" else number.dtype for number in numbers]
     return tuple(np.full(shape, n.initial, d) for n, d in zip(numbers, dtypes, strict=True))
 
 
 def initial_state(scene: Scene) -> State:
-    """The state at time 0: the body as the experiment starts it, the frame following, bonds across
-    the given cracks, and cut before the first step, broken at step 0. Nothing has moved before."""
+    """Return the state at time 0: the body with its initial displacements, the frame following, and
+    bonds across cracks and initial cuts broken at step 0. Nothing has moved before."""
     experiment, state = scene.experiment, unmoved_state(scene, scene.raster.shape[1:])
     if not experiment.initial.at_rest:
         _displace(scene, state.u.reshape(scene.axes, -1))
@@ -144,7 +145,7 @@ def initial_state(scene: Scene) -> State:
 
 
 def _displace(scene: Scene, u: Floats) -> None:
-    """Writes the body's and the frame's displacements, (axis, flat place)."""
+    """Write the displacements of body and frame, (axis, flat place)."""
     raster, body = scene.raster, scene.raster.body_rows
     leads = kinds_at(raster, scene.leading, 0)[body] == LEADER
     generator = np.random.default_rng(scene.experiment.seed)
@@ -155,8 +156,7 @@ def _displace(scene: Scene, u: Floats) -> None:
 
 
 def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Values) -> None:
-    """Writes where the numbers of the part at a field start, if it draws them; those of frame
-    points are left out."""
+    """Write the initial values of the numbers that a component draws; frame points are left out."""
     part: FractureModel | FollowerRule = getattr(scene.experiment, field)
     if not (numbers and isinstance(part, Draws)):
         return
@@ -183,19 +183,19 @@ def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Value
 
 
 def generator_for(seed: int, part: str) -> np.random.Generator:
-    """The random numbers of one part of the experiment, by its field: the same whatever other parts
-    draw."""
+    """Return the random generator of one component of the experiment, by its field; it does not
+    depend on what others draw."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(part.encode())))
 
 
 def describe_particles(scene: Scene) -> Particles:
-    """The particles of the body with their places."""
+    """Return the particles of the body with their places."""
     rows = scene.raster.body_rows
     return Particles(rows.astype(np.int64) + 1, scene.raster.reference(rows))
 
 
 def describe_bonds(scene: Scene) -> Bonds:
-    """The table of bonds with their places."""
+    """Return the table of bonds with their places."""
     table, raster = scene.bonds, scene.raster
     rests = np.array([plane.slot.rest for plane in scene.neighbourhood.planes])
     rest = rests[table.plane]
@@ -205,8 +205,8 @@ def describe_bonds(scene: Scene) -> Bonds:
 def renew(
     numbers: Sequence[Remembered], own: Sequence[Array], new: Sequence[Any], where: Array | None
 ) -> None:
-    """Writes the new values of the numbers that change over what is remembered, in place, where it
-    is asked for (None: everywhere); all are there before any is written.
+    """Write the new values of the numbers that change over the remembered ones, in place, where a
+    mask is true; all are computed before any is written.
 
     Raises ValueError for another number of values, TypeError for fractions of an integer.
     """
@@ -225,7 +225,7 @@ def renew(
 
 
 def shown(values: Iterable[Any]) -> tuple[Any, ...]:
-    """The same, as components see it: nobody writes to the state but the stepper."""
+    """Return read-only views of arrays, as components receive them; other values unchanged."""
     return tuple(_read_only(value) if isinstance(value, np.ndarray) else value for value in values)
 
 

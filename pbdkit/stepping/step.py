@@ -1,45 +1,57 @@
-"""A step is a list of operations, one for each feature of a scene (listed in ARCHITECTURE.md).
+"""Operations of a step, one for each feature of a scene (listed in ARCHITECTURE.md).
 
-An engine interprets the list and knows no feature by name: numpy applies one operation after the
-other, a kernel is written by letting each of them emit its lines. The order stands once, in
-`stepping/program.py`.
+Engines interpret the list of operations without naming a feature: numpy applies one operation after
+the other, kernels consist of the lines that operations emit. `stepping/program.py` has the order.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
-from numpy.typing import NDArray
+import numpy as np
 
-from pbdkit.array_types import Floats, Indices
+from pbdkit.array_types import Array, Floats, Indices
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.kernel import KernelWriter
+from pbdkit.stepping.kernel import KernelWriter, Lines
 from pbdkit.stepping.state import State
 
 
 class Placed(NamedTuple):
-    """Particles that lead: their places, and their displacements u (axis, particle) along those
-    axes."""
+    """Leaders with prescribed displacements.
+
+    Parameters
+    ----------
+    place
+        Flat places.
+    u
+        Displacements, (axis, particle).
+    axes
+        Axes along which the displacements are prescribed.
+    """
 
     place: Indices
     u: Floats
     axes: tuple[int, ...]
 
 
-Led = list[Placed]
+Leaders = list[Placed]
+"""Type of the leaders of a step."""
 Starts = tuple[Floats | None, ...]
+"""Type of the displacements, or velocities, at which the motions of leader groups start."""
 
 
 class Mode(Enum):
-    """A mode of stepping that not every operation goes with."""
+    """Mode of stepping that some operations do not support."""
 
     GPU = "on the threads of a GPU"
     PASSES = "several steps in a pass over the memory"
     RANKS = "rows of the lattice in several processes"
+    RANKS_AT_REST = "an equilibrium in several processes"
     COURSES = "in kernels, while numbers of rule or fracture model change in time"
     SOLVER_COURSES = "in kernels, while numbers of the solver change in time"
 
@@ -47,26 +59,83 @@ class Mode(Enum):
 PUSHED_BY_COURSES = (
     "numbers change in time by which masses, obstacles or leaders along an axis push"
 )
+"""Reason why kernels do not follow numbers that change in time."""
 
 
 class Hindrance(NamedTuple):
-    """Why an operation cannot be made in a mode, and the field of the experiment that asks for
-    it."""
+    """Reason why an operation does not support a mode.
+
+    Parameters
+    ----------
+    reason
+        The reason in words.
+    field
+        Field of the experiment that leads to the operation.
+    """
 
     reason: str
     field: str
 
 
+class Reach(NamedTuple):
+    """Distances along an axis, in repeat cells, at which an operation reads what others write.
+
+    Parameters
+    ----------
+    reach
+        Distance of neighbours.
+    back, ahead
+        Distances behind and ahead of a particle at which bonds are judged, or moves of an inner
+        rule made, before it moves.
+    below, above
+        Distances below and above at which these in turn read displacements.
+    apart
+        Distance of frame points from the particles that they follow.
+    """
+
+    reach: int = 0
+    back: int = 0
+    ahead: int = 0
+    below: int = 0
+    above: int = 0
+    apart: int = 0
+
+    @property
+    def step(self) -> int:
+        """Distance by which each step of a pass follows the one before."""
+        sees = max(self.reach, self.above + self.ahead, self.below + self.back)
+        return max(sees + self.apart, self.back + self.ahead)
+
+    @property
+    def sight(self) -> int:
+        """Distance at which a step reads beyond judged bonds, or moves of an inner rule."""
+        return max(self.reach - self.ahead, self.above)
+
+
 @dataclass(slots=True)
 class Step:
-    """A step under way, as its operations see it one after the other.
+    """Step in progress, which the operations change one after the other.
 
-    `u` are the displacements at the end of the step before, with the leaders in place as long as
-    particles move: the intermediate configuration. `new` comes holding those of the step before
-    that, and leaves holding those at the end of this one. What bonds and particles remember is
-    renewed in place in `state`. `led` are the leaders with where they are put, `stood` the same
-    with where they stood; `turned` is what clamped leaders prescribe, as (values, places,
-    prescribed). `invalid` says what becomes of operations of the rule that give NaN.
+    Parameters
+    ----------
+    number
+        Number of the step.
+    u
+        Displacements at the end of the step before. While particles move, leaders are in place:
+        the intermediate configuration.
+    new
+        Displacements of one step earlier at the beginning, those at the end of this step at the
+        end.
+    state
+        State at the beginning. What bonds and particles remember is renewed in place.
+    invalid
+        Treatment of operations of the rule that give NaN.
+    leaders, origins
+        Leaders with the displacements that are prescribed, and with those before.
+    starts
+        Starts of the motions of leader groups.
+    directions
+        Directions that clamped leaders prescribe, as (values, places, prescribed values).
     """
 
     number: int
@@ -74,14 +143,72 @@ class Step:
     new: Floats
     state: State
     invalid: Literal["raise", "ignore"] = "ignore"
-    led: Led = field(default_factory=list)
-    stood: Led = field(default_factory=list)
+    leaders: Leaders = field(default_factory=list)
+    origins: Leaders = field(default_factory=list)
     starts: Starts = ()
-    turned: list[tuple[NDArray[Any], Indices, NDArray[Any]]] = field(default_factory=list)
+    directions: list[tuple[Array, Indices, Array]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Call:
+    """Steps of one call of a kernel, which the operations prepare on the host.
+
+    Parameters
+    ----------
+    state
+        State before the first step.
+    leaders
+        Leaders in each step, or in all if there is one entry.
+    starts
+        Starts of the motions of leader groups.
+    clamps
+        Flat places of clamped leaders.
+    has_cuts
+        Whether bonds were cut.
+    """
+
+    state: State
+    leaders: list[Leaders] = field(default_factory=lambda: [[]])
+    starts: Starts = ()
+    clamps: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
+    has_cuts: bool = False
+
+    @property
+    def step(self) -> int:
+        """Number of the first step."""
+        return self.state.step + 1
+
+    @property
+    def moments(self) -> range:
+        """Numbers of the steps in which leaders are at different places."""
+        return range(self.step, self.step + len(self.leaders))
+
+
+class Entries(NamedTuple):
+    """List of particles that the lines of an operation go through.
+
+    Parameters
+    ----------
+    place
+        Flat places.
+    values
+        Arrays by name whose last axis is that of the list.
+    """
+
+    place: Indices
+    values: dict[str, Array]
+
+
+Cells = tuple[Indices, ...]
+"""Type of repeat cells, one array for each axis."""
 
 
 class Operation(ABC):
-    """What one feature of a scene does in a step."""
+    """Part of a step that belongs to one feature of a scene.
+
+    Subclasses define `apply` and `emit`, and override what differs from a feature that reads
+    neighbours nowhere, does the same in each step and moves nothing by itself.
+    """
 
     makes_moves: ClassVar[bool] = False
     """Whether it contributes to the move that a rule makes from given positions. An equilibrium is
@@ -92,28 +219,36 @@ class Operation(ABC):
 
     @classmethod
     def of(cls, scene: Scene) -> Sequence[Self]:
-        """The operations of this kind that a scene needs; none of a feature that it lacks."""
+        """Return the operations of this type that a scene needs."""
         return [cls(scene)] if cls.is_needed(scene) else []
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
-        """Whether a scene has the feature."""
+        """Return whether the scene has the feature."""
         return True
 
     @abstractmethod
     def apply(self, step: Step) -> None:
-        """Compute its part of a step by numpy, in place: the reference for every engine."""
+        """Compute the part of a step by numpy, in place: the reference for every engine."""
 
     @abstractmethod
     def emit(self, kernel: KernelWriter) -> None:
-        """Write its part of a step into a kernel."""
+        """Write the part of a step into a kernel."""
+
+    def opening(self, step: str) -> Lines:
+        """Return lines at the beginning of a step; `step` is its number in the call, from 0."""
+        return []
+
+    def end_pass(self, kernel: KernelWriter) -> None:
+        """Write what completes displacements before the last step of a pass of several steps."""
+        return
 
     def functions(self) -> dict[str, Callable[..., Any]]:
         """Return by name the elementwise functions that its lines call."""
         return {}
 
     def numbers(self) -> dict[str, tuple[str, ...]]:
-        """Return by name the named tuples that its lines make, with their fields."""
+        """Return by name the named tuples that its lines create, with their fields."""
         return {}
 
     def constants(self) -> dict[str, Sequence[float]]:
@@ -121,9 +256,71 @@ class Operation(ABC):
         return {}
 
     def lists(self) -> dict[str, Indices]:
-        """Return by name the flat places that its lines go by, where they are always the same."""
+        """Return by name the constant lists of flat places that its lines go through."""
         return {}
 
+    def entries(self, call: Call) -> dict[str, Entries]:
+        """Return by name the lists that its lines go through in a call."""
+        return {}
+
+    def arrays(self, call: Call) -> dict[str, Array]:
+        """Return by name the arrays that its lines read in a call."""
+        return {}
+
+    def prescribed_numbers(self) -> tuple[int, ...]:
+        """Return the remembered numbers of particles that it prescribes."""
+        return ()
+
+    def reads(self, state: State) -> bool:
+        """Return whether `prepare` reads or writes the arrays of a state."""
+        return False
+
+    def prepare(self, call: Call) -> None:
+        """Compute on the host what its lines need in the first step of a call."""
+        return
+
+    def is_foreseeable(self, step: int) -> bool:
+        """Return whether `foresee` can prepare a later step."""
+        return True
+
+    def foresee(self, call: Call, step: int) -> None:
+        """Compute on the host what its lines need in a later step of a call."""
+        return
+
+    def disturbances(self, call: Call) -> Iterator[Cells]:
+        """Generate the cells of particles at rest that a call moves, neighbours apart."""
+        yield from ()
+
+    def fixed_places(self) -> Indices:
+        """Return the flat places of particles that stay in place while it acts."""
+        return np.zeros(0, np.intp)
+
+    def reach(self, axis: int) -> Reach:
+        """Return the distances along an axis at which it reads what others write."""
+        return Reach()
+
+    def sweeps(self) -> int:
+        """Return how many times one after the other it evaluates neighbours in a step."""
+        return 0
+
+    def carries(self) -> Indices:
+        """Return the differences of repeat cell, (difference, axis), over which it carries the
+        motion of a particle on in a step."""
+        return np.zeros((0, self.scene.axes), np.intp)
+
+    def next_change(self, step: int, foreseeable: bool = False) -> float:
+        """Return the first step after `step` in which it does something else; infinity if there is
+        none. Motions do not count that are `foreseeable` where particles are prescribed."""
+        return math.inf
+
+    def events(self, steps: int) -> list[int]:
+        """Return the steps of a run in which it begins or ceases to do something."""
+        return []
+
+    def bends(self, steps: int) -> list[int]:
+        """Return the moments of a run between which its numbers change linearly."""
+        return []
+
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return why it cannot be made in a mode; None where it can."""
+        """Return the reason why it does not support a mode; None if it does."""
         return None

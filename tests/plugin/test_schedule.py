@@ -30,8 +30,8 @@ from pbdkit.simulation import Simulation
 from pbdkit.stability.analysis import Analysis
 from pbdkit.stability.forecast import forecast
 from pbdkit.stepping.engine_choice import choose, what_kernels_lack
-from pbdkit.stepping.leaders import last_event
 from pbdkit.stepping.numpy_engine import Stepper
+from pbdkit.stepping.program import last_event
 from pbdkit.stepping.state import initial_state
 from pbdkit.web.session import Session
 from tests.components.test_elasticity import NATURAL

@@ -1,12 +1,12 @@
-"""Passes of several steps: the loops over pieces, tiles and bands, and the writer of a step there.
+"""Passes of several steps: loops over pieces, tiles and bands, and the writer of a step in a tile.
 
 The lattice is cut along its last axis into tiles that stay in the cache, and each tile along its
-first into bands. Band after band every step of a pass moves a part of the tile, each as far behind
-the one before as `Skew` says, along both axes; then comes the next tile.
+first axis into bands. Band after band, every step of a pass moves a part of the tile, at the
+distance of `Skew` behind the step before along both axes; the next tile follows.
 
-On several threads the rows are cut into pieces that go side by side. Where they meet each step of a
-piece leaves out as many rows more than the one before as it must not see; these gaps, which grow as
-the pieces shrink, come after them, side by side again.
+On several threads the rows are cut into pieces that are moved in parallel. At their ends each step
+of a piece leaves out as many rows more than the one before as it must not read. These gaps, which
+grow as the pieces shrink, are moved in parallel afterwards.
 """
 
 from __future__ import annotations
@@ -16,36 +16,34 @@ from collections.abc import Callable, Iterable
 
 from pbdkit.stepping.frame_following import FollowFrame
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
-from pbdkit.stepping.leaders import GuideLeaders
-from pbdkit.stepping.numba_engine.boundary import held
 from pbdkit.stepping.numba_engine.plan import Passes, Plan, PlanWriter
 from pbdkit.stepping.numba_engine.time_skewing import Skew
 from pbdkit.stepping.program import Program
 
 
 class TileWriter(PlanWriter):
-    """Writes the part of step s of a pass in a tile of a piece: operation after operation, in the
-    rows from i0 to i1 and the columns from j0 to j1. Leaders are placed as far as the step will
-    see; what is done around particles before they move is done ahead of them."""
+    """Writer of step s of a pass in a tile of a piece, in the rows from i0 to i1 and the columns
+    from j0 to j1. Leaders are placed as far as the step reads; bonds and inner rules are evaluated
+    ahead of the particles that move."""
 
     keeps_before = False
     _is_ahead = True
-    """Whether rows and columns are not those of particles that move."""
+    """True if rows and columns are ahead of the particles that move."""
 
     def __init__(self, plan: Plan, passes: Passes) -> None:
-        own = "s", "made", "band_", "tile", "piece", "extent", "boxes"
-        super().__init__(plan, Function(plan.shared, "move_part", *own), passes)
+        arguments = "s", "moment", "band_", "tile", "piece", "extent", "boxes"
+        super().__init__(plan, Function(plan.shared, "move_part", *arguments), passes)
         self._skew = Skew(plan.scene).axes
 
     def begin(self) -> None:
-        """Where the step stands in the tile, and how far it sees."""
+        """Write the position of the step in the tile, and how far it reads."""
         out, (rows, columns) = self.out, self._skew
         out.add(0, "i_low, i_high, j_low, j_high = extent", "begin, end, down, up = piece")
         out.add(0, "step = step + s + 1", "bottom, top = begin + s * down, end + s * up")
         out.add(0, f"high = begin + (band_ + 1) * sizes[1] - s * {rows.step}")
         out.add(0, f"right = j_low + (tile + 1) * sizes[2] - s * {columns.step}")
         out.add(0, "low, left = high - sizes[1], right - sizes[2]")
-        out.add(0, *(held(end, "made + s") for end in self.plan.leads))
+        out.add(0, *self.plan.opening("moment + s"))
         out.add(0, f"i0 = bottom - {rows.ahead + rows.reach}")
         out.add(0, f"i0 = i0 if band_ == 0 else max(low + {rows.sight}, i0)")
         out.add(0, f"i1 = min(high + {rows.sight}, top + {rows.back + rows.reach})")
@@ -53,20 +51,21 @@ class TileWriter(PlanWriter):
         out.add(0, f"j1 = right + {columns.sight}")
 
     def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
-        """Those in the rows and columns."""
+        """Write a loop over the entries in the rows and columns."""
         if not ahead:
             self._keep_to_moving()
         self._loop(name, "e", lines)
 
     def judge_bonds(self) -> None:
-        """Ahead of the particles that move."""
+        """Write a call ahead of the particles that move."""
         if judge := self.passes.judge:
             self._keep_to_moving()
             self.out.add(0, judge.call("i0", "i1", "left", "right"))
             self._move_on()
 
     def sweep(self, level: int) -> None:
-        """Over what has been reached; of an inner rule ahead of the particles that move."""
+        """Write a call over what motion has reached; of an inner rule ahead of the particles that
+        move."""
         out, first = self.out, 2 * self.plan.scene.axes - 2
         self._keep_to_moving()
         out.add(0, "box = boxes[s].copy()", f"box[{first}] = max(box[{first}], left)")
@@ -78,13 +77,13 @@ class TileWriter(PlanWriter):
             self._move_on()
 
     def over_rows(self, name: str, write: Callable[[Function], None]) -> None:
-        """Those that the sweep has moved."""
+        """Write a call for the rows that the sweep has moved."""
         self.out.add(0, "if r0 < r1 and box[2] < box[3]:")
-        self.out.add(1, self.rows(name, write).call("r0", "r1", "made + s"))
+        self.out.add(1, self.rows(name, write).call("r0", "r1", "moment + s"))
 
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Those that follow particles of the range, the last of them there; those that follow some
-        on both sides of where pieces meet wait for the gap."""
+        """Write a loop over the points whose last particle is in the range; points with particles
+        on both sides of the end of a piece wait for the gap."""
         lines = self.each(f"{planes}_@[points[f]] = t_@")
         if lag:  # where the point was to be after the step before
             lines = self.each(f"{planes}_@[points[f]] = lag_@[f]")
@@ -96,21 +95,21 @@ class TileWriter(PlanWriter):
             self._move_on()
 
     def _loop(self, name: str, e: str, lines: Iterable[str], besides: str = "") -> None:
-        """A loop over those of a list in the rows from i0 to i1, and columns from j0 to j1."""
+        """Write a loop over the entries of a list in the rows from i0 to i1, and columns from j0 to
+        j1."""
         self.out.add(0, f"first_one = {name}_rows[min(max(i0, i_low), i_high)]")
         self.out.add(0, f"for {e} in range(first_one, {name}_rows[max(min(i1, i_high), i_low)]):")
         self.out.add(1, f"if j0 <= {name}_columns[{e}] < j1{besides}:")
         self.out.add(2, *lines)
 
     def _keep_to_moving(self) -> None:
-        """Rows and columns of the particles that move, or around which something is done before
-        they do."""
+        """Return to the rows and columns of the particles that move."""
         if self._is_ahead:
             self.out.add(0, "i0, i1, j0, j1 = max(low, bottom), min(high, top), left, right")
             self._is_ahead = False
 
     def _move_on(self) -> None:
-        """After something has been done ahead of the particles that move."""
+        """Shift the range by the distance of what was done ahead of the particles that move."""
         out, (rows, columns) = self.out, self._skew
         for edge, slope in (("bottom", "down"), ("top", "up")):
             out.add(0, f"{edge} += {rows.back} if {slope} > 0 else {-rows.ahead} * ({slope} < 0)")
@@ -120,19 +119,19 @@ class TileWriter(PlanWriter):
 
 
 def lag_lines(kernel: KernelWriter, mapped: Callable[[str], Lines], planes: str) -> Lines:
-    """Where the frame point f is to be a step later."""
+    """Return lines for the displacement of frame point f one step later."""
     return [*mapped(planes), *kernel.each("lag_@[f] = t_@")]
 
 
 def write_piece(plan: Plan, program: Program, passes: Passes) -> list[Function]:
-    """The functions for the steps of a pass in a piece, its own last: rows from `begin` to `end`,
-    of which either end goes further `down` or `up` in every step."""
+    """Return the functions for the steps of a pass in a piece, the main one last: rows from `begin`
+    to `end`, with ends that go further `down` or `up` in every step."""
     tile = TileWriter(plan, passes)
     tile.begin()
     for operation in program:
         operation.emit(tile)
     part = tile.out
-    out = Function(plan.shared, "move_piece", "piece", "made", "deep", "extent", "boxes")
+    out = Function(plan.shared, "move_piece", "piece", "moment", "deep", "extent", "boxes")
     rows, columns = Skew(plan.scene).axes
     margin = rows.back + rows.ahead + rows.apart
     out.add(0, "begin, end, down, up = piece", "i_low, i_high, j_low, j_high = extent")
@@ -148,22 +147,22 @@ def write_piece(plan: Plan, program: Program, passes: Passes) -> list[Function]:
 
 
 def _exchanged(plan: Plan, call: str) -> str:
-    """A call in which what is there before a step and after it change places."""
+    """Return a call with the arrays before and after a step exchanged."""
     pairs = [*zip(plan.each("u_@"), plan.each("v_@"), strict=True)]
     pairs += [(f"own{m}", f"was{m}") for m in plan.kept if plan.shares]
-    other = dict(pairs) | {after: before for before, after in pairs}
+    other = dict(pairs) | {v_name: u_name for u_name, v_name in pairs}
     return re.sub(rf"\b({'|'.join(other)})\b", lambda found: other[found[0]], call)
 
 
-def write_deep_passes(writer: PlanWriter, piece: Function) -> None:
-    """The beginning of a loop over steps: many in a pass, as long as there are several to make and
-    what has been reached is more than stays in the cache."""
+def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> None:
+    """Write the beginning of a loop over steps: many in a pass, as long as several remain and
+    motion has reached more than stays in the cache."""
     out, plan = writer.out, writer.plan
     # numba compiles a function for each literal that it is called with, and again for int64.
-    out.add(0, "boxes, made = np.empty((sizes[0], box.size), np.int64), int64(0)")
-    out.add(0, "while made < count:", "    area = 1", "    for e in range(0, box.size, 2):")
+    out.add(0, "boxes, moment = np.empty((sizes[0], box.size), np.int64), int64(0)")
+    out.add(0, "while moment < count:", "    area = 1", "    for e in range(0, box.size, 2):")
     out.add(2, "area *= min(box[e + 1], kind.shape[e // 2 + 1]) - max(box[e], 0)")
-    out.add(1, "deep = min(sizes[0], count - made)")
+    out.add(1, "deep = min(sizes[0], count - moment)")
     if plan.parallel:  # pieces meet only where there is room for their gaps
         out.add(1, "height = min(box[1], kind.shape[1]) - max(box[0], 0)")
         out.add(1, f"deep = min(deep, height // ({2 * Skew(plan.scene).along[0]} * sizes[4]) - 1)")
@@ -178,33 +177,35 @@ def write_deep_passes(writer: PlanWriter, piece: Function) -> None:
     if plan.shares:
         out.add(0, "if deep % 2 == 0:", *(f"    own{m}[:] = was{m}" for m in plan.kept))
     u, v = (", ".join(plan.each(f"{side}_@")) for side in "uv")
-    out.add(0, "if deep % 2:", f"    {u}, {v} = {v}, {u}", "made += deep", "step += deep")
+    out.add(0, "if deep % 2:", f"    {u}, {v} = {v}, {u}", "moment += deep", "step += deep")
     # Leaders of the step before the last stand where the last has placed them.
     out.add(0, *plan.each("flat_v_@ = v_@.reshape(-1)"))
-    out.add(0, *(held(end, "made - 2") for end in plan.leads))
+    out.add(0, *plan.opening("moment - 2"))
     out.depth -= 1
-    GuideLeaders(plan.scene).emit(writer)
+    for operation in program:
+        operation.end_pass(writer)
     out.add(1, "continue")
     out.depth -= 1
 
 
 def _write_pieces(out: Function, plan: Plan, piece: Function) -> None:
-    """All at once, or the pieces of the threads, and then the gaps between them."""
-    more = ("made", "deep", "extent", "boxes")
+    """Write one call, or calls for the pieces of the threads and for the gaps between them."""
+    arguments = ("moment", "deep", "extent", "boxes")
     if not plan.parallel:
-        out.add(0, piece.call("(i_low, i_high, int64(0), int64(0))", *more))
+        out.add(0, piece.call("(i_low, i_high, int64(0), int64(0))", *arguments))
         return
     skew = Skew(plan.scene).along[0]
-    cut, after = (f"i_low + (i_high - i_low) * {n} // sizes[4]" for n in ("n", "(n + 1)"))
+    cut, end = (f"i_low + (i_high - i_low) * {n} // sizes[4]" for n in ("n", "(n + 1)"))
     up = f"-{skew} if n + 1 < sizes[4] else 0"
     out.add(0, "for c in prange(sizes[4]):", "    n = int64(c)")
-    out.add(1, piece.call(f"({cut}, {after}, {skew} if n > 0 else 0, {up})", *more))
+    out.add(1, piece.call(f"({cut}, {end}, {skew} if n > 0 else 0, {up})", *arguments))
     out.add(0, "for c in prange(sizes[4] - 1):", "    n = int64(c)")
-    out.add(1, piece.call(f"({after}, {after}, int64(-{skew}), int64({skew}))", *more))
+    out.add(1, piece.call(f"({end}, {end}, int64(-{skew}), int64({skew}))", *arguments))
 
 
 def _write_extent(out: Function, plan: Plan) -> None:
-    """What each step of a pass has reached, and how far leaders and frame points can be from it."""
+    """Write what each step of a pass has reached, and the largest distance of leaders and frame
+    points from it."""
     up, across = Skew(plan.scene).along
     first = 2 * plan.scene.axes - 2
     out.add(0, "for s in range(deep):", "    for e in range(box.size):")

@@ -82,9 +82,11 @@ def _arithmetic(sign: str) -> Function:
     """An operation on two vectors, or on a vector and a number."""
 
     def overloaded(a: Any, b: Any) -> Any:
-        one, other = _is_vector(a), _is_vector(b)
-        term = f"a{'.@' * one} {sign} b{'.@' * other}"
-        return _written(a if one else b, "a, b", term) if one or other else None
+        is_vector_a, is_vector_b = _is_vector(a), _is_vector(b)
+        term = f"a{'.@' * is_vector_a} {sign} b{'.@' * is_vector_b}"
+        return (
+            _written(a if is_vector_a else b, "a, b", term) if is_vector_a or is_vector_b else None
+        )
 
     return overloaded
 
@@ -103,7 +105,7 @@ def compiled(function: Function) -> Any:
 
 
 def with_helpers_ready(function: Function) -> Function:
-    """The same, of which numba can compile every Python function that it reaches."""
+    """Return the function with every Python function that it reaches compilable by numba."""
     for helper in _reached(function):
         if helper is not function and helper not in _ready:
             register_jitable(helper)
@@ -112,18 +114,18 @@ def with_helpers_ready(function: Function) -> Function:
 
 
 def source_key(*functions: Function) -> str:
-    """A digest of the source of these functions and of all that they reach, constants included.
+    """Return a digest of the source of functions and of all that they reach, constants included.
 
-    Where they stand counts too: a kernel that is kept finds its functions by their modules.
-    What a function reads and cannot be told apart by its value gets a key of its own every time,
-    so that a kernel is rather made anew than out of date.
+    Their location counts, too: a stored kernel finds its functions by their modules. If a function
+    reads a value that cannot be identified, the key is new every time, so that a kernel is compiled
+    again rather than out of date.
     """
     digest = hashlib.sha256()
-    for reached in chain.from_iterable(map(_reached, functions)):
-        found = sorted(_names(reached).items())
-        parts = [reached.__module__, reached.__qualname__, _source(reached.__code__)]
-        parts.append(repr((reached.__defaults__, reached.__kwdefaults__)))
-        parts += [f"{name}={_content(value)}" for name, value in found]
+    for function in chain.from_iterable(map(_reached, functions)):
+        names = sorted(_names(function).items())
+        parts = [function.__module__, function.__qualname__, _source(function.__code__)]
+        parts.append(repr((function.__defaults__, function.__kwdefaults__)))
+        parts += [f"{name}={_content(value)}" for name, value in names]
         digest.update("\n".join(parts).encode())
     return digest.hexdigest()
 
@@ -150,33 +152,33 @@ def _source(code: types.CodeType) -> str:
 
 def _reached(function: Function) -> list[Function]:
     """The function and, once each, every Python function that it reaches by name."""
-    found = [function]
-    for here in found:
-        for value in _names(here).values():
+    functions = [function]
+    for member in functions:
+        for value in _names(member).values():
             reached = getattr(value, "py_func", value)
-            if isinstance(reached, types.FunctionType) and reached not in found:
-                found.append(reached)
-    return found
+            if isinstance(reached, types.FunctionType) and reached not in functions:
+                functions.append(reached)
+    return functions
 
 
 def _names(function: Function) -> dict[str, Any]:
-    """What the names in a function, and in functions inside it, stand for: globals, closures, and
-    members of modules."""
+    """Return the values of the names in a function, and in functions inside it: globals, closures,
+    and members of modules."""
     codes = [function.__code__]
     for code in codes:
         codes += [c for c in code.co_consts if isinstance(c, types.CodeType)]
     # Sorted, since the order of a set differs from process to process.
     names = sorted({name for code in codes for name in code.co_names})
-    found = {n: function.__globals__[n] for n in names if n in function.__globals__}
-    found |= inspect.getclosurevars(function).nonlocals
-    modules = [v for v in found.values() if isinstance(v, types.ModuleType)]
+    values = {n: function.__globals__[n] for n in names if n in function.__globals__}
+    values |= inspect.getclosurevars(function).nonlocals
+    modules = [v for v in values.values() if isinstance(v, types.ModuleType)]
     for module in modules:
         if module.__name__.split(".")[0] not in ("numpy", "math", "numba"):
             # pbdkit's own are loaded when first used.
             members = {name: getattr(module, name) for name in names if hasattr(module, name)}
-            found |= {f"{module.__name__}.{name}": value for name, value in members.items()}
+            values |= {f"{module.__name__}.{name}": value for name, value in members.items()}
             modules += [v for v in members.values() if isinstance(v, types.ModuleType)]
-    return found
+    return values
 
 
 SOURCE, DIGESTS = "kernel.py", "digests.json"
@@ -196,16 +198,16 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
     parts = [source, source_key(*functions.values(), length), vars(numba)["typeof"](arguments)]
     parts += [numba.__version__, np.__version__, sys.version, processor, interpreted]
     key = hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:32]
-    if (known := (_asked_folder(), key)) not in _loaded:
+    if (index := (_asked_folder(), key)) not in _loaded:
         names = {name: compiled(function) for name, function in functions.items()}
-        kept = None if interpreted else _kept(source, key, names, arguments)
-        _loaded[known] = kept or _prepared(source, names, arguments)
-    return _loaded[known]
+        kernel = None if interpreted else _kept(source, key, names, arguments)
+        _loaded[index] = kernel or _prepared(source, names, arguments)
+    return _loaded[index]
 
 
 def cache_folder() -> Path | None:
-    """PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; None where it cannot be written, or
-    others can write there too, whose code would be run."""
+    """Return PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; None if it is not writable,
+    or other users can write to it, whose code would be run."""
     folder = _asked_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -230,17 +232,17 @@ def _kept(source: str, key: str, names: dict[str, Any], arguments: tuple[Any, ..
         return None
     folder = cache / f"kernel_{key}"
     try:
-        if found := _found(source, folder, names, arguments):
-            return found
+        if kernel := _found(source, folder, names, arguments):
+            return kernel
         with _alone(cache / f".{key}"):  # whoever wants the same meanwhile finds it then
-            found = _found(source, folder, names, arguments)
-            return found or _made(source, folder, names, arguments)
+            kernel = _found(source, folder, names, arguments)
+            return kernel or _made(source, folder, names, arguments)
     except (OSError, pickle.PicklingError):
         return None
 
 
 def _found(source: str, folder: Path, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
-    """The kernel in a folder; None where what lies there is of no use, whatever it says."""
+    """Return the kernel in a folder; None if its files are invalid."""
     if _is_whole(folder):
         with suppress(Exception):
             return _prepared(source, names, arguments, folder)
@@ -250,14 +252,14 @@ def _found(source: str, folder: Path, names: dict[str, Any], arguments: tuple[An
 def _made(source: str, folder: Path, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
     """A new one, laid into the folder."""
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".making-") as name:
-        made = Path(name) / folder.name
-        made.mkdir()
-        (made / SOURCE).write_text(source, encoding="utf-8")
-        run = _prepared(source, names, arguments, made)
-        (made / DIGESTS).write_text(json.dumps(_digests(made)), encoding="utf-8")
+        directory = Path(name) / folder.name
+        directory.mkdir()
+        (directory / SOURCE).write_text(source, encoding="utf-8")
+        run = _prepared(source, names, arguments, directory)
+        (directory / DIGESTS).write_text(json.dumps(_digests(directory)), encoding="utf-8")
         if not _is_whole(folder):  # nobody else has been quicker
             shutil.rmtree(folder, ignore_errors=True)
-            made.replace(folder)
+            directory.replace(folder)
         return run
 
 
@@ -277,7 +279,7 @@ def _alone(path: Path) -> Iterator[None]:
 
 
 def _is_whole(folder: Path) -> bool:
-    """Whether every file is as it was when the kernel was made."""
+    """Return whether every file is unchanged since the kernel was compiled."""
     try:
         digests = json.loads((folder / DIGESTS).read_text(encoding="utf-8"))
         return bool(digests == _digests(folder))
@@ -312,7 +314,7 @@ def _prepared(
 
 
 def words(made: Callable[[Function], Any]) -> dict[str, Any]:
-    """What every kernel may name, with functions as they are `made` for whoever runs it."""
+    """Return the names of every kernel, with functions converted by `made`."""
     kinds: dict[str, Any] = {kind.__name__: kind for kind in KINDS.values()}
     kinds |= {kind.__name__: kind for kind in (Here, Torn, CellStress, Stiffness)}
     numbers = {"int64": np.int64, "real": np.float32, "double": np.float64}

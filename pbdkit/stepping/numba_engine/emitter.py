@@ -1,9 +1,9 @@
-"""The source of a scene's kernel: the sweeps that move particles, and the loop over steps, in
-which each operation of a step emits its lines.
+"""Source of the kernel of a scene: sweeps that move particles, and the loop over steps, to which
+each operation adds its lines.
 
-Row by row the shortest code is run that serves: rest offsets and steps to neighbours are literals
-where all neighbours are there. What varies from run to run (the rule's parameters, thresholds,
-places) are arguments.
+Each row is moved by the shortest code that is valid for it: rest offsets and steps to neighbours
+are literals if all neighbours are present. Numbers that differ between runs (parameters,
+thresholds, places) are arguments.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 
 from pbdkit.stepping.kernel import Function, Lines
 from pbdkit.stepping.numba_engine.blocking import write_deep_passes, write_piece
-from pbdkit.stepping.numba_engine.boundary import held
 from pbdkit.stepping.numba_engine.plan import Level, Passes, Plan, PlanWriter, goes_deep
 from pbdkit.stepping.numba_engine.sweeps import (
     GENERAL,
@@ -24,12 +23,12 @@ from pbdkit.stepping.numba_engine.sweeps import (
 from pbdkit.stepping.program import Program, program_of
 
 Groups = Sequence[tuple[int, int]]
-"""The sublattice and kind of the rows that occur."""
+"""Type of the sublattices and kinds of rows that occur."""
 
 
 def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, list[str]]:
-    """The source of a module with ``run(given, step, count, chunks, band)``, which takes the scene
-    `count` steps further, and the names of the arrays that it is given."""
+    """Return the source of a module with ``run(arrays, step, count, chunks, band)``, which makes
+    `count` steps, and the names of the arrays."""
     events = write_events(plan) if plan.judged else None
     judge = write_bond_pass(plan) if plan.bonds_first else None
     functions = [function for function in (events, judge) if function]
@@ -38,38 +37,42 @@ def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, lis
         functions += _sweep(plan, level, groups, events)
         sweeps.append(functions[-1])
     passes = Passes(judge, sweeps)
-    run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
+    run = Function(plan.shared, "run", "arrays", "step", "count", "chunks", "band")
     writer = LatticeWriter(plan, run, passes)
     pieces = write_piece(plan, program, passes) if goes_deep(plan) else []
     if pieces:
-        write_deep_passes(writer, pieces[-1])
+        write_deep_passes(writer, program, pieces[-1])
     else:
-        run.add(0, "for made in range(count):")
+        run.add(0, "for moment in range(count):")
     writer.begin()
     for operation in program:
         operation.emit(writer)
     writer.end()
-    run.add(1, *(["made += 1"] if pieces else []))
+    run.add(1, *(["moment += 1"] if pieces else []))
     return write_module(plan, [*functions, *passes.others.values(), *pieces], run)
 
 
 def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tuple[str, list[str]]:
-    """The source of a module with these functions, of which `run` is called from outside, and the
-    names of the arrays that it is given."""
+    """Return the source of a module with these functions, of which `run` is the entry, and the
+    names of the arrays."""
     jit = f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=KEPT)'
-    head = [jit, f"def run({', '.join(run.own)}):", f"    {', '.join(run.used)}, = given"]
+    head = [jit, f"def run({', '.join(run.own)}):", f"    {', '.join(run.used)}, = arrays"]
     return module_text(plan, functions, head, run), run.used
 
 
 def module_text(
     plan: Plan, functions: Iterable[Function], head: Iterable[str], run: Function
 ) -> str:
-    """The source of a module with these functions and `run`, which has a head of its own."""
-    seen = plan.levels[-1].seen
-    kinds = {"Fracture": seen.fracture, "Constants": seen.bond}
+    """Return the source of a module with these functions and `run`, which has its own head."""
+    visible = plan.levels[-1].seen
+    kinds = {"Fracture": visible.fracture, "Constants": visible.bond}
     for n, level in enumerate(plan.levels):
-        own = level.seen
-        kinds |= {f"Rule{n}": own.rule, f"Weights{n}": own.weights, f"Own{n}": own.own}
+        of_level = level.seen
+        kinds |= {
+            f"Rule{n}": of_level.rule,
+            f"Weights{n}": of_level.weights,
+            f"Own{n}": of_level.own,
+        }
     fields = {kind: [number.name for number in numbers] for kind, numbers in kinds.items()}
     for operation in program_of(plan.scene):
         fields |= {kind: list(names) for kind, names in operation.numbers().items()}
@@ -83,57 +86,58 @@ def module_text(
 
 
 def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) -> list[Function]:
-    """The functions for the rows that occur, and last the one that moves the particles of some rows
-    with them."""
+    """Return the functions for the rows that occur, and last the one that moves the particles of
+    rows with them."""
     out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
-    general, found = write_general(plan, level, events), list[Function]()
+    general, functions = write_general(plan, level, events), list[Function]()
     for n, (s, kind) in enumerate(groups):
         runs = [f"starts[{n}, first_row, 0]", f"starts[{n}, last_row, 1]", "first_row", "last_row"]
         if kind == GENERAL:
-            found.append(general)
+            functions.append(general)
             runs.insert(0, str(s))
         else:
-            found += write_row(plan, level, s, kind, events)
-        out.add(0, found[-1].call(*runs))
-    return [*dict.fromkeys(found), out]
+            functions += write_row(plan, level, s, kind, events)
+        out.add(0, functions[-1].call(*runs))
+    return [*dict.fromkeys(functions), out]
 
 
 class LatticeWriter(PlanWriter):
-    """Writes a step that goes over all that motion has reached, operation after operation."""
+    """Writer of a step on all that motion has reached, operation after operation."""
 
     _judging: Function | None = None
-    """The pass over bonds that comes with the next sweep."""
+    """Pass over bonds for the next sweep."""
 
     def begin(self) -> None:
-        """What the lines of operations name, and how far motion has come."""
+        """Write the names that lines of operations use, and the growth of what motion has
+        reached."""
         out, plan = self.out, self.plan
         out.add(1, "step += 1")
         planes = ["u_@", "v_@", *(f"z{n}_@" for n in range(len(plan.levels) - 1))]
         for name in planes:
             out.add(1, *plan.each(f"flat_{name} = {name}.reshape(-1)"))
-        out.add(1, *(held(end, "made") for end in plan.leads))
+        out.add(1, *plan.opening("moment"))
         out.add(1, *(f"was{m}[:] = own{m}" for m in plan.kept))
-        for name in (f"{name}{m}" for m in plan.rotations for name in ("own", "was")):
+        for name in (f"{name}{m}" for m in plan.prescribed_numbers for name in ("own", "was")):
             out.add(1, f"flat_{name} = {name}.reshape(-1)")
         out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
         out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
 
     def end(self) -> None:
-        """What was after the step is before the next one."""
+        """Exchange the displacements before and after the step."""
         u, v = (", ".join(self.plan.each(f"{name}_@")) for name in "uv")
         self.out.add(1, f"{u}, {v} = {v}, {u}")
 
     def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
-        """All of them."""
+        """Write a loop over all entries."""
         self.out.add(1, f"for e in range({name}.size):", *("    " + line for line in lines))
 
     def judge_bonds(self) -> None:
-        """With the sweep."""
+        """Leave the pass over bonds to the next sweep."""
         self._judging = self.passes.judge
 
     def sweep(self, level: int) -> None:
-        """Band by band with the pass over bonds, so that what that has read and written is still
-        near; else all rows."""
+        """Write a call for all rows, or with the pass over bonds band by band, so that what that
+        pass has read and written stays in the cache."""
         sweep, judging, self._judging = self.passes.sweeps[level], self._judging, None
         if judging is None:
             write_pass(self.out, self.plan, 1, sweep, "i0", "i1")
@@ -148,11 +152,11 @@ class LatticeWriter(PlanWriter):
         write_pass(out, plan, 2, sweep, "low", "high")
 
     def over_rows(self, name: str, write: Callable[[Function], None]) -> None:
-        """All rows."""
-        write_pass(self.out, self.plan, 1, self.rows(name, write), "i0", "i1", "made")
+        """Write a call for all rows."""
+        write_pass(self.out, self.plan, 1, self.rows(name, write), "i0", "i1", "moment")
 
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """All points."""
+        """Write a loop over all points."""
         source = "flat_u" if lag else planes
         self.out.add(1, "for f in range(points.size):")
         self.out.add(2, *mapped(source), *self.plan.each(f"{planes}_@[points[f]] = t_@"))
@@ -161,7 +165,7 @@ class LatticeWriter(PlanWriter):
 def write_pass(
     out: Function, plan: Plan, depth: int, one: Function, low: str, high: str, *more: str
 ) -> None:
-    """A call for rows from `low` to `high`, or for parts of them on all threads."""
+    """Write a call for rows from `low` to `high`, or for parts of them on all threads."""
     if not plan.parallel:
         out.add(depth, one.call(low, high, *more))
         return

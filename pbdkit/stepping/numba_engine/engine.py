@@ -1,19 +1,18 @@
-"""The compiled engine: whole intervals of steps in one call, on what the motion has reached.
+"""Compiled engine: many steps in one call, on the part of the lattice that motion has reached.
 
-At rest a rule moves nothing, exactly; so a step can only move particles that bear a load or adjoin
-one that has moved. Where that is plain from the scene nothing has moved before the leaders do;
-elsewhere the first step looks at every particle and finds those that are not at rest. From then on
-the box around what has moved, and around leaders that are not at home, grows by one bond a step,
-and by as many as rules work on each other's moves. Where something is remembered that changes,
-everything is looked at in every step.
+At rest a rule moves nothing, exactly; a step can only move particles that bear a load or adjoin one
+that has moved. If the scene implies this, nothing has moved before the leaders do; otherwise the
+first step moves every particle and detects those that are not at rest. From then on the box around
+what has moved, and around leaders, grows by one bond in each step, times the number of rules that
+work on each other's moves. If remembered numbers change, everything is moved in every step.
 
-Where neighbours are found anew at every step, the kernel is a sweep over their list.
+If neighbours are re-evaluated, the kernel is a sweep over their list.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import Any
@@ -23,19 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats
-from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.plugin import RenewsBonds, RenewsParticles, StartsCracked
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.followers import Followers, GatheringFollowers, MoveFollowers
 from pbdkit.stepping.kernel import Function
-from pbdkit.stepping.leaders import Clamps, Guidance, NewtonForces, prescribe, steady_steps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
     bits_for,
+    call_arrays,
     changing_arrays,
     constant_arrays,
     find_runs,
@@ -44,12 +41,10 @@ from pbdkit.stepping.numba_engine.arrays import (
     rule_arrays,
     state_arrays,
 )
-from pbdkit.stepping.numba_engine.boundary import foreseen, leading_arrays, wall_arrays
 from pbdkit.stepping.numba_engine.emitter import write_kernel, write_module, write_pass
 from pbdkit.stepping.numba_engine.plan import (
     Level,
     Plan,
-    banded,
     goes_deep,
     levels_of,
     load_blamed,
@@ -64,15 +59,14 @@ from pbdkit.stepping.numba_engine.sweeps import (
     torn_marks,
 )
 from pbdkit.stepping.numpy_engine import Engine, Stepper
-from pbdkit.stepping.particle_operation import OperateOnParticles
-from pbdkit.stepping.program import program_of
+from pbdkit.stepping.program import Program, foresee, prepare, program_of
 from pbdkit.stepping.rule_evaluation import Evaluator, presence
-from pbdkit.stepping.state import State, cut_bonds, unmoved_state
-from pbdkit.stepping.step import Led
+from pbdkit.stepping.state import State, unmoved_state
+from pbdkit.stepping.step import Call, Cells
 
 
 class PairFollowers(Followers):
-    """Moves the followers of a scene in which neighbours come and go."""
+    """Followers of a scene with re-evaluated neighbours, moved by a kernel."""
 
     def __init__(self, scene: Scene, threads: int) -> None:
         self._finder = finder = GatheringFollowers(scene)
@@ -91,24 +85,24 @@ class PairFollowers(Followers):
         self._run = load_blamed(self._plan.levels, source, arguments)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Neighbours in the order in which the numpy engine sums them."""
+        """Move them with neighbours in the order of the numpy engine."""
         j, other, rest = self._finder.pairs(m)
         first = np.searchsorted(j, np.append(self._finder.body, len(self._finder.place)))
         rest = np.ascontiguousarray(rest)
         arrays = self._named(m, new, state, first_pair=first, partner=other, rests=rest)
-        given = tuple(arrays[name] for name in self._names)
-        self._run(given, 0, len(self._finder.body), self._chunks)
+        arguments = tuple(arrays[name] for name in self._names)
+        self._run(arguments, 0, len(self._finder.body), self._chunks)
 
     def _named(self, m: Floats, new: Floats, state: State, **pairs: Any) -> Arrays:
-        """By name the arrays of the kernel: `first_pair` is by particle of the body, `partner` and
-        `rests` by pair, `place` and `local` by row of the table."""
+        """Return the arrays of the kernel by name: `first_pair` by particle of the body, `partner`
+        and `rests` by pair, `place` and `local` by row of the table."""
         was = {f"was{n}": state.particle_values[n].copy() for n in self._plan.kept}
         return self._arrays | state_arrays(self._plan, m, new, state) | was | pairs
 
 
 def _write_kernel(plan: Plan) -> tuple[str, list[str]]:
-    """A module with ``run(given, first, last, chunks)`` for the particles of the body from `first`
-    to `last`, and the names of the arrays that it is given."""
+    """Return a module with ``run(arrays, first, last, chunks)`` for the particles of the body from
+    `first` to `last`, and the names of the arrays."""
     (level,) = plan.levels
     sweep = Function(plan.shared, "sweep", "first_body", "last_body")
     sweep.add(0, *parameters(plan, level), *plan.each("o@ = flat_v_@"))
@@ -118,84 +112,86 @@ def _write_kernel(plan: Plan) -> tuple[str, list[str]]:
     sweep.add(1, *(f"{t} = double(0.0)" for t in level.totals))
     sweep.add(1, "for n in range(first_pair[e], first_pair[e + 1]):")
     sweep.add(2, "there = place[partner[n]]", difference(plan, level, "flat_u_@[there]"))
-    shown = [f"flat_{array}[there]" for array in plan.shown]
+    partner_numbers = [f"flat_{array}[there]" for array in plan.shown]
     sweep.add(2, f"r = {plan.vector('rests[#, n]')}")
-    sweep.add(2, contributions(plan, level, "r", "", shown))
+    sweep.add(2, contributions(plan, level, "r", "", partner_numbers))
     sweep.add(2, *(f"{t} = {t} + c{n}" for n, t in enumerate(level.totals)))
     sweep.add(1, "moves = first_pair[e + 1] > first_pair[e]")
     sweep.add(1, *target_lines(plan, level, plan.each("local[#, row]"), level.totals, "moves"))
-    run = Function(plan.shared, "run", "given", "first_body", "last_body", "chunks")
+    run = Function(plan.shared, "run", "arrays", "first_body", "last_body", "chunks")
     write_pass(run, plan, 0, sweep, "first_body", "last_body")
     return write_module(plan, [sweep], run)
 
 
 Box = NDArray[np.int64]
-"""(first, last + 1) of repeat cells along each axis, one after the other."""
+"""Type of ranges of repeat cells, (first, last + 1) along each axis, one after the other."""
 
 
-class Reach:
-    """`box` is what has been reached, `growth` how it grows in a step, (2 axes,)."""
+class MotionExtent:
+    """Part of the lattice that motion has reached.
 
-    def __init__(self, levels: Sequence[Level]) -> None:
+    Attributes
+    ----------
+    box
+        Range of cells that have been reached, as `Box`.
+    growth
+        Change of the box in a step, (2 axes,).
+    """
+
+    def __init__(self, levels: Sequence[Level], program: Program) -> None:
         scene = levels[-1].scene
-        experiment, self._shape = scene.experiment, scene.raster.shape
-        self._everything = _interleaved(np.zeros(scene.axes), np.array(self._shape[1:]))
+        experiment, shape = scene.experiment, scene.raster.shape
+        self._program = program
+        self._whole = _interleaved(np.zeros(scene.axes), np.array(shape[1:]))
         self._renews = isinstance(experiment.rule, RenewsParticles) or (
             scene.has_fracture and isinstance(experiment.fracture, RenewsBonds)
         )
         # What rests with some numbers may not with others.
         self._renews |= any(field != "solver" for field, _ in experiment.courses)
         self._rests = not self._renews and _rests_by_construction(levels)
-        self._bond = len(levels) * _growth(scene)
-        self._leaders = [np.unravel_index(led.place, self._shape)[1:] for led in scene.leading]
-        self._known = False
-        self._keep_to(self._everything)
+        self._bond = len(levels) * _growth(program)
+        fixed = np.concatenate([operation.fixed_places() for operation in program])
+        self._fixed = np.unravel_index(fixed, shape)[1:]
+        self._is_known = False
+        self._reset(self._whole)
 
     def begin(self, state: State) -> None:
-        """A state that did not come from here: what has moved is known only where nothing has."""
-        self._known = self._rests and state.step == 0 and not state.u.any()
-        self._keep_to(np.zeros_like(self._bond) if self._known else self._everything)
+        """Start from a state of another origin: all of it may move unless it is at rest."""
+        self._is_known = self._rests and state.step == 0 and not state.u.any()
+        self._reset(np.zeros_like(self._bond) if self._is_known else self._whole)
 
-    def before(self, led: Led, load: Floats | None, count: int) -> int:
-        """Takes the leaders and the load of the coming steps in; returns how many of `count` can be
-        made in one go."""
-        if not self._known:
+    def take_in_call(self, call: Call, count: int) -> int:
+        """Take in the disturbances of a call; return how many of `count` steps it can make."""
+        if not self._is_known:
             return count if self._renews else 1
-        for place, values, _ in led:
-            self._join(np.unravel_index(place[(values != 0.0).any(axis=0)], self._shape)[1:])
-        if load is not None:
-            self._join(np.nonzero((load != 0.0).any(axis=(0, 1))))
+        for operation in self._program:
+            for cells in operation.disturbances(call):
+                self._join(cells)
         return count
 
-    def take_in(self, state: State, rows: slice) -> None:
-        """Takes in what has moved in some rows of cells that somebody else has written."""
-        if self._known:
-            some = (u[:, :, rows] != 0.0 for u in (state.u, state.previous))
-            first, *cells = np.nonzero(np.logical_or(*some).any(axis=(0, 1)))
+    def take_in_rows(self, state: State, rows: slice) -> None:
+        """Take in what has moved in rows of cells that others have written."""
+        if self._is_known:
+            moves = (u[:, :, rows] != 0.0 for u in (state.u, state.previous))
+            first, *cells = np.nonzero(np.logical_or(*moves).any(axis=(0, 1)))
             self._join((first + rows.start, *cells))
 
-    def touch(self, touched: Iterable[tuple[NDArray[np.intp], ...]]) -> None:
-        """Takes in the cells that obstacles push from where they rest."""
-        for cells in touched if self._known else ():
-            self._join(cells)
-
-    def after(self, now: Floats, before: Floats) -> None:
-        """Looks once at what the first step has moved."""
-        if self._known:
-            np.clip(self.box, 0, self._everything.max(), out=self.box)
+    def take_in_moves(self, after: Floats, before: Floats) -> None:
+        """Take in what the first step has moved."""
+        if self._is_known:
+            np.clip(self.box, 0, self._whole.max(), out=self.box)
         elif not self._renews:
-            self._known = True
-            moved = (now != 0.0).any(axis=(0, 1)) | (before != 0.0).any(axis=(0, 1))
-            for cells in self._leaders:  # who is held where it would not rest moves once released
-                moved[cells] = True
-            self._keep_to(np.zeros_like(self._bond))
+            self._is_known = True
+            moved = (after != 0.0).any(axis=(0, 1)) | (before != 0.0).any(axis=(0, 1))
+            moved[self._fixed] = True
+            self._reset(np.zeros_like(self._bond))
             self._join(np.nonzero(moved))
 
-    def _keep_to(self, box: Box) -> None:
+    def _reset(self, box: Box) -> None:
         self.box, self.growth = box.copy(), np.zeros_like(box)
 
-    def _join(self, cells: tuple[NDArray[np.intp], ...]) -> None:
-        """Takes in cells that have moved."""
+    def _join(self, cells: Cells) -> None:
+        """Take in cells that have moved."""
         if not len(cells[0]):
             return
         box = _interleaved([n.min() for n in cells], [n.max() + 1 for n in cells])
@@ -206,9 +202,9 @@ class Reach:
 
 
 def _rests_by_construction(levels: Sequence[Level]) -> bool:
-    """Whether the reference configuration stays as it is: every neighbour is there, all start at
-    rest, no bond is broken or breaks at rest, and the rules' moves from there are zero. Where
-    particles or bonds have numbers of their own it is looked at instead."""
+    """Return whether the reference configuration is known to stay: every neighbour is present, all
+    start at rest, no bond is broken or breaks at rest, the rules' moves from there are zero, and
+    neither particles nor bonds have own numbers."""
     scene = levels[-1].scene
     experiment, raster, fracture = scene.experiment, scene.raster, scene.experiment.fracture
     cracked = (isinstance(fracture, StartsCracked) and fracture.segments()) or experiment.cuts
@@ -218,17 +214,17 @@ def _rests_by_construction(levels: Sequence[Level]) -> bool:
         return False
     for s, slots in enumerate(scene.neighbourhood.slots):
         block = raster.body_block(s)
-        if block and any(there is not None for there in presence(raster, block, slots)):
+        if block and any(present is not None for present in presence(raster, block, slots)):
             return False
     return all(_stays(level.scene) for level in levels)
 
 
 def _stays(scene: Scene) -> bool:
-    """Whether a particle with all its neighbours moves nowhere at rest, and no bond breaks."""
+    """Return whether a particle with all its neighbours stays at rest, and no bond breaks."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     still, slots = vector(np.zeros(scene.axes)), scene.neighbourhood.slots
     with blaming(experiment.rule, "to move at rest"):
-        if any(component != 0.0 for own in slots for component in evaluator.at_rest(own)):
+        if any(component != 0.0 for each in slots for component in evaluator.at_rest(each)):
             return False
     if not scene.has_fracture:
         return True
@@ -241,36 +237,23 @@ def _interleaved(low: Any, high: Any) -> Box:
     return np.stack([low, high], axis=1).astype(np.int64).ravel()
 
 
-def _growth(scene: Scene) -> Box:
-    """How far, in cells, a step of a rule carries a motion along each direction: by a bond, or
-    by a frame point that follows one particle and is a neighbour of another."""
-    slots = list(chain(*scene.neighbourhood.slots))
-    carried = [np.array([slot.cell for slot in slots])]
-    if scene.frame:
-        kinds = scene.raster.kind
-        places = scene.frame.place[scene.frame.map.point], scene.frame.body_place
-        at, body = (np.stack(np.unravel_index(p, kinds.shape)[1:], axis=1) for p in places)
-        for slot in slots:
-            # The particle at `seeing` sees the frame point through this slot.
-            seeing = at - slot.cell
-            inside = ((seeing >= 0) & (seeing < kinds.shape[1:])).all(axis=1)
-            follows = kinds[(slot.source, *seeing[inside].T)] == FOLLOWER
-            carried.append((seeing - body)[inside][follows])
-    most = np.concatenate(carried)
-    return _interleaved(np.minimum(most.min(axis=0), 0), np.maximum(most.max(axis=0), 0))
+def _growth(program: Program) -> Box:
+    """Return how many cells a step of a rule carries a motion along each direction."""
+    steps = np.concatenate([operation.carries() for operation in program])
+    return _interleaved(np.minimum(steps.min(axis=0), 0), np.maximum(steps.max(axis=0), 0))
 
 
 BAND = 16384
-"""Places that bonds are judged on before they are swept, on one thread: what they take stays in the
-cache. On more threads starting them counts too."""
+"""Number of places on which bonds are judged before a sweep, on one thread: their data stay in the
+cache. On several threads the time to start them counts, too."""
 
 
 class CompiledStepper(Engine):
-    """Steps a scene with a kernel made for it.
+    """Engine that steps a scene with its own kernel.
 
-    Lost bonds are one bit a bond and end, made anew from a state that did not come from here; all
-    else of the state is the same arrays that the numpy engine uses. Where neighbours are found anew
-    at every step, the kernel sweeps over their list.
+    Lost bonds are one bit for each bond and end, renewed from a state that does not come from this
+    engine; all other arrays are those of the numpy engine. If neighbours are re-evaluated, the
+    kernel sweeps over their list.
     """
 
     name = "compiled"
@@ -282,44 +265,38 @@ class CompiledStepper(Engine):
         if scene.experiment.neighbours.nearness():
             self._pairs = Stepper(scene, MoveFollowers(scene, PairFollowers(scene, self.threads)))
             return
+        self._program = program_of(scene)
         self._last: State | None = None
         self._numbered = scene
-        """With the numbers that the arrays hold."""
-        self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
-        self._contact = contact = Contact(scene) if scene.barriers else None
+        """Scene with the numbers that the arrays hold."""
         levels = levels_of(scene)
-        self._reach = Reach(levels)
+        self._extent = MotionExtent(levels, self._program)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
         runs, starts, groups = find_runs(scene, plan.long)
         self._arrays = constant_arrays(plan) | {"runs": runs, "starts": starts}
         self._deep = goes_deep(plan)
-        """Whether several steps may go in a pass."""
+        """True if several steps may be made in a pass."""
         self._arrays |= pass_arrays(plan, self.threads) if self._deep else {}
-        if contact and contact.compliance is not None:
-            self._arrays["compliance"] = contact.compliance
         start = unmoved_state(scene, (1,) * scene.axes)
         inner = [name for n in range(len(levels) - 1) for name in plan.each(f"z{n}_@")]
         self._moves = np.zeros((len(inner), *scene.raster.shape), start.u.dtype)
         self._arrays |= dict(zip(inner, self._moves, strict=True))
-        self._moved_at_rest = [
-            np.unravel_index(operation.moved_at_rest, scene.raster.shape)[1:]
-            for operation in OperateOnParticles.of(scene)
-        ]
-        self._clamps, self._clamped = Clamps(scene), np.zeros(0, np.intp)
-        own = start.particle_values
-        self._arrays |= {f"was{m}": np.zeros(scene.raster.shape, own[m].dtype) for m in plan.kept}
+        remembered = start.particle_values
+        self._arrays |= {
+            f"was{m}": np.zeros(scene.raster.shape, remembered[m].dtype) for m in plan.kept
+        }
         if plan.judged:
             self._arrays["lost"] = np.zeros(start.u.shape[1:], bits_for(scene))
         if plan.tears:
             self._arrays["torn"] = np.zeros(start.u.shape[1:], np.uint8)
-        shared = (*plan.shared, *self._named(start, [[]]))
+        shared = (*plan.shared, *self._named(Call(start)))
         plan = replace(plan, shared=shared)
-        source, self._names = write_kernel(plan, program_of(scene), groups)
+        source, self._names = write_kernel(plan, self._program, groups)
         # No step is made, so that what does not compile is known before the first.
-        self._run = load_blamed(levels, source, self._given(start, [[]], 0))
+        self._run = load_blamed(levels, source, self._arguments(Call(start), 0))
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """As many steps a call as the leaders stay where they are."""
+        """Return the state after `steps` steps, as many in a call as operations foresee."""
         if self._pairs:
             return self._pairs.advance(state, steps)
         if state is not self._last:
@@ -331,13 +308,13 @@ class CompiledStepper(Engine):
         return state
 
     def renewed(self, state: State, rows: slice) -> None:
-        """Lost bonds are bits here, and what has moved is in a box."""
+        """Update the bits of lost bonds, the marks of damage and the box of motion."""
         if self._pairs is None and state is self._last:
             if self._plan.judged:
                 renew_lost_bits(self._arrays["lost"], self._scene, state, rows)
             if self._plan.tears:
                 renew_torn_marks(self._arrays["torn"], self._scene, state, rows)
-            self._reach.take_in(state, rows)
+            self._extent.take_in_rows(state, rows)
 
     def _begin(self, state: State) -> None:
         self._moves[...] = 0.0
@@ -345,71 +322,49 @@ class CompiledStepper(Engine):
             self._arrays["lost"] = lost_bits(self._scene, state)
         if self._plan.tears:
             self._arrays["torn"] = torn_marks(self._scene, state)
-        self._reach.begin(state)
+        self._extent.begin(state)
 
     def _some_steps(self, state: State, end: int) -> State:
-        step = state.step + 1
-        if cut_bonds(self._scene, state.broken_step, step):
+        self._renumber(self._scene.at(state.step + 1))
+        call = prepare(self._program, state)
+        if call.has_cuts:
             self._begin(state)
-        self._renumber(self._scene.at(step))
-        led, starts = prescribe(self._scene, state, step, self._newton)
-        self._clamped = self._clamps.turn(state, step)
-        load = self._load(state)
-        steady = steady_steps(self._scene, step, end - state.step)
-        ways = [led]
-        if steady == 1:
-            begun = replace(state, starts=starts)
-            ways += foreseen(self._scene, begun, led, end, self._clamps.turning)
-        placed = [each for way in ways for each in way]
-        if self._contact:
-            for later in range(step, step + len(ways)):
-                self._reach.touch(self._contact.touched_at_rest(later))
-        self._reach.touch(self._moved_at_rest)
-        count = self._reach.before(placed, load, max(steady, len(ways)))
-        with blaming(self._scene.experiment.rule, f"at step {step}"):
-            self._run(*self._given(state, ways, count))
+        count = foresee(self._program, call, end)
+        count = self._extent.take_in_call(call, count)
+        with blaming(self._scene.experiment.rule, f"at step {call.step}"):
+            self._run(*self._arguments(call, count))
         u, new = state.u, state.previous
-        now, before = (new, u) if count % 2 else (u, new)
-        self._reach.after(now, before)
-        return replace(state, step=state.step + count, u=now, previous=before, starts=starts)
+        final, previous = (new, u) if count % 2 else (u, new)
+        self._extent.take_in_moves(final, previous)
+        return replace(
+            state,
+            step=state.step + count,
+            u=final,
+            previous=previous,
+            starts=call.starts or state.starts,
+        )
 
     def _renumber(self, scene: Scene) -> None:
         if scene is not self._numbered:
             self._arrays |= changing_arrays(self._plan.renumbered(scene))
             self._numbered = scene
 
-    def _named(self, state: State, ways: list[Led]) -> Arrays:
-        """The arrays of a kernel that steps in those of the state, by name."""
-        slants = self._guidance.slants(state.step + 1) if ways[0] and self._guidance.slanted else {}
-        leaders = leading_arrays(self._plan, ways, slants, state.u.dtype, self._deep)
-        reached = {"box": self._reach.box, "growth": self._reach.growth}
-        if self._plan.rotations:
-            reached |= self._clamped_arrays()
-        moved = state_arrays(self._plan, state.u, state.previous, state)
-        load = self._load(state)
-        loads = {} if load is None else dict(zip(self._plan.each("load_@"), load, strict=True))
-        first = state.step + 1
-        walls = wall_arrays(self._scene, range(first, first + len(ways)))
-        if self._contact and (codes := self._contact.led(first)) is not None:
-            walls["led_axes"] = codes
-        return self._arrays | moved | leaders | reached | loads | walls
+    def _named(self, call: Call) -> Arrays:
+        """Return the arrays of a kernel that steps in those of the state, by name."""
+        state = call.state
+        return {
+            **self._arrays,
+            **state_arrays(self._plan, state.u, state.previous, state),
+            **call_arrays(self._plan, self._program, call, by_rows=self._deep),
+            "box": self._extent.box,
+            "growth": self._extent.growth,
+        }
 
-    def _clamped_arrays(self) -> Arrays:
-        if not self._deep:
-            return {"clamped": self._clamped}
-        order, rows = banded(self._plan, "clamped", self._clamped)
-        return {"clamped": self._clamped[order]} | rows
-
-    def _load(self, state: State) -> Floats | None:
-        """What acts in the step after a state."""
-        loads = self._scene.loads
-        return loads.at(state.step + 1, state.u.dtype) if loads else None
-
-    def _given(self, state: State, ways: list[Led], count: int) -> tuple[Any, ...]:
-        """The arguments of the kernel that makes `count` steps."""
+    def _arguments(self, call: Call, count: int) -> tuple[Any, ...]:
+        """Return the arguments of the kernel that makes `count` steps."""
         if self.threads > 1:
             numba.set_num_threads(self.threads)
-        arrays = self._named(state, ways)
-        given = tuple(arrays[name] for name in self._names)
+        named = self._named(call)
+        arrays = tuple(named[name] for name in self._names)
         chunks, row = 4 * self.threads, math.prod(self._scene.raster.shape[2:])
-        return given, state.step, count, chunks, max(1, BAND * self.threads**2 // row)
+        return arrays, call.state.step, count, chunks, max(1, BAND * self.threads**2 // row)

@@ -1,18 +1,17 @@
-"""The lines of the sweeps that move particles, and of the pass that judges bonds.
+"""Lines of the sweeps that move particles, and of the pass that judges bonds.
 
 Rows of particles that have all their neighbours are written slot by slot: rest offsets, steps and
-weights are literals, so that what cancels at rest folds away. All other particles are moved in a
-loop over their slots: neighbours may be missing, cells cut, and there may be thousands of slots.
-That is done particle after particle, since what is not like the middle of a body are its edges;
-where there are too many slots to write out it is everything, and all particles of a row take in one
-slot after the other.
+weights are literals, so that terms that cancel at rest fold away. All other particles are moved in
+a loop over their slots: neighbours may be missing, cells cut, and there may be thousands of slots.
+Particles at edges are few and moved one after the other; if there are too many slots to write out,
+all particles of a row are evaluated slot after slot.
 
 Few particles have damaged cells around them. A plane of marks records which: the sweep moves all
 others as if no bond could break, and then computes the marked ones in short chunks. A mark stays,
-and is set too early rather than too late: without damage both ways give the same numbers.
+and is set rather too early than too late: without damage both ways give the same numbers.
 
-Bonds that remember what changes are renewed and broken in a pass before the sweep, where they are
-kept; others by the sweep, which notes what it has broken.
+Bonds with numbers that change are renewed and broken in a pass before the sweep, where they are
+stored; others by the sweep, which notes what it has broken.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ from pbdkit.stepping.numba_engine.plan import Level, Plan, listed, values
 from pbdkit.stepping.state import State
 
 CHUNK = 64
-"""Particles of a row among which one that is marked makes all be computed as torn."""
+"""Number of particles of a row that are computed as torn if one of them is marked."""
 Marks = NDArray[np.uint8]
 
 
 def damage_word(plan: Plan, broken: str, n: str, bond: str, limit: str, side: int = 0) -> str:
-    """The share of its pull that a bond of plane n has lost in the cell on a side of it, from the
-    words for the step at which it broke and, with `{n}` for their numbers, for what is remembered
-    of it and its limits."""
+    """Return an expression for the share of its force that a bond of plane n has lost in the cell
+    on one side, from the expressions for the step at which it broke and, with `{n}` for their
+    numbers, its remembered numbers and its limits."""
     softened = plan.number(0.0)
     if plan.softens_cells:
         softened = bond.format(n=_numbers_of_damage(plan)[side])
@@ -57,56 +56,67 @@ def damage_word(plan: Plan, broken: str, n: str, bond: str, limit: str, side: in
 
 
 def _numbers_of_damage(plan: Plan) -> list[int]:
-    """Which of the numbers that are remembered of a bond are its damage on its left and right."""
+    """Return the indices of the remembered numbers of a bond that are the damage on its left and
+    right."""
     names = [number.name for number in bond_numbers(plan.scene.experiment)]
     return [names.index(f"damage_{side}") for side in ("left", "right")]
 
 
 def _raised(name: str, other: str) -> str:
-    """The larger of two as a choice, which vectorises: `max` does not."""
+    """Return a line for the larger of two values as a conditional expression, which vectorises:
+    `max` does not."""
     return f"{name} = {name} if {name} > {other} else {other}"
 
 
 def _damage_at(plan: Plan, home: str, n: str, side: int = 0) -> str:
-    """The same of the bond at a flat place."""
+    """Return an expression for the damage of the bond at a flat place."""
     words = f"flat_bond{{n}}[{home}]", f"flat_limit{{n}}[{home}]"
     return damage_word(plan, f"flat_broken[{home}]", n, *words, side)
 
 
 def _chosen(plan: Plan, home: str, n: str, on_right: str) -> str:
-    """That of a bond on the side that a word tells."""
-    one, other = (_damage_at(plan, home, n, side) for side in (0, 1))
-    return f"({other} if {on_right} else {one})" if plan.softens_cells else one
+    """Return an expression for the damage of a bond on the side of a variable."""
+    left_damage, right_damage = (_damage_at(plan, home, n, side) for side in (0, 1))
+    return (
+        f"({right_damage} if {on_right} else {left_damage})" if plan.softens_cells else left_damage
+    )
 
 
 def damage_lines(plan: Plan) -> list[str]:
-    """The damage of the cells around the particle at the flat place at_j of sublattice s."""
+    """Return lines for the damage of the cells around the particle at the flat place at_j of
+    sublattice s."""
     cells, bonds = _table_shape(plan.scene)
     lines = []
     for cell in range(cells):
         for b in range(bonds):
             lines.append(f"home = at_j + cell_bonds[s, {cell}, {b}]")
             at = f"[s, {cell}, {b}]"
-            own = _chosen(plan, "home", f"cell_planes{at}", f"cell_sides{at}")
-            lines += [f"own = {own}", _raised(f"m{cell}", "own")] if b else [f"m{cell} = {own}"]
+            damage = _chosen(plan, "home", f"cell_planes{at}", f"cell_sides{at}")
+            lines += (
+                [f"own = {damage}", _raised(f"m{cell}", "own")] if b else [f"m{cell} = {damage}"]
+            )
     return [*lines, f"around = ({', '.join(f'm{cell}' for cell in range(cells))},)"]
 
 
 def torn_at_slot(plan: Plan) -> list[str]:
-    """The damage t beside slot k of that particle."""
+    """Return lines for the damage t beside slot k of that particle."""
     sides = (f"around[slot_cells[s, k, {side}]]" for side in (0, 1))
     plane = "slot_planes[s, k]"
-    own = [f"own = {_damage_at(plan, 'home', plane)}", "other = own"]
+    lines = [f"own = {_damage_at(plan, 'home', plane)}", "other = own"]
     if plan.softens_cells:
-        one, other = (_damage_at(plan, "home", plane, side) for side in (0, 1))
-        own = [f"own, other = {one}, {other}", "if signs[s, k] < 0:", "    own, other = other, own"]
-    return ["home = at_j + bonds_away[s, k]", *own, f"t = Torn({', '.join(sides)}, own, other)"]
+        left_damage, right_damage = (_damage_at(plan, "home", plane, side) for side in (0, 1))
+        lines = [
+            f"own, other = {left_damage}, {right_damage}",
+            "if signs[s, k] < 0:",
+            "    own, other = other, own",
+        ]
+    return ["home = at_j + bonds_away[s, k]", *lines, f"t = Torn({', '.join(sides)}, own, other)"]
 
 
 class RowDamage:
-    """The damage of the cells and bonds around the particles of a row of sublattice s that have all
-    their neighbours, from j0 to j1. `lines` compute it, kind by kind in loops of their own: one
-    loop with as many arrays would not vectorise."""
+    """Damage of the cells and bonds around the particles of a row of sublattice s that have all
+    their neighbours, from j0 to j1. `lines` compute it in one loop for each kind: one loop with as
+    many arrays would not vectorise."""
 
     def __init__(self, plan: Plan, s: int) -> None:
         self._around = plan.scene.neighbourhood.cells_around[s]
@@ -120,17 +130,17 @@ class RowDamage:
         count, cells = len(self._number), self._around.cells
         loops.append("for j in range(j1 - j0):")
         for n, cell in enumerate(cells):
-            first, *others = (
+            first, *rest = (
                 self._number[bond.plane, bond.home, self._side(bond.side)] for bond in cell
             )
             loops.append(f"    m = damage[{first}, j]")
-            loops += [f"    {_raised('m', f'damage[{other}, j]')}" for other in others]
+            loops += [f"    {_raised('m', f'damage[{other}, j]')}" for other in rest]
             loops.append(f"    damage[{count + n}, j] = m")
-        made = f"damage = np.empty(({count + len(cells)}, j1 - j0), {plan.real})"
-        self.lines = [made, *rows, *loops]
+        allocation = f"damage = np.empty(({count + len(cells)}, j1 - j0), {plan.real})"
+        self.lines = [allocation, *rows, *loops]
 
     def _side(self, side: int) -> int:
-        """The side by which damage is known: one for both where they are alike."""
+        """Return the index of the side of damage: one for both if they are equal."""
         return side if len(self._sides) == 2 else 0
 
     def _add(self, plan: Plan, bond: CellBond, rows: list[str], loops: list[str]) -> None:
@@ -150,18 +160,18 @@ class RowDamage:
             loops.append(f"    damage[{m}, j] = {damage_word(plan, *words, side)}")
 
     def beside(self, slot: Slot) -> str:
-        """The damage t beside a slot of the particle j of the row."""
+        """Return a line for the damage t beside a slot of the particle j of the row."""
         plane, at_this_end = self._home[slot]
         ends = (0, 1) if at_this_end else (1, 0)
         home = None if at_this_end else slot
-        own = (self._number[plane, home, self._side(side)] for side in ends)
+        damage = (self._number[plane, home, self._side(side)] for side in ends)
         sides = (len(self._number) + cell for cell in self._around.beside[slot])
-        return f"t = Torn({', '.join(f'damage[{n}, j]' for n in (*sides, *own))})"
+        return f"t = Torn({', '.join(f'damage[{n}, j]' for n in (*sides, *damage))})"
 
 
 def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
-    """Marks the particles around a bond of plane n that has any damage: its flat place among the
-    bonds, and that of its home among the particles."""
+    """Return lines that mark the particles around a damaged bond of plane n, from its flat place
+    among the bonds, and that of its home among the particles."""
     if not plan.tears:
         return []
     words = (_damage_at(plan, home, "n", side) for side in range(1 + plan.softens_cells))
@@ -173,16 +183,16 @@ def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
 
 
 def stress_lines(plan: Plan, home: str) -> list[str]:
-    """The stress of the cells to the `left` and `right` of a bond of plane n whose end where it is
-    kept has this flat place."""
+    """Return lines for the stress of the cells to the `left` and `right` of a bond of plane n, from
+    the flat place of its home."""
     corners = len(plan.scene.neighbourhood.tiling.polygons[0].corners)
     count = len(Stiffness._fields)
-    known = [f"cell_ratios[{m}]" for m in range(count)]
+    ratio_names = [f"cell_ratios[{m}]" for m in range(count)]
     lines = list[str]()
     for side, name in enumerate(("left", "right")):
         lines.append(f"cell = {home} + body_steps[n, {side}]")
         if plan.mixed:
-            known = [f"flat_ratios[{count} * cell + {m}]" for m in range(count)]
+            ratio_names = [f"flat_ratios[{count} * cell + {m}]" for m in range(count)]
         lines.append(f"origin = {home} + corner_steps[n, {side}, 0]")
         for k in range(1, corners):
             lines.append(f"corner = {home} + corner_steps[n, {side}, {k}]")
@@ -192,29 +202,29 @@ def stress_lines(plan: Plan, home: str) -> list[str]:
                 rates = ((k, f"corner_rates[n, {side}, {k - 1}, {b}]") for k in range(1, corners))
                 terms = (f"e{k}_{a} * {rate}" for k, rate in rates)
                 lines.append(f"g_{a}{axis} = {' + '.join(terms)}")
-        ratios = f"Stiffness({', '.join(known)})"
+        ratios = f"Stiffness({', '.join(ratio_names)})"
         lines.append(f"xx, yy, xy = stress(g_xx, g_xy, g_yx, g_yy, {ratios})")
         lines.append(f"{name} = CellStress(xx, yy, xy, flat_body[cell])")
     return lines
 
 
 def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
-    """The tables that these lines read: by plane and side the ways from a bond's home to the
-    corners of the cell, their rates, and the way to its share, with these."""
+    """Return the tables that these lines read: by plane and side the differences from a bond's home
+    to the corners of the cell, their rates, and the difference to its share."""
     assert scene.cells is not None
     stresses, shape = CellStresses(scene), scene.raster.shape
     steps, rates, shares = [], [], []
     for plane in scene.neighbourhood.planes:
-        beside = stresses.beside(plane.slot)
+        cells = stresses.beside(plane.slot)
         steps.append(
-            [[one.way(corner, plane.slot, shape) for corner in one.corners] for one in beside]
+            [[cell.way(corner, plane.slot, shape) for corner in cell.corners] for cell in cells]
         )
-        rates.append([one.rates for one in beside])
+        rates.append([cell.rates for cell in cells])
         shares.append(
             [
-                one.side.kind * math.prod(shape)
-                + (slot_step(shape, one.side.first) if one.side.first else 0)
-                for one in beside
+                cell.side.kind * math.prod(shape)
+                + (slot_step(shape, cell.side.first) if cell.side.first else 0)
+                for cell in cells
             ]
         )
     return {
@@ -226,20 +236,20 @@ def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
 
 
 def tearing_arrays(scene: Scene) -> dict[str, Any]:
-    """The tables that these functions read: by sublattice and cell around a particle the way to
-    each bond, its plane, and the side of it on which the cell lies; by sublattice and slot the
-    plane of its bond and the cells beside it; by plane the ways to the particles around a bond."""
+    """Return the tables of damage: by sublattice and cell around a particle the difference to each
+    bond, its plane, and the side of it on which the cell lies; by sublattice and slot the plane of
+    its bond and the cells beside it; by plane the differences to the particles around a bond."""
     around = scene.neighbourhood
     cells, bonds = _table_shape(scene)
-    most, sublattices = max(map(len, around.slots)), len(around.slots)
+    width, sublattices = max(map(len, around.slots)), len(around.slots)
     ways, planes, side = np.zeros((3, sublattices, cells, bonds), np.int64)
-    slot_planes = np.zeros((sublattices, most), np.int64)
-    slot_cells = np.zeros((sublattices, most, 2), np.int64)
+    slot_planes = np.zeros((sublattices, width), np.int64)
+    slot_cells = np.zeros((sublattices, width, 2), np.int64)
     for s, of in enumerate(around.cells_around):
         for n in range(cells):
-            own = of.cells[min(n, len(of.cells) - 1)]
+            bonds_of = of.cells[min(n, len(of.cells) - 1)]
             for b in range(bonds):
-                bond = own[min(b, len(own) - 1)]
+                bond = bonds_of[min(b, len(bonds_of) - 1)]
                 ways[s, n, b], planes[s, n, b] = _way(scene, s, bond), bond.plane
                 side[s, n, b] = bond.side
         for k, slot in enumerate(around.slots[s]):
@@ -255,7 +265,7 @@ def tearing_arrays(scene: Scene) -> dict[str, Any]:
 
 
 def _table_shape(scene: Scene) -> tuple[int, int]:
-    """The most cells around a particle, and the most bonds of one."""
+    """Return the largest number of cells around a particle, and of bonds of one."""
     around = scene.neighbourhood.cells_around
     return (
         max(len(of.cells) for of in around),
@@ -264,82 +274,82 @@ def _table_shape(scene: Scene) -> tuple[int, int]:
 
 
 def _way(scene: Scene, s: int, bond: CellBond) -> int:
-    """From the flat place of a particle of sublattice s to that of a bond."""
+    """Return the difference from the flat place of a particle of sublattice s to that of a bond."""
     shape, home = scene.raster.shape, bond.home
     step, sublattice = (slot_step(shape, home), home.target) if home else (0, s)
     return step + (bond.plane - sublattice) * math.prod(shape[1:])
 
 
 def _mark_steps(scene: Scene) -> NDArray[np.int64]:
-    """(plane, step): from the flat place of a bond's home to those of all corners of the cells
-    beside it; some twice, so that all planes have as many."""
+    """Return the differences from the flat place of a bond's home to those of all corners of the
+    cells beside it, (plane, step); some twice, so that all planes have as many."""
     around, shape = scene.neighbourhood, scene.raster.shape
-    found = []
+    rows = []
     for plane in around.planes:
         home = around.cells_around[plane.slot.source]
         ends: set[Slot | None] = {None}
         for cell in {*home.beside[plane.slot]}:
-            ends |= {slot for slot, beside in home.beside.items() if cell in beside}
-        found.append(sorted(slot_step(shape, slot) if slot else 0 for slot in ends))
-    most = max(map(len, found))
-    return np.array([steps + steps[:1] * (most - len(steps)) for steps in found], np.int64)
+            ends |= {slot for slot, cells in home.beside.items() if cell in cells}
+        rows.append(sorted(slot_step(shape, slot) if slot else 0 for slot in ends))
+    width = max(map(len, rows))
+    return np.array([steps + steps[:1] * (width - len(steps)) for steps in rows], np.int64)
 
 
 def torn_marks(scene: Scene, state: State) -> Marks:
-    """1 at particles around which a bond is broken or softened."""
+    """Return 1 at particles around which a bond is broken or softened."""
     marks = np.zeros(scene.raster.shape, np.uint8)
     renew_torn_marks(marks, scene, state, slice(0, marks.shape[1]))
     return marks
 
 
 def renew_torn_marks(marks: Marks, scene: Scene, state: State, rows: slice) -> None:
-    """Writes those of the particles that have bonds in some rows of cells around them."""
+    """Write the marks of the particles that have bonds in some rows of cells around them."""
     assert state.broken_step is not None
     around, (height, *across) = scene.neighbourhood, scene.raster.shape[1:]
-    margin, *beside = around.reach_in_cells  # beyond it nobody is
+    margin, *margins = around.reach_in_cells  # beyond it nobody is
     first, last = max(rows.start - margin, margin), min(rows.stop + margin, height - margin)
-    stop = tuple(size - n for size, n in zip(across, beside, strict=True))
+    stop = tuple(size - n for size, n in zip(across, margins, strict=True))
     softened = isinstance(scene.experiment.fracture, (Softens, SoftensCells))
     for s, of in enumerate(around.cells_around):
-        block = Block(s, (first, *beside), (max(first, last), *stop))
-        found = np.zeros(block.of(marks).shape, bool)
+        block = Block(s, (first, *margins), (max(first, last), *stop))
+        damaged = np.zeros(block.of(marks).shape, bool)
         for bond in {bond for cell in of.cells for bond in cell}:
             home = block.seen_through(bond.home) if bond.home else block
-            found |= home.within(state.broken_step[bond.plane]) >= 0
+            damaged |= home.within(state.broken_step[bond.plane]) >= 0
             if softened:
                 for value, initial in _changed(scene, state):
-                    found |= home.within(value[bond.plane]) != initial
-        block.of(marks)[...] = found
+                    damaged |= home.within(value[bond.plane]) != initial
+        block.of(marks)[...] = damaged
 
 
 def _changed(scene: Scene, state: State) -> list[tuple[NDArray[Any], Any]]:
-    """The numbers that are remembered of bonds and change, with where they start."""
+    """Return the remembered numbers of bonds that change, with their initial values."""
     numbers = zip(bond_numbers(scene.experiment), state.bond_values, strict=True)
     return [(value, number.initial) for number, value in numbers if number.changes]
 
 
 RUNS = ("first_run", "last_run", "first_row", "last_row")
-"""What functions of rows are given: some runs, and the rows of the first axis to keep to."""
+"""Arguments of functions of rows: some runs, and the range of rows of the first axis."""
 
 
 def parameters(plan: Plan, level: Level) -> list[str]:
-    """p of the rule, and of the fracture model, whose numbers are literals: they decide what is to
-    be computed at all."""
+    """Return lines for p of the rule, and of the fracture model, whose numbers are literals: they
+    decide what is computed."""
     rule = [] if level.fields else [_rule(level)]
     literal = listed(map(plan.number, plan.scene.constants.fracture))
     return [*rule, f"q = Fracture({literal})"] if plan.model else rule
 
 
 def _rule(level: Level) -> str:
-    """p of the rule at a particle."""
+    """Return a line for p of the rule at a particle."""
     n = level.number
     homes = {Home.SCENE: f"rule{n}[{{n}}]", Home.FIXED_PARTICLE: "g{n}[j]"}
     return f"p = Rule{n}({values(level.seen.rule, homes)})"
 
 
 def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
-    """The loop over the rows of some runs, as far as motion has come, with the rows of what stands
-    at the particles themselves and of where their moves go; what comes after stands in it."""
+    """Write a loop over the rows of runs, as far as motion has reached, with the rows of values at
+    the particles and of their moves; later lines are inside it."""
     out.add(0, *parameters(plan, level), "for n in range(first_run, last_run):")
     *lead, name = plan.lead
     a = len(lead)
@@ -353,8 +363,7 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
 
 
 def write_rows(out: Function, plan: Plan, level: Level, s: str) -> None:
-    """The rows of what stands at the particles of a row from j0 to j1, and of where their moves
-    go."""
+    """Write the rows of values at the particles from j0 to j1, and of their moves."""
     n = level.number
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
@@ -364,25 +373,26 @@ def write_rows(out: Function, plan: Plan, level: Level, s: str) -> None:
     for row, of in rows.items():
         out.add(0, *plan.each(f"{row} = {plan.row(of, s)}"))
     for m in range(len(level.seen.own)):
-        before, after = (plan.row(array, s) for array in (plan.read[m], f"own{m}"))
-        out.add(0, f"a{m}, w{m} = {before}, {after}")
+        old, new = (plan.row(array, s) for array in (plan.read[m], f"own{m}"))
+        out.add(0, f"a{m}, w{m} = {old}, {new}")
     out.add(0, *(f"g{m} = {plan.row(f'field{m}', s)}" for m in range(level.fields)))
 
 
 def displacements(plan: Plan, level: Level) -> list[str]:
-    """u of the particle, and z, which the rule sees, on later levels; p where it differs."""
+    """Return lines for u of the particle, for z, which the rule receives on later levels, and for p
+    if it varies in space."""
     u, z = (f"{name} = {plan.vector(f'{row}@[j]')}" for name, row in ("uh", "zz"))
     return [u, *([z] if level.number else []), *([_rule(level)] if level.fields else [])]
 
 
 def difference(plan: Plan, level: Level, there: str) -> str:
-    """d to the neighbour whose components have this pattern."""
+    """Return a line for d to the neighbour with components of this pattern."""
     return f"d = {plan.vector(f'{there} - {level.source[0]}.@')}"
 
 
 def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -> list[str]:
-    """d as the rule sees it at slot k: softened, or that of the fictitious point where the bond
-    `breaks` or is lost `since` a step."""
+    """Return lines for d as the rule receives it at slot k: softened, or that to the fictitious
+    point if the bond `breaks` or is broken `since` a step."""
     if plan.model is None or plan.tears:
         return []
     lines = [f"is_lost = {since} >= 0"]
@@ -401,15 +411,15 @@ def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -
 def contributions(
     plan: Plan, level: Level, r: str, weights: str, there: Iterable[str] = (), torn: bool = False
 ) -> str:
-    """What a neighbour contributes, by name; `there` is what is remembered of it, where the rule
-    sees that; with the damage t beside the bond where cells are `torn`."""
+    """Return a line for the contribution of a neighbour, from its remembered numbers if the rule
+    uses them; with the damage t beside the bond if cells are `torn`."""
     return _gathered(plan, level, r, weights, there, "c", torn)
 
 
 def more_contributions(
     plan: Plan, level: Level, r: str, weights: Sequence[str], there: Iterable[str] = ()
 ) -> list[str]:
-    """What cells of a stiffness of their own add to it, with these weights."""
+    """Return lines for the contributions of cells of further stiffnesses, with these weights."""
     lines = list[str]()
     for w in weights:
         lines.append(_gathered(plan, level, r, w, there, "e", plan.tears))
@@ -422,14 +432,14 @@ def _gathered(
 ) -> str:
     n = level.number
     names = _pattern(level, [f"{into}{total[1:]}" for total in level.totals], "")
-    given = ["d", r, f"Weights{n}({weights})", *(["t"] if torn else []), "p"]
+    arguments = ["d", r, f"Weights{n}({weights})", *(["t"] if torn else []), "p"]
     if plan.shares:
-        given += [f"Own{n}({_own(level)})", f"Own{n}({listed(there)})"]
-    return f"{names}, = {'torn' if torn else 'gather'}{n}({', '.join(given)})"
+        arguments += [f"Own{n}({_own(level)})", f"Own{n}({listed(there)})"]
+    return f"{names}, = {'torn' if torn else 'gather'}{n}({', '.join(arguments)})"
 
 
 def _own(level: Level) -> str:
-    """What is remembered of the particle."""
+    """Return an expression for the remembered numbers of the particle."""
     return values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
 
 
@@ -441,8 +451,9 @@ def target_lines(
     movable: str = "",
     otherwise: str = "u.@",
 ) -> list[str]:
-    """Where the particle goes, and what it remembers, where it is `movable` (everywhere), and what
-    stands there `otherwise`. `local` are the components of X from site (0, 0)."""
+    """Return lines for the displacement and the remembered numbers of the particle after the step,
+    where it is `movable` (everywhere), and `otherwise`. `local` are the components of X from site
+    (0, 0)."""
     n, solver = level.number, plan.scene.experiment.stepping
     sums = _pattern(level, totals, "Vector")
     lines = list[str]()
@@ -488,16 +499,16 @@ def _chosen_target(value: str, where: str, otherwise: str) -> str:
 
 
 def _pattern(level: Level, names: list[str], kind: str) -> str:
-    """Names of components, those of a vector together."""
-    found, rest = [], iter(names)
+    """Return names of components, those of a vector together."""
+    components, rest = [], iter(names)
     for size in level.parts:
-        own = list(islice(rest, size))
-        found.append(own[0] if size == 1 else f"{kind}({', '.join(own)})")
-    return ", ".join(found)
+        group = list(islice(rest, size))
+        components.append(group[0] if size == 1 else f"{kind}({', '.join(group)})")
+    return ", ".join(components)
 
 
 def write_bond_pass(plan: Plan) -> Function:
-    """The function that renews the bonds of some rows and columns, and breaks them."""
+    """Return the function that renews the bonds of a range of rows and columns, and breaks them."""
     rows, columns = ("first_row", "last_row"), ("first_column", "last_column")
     out = Function(plan.shared, "judge_bonds", *rows, *columns)
     axes = range(len(plan.axes))
@@ -525,8 +536,8 @@ def write_bond_pass(plan: Plan) -> Function:
 
 
 class Judging(NamedTuple):
-    """What is done with the bond j of plane n: the lines that look at it, whether it breaks and
-    whether what it remembers differs then, and the lines that write both."""
+    """Lines for the bond j of plane n: lines that evaluate it, expressions for whether it breaks
+    and whether its remembered numbers differ then, and lines that write both."""
 
     look: list[str]
     breaks: str
@@ -535,14 +546,14 @@ class Judging(NamedTuple):
 
 
 def judging(plan: Plan, d: str, home: str) -> Judging:
-    """For a bond whose d has this pattern, and whose end where it is kept has this flat place."""
+    """Return the lines for a bond with d of this pattern, and the flat place of its home."""
     numbers = plan.levels[-1].seen.bond
     homes = {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]", Home.FIXED_BOND: "x{n}[j]"}
     c = values(numbers, homes)
     look = [f"d = {plan.vector(d)}"]
-    kept = [number.changes for number in numbers if number.home is Home.BOND]
+    changes_of = [number.changes for number in numbers if number.home is Home.BOND]
     renews = isinstance(plan.model, RenewsBonds)
-    changing = [m for m, changes in enumerate(kept) if changes and renews]
+    changing = [m for m, changes in enumerate(changes_of) if changes and renews]
     if changing:
         cells = ""
         if plan.softens_cells:
@@ -560,29 +571,29 @@ def judging(plan: Plan, d: str, home: str) -> Judging:
 
 
 def _write_judging(out: Function, plan: Plan) -> None:
-    """One row of bonds."""
+    """Write the lines for one row of bonds."""
     can = f"((one[j] == {FOLLOWER}) & (other[j] == {FOLLOWER}))"
     if plan.model.breaks_frame_bonds():
         can = (
             f"((one[j] == {FOLLOWER}) & (other[j] != {EMPTY}) | "
             f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
-    own = judging(plan, "n@[j] - h@[j]", "base + j")
+    lines = judging(plan, "n@[j] - h@[j]", "base + j")
     # Loops that look, and vectorise; the last one writes, where there is anything to write. What is
     # far from breaking is told by lengths alone, which takes half the time.
     out.add(0, "some = 0", "for j in range(j1 - j0):")
-    out.add(1, *own.look, f"some = some | (1 if {own.breaks}{own.differ} else 0)")
+    out.add(1, *lines.look, f"some = some | (1 if {lines.breaks}{lines.differ} else 0)")
     out.add(0, "if some:", "    some = 0", "    for j in range(j1 - j0):")
-    out.add(2, *own.look, f"fresh = (since[j] < 0) & {can} & ({own.breaks}{own.differ})")
+    out.add(2, *lines.look, f"fresh = (since[j] < 0) & {can} & ({lines.breaks}{lines.differ})")
     out.add(2, "some = some | (1 if fresh else 0)")
     out.add(0, "if some:", "    for j in range(j1 - j0):")
-    write = [*own.write, *marking_lines(plan, "bond_base + j", "base + j")]
+    write = [*lines.write, *marking_lines(plan, "bond_base + j", "base + j")]
     out.add(2, f"if (since[j] < 0) & {can}:", *("    " + line for line in write))
 
 
 def write_events(plan: Plan) -> Function:
-    """The function that notes step and length of the bonds in a row that the sweep has just broken,
-    as their home end sees them; `base` is the row's first place."""
+    """Return the function that notes step and length of the bonds in a row that the sweep has just
+    broken, from their home end; `base` is the row's first place."""
     out = Function(plan.shared, "note_broken", "s", "base", "width")
     out.add(0, "for here in range(base, base + width):")
     out.add(1, "bits = int64(flat_lost[here])", "for k in range(counts[s]):")
@@ -597,15 +608,15 @@ def write_events(plan: Plan) -> Function:
 
 
 NOBODY, GENERAL, PLAIN, WITH_CELLS = range(4)
-"""Kinds of rows: those where no particle follows; where something may be missing; where all
-neighbours are there and cells are whole; where cells are not."""
+"""Kinds of rows: without followers; with neighbours that may be missing; with all neighbours and
+whole cells; with all neighbours and cut cells."""
 
 
 class Words(NamedTuple):
-    """The words for what one neighbour and its bond have: what stands there, with `@` for the axis;
-    what is remembered of it; the shares of the cells beside its slot, none where cells are whole;
-    with `{n}` for their numbers what is remembered of the bond, and its limits; and since when it
-    is broken."""
+    """Expressions for one neighbour and its bond: its displacement, with `@` for the axis; its
+    remembered numbers; the shares of the cells beside its slot, none if cells are whole; with `{n}`
+    for their numbers the remembered numbers of the bond, and its limits; and the step at which it
+    broke."""
 
     there: str
     shown: Sequence[str]
@@ -618,7 +629,7 @@ class Words(NamedTuple):
 def write_row(
     plan: Plan, level: Level, s: int, kind: int, events: Function | None
 ) -> list[Function]:
-    """The functions that move the particles of such a row, the one to be called last."""
+    """Return the functions that move the particles of a kind of rows, the main one last."""
     out = Function(plan.shared, f"row{level.number}_{s}_{kind}", *RUNS)
     write_row_loop(out, plan, level, str(s))
     words = _write_neighbours(out, plan, level, s, kind)
@@ -640,13 +651,13 @@ def write_row(
 
 
 def _write_neighbours(out: Function, plan: Plan, level: Level, s: int, kind: int) -> list[Words]:
-    """The rows of the neighbours of a row, and the words for what each has."""
+    """Write the rows of the neighbours of a row; return the expressions for each."""
     slots = plan.scene.neighbourhood.slots[s]
     for k, slot in enumerate(slots):
-        there = plan.row(f"{level.source}_@", slot.target, slot.cell)
-        out.add(0, *plan.each(f"n{k}@ = {there}"), *_bond_rows(plan, k, slot))
-        shown = (plan.row(array, slot.target, slot.cell) for array in plan.shown)
-        out.add(0, *(f"e{k}_{m} = {row}" for m, row in enumerate(shown)))
+        pattern = plan.row(f"{level.source}_@", slot.target, slot.cell)
+        out.add(0, *plan.each(f"n{k}@ = {pattern}"), *_bond_rows(plan, k, slot))
+        rows_of = (plan.row(array, slot.target, slot.cell) for array in plan.shown)
+        out.add(0, *(f"e{k}_{m} = {row}" for m, row in enumerate(rows_of)))
     shares: dict[str, str] = {}
     if kind == WITH_CELLS:
         rows = dict.fromkeys(row for slot in slots for row in _beside(plan, slot))
@@ -654,10 +665,10 @@ def _write_neighbours(out: Function, plan: Plan, level: Level, s: int, kind: int
     out.add(0, *(f"{name} = {row}" for row, name in shares.items()))
     words = []
     for k, slot in enumerate(slots):
-        own = [f"e{k}_{m}[j]" for m in range(len(plan.shown))]
-        beside = [f"{shares[row]}[j]" for row in _beside(plan, slot)] if shares else []
+        numbers = [f"e{k}_{m}[j]" for m in range(len(plan.shown))]
+        shares_of = [f"{shares[row]}[j]" for row in _beside(plan, slot)] if shares else []
         bond = f"b{k}_{{n}}[j]", f"x{k}_{{n}}[j]", f"f{k}[j]"
-        words.append(Words(f"n{k}@[j]", own, beside, *bond))
+        words.append(Words(f"n{k}@[j]", numbers, shares_of, *bond))
     return words
 
 
@@ -671,9 +682,9 @@ def write_whole(
     mark: str = "",
     damage: RowDamage | None = None,
 ) -> None:
-    """The lines, in a loop, for a particle that has all its neighbours, with the words for each and
-    for its `lost` bonds. Where cells can be torn, particles with a `mark` stay as they are, or with
-    the damage around them the others."""
+    """Write the lines, in a loop, for a particle that has all its neighbours, with the expressions
+    for each and for its `lost` bonds. If cells can be torn, particles with a `mark` stay in place
+    or, with the damage around them, the others."""
     out.add(1, *displacements(plan, level))
     if plan.judged:
         out.add(1, f"bits = int64({lost})", "now = bits")
@@ -688,8 +699,8 @@ def write_whole(
 
 
 def write_torn_row(plan: Plan, level: Level, s: int, kind: int) -> Function:
-    """The function that moves the marked particles of such a row, from j0 to j1. All that it reads
-    begins at j0, so that its loops vectorise."""
+    """Return the function that moves the marked particles of such a row, from j0 to j1. All that it
+    reads begins at j0, so that its loops vectorise."""
     out = Function(plan.shared, f"torn{level.number}_{s}_{kind}", *plan.lead, "j0", "j1")
     damage = RowDamage(plan, s)
     out.add(0, *parameters(plan, level))
@@ -701,7 +712,7 @@ def write_torn_row(plan: Plan, level: Level, s: int, kind: int) -> Function:
 
 
 def _write_marked(out: Function, torn: Function) -> None:
-    """A call for each chunk of a row in which particles are marked."""
+    """Write a call for each chunk of a row in which particles are marked."""
     *lead, _, _ = torn.own
     out.add(0, "if marked:", f"    for begin in range(0, j1 - j0, {CHUNK}):")
     out.add(2, f"end, marked = min(begin + {CHUNK}, j1 - j0), 0", "for j in range(begin, end):")
@@ -712,7 +723,7 @@ def _write_marked(out: Function, torn: Function) -> None:
 def _slot_lines(
     plan: Plan, level: Level, k: int, slot: Slot, words: Words, damage: RowDamage | None
 ) -> list[str]:
-    """The contributions of one neighbour."""
+    """Return lines for the contributions of one neighbour."""
     bond = {
         Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]",
         Home.BOND: words.bond,
@@ -721,7 +732,7 @@ def _slot_lines(
     c = f"Constants({values(level.seen.bond, bond)})"
     # A bond is judged as its home end sees it, so that both ends agree to the last bit.
     _, at_home = plan.scene.neighbourhood.home[slot]
-    seen = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
+    arguments = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
     literal = level.scene.constants.weights[slot]._asdict()
     weights = {name: plan.number(value) for name, value in literal.items()}
     if words.shares:
@@ -729,7 +740,7 @@ def _slot_lines(
     r = plan.literal(slot.rest)
     return [
         difference(plan, level, words.there),
-        *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", words.since),
+        *bond_lines(plan, k, r, c, f"breaks({arguments}, {c}, q)", words.since),
         *([damage.beside(slot)] if damage else []),
         contributions(plan, level, r, listed(weights.values()), words.shown, damage is not None),
         *(
@@ -740,7 +751,7 @@ def _slot_lines(
 
 
 def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
-    """The rows of what is known of the bonds along a slot, where they are kept."""
+    """Return lines for the rows of data of the bonds along a slot, where they are stored."""
     if plan.model is None or plan.tears:
         return []
     plane, at_home = plan.scene.neighbourhood.home[slot]
@@ -753,7 +764,7 @@ def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
 
 
 def _beside(plan: Plan, slot: Slot) -> list[str]:
-    """The rows of shares of the cells on both sides of a slot."""
+    """Return the rows of shares of the cells on both sides of a slot."""
     assert plan.scene.cells
     rows = []
     for side in plan.scene.cells.tiling.beside[slot]:
@@ -763,7 +774,7 @@ def _beside(plan: Plan, slot: Slot) -> list[str]:
 
 
 def write_general(plan: Plan, level: Level, events: Function | None) -> Function:
-    """The function that moves particles of sublattice s."""
+    """Return the function that moves particles of sublattice s."""
     out = Function(plan.shared, f"general{level.number}", "s", *RUNS)
     write_row_loop(out, plan, level, "s")
     out.add(0, f"base = {plan.flat('s')}", "width = j1 - j0")
@@ -778,7 +789,7 @@ def write_general(plan: Plan, level: Level, events: Function | None) -> Function
 
 
 def write_one(out: Function, plan: Plan, level: Level) -> None:
-    """The lines, in a loop, for one particle of sublattice s."""
+    """Write the lines, in a loop, for one particle of sublattice s."""
     # -0.0 + x is x, whatever its sign.
     out.add(1, *(f"{t} = {plan.real}(-0.0)" for t in level.totals), "near, at_j = 0, base + j")
     if plan.judged:
@@ -806,14 +817,14 @@ def _write_slot_after_slot(out: Function, plan: Plan, level: Level) -> None:
 
 
 def _is_slot_after_slot(plan: Plan) -> bool:
-    """Whether all particles of a row take in one slot after the other."""
+    """Return whether all particles of a row are evaluated slot after slot."""
     return plan.long and not plan.gpu
 
 
 def _seen(out: Function, plan: Plan, array: str, away: str) -> str:
-    """The word for a value of an array, `away` from the particle's place in flat arrays: looked up,
-    or from a row of them where all particles take in one slot after the other. `@` in the name is
-    each axis."""
+    """Return an expression for a value of an array, `away` from the particle's place in flat
+    arrays: looked up, or from a row of them if all particles are evaluated slot after slot. `@` in
+    the name is each axis."""
     if not _is_slot_after_slot(plan):
         return f"flat_{array}[at_j + {away}]"
     row = f"row_{array} = flat_{array}[base + {away}:base + {away} + width]"
@@ -822,14 +833,14 @@ def _seen(out: Function, plan: Plan, array: str, away: str) -> str:
 
 
 def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], near: str) -> None:
-    there = _seen(out, plan, f"{level.source}_@", "away[s, k]")
+    pattern = _seen(out, plan, f"{level.source}_@", "away[s, k]")
     kind = _seen(out, plan, "kind", "away[s, k]")
     named = {Home.SLOT: f"weights{level.number}[s, k, {{n}}]", Home.CELL: "share_{n}"}
     depth = 1 if _is_slot_after_slot(plan) else 2
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
-    shown = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
+    numbers = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
     bonds, limits_ = (0, 0) if plan.tears else (plan.bonds, plan.limits)
     bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(bonds)]
     fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(limits_)]
@@ -839,7 +850,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     if _is_slot_after_slot(plan):
         out.add(1, "for j in range(width):")
         out.add(2, *displacements(plan, level))
-    out.add(2, f"is_there = {kind} != {EMPTY}", difference(plan, level, there))
+    out.add(2, f"is_there = {kind} != {EMPTY}", difference(plan, level, pattern))
     out.add(2, *(f"b{n} = {value}" for n, value in enumerate(bond)))
     out.add(2, *(f"x{n} = {value}" for n, value in enumerate(fixed)))
     limits = {Home.SLOT: "limits[s, k, {n}]", Home.BOND: "b{n}", Home.FIXED_BOND: "x{n}"}
@@ -851,17 +862,16 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     if plan.tears:
         out.add(2, *torn_at_slot(plan))
     weights = values(level.seen.weights, named)
-    out.add(2, contributions(plan, level, "r", weights, shown, torn=plan.tears))
+    out.add(2, contributions(plan, level, "r", weights, numbers, torn=plan.tears))
     if plan.mixed:
-        _write_mixed(out, plan, level, shown)
+        _write_mixed(out, plan, level, numbers)
     for n, t in enumerate(sums):
         out.add(2, f"{t} = {t} + ({plan.rounded(f'c{n}')} if is_there else {plan.number(0.0)})")
     out.add(2, f"{near} = {near} + (1 if is_there else 0)")
 
 
 def _write_mixed(out: Function, plan: Plan, level: Level, shown: Sequence[str]) -> None:
-    """What cells of a stiffness of their own add. Of the others' stiffness they have no share, and
-    few particles are beside one."""
+    """Write the contributions of cells of further stiffnesses, beside which few particles are."""
     nothing = plan.number(0.0)
     out.add(2, f"if share_0 == {nothing} or share_1 == {nothing}:")
     weights = []

@@ -16,7 +16,8 @@ from pbdkit.stepping import engine_choice as choice
 from pbdkit.stepping.engine_choice import choose
 from pbdkit.stepping.numba_engine import plan as bands, time_skewing as passes
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
-from pbdkit.stepping.numba_engine.time_skewing import AxisSkew, Skew, single_steps
+from pbdkit.stepping.numba_engine.time_skewing import Skew, single_steps
+from pbdkit.stepping.step import Reach
 from tests.stepping.numba_engine.test_engine import (
     ANEW,
     COMPONENTS,
@@ -191,7 +192,7 @@ def compare(experiment, calls, pieces, sizes):
 
 @pytest.mark.parametrize("pieces", [1, 2])
 def test_steps_too_near_each_other_would_spoil_the_numbers(pieces, monkeypatch):
-    monkeypatch.setattr(AxisSkew, "step", 1)
+    monkeypatch.setattr(Reach, "step", 1)
     with small_passes(order=backwards):
         scene = scene_of(**LONG | {"neighbours": {"type": "chebyshev", "shells": 2}})
         engine = CompiledStepper(scene, pieces)
