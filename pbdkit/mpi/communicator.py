@@ -1,4 +1,4 @@
-"""The processes that share a run, each by its rank, and what they say to each other by MPI."""
+"""Communicator of ranks by MPI."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ from pbdkit.communicator import Communicator
 from pbdkit.errors import PbdkitError
 
 NUMBERS_AT_ONCE = 2**20
-"""So many of all processes together are compared at a time."""
+"""Number of values of all processes together that are compared at a time."""
 PAUSE_S = 0.05
-"""For which processes sleep that wait for the first."""
+"""Interval at which processes test for a message of the root."""
 FAILED = 1
-"""The exit status of a run that is given up because one process failed."""
+"""Exit status of a run that ends because one process failed."""
 
 
 class MPICommunicator(Communicator):
-    """The processes of a communicator of mpi4py. All operations but `raise_together` and `scatter`
-    raise nothing."""
+    """Communicator of mpi4py.
+
+    All operations except `raise_together` and `scatter` raise nothing.
+    """
 
     def __init__(self, comm: Any) -> None:
         self._comm = comm
@@ -43,35 +45,35 @@ class MPICommunicator(Communicator):
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
         """Return the elementwise minimum over arrays of one shape."""
         flat = np.ascontiguousarray(numbers).ravel()
-        found, some = np.empty_like(flat), max(1, NUMBERS_AT_ONCE // self.size)
-        for at in range(0, len(flat), some):
-            mine = flat[at : at + some]
+        minimum, size = np.empty_like(flat), max(1, NUMBERS_AT_ONCE // self.size)
+        for at in range(0, len(flat), size):
+            mine = flat[at : at + size]
             every = np.empty((self.size, len(mine)), mine.dtype)
             self._comm.Allgather(mine, every)
-            every.min(axis=0, out=found[at : at + some])
-        return found.reshape(numbers.shape)
+            every.min(axis=0, out=minimum[at : at + size])
+        return minimum.reshape(numbers.shape)
 
     def any(self, value: Any) -> bool:
         """Return whether the value is true in any process."""
-        mine, found = np.array([bool(value)], np.uint8), np.empty(self.size, np.uint8)
-        self._comm.Allgather(mine, found)
-        return bool(found.any())
+        mine, values = np.array([bool(value)], np.uint8), np.empty(self.size, np.uint8)
+        self._comm.Allgather(mine, values)
+        return bool(values.any())
 
     def send(self, block: Bytes, rank: int) -> None:
-        """To one process, which receives as many bytes."""
+        """Send bytes to one process, which receives as many."""
         self._comm.Send(block, rank)
 
     def receive(self, into: Bytes, rank: int) -> None:
-        """From one process, as many bytes as there is room for."""
+        """Receive bytes from one process into an array."""
         self._comm.Recv(into, rank)
 
     def scatter(self, each: Iterable[Any] | None) -> Any:
         """Return what the root has for this process, made one after the other. What is raised in
         making it is raised in all."""
-        own: Any = None
+        result: Any = None
         with self.raise_together():
             if each is None:
-                own = self._comm.recv(source=0)
+                result = self._comm.recv(source=0)
             else:
                 rank = 0
                 try:
@@ -79,15 +81,15 @@ class MPICommunicator(Communicator):
                         if rank:
                             self._comm.send(value, rank)
                         else:
-                            own = value
+                            result = value
                 except Exception:
                     for waiting in range(rank + 1, self.size):
                         self._comm.send(None, waiting)
                     raise
-        return own
+        return result
 
     def exchange(self, sent: dict[int, list[Bytes]], received: dict[int, list[Bytes]]) -> None:
-        """Sends blocks to some ranks, and fills those that are to be received from them."""
+        """Send blocks to ranks, and fill those that are received from them."""
         waiting = [self._comm.Irecv(b, rank) for rank, each in received.items() for b in each]
         waiting += [self._comm.Isend(b, rank) for rank, each in sent.items() for b in each]
         for request in waiting:
@@ -109,7 +111,7 @@ class MPICommunicator(Communicator):
         if not self.any(error is not None):
             return
         errors = self.allgather(error and _carried(error))
-        first = next(n for n, one in enumerate(errors) if one is not None)
+        first = next(n for n, error_of_rank in enumerate(errors) if error_of_rank is not None)
         raised: Exception = error if first == self.rank and error else errors[first]
         raise raised
 
@@ -132,8 +134,8 @@ class MPICommunicator(Communicator):
 
     @contextmanager
     def root_speaks(self) -> Iterator[None]:
-        """The first process alone says what ends the block. After what is no PbdkitError this one
-        ends all processes when it ends: others would wait for it for ever."""
+        """Report in the root alone what ends the block. After an error that is no PbdkitError this
+        process ends all others when it ends: they would wait for it."""
         try:
             yield
         except PbdkitError as error:
@@ -145,7 +147,7 @@ class MPICommunicator(Communicator):
 
 
 def _carried(error: Exception) -> Exception:
-    """An error that can be sent: itself, or one that says the same."""
+    """Return an error that can be sent: itself, or one with the same message."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:

@@ -55,9 +55,9 @@ from pbdkit.stepping.state import State
 
 
 class PartitionScheme(NamedTuple):
-    """What cuts a scene into parts for a solver; and how wide halos are at most, where neighbours
-    and frame points of a step reach so many rows, neighbours alone so many, of parts of so many
-    rows and more, and of so many parts."""
+    """Partition of a scene for a solver: a function that cuts it into subdomains, and one that
+    returns an upper bound of the halo, from the rows that a step and neighbours reach, the least
+    rows of a part and the number of parts."""
 
     subdomains: Callable[[Scene, int], list[Subdomain]]
     widest: Callable[[int, int, int, int], int]
@@ -70,12 +70,12 @@ CUTS: dict[type[Solver], PartitionScheme] = {
 
 
 class ElsewhereError(PbdkitError):
-    """Another process has given up."""
+    """Error of another process."""
 
 
 class BuildCommunicator(Communicator):
-    """The communicator while a scene is built: where one process gives up, all others do at their
-    next call."""
+    """Communicator during the construction of a scene: if one process fails, all others raise
+    ElsewhereError at their next call."""
 
     def __init__(self, communicator: MPICommunicator) -> None:
         self._inner = communicator
@@ -83,10 +83,10 @@ class BuildCommunicator(Communicator):
 
     def allgather(self, value: Any) -> list[Any]:
         """Return the values of all processes, by rank."""
-        found = self._inner.allgather((True, value))
-        if not all(goes_on for goes_on, _ in found):
+        values = self._inner.allgather((True, value))
+        if not all(goes_on for goes_on, _ in values):
             raise ElsewhereError("another process has given up")
-        return [one for _, one in found]
+        return [each for _, each in values]
 
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
         """Return the elementwise minimum over arrays of one shape."""
@@ -95,7 +95,7 @@ class BuildCommunicator(Communicator):
 
     @contextmanager
     def raise_together(self) -> Iterator[None]:
-        """End the block in all processes where one raises: by ElsewhereError in the others."""
+        """End the block in all processes if one raises: by ElsewhereError in the others."""
         try:
             yield
         except ElsewhereError:
@@ -107,9 +107,11 @@ class BuildCommunicator(Communicator):
 
 
 def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
-    """The scene of a process's own rows and what is near; of the whole where parts cannot be built
-    alone: where frame points follow particles far away, and to say what is wrong as one process
-    does. Raises what `build_scene` does, in all processes."""
+    """Return the scene of a process's own rows and their surroundings; of the whole if frame points
+    follow particles far away, or to raise an error as a single process does.
+
+    Raises what `build_scene` does, in all processes.
+    """
     if experiment.frame.local:
         error: Exception | None = None
         try:
@@ -128,7 +130,7 @@ def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
 
 
 def _is_too_large(experiment: Experiment) -> bool:
-    """Whether the whole is too large for one process."""
+    """Return whether the whole is too large for one process."""
     try:
         Ground(experiment)
     except TooLargeError:
@@ -140,17 +142,17 @@ def _is_too_large(experiment: Experiment) -> bool:
 
 def _built(experiment: Experiment, ranks: Communicator) -> Scene:
     ground = Ground(experiment, ranks)
-    if not (known := count_rows(ground, ranks)):
+    if not (counts := count_rows(ground, ranks)):
         raise ground.nothing()
-    bounds = bounds_of(known.rows, ranks.size)
+    bounds = bounds_of(counts.rows, ranks.size)
     begin, end = bounds[ranks.rank : ranks.rank + 2]
     search, reach = _search(ground), ground.neighbourhood.reach_in_cells[0]
-    each, least = _levels(experiment.rule) * (reach + search), int(np.diff(bounds).min())
+    each, smallest = _levels(experiment.rule) * (reach + search), int(np.diff(bounds).min())
     cut = CUTS[type(experiment.solver)]
-    halo = cut.widest(each, reach, least, ranks.size)
+    halo = cut.widest(each, reach, smallest, ranks.size)
 
     def around(rows: int) -> Stretch:
-        return known.stretch(begin - rows, end + rows)
+        return counts.stretch(begin - rows, end + rows)
 
     build = RowRange(around(halo + search + reach), around(0).lines, around(halo).lines)
     scene = build_scene(experiment, ranks, build)
@@ -162,7 +164,7 @@ def _built(experiment: Experiment, ranks: Communicator) -> Scene:
 
 
 def _levels(rule: FollowerRule) -> int:
-    """So many times what a step reaches a particle sees at most: masses see one step farther."""
+    """Return an upper bound of the number of sweeps of a step: masses read one more."""
     levels = 2
     while isinstance(rule, AppliesTwice):
         with blaming(rule, "to return its inner rule", "rule"):
@@ -171,7 +173,7 @@ def _levels(rule: FollowerRule) -> int:
 
 
 def _search(ground: Ground) -> int:
-    """So many rows from a frame point at most are the particles that are nearest to it, and those
+    """Return the largest number of rows from a frame point to its nearest particles, and to those
     twice as far as the frame is deep, in site indices."""
     cell: Cell = ground.cell
     steps = [math.hypot(*v) / p for v, p in zip(cell.vectors, cell.period, strict=True)]
@@ -183,8 +185,8 @@ def _search(ground: Ground) -> int:
 
 
 class DistributedRecorder(Recorder):
-    """Records a part. Diagnostics that are not `local` measure the whole state, which the first
-    process gathers for them."""
+    """Recorder of a part. Diagnostics that are not `local` measure the whole state, which the first
+    process gathers."""
 
     def __init__(self, division: Division, sink: PartSink) -> None:
         super().__init__(division.scene, sink)
@@ -198,7 +200,7 @@ class DistributedRecorder(Recorder):
         self._local = {when_measured(d) for d in diagnostics if d.local}
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
-        """A history is that of the whole, which the first process has."""
+        """Begin; a history is that of the whole, in the first process."""
         super().begin(None if history is None else ())
         if history is not None:
             self._joining.take(history)
@@ -219,7 +221,7 @@ class DistributedRecorder(Recorder):
         self._put(state, values)
 
     def finish(self, state: State, outcome: Any, prediction: dict[str, Any]) -> None:
-        """As one process does."""
+        """Finish as a single process does."""
         self._whole = self._division.gathered(state) if When.END in self._gathered else None
         if When.END in self._local:
             self._division.halo.look_back(state)
@@ -234,7 +236,8 @@ class DistributedRecorder(Recorder):
         return values
 
     def _inside_out(self, state: State) -> str | None:
-        """Only where some part has turned over is the whole looked at."""
+        """Return the description of cells that are inside out; the whole is gathered only if a part
+        has some."""
         if not self._ranks.any(super()._inside_out(state) is not None):
             return None
         whole = self._division.gathered(state)
@@ -249,7 +252,7 @@ def _is_local(diagnostic: Diagnostic) -> bool:
 
 
 class PartSink(KeepingSink):
-    """Takes the parts of all processes, and puts them into the sink that the first one has."""
+    """Sink that joins the parts of all processes for that of the first one."""
 
     def __init__(self, division: Division, inner: KeepingSink) -> None:
         self._ranks = division.ranks
@@ -258,20 +261,20 @@ class PartSink(KeepingSink):
         if division.scene.experiment.shows_bonds:
             rows, ends = division.part.rows, division.scene.bonds.ends[:, 0]
             self._own["bond"] = slice(*np.searchsorted(ends, (rows.start, rows.stop)).tolist())
-        counts = {dim: own.stop - own.start for dim, own in self._own.items()}
+        counts = {dim: span.stop - span.start for dim, span in self._own.items()}
         self._lengths = {dim: self._ranks.allgather(count) for dim, count in counts.items()}
         self._sizes = {dim: sum(lengths) for dim, lengths in self._lengths.items()}
         diagnostics = division.scene.experiment.diagnostics
         self._not_local = {v.name for d in diagnostics if not d.local for v in d.variables()}
         columns = columns_of(division.scene)
-        self._parts = {c.name: found for c in columns if (found := self._parted(c))}
+        self._parts = {c.name: part for c in columns if (part := self._parted(c))}
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """With the sizes of the whole."""
+        """Begin with the sizes of the whole."""
         self._first(lambda inner: inner.begin(columns, sizes | self._sizes, planned))
 
     def take(self, history: Iterable[Values]) -> None:
-        """Entries of the whole, which the first process has."""
+        """Write entries of the whole, in the first process."""
 
         def put(inner: Sink) -> None:
             for values in history:
@@ -280,7 +283,7 @@ class PartSink(KeepingSink):
         self._first(put)
 
     def _parted(self, column: Column) -> tuple[str, int] | None:
-        """The dimension of which processes have parts, and which axis of an entry it is; None where
+        """Return the dimension of which processes have parts, and its axis in an entry; None if
         each has all."""
         dims = column.dims[1:] if column.grows else column.dims
         along = [n for n, dim in enumerate(dims) if dim in self._own]
@@ -289,7 +292,7 @@ class PartSink(KeepingSink):
         return dims[along[0]], along[0]
 
     def put(self, values: Values) -> None:
-        """Parts are joined; of all else that of the first process counts."""
+        """Write an entry of joined parts; other values are those of the first process."""
         whole = dict(values)
         for name in [name for name in values if name in self._parts]:
             dim, axis = self._parts[name]
@@ -300,35 +303,35 @@ class PartSink(KeepingSink):
         self._first(lambda inner: inner.put(whole), whole)
 
     def due(self) -> bool:
-        """As the first process finds it."""
+        """Return whether the sink of the first process is due."""
         return bool(self._ranks.bcast(self._inner is not None and self._inner.due()))
 
     def keep(self, checkpoint: Checkpoint) -> None:
-        """One for all, with the state of the whole."""
+        """Write one checkpoint with the state of the whole."""
         self._first(lambda inner: inner.keep(checkpoint), checkpoint.arrays)
 
     def suspend(self, checkpoint: Checkpoint) -> None:
-        """As it is kept."""
+        """Write one checkpoint with the state of the whole."""
         self._first(lambda inner: inner.suspend(checkpoint), checkpoint.arrays)
 
     def keep_final(self, checkpoint: Checkpoint) -> None:
-        """As it is kept."""
+        """Write one checkpoint with the state of the whole."""
         self._first(lambda inner: inner.keep_final(checkpoint), checkpoint.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
-        """Says on how many processes it was run."""
+        """Finish with the number of processes."""
         self._first(lambda inner: inner.finish(attributes | {"ranks": str(self._ranks.size)}))
 
     def abandon(self) -> None:
-        """Only the first process has anything to remove."""
+        """Remove the file of the first process."""
         if self._inner:
             self._inner.abandon()
 
     def _first(
         self, call: Callable[[KeepingSink], None], joining: Mapping[str, Any] | None = None
     ) -> None:
-        """Calls the sink, in the first process; what goes wrong there is raised in all. Others send
-        their shares of what is joined meanwhile."""
+        """Call the sink in the first process, and raise its errors in all. Others send their shares
+        of joined arrays meanwhile."""
         with self._ranks.raise_together():
             if self._inner:
                 try:
@@ -347,12 +350,12 @@ DRIVERS: dict[type[Solver], Callable[[Division, Scene, Watch], Driver]] = {
     Stepping: DistributedSteppingDriver,
     Equilibrium: DistributedEquilibriumDriver,
 }
-"""What carries it out on one of them."""
+"""Driver of each solver on a rank."""
 
 
 class DistributedSimulation(Simulation):
-    """One run that several processes share: each has its part of the scene. What it gives out are
-    states of the part. Raises what any run does, in all processes."""
+    """Run that several processes share, each with its part of the scene. Its states are those of
+    the part. Raises what any run does, in all processes."""
 
     def __init__(self, ranks: MPICommunicator, scene: Scene, watch: Watch) -> None:
         automatic = scene.experiment.stepping.open_parameters
@@ -367,7 +370,8 @@ class DistributedSimulation(Simulation):
         self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
 
     def _warnings(self, scene: Scene, bound: Bound | None) -> tuple[str, ...]:
-        """Whether masses are too light the first process finds, of the whole."""
+        """Return warnings of the part; those about masses come from the whole, in the first
+        process."""
         if not any(leading.share is not None for leading in scene.leading):
             return quick_warnings(scene, bound)
         with self.division.ranks.raise_together():
@@ -375,37 +379,38 @@ class DistributedSimulation(Simulation):
             return quick_warnings(whole, bound) if whole else ()
 
     def outlook(self) -> list[str]:
-        """Nothing: `check` looks at the whole."""
+        """Return nothing: `check` evaluates the whole."""
         return []
 
     @property
     def particles(self) -> int:
-        """Of the whole."""
+        """Number of particles of the whole."""
         return self.division.count
 
     def recorder(self, sink: Sink) -> Recorder:
-        """Of the part, into what `sink` gives."""
+        """Return the recorder of the part, which writes into the result of `sink`."""
         assert isinstance(sink, PartSink)
         return DistributedRecorder(self.division, sink)
 
     def sink(self, inner: KeepingSink) -> KeepingSink:
-        """Joins the parts for the sink of the first process."""
+        """Return a sink that joins the parts for that of the first process."""
         return PartSink(self.division, inner)
 
 
 def _tuned(ranks: MPICommunicator, scene: Scene) -> Scene:
-    """With numbers in place of `auto`, which the first process finds, of the whole."""
+    """Return the scene with numbers in place of `auto`, which the first process computes for the
+    whole."""
     if not scene.experiment.stepping.is_open:
         return scene
-    found = None
+    solver = None
     with ranks.raise_together():
         if whole := whole_of(ranks, scene):
-            found = tuned(whole).experiment.stepping
-    return with_solver(scene, ranks.bcast(found))
+            solver = tuned(whole).experiment.stepping
+    return with_solver(scene, ranks.bcast(solver))
 
 
 class DistributedExecution(Execution):
-    """Every run is shared by the processes of an MPI communicator."""
+    """Execution in which the processes of an MPI communicator share every run."""
 
     communicator: MPICommunicator
 

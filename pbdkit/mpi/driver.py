@@ -44,8 +44,8 @@ from pbdkit.stepping.step import Mode
 
 
 class DividedStepper(Engine):
-    """Makes as many steps at once as the halo serves for, and as no leaders begin to lead in: where
-    they begin is taken from a state that is whole."""
+    """Engine that makes as many steps in a call as the halo allows, up to the beginning of a
+    motion, which starts from an updated state."""
 
     def __init__(
         self, ranks: MPICommunicator, scene: Scene, engine: Engine, halo: Halo, steps: int
@@ -55,11 +55,11 @@ class DividedStepper(Engine):
         self._halo, self._steps = halo, steps
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """Every process its own part. What one raises all of them do."""
+        """Return the state after `steps` steps. An error of one process is raised in all."""
         end = state.step + steps
         while state.step < end:
-            most = min(self._steps, end - state.step)
-            count = steady_steps(self._program, state.step + 1, most, foreseeable=True)
+            limit = min(self._steps, end - state.step)
+            count = steady_steps(self._program, state.step + 1, limit, foreseeable=True)
             error: Exception | None = None
             try:
                 state = self._engine.advance(state, count)
@@ -73,15 +73,17 @@ class DividedStepper(Engine):
 
 
 def whole_of(ranks: MPICommunicator, scene: Scene) -> Scene | None:
-    """The scene that processes have parts of, in the first of them."""
+    """Return the whole scene in the first process, None in the others."""
     if not ranks.is_root:
         return None
     return build_scene(scene.experiment) if scene.raster.extent else scene
 
 
 class Division:
-    """A scene cut up among processes: this one's part, and how a state of it is put together with
-    those of the others. The first process keeps the `whole` scene where somebody looks at that."""
+    """Scene divided among processes: the part of this one, and how states are gathered.
+
+    The first process stores the `whole` scene if diagnostics or the steady state need it.
+    """
 
     def __init__(self, ranks: MPICommunicator, scene: Scene, parts: list[Subdomain]) -> None:
         self.ranks, self.count, self.subdomains = ranks, scene.raster.total, parts
@@ -95,12 +97,12 @@ class Division:
                 self.whole = self.whole_of(scene)
 
     def whole_of(self, scene: Scene) -> Scene | None:
-        """The scene that others have parts of, in the first process."""
+        """Return the whole scene in the first process."""
         return self.whole or whole_of(self.ranks, scene)
 
     def begun(self, scene: Scene) -> tuple[State, bool]:
-        """The part of the state at time 0, and whether it can be made again from the part alone:
-        random numbers are drawn for the whole, by the first process."""
+        """Return the part of the state at time 0, and whether it can be computed again from the
+        part alone: random numbers are drawn for the whole, by the first process."""
         experiment, whole = scene.experiment, None
         draws = any(isinstance(part, Draws) for part in (experiment.rule, experiment.fracture))
         if not (experiment.initial.is_drawn or draws):
@@ -109,39 +111,39 @@ class Division:
                 self.halo.renew(state)
             return state, at_rest
         with self.ranks.raise_together():
-            if found := self.whole_of(scene):
-                whole = initial_state(found)
+            if scene_of_all := self.whole_of(scene):
+                whole = initial_state(scene_of_all)
         return self.dealt(whole), False
 
     def dealt(self, whole: State | None) -> State:
-        """The part of a state that the first process has."""
+        """Return the part of a state that the first process has."""
         members = self.ranks.allgather(self.halo.members)
         if whole is None or not self.ranks.is_root:
             return self._state(None)
         axes = self.scene.axes
         parts = zip(self.subdomains, members, strict=True)
-        return self._state(part_of_state(whole, axes, own, some) for own, some in parts)
+        return self._state(part_of_state(whole, axes, subdomain, rows) for subdomain, rows in parts)
 
     def _state(self, each: Iterable[State] | None) -> State:
-        found: State = self.ranks.scatter(each)
-        return found
+        state: State = self.ranks.scatter(each)
+        return state
 
     def gathered(self, state: State) -> State | None:
-        """The whole state, in the first process."""
+        """Return the whole state in the first process."""
         return self.halo.gathered(state)
 
     def state_dict(self, own: dict[str, Any]) -> dict[str, Any]:
-        """That of a driver of the part with the state of the whole, as it is joined."""
+        """Return the state of a driver of the part with the state of the whole, as it is joined."""
         return own | {"state": self.halo.joined(own["state"])}
 
     def scattered(self, parts: Mapping[str, Any]) -> dict[str, Any]:
-        """For the part, where the first process has that of the whole."""
+        """Return the state of a driver of the part from that of the whole, in the first process."""
         rest = self.ranks.bcast({key: part for key, part in parts.items() if key != "state"})
         state = self.dealt(parts.get("state") if self.ranks.is_root else None)
         return {**rest, "state": state}
 
     def stepper(self, choice: Choice) -> tuple[Engine, Choice]:
-        """Of the part: a thread a process, unless more are asked for."""
+        """Return the engine of the part: one thread in each process by default."""
         if self.scene.experiment.stepping.threads == "auto":
             choice = replace(choice, threads=1)
         with self.ranks.raise_together():
@@ -151,7 +153,7 @@ class Division:
 
 
 class DistributedWatch(Watch):
-    """All stop where one is asked to; the first shows how far the run is."""
+    """Watch by which all stop if one is to stop; the first shows the progress."""
 
     def __init__(self, ranks: MPICommunicator, watch: Watch) -> None:
         super().__init__(lambda: ranks.any(watch.stopping()), watch.show)
@@ -159,22 +161,22 @@ class DistributedWatch(Watch):
 
 @dataclass
 class DividedGuard(Guard):
-    """Looks at all parts."""
+    """Guard over all parts."""
 
     ranks: MPICommunicator
 
     def most(self, state: State) -> float:
-        """The largest of all."""
+        """Return the largest displacement of all parts."""
         return self.ranks.largest(super().most(state))
 
     def worst(self, scene: Scene, state: State) -> int:
-        """That of the part with the largest, the first on ties."""
-        found = self.ranks.allgather((super().most(state), super().worst(scene, state)))
-        return int(found[int(np.argmax([most for most, _ in found]))][1])  # NaN is largest
+        """Return the number of the particle with the largest displacement, the first on ties."""
+        values = self.ranks.allgather((super().most(state), super().worst(scene, state)))
+        return int(values[int(np.argmax([largest for largest, _ in values]))][1])  # NaN is largest
 
 
 class DividedSettling(SteadyStateMonitor):
-    """The first process looks whether the whole has settled."""
+    """Steady-state monitor of the whole in the first process."""
 
     def __init__(self, division: Division, settle: Settle) -> None:
         self._division, self._settling = division, None
@@ -183,29 +185,29 @@ class DividedSettling(SteadyStateMonitor):
         self._agree(None)
 
     def _agree(self, found: Certificate | None) -> Certificate | None:
-        """On what the first process has found."""
-        own = self._settling
-        told = self._division.ranks.bcast(own and (found, own.pace, own.obstacle))
-        certificate: Certificate | None = told[0]
-        self.pace, self.obstacle = told[1:]
+        """Share the result of the first process."""
+        monitor = self._settling
+        values = self._division.ranks.bcast(monitor and (found, monitor.pace, monitor.obstacle))
+        certificate: Certificate | None = values[0]
+        self.pace, self.obstacle = values[1:]
         return certificate
 
     def look(self, state: State) -> Certificate | None:
-        """As one process does. Raises StoppedError in all."""
-        whole, found, ranks = self._division.gathered(state), None, self._division.ranks
+        """Return the certificate as a single process does. Raises StoppedError in all."""
+        whole, certificate, ranks = self._division.gathered(state), None, self._division.ranks
         error: Exception | None = None
         if self._settling and whole is not None:
             self._settling.pace, self._settling.obstacle = self.pace, self.obstacle
             try:
-                found = self._settling.look(whole)
+                certificate = self._settling.look(whole)
             except StoppedError as stopped:
                 error = stopped
         ranks.raise_first(error)
-        return self._agree(found)
+        return self._agree(certificate)
 
 
 class DistributedSteppingDriver(SteppingDriver):
-    """Steps a part; decides with the others."""
+    """Stepping driver of a part, which agrees with the others."""
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
@@ -217,19 +219,19 @@ class DistributedSteppingDriver(SteppingDriver):
         size = size_of(scene) + ranks.largest(most_of(start))
         self.guard = DividedGuard(size, 0, EVERY, None if anew else start.copy(), ranks)
         self.monitor, self.recorded_step = None, -1
-        if asked := scene.experiment.stepping.settle:
-            self.monitor = DividedSettling(division, asked)
+        if settle := scene.experiment.stepping.settle:
+            self.monitor = DividedSettling(division, settle)
 
     def _steps_in(self, seconds_a_step: float) -> int:
-        """As the first process finds it."""
+        """Return the number of steps as the first process estimates it."""
         return int(self._division.ranks.bcast(super()._steps_in(seconds_a_step)))
 
     def state_dict(self) -> dict[str, Any]:
-        """With the state of the whole, as it is joined."""
+        """Return the state of the driver with the state of the whole, as it is joined."""
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """From the state of the whole, which the first process has."""
+        """Restore the driver from the state of the whole, in the first process."""
         super().load_state_dict(self._division.scattered(parts))
 
 
@@ -248,14 +250,14 @@ def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> 
 
 
 SHARE = 4
-"""The first grid that all processes have is by so much smaller than the part of one."""
+"""Ratio of the part of one process to the first grid that all processes have."""
 A_CYCLE = 6
-"""Rows of that grid beyond its own that a process takes into a cycle: what is right shrinks by 4
-on the way down, and by 2 on the way up."""
+"""Number of rows of that grid beyond its own that a process takes into a cycle: valid rows shrink
+by 4 on the way down, and by 2 on the way up."""
 
 
 class DistributedRows(Rows):
-    """The rows of one of the processes that share a grid."""
+    """Rows of one process on a shared grid."""
 
     def __init__(self, ranks: MPICommunicator, halo: Halo, strip: Strip) -> None:
         super().__init__(ranks)
@@ -270,38 +272,42 @@ class DistributedRows(Rows):
         return np.concatenate(self.communicator.allgather(numbers[..., self.own]), axis=-1)
 
     def random(self, shape: tuple[int, ...]) -> Floats:
-        """What one process draws for these rows: a number is one turn of its generator."""
+        """Return the numbers that a single process draws for these rows: each is one advance of its
+        generator."""
         assert self.strip
         planes, (rows, places) = shape[:-2], shape[-2:]
-        found: Floats = np.empty((math.prod(planes), rows, places))
-        for n, plane in enumerate(found):
+        numbers: Floats = np.empty((math.prod(planes), rows, places))
+        for n, plane in enumerate(numbers):
             turned = np.random.PCG64(0).advance((n * self.strip.count + self.strip.low) * places)
             plane[...] = np.random.Generator(turned).uniform(-1.0, 1.0, (rows, places))
-        return found.reshape(shape)
+        return numbers.reshape(shape)
 
 
 def deep_subdomains(scene: Scene, parts: int) -> list[Subdomain]:
-    """Parts with halos that serve for a cycle of multigrid, and arrays that begin where all grids
-    that are parted have a row. Raises ExperimentError where rows are too few."""
+    """Return parts with halos for a cycle of multigrid, and arrays that begin where all divided
+    grids have a row.
+
+    Raises ExperimentError if rows are too few.
+    """
     spread = 2 ** _depth(parts)
     each, edge = reaches(scene)
     halo, rows = _margin(scene) + A_CYCLE * spread, len(scene.raster.row_counts)
-    found = []
-    for own in subdomains(scene, parts):
-        low = max(0, own.begin - halo) // spread * spread
-        high = min(rows, own.end + halo)
+    deep = []
+    for part in subdomains(scene, parts):
+        low = max(0, part.begin - halo) // spread * spread
+        high = min(rows, part.end + halo)
         steps = max(1, min(MOST_STEPS, (halo - edge) // max(1, each)))
-        found.append(Subdomain(own.begin, own.end, low, high, edge, steps))
-    return found
+        deep.append(Subdomain(part.begin, part.end, low, high, edge, steps))
+    return deep
 
 
 def deep_halo(each: int, edge: int, least: int, parts: int) -> int:
-    """More rows than `deep_subdomains` take as halos, as `widest_halo` is."""
+    """Return an upper bound of the halos of `deep_subdomains`, as `widest_halo` does."""
     return 3 * edge + each + (A_CYCLE + 1) * int(2 ** _depth(parts))
 
 
 def strip_of(scene: Scene, own: Subdomain, parts: int) -> Strip:
-    """What a part knows of the grid of a scene."""
+    """Return the strip of a part on the grid of a scene."""
     count, margin = scene.raster.whole_shape[1], _margin(scene)
     first = own.low + margin if own.low else 0
     last = own.high - margin if own.high < count else count
@@ -309,13 +315,13 @@ def strip_of(scene: Scene, own: Subdomain, parts: int) -> Strip:
 
 
 def _depth(parts: int) -> int:
-    """How many grids are parted among so many processes."""
+    """Return the number of grids that are divided among the processes."""
     return math.ceil(math.log(SHARE * parts, 4))
 
 
 def _margin(scene: Scene) -> int:
-    """The outermost rows of a part that are empty, that stand still, and whose particles see those,
-    or frame points that follow them."""
+    """Return the number of outermost rows of a part that are empty, that do not move, or whose
+    particles have these or their frame points as neighbours."""
     return 3 * reach_of(scene, 0).reach + farthest_apart(scene)
 
 
@@ -323,8 +329,8 @@ STUCK = "the iteration that several processes share gets nowhere; run it in one 
 
 
 class DistributedEquilibriumDriver(EquilibriumDriver):
-    """Finds the equilibrium of a part with the others: of rules that are linear, without bonds that
-    break and without obstacles, on the stencils of a lattice with one site a cell."""
+    """Driver of an equilibrium that several processes share: of linear rules, without bonds that
+    break and without obstacles, on the stencils of a lattice with one site in a cell."""
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
@@ -338,11 +344,11 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         self._rows = DistributedRows(ranks, division.halo, strip)
 
     def state_dict(self) -> dict[str, Any]:
-        """With the state of the whole, as it is joined."""
+        """Return the state of the driver with the state of the whole, as it is joined."""
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """From the state of the whole, which the first process has."""
+        """Restore the driver from the state of the whole, in the first process."""
         super().load_state_dict(self._division.scattered(parts))
 
     def _way(self, state: State) -> Way:
@@ -359,7 +365,7 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         return certificate
 
     def _renewed(self, way: Way) -> Way:
-        """The same with what frame points show at each equilibrium."""
+        """Renew the frame points at each equilibrium of a load path."""
         while True:
             try:
                 reached = next(way)

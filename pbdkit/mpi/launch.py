@@ -1,4 +1,4 @@
-"""Detection of a launch by mpiexec, which imports little where there was none."""
+"""Detection of a launch by mpiexec, with few imports otherwise."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from pbdkit.simulation import Execution
 
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
-"""How many processes launchers of MPI programs say in the environment that there are."""
+"""Environment variables in which launchers of MPI programs store the number of processes."""
 RANK = "PMIX_RANK"
-"""What others leave there."""
+"""Environment variable of other launchers."""
 
 
 @contextmanager
@@ -25,7 +25,7 @@ def launched() -> Iterator[Communicator]:
 
     The root alone prints in the block. A process that was started alone has the serial one.
 
-    Raises ExperimentError where mpi4py is missing, finds no MPI library, or belongs to another
+    Raises ExperimentError if mpi4py is missing, finds no MPI library, or belongs to another
     launcher.
     """
     size = max(int(os.environ.get(name, 1)) for name in SIZES)

@@ -1,7 +1,7 @@
-"""Partition of a lattice among ranks: rows of repeat cells with a halo, the part of a scene as a
-scene, exchange of halos, and joining of parts.
+"""Partition of a lattice among ranks: rows of repeat cells with a halo, exchange of halos, and
+joining of parts.
 
-A part holds its own rows and, beyond them, a halo of rows of its neighbours. Its outermost rows, as
+A part has its own rows and, beyond them, a halo of rows of its neighbours. Its outermost rows, as
 many as neighbours reach, are empty; as many again hold frame points that follow no particle, except
 for leaders. In each step the valid rows shrink by the reach of a step, so that several steps can be
 made before the halo is exchanged.
@@ -43,12 +43,12 @@ from pbdkit.stepping.program import program_of, reach_of
 from pbdkit.stepping.state import State
 
 BLOCK = 2**23
-"""Bytes that are sent at once."""
+"""Number of bytes that are sent at once."""
 
 
 class Share:
-    """What another process than the first has of an array, along an axis. It has the array's kind
-    alone, and can be sent."""
+    """Share of an array in another process than the first, along an axis: its type, and a method to
+    send it."""
 
     def __init__(self, part: Array, axis: int) -> None:
         self.shape, self.dtype, self.ndim = part.shape, part.dtype, part.ndim
@@ -56,14 +56,14 @@ class Share:
         self._part, self._axis = part, axis
 
     def send(self, ranks: MPICommunicator) -> None:
-        """To the first process."""
+        """Send the share to the first process."""
         for block in _blocks(self._part, self._axis):
             ranks.send(block, 0)
 
 
 def joined(ranks: MPICommunicator, part: Array, axis: int, lengths: Sequence[int]) -> Any:
-    """An array of which each process has a part, so many long along an axis, in the order of ranks:
-    in the first process a PiecedArray, in the others their share of it."""
+    """Return an array of which each process has a part, with these lengths along an axis, in the
+    order of ranks: in the first process a PiecedArray, in the others their share."""
     if not ranks.is_root:
         return Share(part, axis)
     shape = (*part.shape[:axis], sum(lengths), *part.shape[axis + 1 :])
@@ -76,11 +76,11 @@ def _received(
     for lead in np.ndindex(part.shape[:axis]):
         yield part[lead]
         for rank, length in enumerate(lengths[1:], 1):
-            left = length * _row_bytes(part, axis)
-            while left:
-                piece = np.empty(min(left, BLOCK), np.uint8)
+            remaining = length * _row_bytes(part, axis)
+            while remaining:
+                piece = np.empty(min(remaining, BLOCK), np.uint8)
                 ranks.receive(piece, rank)
-                left -= piece.size
+                remaining -= piece.size
                 yield piece
 
 
@@ -96,17 +96,18 @@ def _blocks(part: Array, axis: int) -> Iterator[Bytes]:
 
 
 MOST_STEPS = 16
-"""Steps between two exchanges, at most: by then halos are a hundredth of a part of 1500 rows."""
+"""Maximum number of steps between two exchanges: by then halos are a hundredth of a part of 1500
+rows."""
 MADE_TWICE = 0.05
-"""This share of its own rows a part makes on either side that others make too, at most."""
+"""Maximum number of rows that two parts both compute, relative to the own rows of a part."""
 LOOKED_AT = 3
-"""So many rows beside its own that move a part has at least, where somebody measures."""
+"""Minimum number of moving rows beside its own if diagnostics measure a part."""
 
 
 @dataclass(frozen=True)
 class Subdomain:
     """Rows `begin` to `end` of repeat cells with those from `low` to `high` around them, of which
-    the outermost `edge` are empty, and as many stand still; `steps` can be made between two
+    the outermost `edge` are empty, and as many do not move; `steps` can be made between two
     exchanges."""
 
     begin: int
@@ -118,24 +119,24 @@ class Subdomain:
 
     @property
     def own(self) -> slice:
-        """Its own rows, in arrays of the part."""
+        """Own rows in arrays of the part."""
         return slice(self.begin - self.low, self.end - self.low)
 
     def after(self, rows: int) -> Subdomain:
-        """The same, counted from a row that is so many after the first."""
+        """Return the subdomain with rows counted from another row."""
         begin, end, low, high = (n - rows for n in (self.begin, self.end, self.low, self.high))
         return replace(self, begin=begin, end=end, low=low, high=high)
 
     def cut(self, array: Array, axes: int) -> Array:
-        """The part of an array whose last `axes` are those of cells, in memory of its own."""
+        """Return a copy of the part of an array whose last `axes` are those of cells."""
         return row_view(array, axes, slice(self.low, self.high)).copy()
 
     def seen(self, rows: int) -> tuple[int, int]:
-        """The rows of a lattice of so many that are not empty."""
+        """Return the rows with particles, of a lattice of `rows` rows."""
         return self._within(rows, self.edge)
 
     def inner(self, rows: int) -> tuple[int, int]:
-        """Those that do not stand still either."""
+        """Return the rows that move."""
         return self._within(rows, 2 * self.edge)
 
     def _within(self, rows: int, edge: int) -> tuple[int, int]:
@@ -156,8 +157,10 @@ def farthest_apart(scene: Scene) -> int:
 
 
 def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
-    """Parts with about equally many particles, of whole rows. Raises ExperimentError where rows
-    are too few."""
+    """Return parts of whole rows with about equally many particles.
+
+    Raises ExperimentError if rows are too few.
+    """
     (each, edge), experiment = reaches(scene), scene.experiment
     counts = scene.raster.row_counts
     bounds = bounds_of(counts, parts)
@@ -175,14 +178,17 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
 
 
 def widest_halo(each: int, edge: int, least: int, parts: int) -> int:
-    """More rows than `subdomains` take as halos, where a step reaches `each` rows at most, and
-    neighbours `edge`, of parts of `least` rows."""
+    """Return an upper bound of the halos of `subdomains`, if a step reaches at most `each` rows,
+    and neighbours `edge`, of parts of at least `least` rows."""
     return _steps(each, least) * each + 3 * edge + LOOKED_AT + int(MADE_TWICE * least)
 
 
 def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
-    """The rows at which parts begin, and the end of the last; `counts` are the particles of each
-    row. Raises ExperimentError where rows are too few."""
+    """Return the rows at which parts begin, and the end of the last; `counts` are the particles of
+    each row.
+
+    Raises ExperimentError if rows are too few.
+    """
     share = np.cumsum(counts) / max(1, counts.sum())
     cuts = np.searchsorted(share, np.arange(1, parts) / parts) + 1
     bounds = [0, *cuts.tolist(), len(counts)]
@@ -196,22 +202,24 @@ def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
 
 
 def _steps(each: int, least: int) -> int:
-    """Between two exchanges, where a step reaches so many rows, of parts of so many rows."""
+    """Return the number of steps between two exchanges, from the rows that a step reaches and the
+    least rows of a part."""
     return min(MOST_STEPS, 1 + int(MADE_TWICE * least / each)) if each else MOST_STEPS
 
 
 @dataclass(frozen=True)
 class SubdomainScene:
-    """A subdomain's part of a scene: the scene of the part, and what is known of the whole.
-    `ours` are which particles of each leader group that the part has are of its own rows, and
-    `early` how many of these groups' particles come before."""
+    """Scene of a subdomain and its place in the whole.
+
+    `ours` are the particles of each leader group in its own rows, `early` the numbers of those in
+    rows before, and `rows` the rows of the table that are its own particles.
+    """
 
     subdomain: Subdomain
     scene: Scene
     ours: tuple[Mask, ...]
     early: tuple[int, ...]
     rows: slice
-    """Of the table of its scene, those of its own particles."""
 
 
 def part_of(scene: Scene, subdomain: Subdomain) -> SubdomainScene:
@@ -271,7 +279,7 @@ def _others(sites: Array) -> Sequence[int]:
 
 
 class Halo:
-    """The halo of a part: what other parts have of their own rows."""
+    """Halo of a part: own rows of other parts."""
 
     def __init__(
         self, ranks: MPICommunicator, parts: Sequence[Subdomain], part: SubdomainScene
@@ -280,17 +288,17 @@ class Halo:
         self._parts = parts
         sizes = ranks.allgather([int(ours.sum()) for ours in part.ours])
         self._counts = list(zip(*sizes, strict=True))
-        before = [sum(counts[: ranks.rank]) for counts in self._counts]
+        offsets = [sum(counts[: ranks.rank]) for counts in self._counts]
         self.members = tuple(
             np.arange(len(ours)) + first - early
-            for ours, early, first in zip(part.ours, part.early, before, strict=True)
+            for ours, early, first in zip(part.ours, part.early, offsets, strict=True)
         )
-        """The particles of each leader group that the part has, by their number in the group."""
+        """Particles of each leader group that the part has, by their number in the group."""
         own, rank, rows = part.subdomain, ranks.rank, parts[-1].end
-        others = [n for n in range(len(parts)) if n != rank]
-        sides = [n for n in others if _touch(own, parts[n]) or _touch(parts[n], own)]
+        ranks_around = [n for n in range(len(parts)) if n != rank]
+        sides = [n for n in ranks_around if _touch(own, parts[n]) or _touch(parts[n], own)]
         self.received = {n: self._rows(_shared(own, parts[n])) for n in sides}
-        """By rank the rows that come from there."""
+        """Rows that come from each rank."""
         self._sent = {n: self._rows(_shared(parts[n], own)) for n in sides}
         places = [each.place for each in part.scene.leading]
         self._at = [np.unravel_index(place, part.scene.raster.shape)[1] for place in places]
@@ -302,66 +310,69 @@ class Halo:
         self._pushed = [n for n, each in enumerate(part.scene.leading) if each.share is not None]
 
     def _rows(self, rows: tuple[int, int]) -> slice:
-        """Rows of the whole as they are counted in the part."""
+        """Return rows of the whole as rows of the part."""
         low, count = self._part.subdomain.low, self._part.scene.raster.shape[1]
         first, last = (min(max(row - low, 0), count) for row in rows)
         return slice(first, max(first, last))
 
     def _members(self, *within: slice) -> list[Array]:
-        """Of each leader group those in some rows."""
+        """Return the members of each leader group in rows."""
         ins = [[(at >= rows.start) & (at < rows.stop) for rows in within] for at in self._at]
-        return [np.flatnonzero(np.logical_and.reduce(one)) for one in ins]
+        return [np.flatnonzero(np.logical_and.reduce(masks)) for masks in ins]
 
     def renew(self, state: State) -> None:
-        """Writes the halo of a state, in place; and the velocities of masses that lie there. The
-        displacements of the step before are left out where no step reads them."""
+        """Update the halo of a state, in place, and the velocities of masses in it. Displacements
+        of the step before are omitted if no step reads them."""
         arrays = [
             array for array in state.arrays() if self._looks_back or array is not state.previous
         ]
         starts = [(n, start) for n in self._pushed if (start := state.starts[n]) is not None]
         theirs = {r: [s[:, self._theirs[r][n]] for n, s in starts] for r in self._sent}
         mine = {
-            r: [np.empty((len(s), len(those[n])), s.dtype) for n, s in starts]
-            for r, those in self._mine.items()
+            r: [np.empty((len(s), len(members[n])), s.dtype) for n, s in starts]
+            for r, members in self._mine.items()
         }
         self._exchange(arrays, theirs, mine)
-        for rank, found in mine.items():
-            for (n, start), values in zip(starts, found, strict=True):
+        for rank, arrays_of in mine.items():
+            for (n, start), values in zip(starts, arrays_of, strict=True):
                 start[:, self._mine[rank][n]] = values
 
     def meet(self, field: Array) -> None:
-        """Writes the halo of an array whose last axes are those of cells, in place."""
+        """Update the halo of an array whose last axes are those of cells, in place."""
         self._exchange([field], {}, {})
 
     def look_back(self, state: State) -> None:
-        """Writes the halo of the displacements of the step before, in place."""
+        """Update the halo of the displacements of the step before, in place."""
         if not self._looks_back:
             self.meet(state.previous)
 
     def _exchange(
         self, arrays: list[Array], theirs: dict[int, list[Array]], mine: dict[int, list[Array]]
     ) -> None:
-        """Sends own rows of arrays, and others from there into these; and further ones."""
+        """Exchange rows of arrays, and further arrays, with each rank."""
         sent, received = (
-            {r: [*self._blocks(arrays, rows), *map(as_bytes, more.get(r, []))] for r, rows in each}
-            for each, more in ((self._sent.items(), theirs), (self.received.items(), mine))
+            {r: [*self._blocks(arrays, rows), *map(as_bytes, extra.get(r, []))] for r, rows in each}
+            for each, extra in ((self._sent.items(), theirs), (self.received.items(), mine))
         )
         self._ranks.exchange(sent, received)
 
     def _blocks(self, arrays: list[Array], rows: slice) -> Iterator[Bytes]:
-        """Some rows as they lie in memory, plane by plane."""
+        """Generate rows as they lie in memory, plane by plane."""
         for array in arrays:
             for plane in np.ndindex(array.shape[: array.ndim - self._axes]):
                 yield as_bytes(array[plane][rows])
 
     def joined(self, state: State) -> State:
-        """The state of the whole, of arrays that are joined when somebody asks for them; in other
-        processes than the first, of their shares."""
-        own, rows = self._part.subdomain.own, [part.end - part.begin for part in self._parts]
+        """Return the state of the whole, of arrays that are joined on access; in other processes
+        than the first, of their shares."""
+        rows_of_part, rows = (
+            self._part.subdomain.own,
+            [part.end - part.begin for part in self._parts],
+        )
 
         def whole(array: Array) -> Any:
             axis = array.ndim - self._axes
-            return joined(self._ranks, row_view(array, self._axes, own), axis, rows)
+            return joined(self._ranks, row_view(array, self._axes, rows_of_part), axis, rows)
 
         starts = tuple(
             None if start is None else joined(self._ranks, start[:, ours], 1, counts)
@@ -370,13 +381,13 @@ class Halo:
         return _each(state, whole, starts)
 
     def gathered(self, state: State) -> State | None:
-        """The state of the whole, in the first process; None in the others."""
+        """Return the state of the whole in the first process; None in the others."""
         shares = self.joined(state)
         if self._ranks.is_root:
             starts = (None if start is None else np.asarray(start) for start in shares.starts)
             # In the order in which the others send.
-            found = _each(shares, np.asarray, ())
-            return replace(found, starts=tuple(starts))
+            whole = _each(shares, np.asarray, ())
+            return replace(whole, starts=tuple(starts))
         every: list[Any] = [*shares.arrays(), *(s for s in shares.starts if s is not None)]
         for share in every:
             share.send(self._ranks)
@@ -384,7 +395,7 @@ class Halo:
 
 
 def _shared(part: Subdomain, other: Subdomain) -> tuple[int, int]:
-    """The rows of a part's halo that are another's own."""
+    """Return the rows of a part's halo that are another's own."""
     return max(part.low, other.begin), min(part.high, other.end)
 
 
@@ -394,7 +405,7 @@ def _touch(part: Subdomain, other: Subdomain) -> bool:
 
 
 def _each(state: State, function: Callable[[Array], Any], starts: tuple[Any, ...]) -> State:
-    """A state with what a function makes of each array."""
+    """Return a state with the result of a function for each array."""
 
     def of(array: Array | None) -> Any:
         return None if array is None else function(array)
@@ -414,22 +425,27 @@ def _each(state: State, function: Callable[[Array], Any], starts: tuple[Any, ...
 def part_of_state(
     whole: State, axes: int, subdomain: Subdomain, members: Sequence[Indices]
 ) -> State:
-    """A part of a whole state, in memory of its own, with some members of the leader groups."""
+    """Return a copy of a part of a whole state, with some members of the leader groups."""
     starts = zip(whole.starts, members, strict=True)
-    found = tuple(None if start is None else np.asarray(start)[:, some] for start, some in starts)
-    return _each(whole, lambda array: subdomain.cut(array, axes), found)
+    starts_of_part = tuple(
+        None if start is None else np.asarray(start)[:, rows] for start, rows in starts
+    )
+    return _each(whole, lambda array: subdomain.cut(array, axes), starts_of_part)
 
 
 SITES_AT_ONCE = 2**22
-"""So many are counted at a time: what that takes does not grow with the body."""
+"""Number of sites that are counted at a time, so that the memory does not grow with the body."""
 
 
 @dataclass(frozen=True)
 class RowCount:
-    """What all processes know of a lattice: the body's box of sites, from `low` to below `high`;
-    how many particles each line of sites has, frame included, from the first on that has any; how
-    many indices a repeat cell has, and how many cells neighbours reach, along the first axis; the
-    cells left out at narrow voids."""
+    """Number of particles in the rows of a lattice.
+
+    `low` and `high` are the ends of the body's box of sites; `lines` are the numbers of particles
+    on each line of sites, frame included, from the first on that has any; `period` and `reach` are
+    the number of indices of a repeat cell and of cells that neighbours reach along the first axis;
+    `left_out` are the cells omitted at narrow voids.
+    """
 
     low: Index
     high: Index
@@ -441,18 +457,18 @@ class RowCount:
 
     @property
     def first(self) -> int:
-        """The repeat cells of the first row of the lattice, which is padding."""
+        """Repeat cells of the first row of the lattice, which is padding."""
         return self._start // self.period - self.reach
 
     @cached_property
     def rows(self) -> NDArray[np.int64]:
-        """(row,): how many particles each row of repeat cells has, padding included."""
+        """Number of particles of each row of repeat cells, padding included, (row,)."""
         row = (self._start + np.arange(len(self.lines))) // self.period - self.first
         rows = np.bincount(row, self.lines, row[-1] + 1 + self.reach)
         return rows.astype(np.int64)
 
     def stretch(self, begin: int, end: int) -> Stretch:
-        """Of the rows from `begin` to below `end`."""
+        """Return the stretch of the rows from `begin` to below `end`."""
         first, last = self._line(begin), self._line(end)
         near, far = first - self.layers, last + self.layers
         return Stretch(
@@ -467,17 +483,17 @@ class RowCount:
 
     @property
     def _start(self) -> int:
-        """The index i of the first line."""
+        """Index i of the first line."""
         return self.low[0] - self.layers
 
     def _line(self, row: int) -> int:
-        """The first line of sites of a row, among those with particles."""
+        """Return the first line of sites of a row, among those with particles."""
         line = (self.first + row) * self.period
         return min(max(line, self._start), self._start + len(self.lines))
 
 
 def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
-    """Count the particles of a body and its frame in each row; None where there is no body. Each
+    """Count the particles of a body and its frame in each row; return None without a body. Each
     process counts on an equal number of lines."""
     rank = communicator.rank
     lattice, layers = ground.experiment.lattice, ground.layers
@@ -485,8 +501,8 @@ def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
     spill = layers + ground.spill
     cuts = np.linspace(first - spill, last + 1 + spill, communicator.size + 1).astype(int).tolist()
     across = math.prod(b - a + 1 for a, b in zip(low[1:], high[1:], strict=True))
-    found = [_counted(ground, some) for some in _bands(cuts[rank : rank + 2], across)]
-    every = [one for own in communicator.allgather(found) for one in own]
+    local = [_counted(ground, band) for band in _bands(cuts[rank : rank + 2], across)]
+    every = [count for each in communicator.allgather(local) for count in each]
     boxes = [box for box, _, _ in every if box]
     if not boxes:
         return None
@@ -502,15 +518,15 @@ def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
 
 def _bands(lines: list[int], across: int) -> Iterator[Lines]:
     first, last = lines
-    some = max(1, SITES_AT_ONCE // across)
-    for begin in range(first, last, some):
-        yield begin, min(begin + some, last)
+    width = max(1, SITES_AT_ONCE // across)
+    for begin in range(first, last, width):
+        yield begin, min(begin + width, last)
 
 
 def _counted(
     ground: Ground, lines: Lines
 ) -> tuple[tuple[Index, Index] | None, NDArray[np.int64], LeftOut]:
-    """(box of the body, particles on each line, cells left out) of some lines."""
+    """Return (box of the body, particles on each line, omitted cells) of some lines."""
     first, last = lines
     counts, layers = np.zeros(last - first, np.int64), ground.layers
     filling = ground.filled((first - layers, last + layers))
@@ -518,10 +534,10 @@ def _counted(
     if not (box := filling.box):
         return None, counts, left_out
     low, kinds = framed(ground.experiment.lattice, filling.within(*box), layers)
-    many = np.count_nonzero(kinds != EMPTY, axis=tuple(range(1, kinds.ndim)))
-    line = np.arange(low[0], low[0] + len(many))
-    own = (line >= first) & (line < last)
-    counts[line[own] - first] = many[own]
+    numbers = np.count_nonzero(kinds != EMPTY, axis=tuple(range(1, kinds.ndim)))
+    line = np.arange(low[0], low[0] + len(numbers))
+    is_own = (line >= first) & (line < last)
+    counts[line[is_own] - first] = numbers[is_own]
     inside = [max(first, box[0][0]), min(last, box[1][0])]
     if inside[0] >= inside[1]:
         return None, counts, left_out

@@ -438,7 +438,7 @@ def _refuse_other_names(by_slot: dict[Slot, Any], what: str) -> None:
 
 
 class Home(Enum):
-    """What a number is attached to."""
+    """Owner of a number."""
 
     SCENE = "scene"
     SLOT = "slot"

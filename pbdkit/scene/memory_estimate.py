@@ -60,14 +60,14 @@ def equilibrium_size(
 
 
 def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
-    """Whether stencils serve best, where they serve."""
+    """Return whether stencils are the best method, where they apply."""
     once = experiment.rule.linear and not experiment.fracture.can_break
     largest = LARGEST_DIRECT if once else LARGEST_ANEW
     return method == "multigrid" or (method == "auto" and particles > largest)
 
 
 def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> bool:
-    """Whether the lattice's stencils serve."""
+    """Return whether the lattice's stencils apply."""
     method, cell = experiment.solver.equilibrium.method, neighbourhood.cell
     if not (asks_for_grids(experiment, method, particles) and find_spec("numba")):
         return False
@@ -91,7 +91,7 @@ WORKSPACE = 20
 BONDS = 80
 """Table of bonds and the building of it, for each plane of bonds."""
 CELLS = 110
-"""Shares of cells."""
+"""Number of shares of cells."""
 FREE_EDGES = 60
 """A calibrated rule under a frame with points."""
 INNER = 130
@@ -118,7 +118,7 @@ FILE_OVERHEAD, VARIABLE_OVERHEAD = 40_000, 1500
 
 
 class TooLargeError(ExperimentError):
-    """For the memory."""
+    """Error for lack of memory."""
 
 
 @dataclass(frozen=True)
@@ -236,14 +236,14 @@ def refuse_too_large(
 
 
 def _bytes_of(dtype: str, value: int) -> int:
-    """Of one number, where numbers that are not whole take `value`."""
+    """Return the bytes of one number; numbers that are not whole take `value`."""
     return value if dtype == "f8" else np.dtype(dtype).itemsize
 
 
 def _bytes_an_entry(
     diagnostic: Diagnostic, particles: int, recorded: int, *, in_mm: bool
 ) -> list[float]:
-    """Of each variable in the file; with `in_mm` lengths stand there twice."""
+    """Return the bytes of each variable in the file; with `in_mm` lengths are stored twice."""
     sizes = {"particle": particles, "axis": 2, "principal": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     sizes |= {diagnostic.own_dimension: OPEN_CHUNK}

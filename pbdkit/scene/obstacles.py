@@ -90,7 +90,7 @@ class Walls(NamedTuple):
 
     @classmethod
     def of(cls, outlines: Sequence[Outline]) -> Walls:
-        """Create from outlines."""
+        """Create the walls of outlines."""
         points = [np.empty((0, 2)), *(outline.points for outline in outlines)]
         return cls(
             np.array([outline.kind for outline in outlines], np.int64),

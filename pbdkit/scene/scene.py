@@ -264,7 +264,7 @@ class Scene:
 
     @cached_property
     def _courses(self) -> tuple[Course[float], ...]:
-        """Time-dependent parameters."""
+        """Courses of the parameters that depend on time."""
         return tuple(self.experiment.courses.values())
 
     @cached_property
@@ -293,12 +293,12 @@ class Scene:
 
     @property
     def has_fracture(self) -> bool:
-        """Whether bonds can be torn or cut, so that their state is stored."""
+        """True if bonds can be torn or cut, so that their state is stored."""
         return self.experiment.parts_bonds
 
     @property
     def tears(self) -> bool:
-        """Whether bonds can break and the rule computes the forces of torn cells."""
+        """True if bonds can break and the rule computes the forces of torn cells."""
         return self.has_fracture and isinstance(self.experiment.rule, TearsCells)
 
     @cached_property
@@ -328,13 +328,13 @@ class Scene:
 
     @property
     def frame_changes(self) -> bool:
-        """Whether the map of the frame depends on time-dependent parameters of the rule."""
+        """True if the map of the frame depends on time-dependent parameters of the rule."""
         is_variable = bool(self.experiment.rule.courses)
         return is_variable and self.frame is not None and self.frame.depends_on_rule
 
     @cached_property
     def leaders_overlap(self) -> bool:
-        """Whether a particle belongs to two leader groups."""
+        """True if a particle belongs to two leader groups."""
         rows = [leading.rows for leading in self.leading]
         return bool(rows) and len(distinct(np.concatenate(rows))) < sum(map(len, rows))
 
