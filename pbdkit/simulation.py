@@ -158,8 +158,8 @@ class SteppingDriver(Driver):
         """
         self.state, self.recorded_step = parts["state"], parts["kept"]
         is_good = parts["guard"]["good_step"] == self.state.step
-        good_state = self.state.copy() if is_good else self.guard.kept
-        self.guard = replace(self.guard, kept=good_state, **parts["guard"])
+        good_state = self.state.copy() if is_good else self.guard.good_copy
+        self.guard = replace(self.guard, good_copy=good_state, **parts["guard"])
         if self.monitor and "pace" in parts:
             self._restore_monitor(self.monitor, parts["pace"], parts["obstacle"])
 
@@ -180,7 +180,7 @@ class SteppingDriver(Driver):
     def restart(self, state: State) -> None:
         """Continue from another state, which the guard takes as good."""
         super().restart(state)
-        self.guard = replace(self.guard, good_step=state.step, kept=state.copy())
+        self.guard = replace(self.guard, good_step=state.step, good_copy=state.copy())
 
     def states(self) -> States:
         """Generate the states of the run.
@@ -277,7 +277,7 @@ class SteppingDriver(Driver):
         """
         if not np.isnan(self.state.u).any():
             return ""
-        rule, start = type(self.scene.experiment.rule), self.guard.kept
+        rule, start = type(self.scene.experiment.rule), self.guard.good_copy
         start = start.copy() if start else initial_state(self.scene)
         steps, place = self.state.step - start.step, ""
         try:

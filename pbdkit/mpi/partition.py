@@ -128,7 +128,7 @@ class Subdomain:
         return replace(self, begin=begin, end=end, low=low, high=high)
 
     def cut(self, array: Array, axes: int) -> Array:
-        """Return a copy of the part of an array whose last `axes` are those of cells."""
+        """Return a copy of the part of an array with cells along the last `axes`."""
         return row_view(array, axes, slice(self.low, self.high)).copy()
 
     def seen(self, rows: int) -> tuple[int, int]:
@@ -338,7 +338,7 @@ class Halo:
                 start[:, self._mine[rank][n]] = values
 
     def meet(self, field: Array) -> None:
-        """Update the halo of an array whose last axes are those of cells, in place."""
+        """Update the halo of an array with cells along the last axes, in place."""
         self._exchange([field], {}, {})
 
     def look_back(self, state: State) -> None:

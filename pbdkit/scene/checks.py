@@ -37,7 +37,7 @@ MAX_DISTANCE = 2.0
 MAX_LISTED = 5
 """Maximum number of distant points listed in warnings."""
 ROUND_ANGLE = math.pi / 12
-"""Angle whose multiples are recognised as radians."""
+"""Angle of which multiples are recognised as radians."""
 ROUND_ATOL = 1e-3
 """Tolerance of the recognition of multiples of `ROUND_ANGLE`."""
 DECIMALS = 2
@@ -157,7 +157,7 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
 def carried_by_leaders(
     raster: Raster, leading: Sequence[Leading], loads: Loads | None, steps: int
 ) -> Iterator[str]:
-    """Generate a warning for each load whose particles all lead along it whenever it acts."""
+    """Generate a warning for each load on particles that all lead along it while it acts."""
     for n, loading in enumerate(loads.each if loads else ()):
         load = loading.load
         along = np.flatnonzero(load.force_at(max(load.from_, 1))).tolist()

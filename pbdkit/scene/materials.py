@@ -27,9 +27,9 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import Values, kinds_of, named_weights, signed_distance, values_at
 
 ACROSS = [0, 2]
-"""Indices of the components (normal, tangential, shear) whose stress is the same in all layers."""
+"""Indices of the components (normal, tangential, shear) of equal stress in all layers."""
 ALONG = [1]
-"""Indices of the components whose strain is the same in all layers."""
+"""Indices of the components of equal strain in all layers."""
 ISOTROPY_RTOL = 1e-6
 """Anisotropy of the normals of a border below which it has no direction, as a square in a cell."""
 DIRECTIONS = 12

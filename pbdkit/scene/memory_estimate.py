@@ -77,8 +77,8 @@ def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: i
         return False
     slots = neighbourhood.every
     steps = [cell.offset(slot.source, slot.target, slot.cell).primitive for slot in slots]
-    alike = abs(np.linalg.det(cell.primitive)) == len(cell.sites)
-    return bool(alike and np.abs(steps).max() <= 1)
+    is_primitive = abs(np.linalg.det(cell.primitive)) == len(cell.sites)
+    return bool(is_primitive and np.abs(steps).max() <= 1)
 
 
 MIB = 2**20
@@ -111,7 +111,7 @@ they are large. Columns take whole chunks. Reading the history of a particle tou
 batch, reading a snapshot little more than itself."""
 
 OPEN_CHUNK = 1024
-"""Entries a chunk along a dimension whose length is known at the end only."""
+"""Number of entries of a chunk along a dimension of unknown length."""
 
 FILE_OVERHEAD, VARIABLE_OVERHEAD = 40_000, 1500
 """Bytes of a file besides values: of any, and of each variable that grows or is measured."""
@@ -143,8 +143,8 @@ def sizes_of(
     state += sum(_bytes_of(n.dtype, value) for n in particle_numbers(experiment))
     table: float = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
     table += experiment.parts_bonds * planes
-    made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
-    memory = math.ceil(particles * (state + table + made))
+    workspace = _workspace(experiment, len(neighbourhood.slots[0]), planes)
+    memory = math.ceil(particles * (state + table + workspace))
     if not experiment.solver.makes_steps:
         solved = equilibrium_size(experiment, neighbourhood, particles, grids)
         memory = max(memory, math.ceil(particles * (state + table)) + solved)
@@ -156,21 +156,21 @@ def sizes_of(
 def _workspace(experiment: Experiment, each: int, planes: float) -> float:
     """Bytes a particle besides state and table, with `each` neighbours."""
     rule, frame, diagnostics = experiment.rule, experiment.frame, experiment.diagnostics
-    made = WORKSPACE + experiment.shows_bonds * planes * BONDS
-    made += INNER * isinstance(rule, AppliesTwice) + LOADS * bool(experiment.loads)
-    made += MATERIALS * bool(rule.varying and rule.uses_cells) + 8 * len(rule.varying)
-    made += 8 * planes * len(experiment.fracture.varying)
-    made += CELLS if frame.weighs_cells else rule.uses_cells * FREE_EDGES
+    workspace = WORKSPACE + experiment.shows_bonds * planes * BONDS
+    workspace += INNER * isinstance(rule, AppliesTwice) + LOADS * bool(experiment.loads)
+    workspace += MATERIALS * bool(rule.varying and rule.uses_cells) + 8 * len(rule.varying)
+    workspace += 8 * planes * len(experiment.fracture.varying)
+    workspace += CELLS if frame.weighs_cells else rule.uses_cells * FREE_EDGES
     tables = [d for d in diagnostics if any("particle" in v.dims for v in d.variables())]
     if any("cells" in d.needs for d in tables):
-        made += GRADIENT
+        workspace += GRADIENT
     elif any("forces" in d.needs for d in diagnostics):
-        made += FORCES
+        workspace += FORCES
     elif tables:
-        made += TABLES
+        workspace += TABLES
     if experiment.neighbours.nearness():
-        made += NEW_NEIGHBOURS + each * NEW_NEIGHBOURS_EACH
-    return made
+        workspace += NEW_NEIGHBOURS + each * NEW_NEIGHBOURS_EACH
+    return workspace
 
 
 def _output(experiment: Experiment, particles: int, planes: float) -> int:

@@ -345,7 +345,7 @@ class Scene:
 
     @cached_property
     def patches(self) -> tuple[Patch, ...]:
-        """Cells whose corners are all in the body."""
+        """Cells with all corners in the body."""
         return patches(self.raster, self.neighbourhood.tiling)
 
 

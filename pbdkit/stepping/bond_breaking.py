@@ -115,7 +115,7 @@ class Fracturing:
         """Return which bonds break."""
         with np.errstate(all="ignore"), blaming(self._model, when):
             return np.asarray(
-                part.intact & self._evaluator.breaks(part.d, part.r, part.limits, part.own)
+                part.intact & self._evaluator.breaks(part.d, part.r, part.limits, part.numbers)
             )
 
     def _hold_back(self, previous: list[NDArray[Any]], parts: Sequence[_Renewed]) -> None:
@@ -129,7 +129,7 @@ class Fracturing:
                 old = [
                     value[part.home] for value, its in zip(previous, numbers, strict=True) if its
                 ]
-                new = [value for value, its in zip(part.own, numbers, strict=True) if its]
+                new = [value for value, its in zip(part.numbers, numbers, strict=True) if its]
                 begins = np.all([value == 0.0 for value in old], axis=0)
                 ways = (abs(b - a) / np.maximum(1.0, abs(a)) for a, b in zip(old, new, strict=True))
                 change = max(change, *(float(way[~begins].max(initial=0.0)) for way in ways))
@@ -146,7 +146,7 @@ class Fracturing:
     def _load(self, part: _Renewed, side: int) -> NDArray[Any]:
         """Return the load of the cells on one side of bonds, or on the other side where there is
         none."""
-        loads = [self._evaluator.load(cell, part.limits, part.own) for cell in part.cells]
+        loads = [self._evaluator.load(cell, part.limits, part.numbers) for cell in part.cells]
         load: NDArray[Any] = np.where(part.cells[side].share > 0.0, loads[side], loads[1 - side])
         return np.broadcast_to(load, part.intact.shape)
 
@@ -158,7 +158,7 @@ class _Renewed(NamedTuple):
     d: Vector
     r: Vector
     limits: Any
-    own: list[NDArray[Any]]
+    numbers: list[NDArray[Any]]
     intact: NDArray[np.bool_]
     cells: tuple[CellStress, ...]
 

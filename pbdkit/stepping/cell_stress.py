@@ -114,8 +114,8 @@ class CellStresses:
 
     def beside(self, slot: Slot) -> tuple[CellBeside, CellBeside]:
         """Return the cells to the left and to the right of a slot."""
-        left, right = (_beside(self._scene, slot, side) for side in self.tiling.beside[slot])
-        return left, right
+        first, second = (_beside(self._scene, slot, side) for side in self.tiling.beside[slot])
+        return first, second
 
     @property
     def tiling(self) -> Any:
@@ -131,11 +131,11 @@ class CellStresses:
         if self._cells.mixed:
             parts = (self._cells.beside(slot, home, precision, p) for p in self.ratios_by_cell)
             ratios = [Stiffness(*side) for side in zip(*parts, strict=True)]
-        left, right = (
+        first, second = (
             self._stressed(cell.gradient(u, home), c, share)
             for cell, c, share in zip(self.beside(slot), ratios, shares, strict=True)
         )
-        return left, right
+        return first, second
 
     def _stressed(self, gradient: list[Any], ratios: Stiffness, share: Any) -> CellStress:
         xx, yy, xy = self.stress(*gradient, ratios)

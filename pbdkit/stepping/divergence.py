@@ -30,13 +30,13 @@ class Guard:
 
     A state is good if no displacement exceeds `size`: that of the body, its start and its leaders'
     motions together. `next_look` is the step of the next check at the latest, `good_step` the last
-    good step, `copy` a copy of a good state.
+    good step, `good_copy` a copy of a good state.
     """
 
     size: float
     good_step: int
     next_look: int
-    kept: State | None
+    good_copy: State | None
 
     @classmethod
     def of(cls, scene: Scene, start: State) -> Guard:
@@ -59,8 +59,8 @@ class Guard:
     def _note(self, state: State, largest: float) -> None:
         if largest <= self.size:
             self.good_step = state.step
-            if state.step >= KEPT_EVERY + (self.kept.step if self.kept else 0):
-                self.kept = state.copy(self.kept)
+            if state.step >= KEPT_EVERY + (self.good_copy.step if self.good_copy else 0):
+                self.good_copy = state.copy(self.good_copy)
 
     def most(self, state: State) -> float:
         """Return the largest displacement along an axis."""
@@ -78,7 +78,7 @@ class Guard:
     ) -> State | None:
         """Return the last good state before a step, by repeating steps from the copy, at most
         `patience` in a call; None if `stopping` becomes true."""
-        state, self.kept = self.kept or initial_state(scene), None
+        state, self.good_copy = self.good_copy or initial_state(scene), None
         while state.step < self.good_step and not stopping():
             state = engine.advance(state, min(patience, self.good_step - state.step))
         good = state.copy()

@@ -244,7 +244,7 @@ class GatheringFollowers(Followers):
 def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
     """Return the number of a slot by (sublattice, sublattice, step of cells along each axis), the
     count of slots if there is none; and the rest offset by that number, (axis, slot)."""
-    slots = [slot for own in neighbourhood.slots for slot in own]
+    slots = [slot for each in neighbourhood.slots for slot in each]
     reach, size = neighbourhood.reach_in_cells, len(neighbourhood.slots)
     rank = np.full((size, size, *(2 * n + 1 for n in reach)), len(slots))
     for number, slot in enumerate(slots):
@@ -405,7 +405,7 @@ def _levels(scene: Scene) -> Iterator[Scene]:
 def _differ_in_kernels(scene: Scene, changed: Scene) -> bool:
     """Return whether scenes that differ in numbers differ in constants that kernels contain."""
     return any(
-        (one.constants.weights, one.constants.fracture)
-        != (other.constants.weights, other.constants.fracture)
-        for one, other in zip(_levels(scene), _levels(changed), strict=False)
+        (old.constants.weights, old.constants.fracture)
+        != (new.constants.weights, new.constants.fracture)
+        for old, new in zip(_levels(scene), _levels(changed), strict=False)
     )

@@ -44,16 +44,16 @@ class Stepper(Engine):
         self._scene = scene
         self._invalid: Literal["raise", "ignore"] = "raise" if strict else "ignore"
         self._program = program_of(scene, sweep)
-        self._now = self
+        self._numbered = self
         """Engine with the numbers of the last step."""
 
     def advance(self, state: State, steps: int = 1) -> State:
         """Make one step after the other, each with the numbers at its end."""
         for _ in range(steps):
-            now = self._scene.at(state.step + 1)
-            if now is not self._scene and now is not self._now._scene:
-                self._now = Stepper(now, strict=self._invalid == "raise")
-            state = (self if now is self._scene else self._now)._step(state)
+            scene = self._scene.at(state.step + 1)
+            if scene is not self._scene and scene is not self._numbered._scene:
+                self._numbered = Stepper(scene, strict=self._invalid == "raise")
+            state = (self if scene is self._scene else self._numbered)._step(state)
         return state
 
     def _step(self, state: State) -> State:

@@ -64,13 +64,13 @@ def prepare(program: Program, state: State) -> Call:
 
 def foresee(program: Program, call: Call, end: int) -> int:
     """Prepare a call for the steps up to `end` that go on in the same way; return their number."""
-    step, most = call.step, end - call.state.step
-    steady = steady_steps(program, step, most)
+    step, limit = call.step, end - call.state.step
+    steady = steady_steps(program, step, limit)
     if steady > 1:
         return steady
     values = sum(leaders.u.size for leaders in call.leaders[0])
-    most = min(steady_steps(program, step, most, foreseeable=True), MAX_FORESEEN)
-    for later in range(step + 1, step + min(most, max(1, MAX_VALUES // max(1, values)))):
+    limit = min(steady_steps(program, step, limit, foreseeable=True), MAX_FORESEEN)
+    for later in range(step + 1, step + min(limit, max(1, MAX_VALUES // max(1, values)))):
         if not all(operation.is_foreseeable(later) for operation in program):
             break
         for operation in program:

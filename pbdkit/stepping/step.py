@@ -192,7 +192,7 @@ class Entries(NamedTuple):
     place
         Flat places.
     values
-        Arrays by name whose last axis is that of the list.
+        Arrays by name, with the list along the last axis.
     """
 
     place: Indices

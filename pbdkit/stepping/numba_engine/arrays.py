@@ -47,7 +47,7 @@ def constant_arrays(plan: Plan) -> Arrays:
         "kind": scene.raster.kind,
         "first": np.array(scene.raster.first, np.int64),
         "at": scene.raster.cell.basis,
-        "counts": np.array([len(own) for own in slots]),
+        "counts": np.array([len(each) for each in slots]),
         **changing_arrays(plan),
         **{name: v.reshape(len(slots), width, *v.shape[1:]) for name, v in by_slot.items()},
         **_stacked([_of_plane(plan, plane) for plane in scene.neighbourhood.planes], real),
@@ -149,7 +149,9 @@ def rule_arrays(plan: Plan) -> Arrays:
     """Return the parameters of rules and solver."""
     solver = plan.scene.experiment.stepping
     # One more, so that no array is empty.
-    rules = {f"rule{n}": [*own.scene.constants.shared, 0.0] for n, own in enumerate(plan.levels)}
+    rules = {
+        f"rule{n}": [*level.scene.constants.shared, 0.0] for n, level in enumerate(plan.levels)
+    }
     numbers = {"solver": [solver.relaxation, solver.memory], **rules}
     return {name: np.array(values, solver.precision) for name, values in numbers.items()}
 
@@ -177,7 +179,10 @@ def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
         "bonds_away": home * math.prod(shape[1:]) + (0 if is_home else away),
         "cells_away": [kind * math.prod(shape) + step for kind, step in cells],
         **{f"more{m}": by_slot[slot] for m, by_slot in enumerate(extra)},
-        **{f"weights{n}": own.scene.constants.weights[slot] for n, own in enumerate(plan.levels)},
+        **{
+            f"weights{n}": level.scene.constants.weights[slot]
+            for n, level in enumerate(plan.levels)
+        },
     }
 
 

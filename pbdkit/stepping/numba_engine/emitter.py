@@ -49,7 +49,7 @@ def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, lis
         operation.emit(writer)
     writer.end()
     run.add(1, *(["moment += 1"] if pieces else []))
-    return write_module(plan, [*functions, *passes.others.values(), *pieces], run)
+    return write_module(plan, [*functions, *passes.functions.values(), *pieces], run)
 
 
 def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tuple[str, list[str]]:

@@ -298,7 +298,7 @@ class Passes:
 
     judge: Function | None
     sweeps: Sequence[Function]
-    others: dict[str, Function] = field(default_factory=dict)
+    functions: dict[str, Function] = field(default_factory=dict)
 
 
 class PlanWriter(KernelWriter):
@@ -309,11 +309,11 @@ class PlanWriter(KernelWriter):
 
     def rows(self, name: str, write: Callable[[Function], None]) -> Function:
         """Return a function of rows that belongs to an operation."""
-        if name not in self.passes.others:
+        if name not in self.passes.functions:
             function = Function(self.plan.shared, name, "first_row", "last_row", "moment")
             write(function)
-            self.passes.others[name] = function
-        return self.passes.others[name]
+            self.passes.functions[name] = function
+        return self.passes.functions[name]
 
     def each(self, pattern: str, axes: str = "") -> Lines:
         """Return the pattern for each axis, or some."""

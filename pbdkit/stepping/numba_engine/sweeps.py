@@ -618,8 +618,8 @@ class Words(NamedTuple):
     for their numbers the remembered numbers of the bond, and its limits; and the step at which it
     broke."""
 
-    there: str
-    shown: Sequence[str]
+    pattern: str
+    numbers: Sequence[str]
     shares: Sequence[str]
     bond: str
     limit: str
@@ -739,10 +739,10 @@ def _slot_lines(
         weights["left"], weights["right"] = words.shares
     r = plan.literal(slot.rest)
     return [
-        difference(plan, level, words.there),
+        difference(plan, level, words.pattern),
         *bond_lines(plan, k, r, c, f"breaks({arguments}, {c}, q)", words.since),
         *([damage.beside(slot)] if damage else []),
-        contributions(plan, level, r, listed(weights.values()), words.shown, damage is not None),
+        contributions(plan, level, r, listed(weights.values()), words.numbers, damage is not None),
         *(
             f"t{n} = {f't{n} + ' if k else ''}{plan.rounded(f'c{n}')}"
             for n in range(len(level.totals))
