@@ -247,7 +247,7 @@ class Contact:
         return [block for block in blocks if block]
 
     def _near(self, block: Block, u: Floats, box: Floats) -> Block | None:
-        """Return the part of a block with particles that may lie in the box; u are displacements."""
+        """Return the part of a block with particles that may lie in the box; u are planes."""
         raster = self._scene.raster
         low, high = np.array([[np.fmin.reduce(p, axis=None) for p in u],
                               [np.fmax.reduce(p, axis=None) for p in u]])  # fmt: skip

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from pbdkit.array_types import Floats, Indices
+from pbdkit.plugin import Component
 from pbdkit.plugin.component import as_vector
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.vector import vector
@@ -55,6 +56,10 @@ class OperateOnParticles(Operation):
     def functions(self) -> dict[str, Callable[..., Any]]:
         """Return the `displacement` of the component."""
         return {f"displacement{self._number}": self._operated.operation.displacement}
+
+    def component(self) -> Component:
+        """Return the operation of the plugin."""
+        return self._operated.operation
 
     def numbers(self) -> dict[str, tuple[str, ...]]:
         """Return the names of its parameters."""

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 
 from pbdkit.array_types import Array, Floats, Indices
+from pbdkit.plugin import Component
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter, Lines
 from pbdkit.stepping.state import State
@@ -246,6 +247,11 @@ class Operation(ABC):
     def functions(self) -> dict[str, Callable[..., Any]]:
         """Return by name the elementwise functions that its lines call."""
         return {}
+
+    def component(self) -> Component | None:
+        """Return the component to which these functions belong; None if it is the rule or the
+        fracture model, or if they are built in."""
+        return None
 
     def numbers(self) -> dict[str, tuple[str, ...]]:
         """Return by name the named tuples that its lines create, with their fields."""

@@ -123,7 +123,7 @@ def threads() -> Iterator[Goal]:
 
 def reach() -> Iterator[Goal]:
     reached, everything = Afresh(pulled(1000), 200), Afresh(pulled(1000), 200)
-    everything.engine._reach = Everywhere(everything.engine._reach)
+    everything.engine._extent = Everywhere(everything.engine._extent)
     everything.engine._arrays["sizes"][0] = 1  # one step a pass, as what has been reached
     found = ratio(everything, reached, 7)
     assert (reached.state.u == everything.state.u).all()

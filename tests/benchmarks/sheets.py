@@ -204,16 +204,16 @@ class Sharing:
 
 
 class Everywhere:
-    """Stands in for the compiled engine's reach: everything counts as reached from the start."""
+    """Replaces the extent of motion of the compiled engine: all has been reached from the start."""
 
-    def __init__(self, reach: Any):
-        self._everything = reach._everything
+    def __init__(self, extent: Any):
+        self._whole = extent._whole
         self.begin()
 
     def begin(self, *state: Any) -> None:
-        self.box, self.growth = self._everything.copy(), np.zeros_like(self._everything)
+        self.box, self.growth = self._whole.copy(), np.zeros_like(self._whole)
 
-    def before(self, led: Any, load: Any, count: int) -> int:
+    def take_in_call(self, call: Any, count: int) -> int:
         return count
 
-    forget = after = begin
+    take_in_moves = begin

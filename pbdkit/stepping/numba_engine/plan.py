@@ -455,9 +455,10 @@ def _culprit(levels: Sequence[Level], error: BaseException) -> Component:
     """Return the component whose function is named in an error of the compiler, else the rule."""
     functions, text = functions_of(levels).items(), str(error)
     named = [name for name, of in functions if f"function {of.__qualname__} " in text]
-    for n, operated in enumerate(levels[-1].scene.operations):
-        if f"displacement{n}" in named:
-            return operated.operation
+    for operation in program_of(levels[-1].scene):
+        component = operation.component()
+        if component and operation.functions().keys() & set(named):
+            return component
     if any(not name[-1].isdigit() for name in named):
         return levels[-1].scene.experiment.fracture
     culprit = next((level for level in levels if f"apply{level.number}" in named), levels[-1])
