@@ -25,24 +25,8 @@ from pbdkit.lattice.raster import RowRange, Stretch
 from pbdkit.linear.stencil import Bound, wave_bound
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.solver import Equilibrium, Solver, Stepping
+from pbdkit.mpi import driver, partition
 from pbdkit.mpi.communicator import MPICommunicator
-from pbdkit.mpi.driver import (
-    DistributedEquilibriumDriver,
-    DistributedSteppingDriver,
-    Division,
-    deep_halo,
-    deep_subdomains,
-    whole_of,
-)
-from pbdkit.mpi.partition import (
-    Share,
-    Subdomain,
-    bounds_of,
-    count_rows,
-    joined,
-    subdomains,
-    widest_halo,
-)
 from pbdkit.plugin import AppliesTwice, Cell, Diagnostic, FollowerRule
 from pbdkit.plugin.discovery import blaming
 from pbdkit.progress import Watch
@@ -59,13 +43,13 @@ class PartitionScheme(NamedTuple):
     returns an upper bound of the halo, from the rows that a step and neighbours reach, the least
     rows of a part and the number of parts."""
 
-    subdomains: Callable[[Scene, int], list[Subdomain]]
+    subdomains: Callable[[Scene, int], list[partition.Subdomain]]
     widest: Callable[[int, int, int, int], int]
 
 
 CUTS: dict[type[Solver], PartitionScheme] = {
-    Stepping: PartitionScheme(subdomains, widest_halo),
-    Equilibrium: PartitionScheme(deep_subdomains, deep_halo),
+    Stepping: PartitionScheme(partition.subdomains, partition.widest_halo),
+    Equilibrium: PartitionScheme(driver.deep_subdomains, driver.deep_halo),
 }
 
 
@@ -142,9 +126,9 @@ def _is_too_large(experiment: Experiment) -> bool:
 
 def _built(experiment: Experiment, ranks: Communicator) -> Scene:
     ground = Ground(experiment, ranks)
-    if not (counts := count_rows(ground, ranks)):
+    if not (counts := partition.count_rows(ground, ranks)):
         raise ground.nothing()
-    bounds = bounds_of(counts.rows, ranks.size)
+    bounds = partition.bounds_of(counts.rows, ranks.size)
     begin, end = bounds[ranks.rank : ranks.rank + 2]
     search, reach = _search(ground), ground.neighbourhood.reach_in_cells[0]
     each, smallest = _levels(experiment.rule) * (reach + search), int(np.diff(bounds).min())
@@ -188,7 +172,7 @@ class DistributedRecorder(Recorder):
     """Recorder of a part. Diagnostics that are not `local` measure the whole state, which the first
     process gathers."""
 
-    def __init__(self, division: Division, sink: PartSink) -> None:
+    def __init__(self, division: driver.Division, sink: PartSink) -> None:
         super().__init__(division.scene, sink)
         self._joining = sink
         self._division, self._ranks = division, division.ranks
@@ -254,7 +238,7 @@ def _is_local(diagnostic: Diagnostic) -> bool:
 class PartSink(KeepingSink):
     """Sink that joins the parts of all processes for that of the first one."""
 
-    def __init__(self, division: Division, inner: KeepingSink) -> None:
+    def __init__(self, division: driver.Division, inner: KeepingSink) -> None:
         self._ranks = division.ranks
         self._inner = inner if self._ranks.is_root else None
         self._own = {"particle": division.part.rows}
@@ -299,7 +283,7 @@ class PartSink(KeepingSink):
             part = np.asarray(values[name])[(*(slice(None),) * axis, self._own[dim])]
             if name == "bond":  # a part counts its own
                 part += sum(self._lengths[name][: self._ranks.rank]) + 1 - part[:1]
-            whole[name] = joined(self._ranks, part, axis, self._lengths[dim])
+            whole[name] = partition.joined(self._ranks, part, axis, self._lengths[dim])
         self._first(lambda inner: inner.put(whole), whole)
 
     def due(self) -> bool:
@@ -342,13 +326,13 @@ class PartSink(KeepingSink):
                             array.drain()
             else:
                 for share in (joining or {}).values():
-                    if isinstance(share, Share):
+                    if isinstance(share, partition.Share):
                         share.send(self._ranks)
 
 
-DRIVERS: dict[type[Solver], Callable[[Division, Scene, Watch], Driver]] = {
-    Stepping: DistributedSteppingDriver,
-    Equilibrium: DistributedEquilibriumDriver,
+DRIVERS: dict[type[Solver], Callable[[driver.Division, Scene, Watch], Driver]] = {
+    Stepping: driver.DistributedSteppingDriver,
+    Equilibrium: driver.DistributedEquilibriumDriver,
 }
 """Driver of each solver on a rank."""
 
@@ -362,7 +346,7 @@ class DistributedSimulation(Simulation):
         scene, kind = _tuned(ranks, scene), type(scene.experiment.solver)
         with ranks.raise_together():
             parts = CUTS[kind].subdomains(scene, ranks.size)
-        self.division = Division(ranks, scene, parts)
+        self.division = driver.Division(ranks, scene, parts)
         self.scene, self.outcome, self.processes = self.division.scene, None, ranks.size
         self.driver = DRIVERS[kind](self.division, scene, watch)
         self.driver.automatic = automatic
@@ -404,7 +388,7 @@ def _tuned(ranks: MPICommunicator, scene: Scene) -> Scene:
         return scene
     solver = None
     with ranks.raise_together():
-        if whole := whole_of(ranks, scene):
+        if whole := driver.whole_of(ranks, scene):
             solver = tuned(whole).experiment.stepping
     return with_solver(scene, ranks.bcast(solver))
 

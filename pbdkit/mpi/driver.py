@@ -19,17 +19,8 @@ from pbdkit.equilibrium.load_stepping import Way
 from pbdkit.equilibrium.system import Rows, Strip, StuckError
 from pbdkit.errors import NotSharedError
 from pbdkit.model.solver import Settle
+from pbdkit.mpi import partition
 from pbdkit.mpi.communicator import MPICommunicator
-from pbdkit.mpi.partition import (
-    MOST_STEPS,
-    Halo,
-    Subdomain,
-    farthest_apart,
-    part_of,
-    part_of_state,
-    reaches,
-    subdomains,
-)
 from pbdkit.plugin import Draws
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.memory_estimate import asks_for_grids
@@ -48,7 +39,7 @@ class DividedStepper(Engine):
     motion, which starts from an updated state."""
 
     def __init__(
-        self, ranks: MPICommunicator, scene: Scene, engine: Engine, halo: Halo, steps: int
+        self, ranks: MPICommunicator, scene: Scene, engine: Engine, halo: partition.Halo, steps: int
     ) -> None:
         self.name, self.threads = engine.name, engine.threads
         self._ranks, self._engine, self._program = ranks, engine, program_of(scene)
@@ -85,11 +76,13 @@ class Division:
     The first process stores the `whole` scene if diagnostics or the steady state need it.
     """
 
-    def __init__(self, ranks: MPICommunicator, scene: Scene, parts: list[Subdomain]) -> None:
+    def __init__(
+        self, ranks: MPICommunicator, scene: Scene, parts: list[partition.Subdomain]
+    ) -> None:
         self.ranks, self.count, self.subdomains = ranks, scene.raster.total, parts
-        self.part = part_of(scene, self.subdomains[ranks.rank])
+        self.part = partition.part_of(scene, self.subdomains[ranks.rank])
         self.scene, experiment = self.part.scene, scene.experiment
-        self.halo = Halo(ranks, self.subdomains, self.part)
+        self.halo = partition.Halo(ranks, self.subdomains, self.part)
         self.whole: Scene | None = None
         measured = any(not each.local for each in experiment.diagnostics)
         with ranks.raise_together():
@@ -122,7 +115,9 @@ class Division:
             return self._state(None)
         axes = self.scene.axes
         parts = zip(self.subdomains, members, strict=True)
-        return self._state(part_of_state(whole, axes, subdomain, rows) for subdomain, rows in parts)
+        return self._state(
+            partition.part_of_state(whole, axes, subdomain, rows) for subdomain, rows in parts
+        )
 
     def _state(self, each: Iterable[State] | None) -> State:
         state: State = self.ranks.scatter(each)
@@ -259,7 +254,7 @@ by 4 on the way down, and by 2 on the way up."""
 class DistributedRows(Rows):
     """Rows of one process on a shared grid."""
 
-    def __init__(self, ranks: MPICommunicator, halo: Halo, strip: Strip) -> None:
+    def __init__(self, ranks: MPICommunicator, halo: partition.Halo, strip: Strip) -> None:
         super().__init__(ranks)
         self._halo, self.strip = halo, strip
 
@@ -283,21 +278,21 @@ class DistributedRows(Rows):
         return numbers.reshape(shape)
 
 
-def deep_subdomains(scene: Scene, parts: int) -> list[Subdomain]:
+def deep_subdomains(scene: Scene, parts: int) -> list[partition.Subdomain]:
     """Return parts with halos for a cycle of multigrid, and arrays that begin where all divided
     grids have a row.
 
     Raises ExperimentError if rows are too few.
     """
     spread = 2 ** _depth(parts)
-    each, edge = reaches(scene)
+    each, edge = partition.reaches(scene)
     halo, rows = _margin(scene) + A_CYCLE * spread, len(scene.raster.row_counts)
     deep = []
-    for part in subdomains(scene, parts):
+    for part in partition.subdomains(scene, parts):
         low = max(0, part.begin - halo) // spread * spread
         high = min(rows, part.end + halo)
-        steps = max(1, min(MOST_STEPS, (halo - edge) // max(1, each)))
-        deep.append(Subdomain(part.begin, part.end, low, high, edge, steps))
+        steps = max(1, min(partition.MOST_STEPS, (halo - edge) // max(1, each)))
+        deep.append(partition.Subdomain(part.begin, part.end, low, high, edge, steps))
     return deep
 
 
@@ -306,7 +301,7 @@ def deep_halo(each: int, edge: int, least: int, parts: int) -> int:
     return 3 * edge + each + (A_CYCLE + 1) * int(2 ** _depth(parts))
 
 
-def strip_of(scene: Scene, own: Subdomain, parts: int) -> Strip:
+def strip_of(scene: Scene, own: partition.Subdomain, parts: int) -> Strip:
     """Return the strip of a part on the grid of a scene."""
     count, margin = scene.raster.whole_shape[1], _margin(scene)
     first = own.low + margin if own.low else 0
@@ -322,7 +317,7 @@ def _depth(parts: int) -> int:
 def _margin(scene: Scene) -> int:
     """Return the number of outermost rows of a part that are empty, that do not move, or whose
     particles have these or their frame points as neighbours."""
-    return 3 * reach_of(scene, 0).reach + farthest_apart(scene)
+    return 3 * reach_of(scene, 0).reach + partition.farthest_apart(scene)
 
 
 STUCK = "the iteration that several processes share gets nowhere; run it in one process"

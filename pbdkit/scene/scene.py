@@ -49,16 +49,7 @@ from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.schedule import Course
-from pbdkit.scene.checks import (
-    angles_in_radians,
-    carried_by_leaders,
-    far_from_the_body,
-    lattice_warnings,
-    locking,
-    narrow_voids,
-    never_near,
-    without_effect,
-)
+from pbdkit.scene import checks
 from pbdkit.scene.constants import SceneConstants, check_diagnostics, scene_constants, with_fields
 from pbdkit.scene.frame import Frame, build_frame
 from pbdkit.scene.leader_groups import Leading, build_leading, check_directions
@@ -381,11 +372,17 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     neighbourhood, layers = ground.neighbourhood, ground.layers
     raster, cells = ground.raster()
     box = raster.body_box()
-    warnings = [*ground.warnings, *lattice_warnings(experiment, neighbourhood, raster, layers)]
+    warnings = [
+        *ground.warnings,
+        *checks.lattice_warnings(experiment, neighbourhood, raster, layers),
+    ]
     warnings += check_diagnostics(experiment, raster, neighbourhood)
-    warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
-    warnings += [*angles_in_radians(experiment), *locking(experiment, raster, box)]
-    warnings += narrow_voids(experiment.lattice, ground.left_out)
+    warnings += [
+        *checks.without_effect(experiment, raster),
+        *checks.far_from_the_body(experiment, raster),
+    ]
+    warnings += [*checks.angles_in_radians(experiment), *checks.locking(experiment, raster, box)]
+    warnings += checks.narrow_voids(experiment.lattice, ground.left_out)
     warnings += missing_segments(raster, neighbourhood, _segments(experiment))
     setting = setting_of(raster, neighbourhood, box)
     constants = scene_constants(experiment, setting)
@@ -403,9 +400,9 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     loads = build_loads(raster, neighbourhood.tiling, cells, experiment)
     barriers = build_obstacles(raster, experiment)
     warnings += collisions(raster, leading, barriers, experiment.steps)
-    warnings += carried_by_leaders(raster, leading, loads, experiment.steps)
+    warnings += checks.carried_by_leaders(raster, leading, loads, experiment.steps)
     if not loads:
-        warnings += never_near(raster, barriers, leading, experiment.steps)
+        warnings += checks.never_near(raster, barriers, leading, experiment.steps)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     lower, upper = box
     facts = loads, setting, (lower + upper) / 2

@@ -32,6 +32,7 @@ from pbdkit.plugin import Slot
 from pbdkit.plugin.discovery import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, Lines
+from pbdkit.stepping.numba_engine import sweeps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
     bits_for,
@@ -53,19 +54,6 @@ from pbdkit.stepping.numba_engine.plan import (
     functions_of,
     levels_of,
 )
-from pbdkit.stepping.numba_engine.sweeps import (
-    GENERAL,
-    PLAIN,
-    WITH_CELLS,
-    Words,
-    judging,
-    marking_lines,
-    parameters,
-    torn_marks,
-    write_events,
-    write_one,
-    write_whole,
-)
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.program import foresee, prepare, program_of
 from pbdkit.stepping.state import State, unmoved_state
@@ -85,8 +73,8 @@ def find_groups(plan: Plan) -> tuple[NDArray[Any], Whole]:
     for s, block in enumerate(blocks):
         if block:
             kinds = kinds_of(plan.scene, block, plan.long)
-            block.of(groups)[kinds == GENERAL] = -1 - s
-            for kind in (PLAIN, WITH_CELLS):
+            block.of(groups)[kinds == sweeps.GENERAL] = -1 - s
+            for kind in (sweeps.PLAIN, sweeps.WITH_CELLS):
                 if (kinds == kind).any():
                     whole.append((s, kind))
                     block.of(groups)[kinds == kind] = len(whole)
@@ -108,7 +96,7 @@ def breakable_bonds(plan: Plan) -> NDArray[np.uint8]:
 def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None) -> Function:
     """Return the function by which a thread moves its particles, one after the other."""
     out = Function(plan.shared, f"sweep{level.number}", *THREAD)
-    out.add(0, *parameters(plan, level), "base = 0", *_aliases(plan, level))
+    out.add(0, *sweeps.parameters(plan, level), "base = 0", *_aliases(plan, level))
     for s, kind in whole:
         for k, slot in enumerate(plan.scene.neighbourhood.slots[s]):
             out.add(0, *_steps(plan, kind, s, k, slot))
@@ -123,11 +111,11 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
         slots = plan.scene.neighbourhood.slots[s]
         words = [_words(plan, level, kind, s, k) for k in range(len(slots))]
         out.add(0, f"if group == {n}:", "    changed = 0")
-        write_whole(out, plan, level, s, words, "flat_lost[j]")
+        sweeps.write_whole(out, plan, level, s, words, "flat_lost[j]")
         if events:
             out.add(1, "if changed:", "    " + events.call(str(s), "j", "1"))
     out.add(0, f"if group > {len(whole)}:", f"    s, changed = group - {len(whole) + 1}, 0")
-    write_one(out, plan, level)
+    sweeps.write_one(out, plan, level)
     if events:
         out.add(1, "if changed:", "    " + events.call("s", "j", "1"))
     return out
@@ -136,7 +124,7 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
 def write_bonds(plan: Plan) -> Function:
     """Return the function by which a thread renews its bonds and breaks them, plane after plane."""
     out = Function(plan.shared, "judge_bonds", *THREAD)
-    out.add(0, parameters(plan, plan.levels[-1])[-1])
+    out.add(0, sweeps.parameters(plan, plan.levels[-1])[-1])
     out.add(0, "cells = flat_broken.size // len(ends)", "for n in range(len(ends)):")
     out.add(1, f"r = {plan.vector('end_rests[n, #]')}")
     rows = {"since": "broken", "ways": "lengths", "may": "breakable"}
@@ -145,8 +133,8 @@ def write_bonds(plan: Plan) -> Function:
     out.add(1, *(f"{name} = flat_{of}[n * cells:(n + 1) * cells]" for name, of in rows.items()))
     out.add(1, f"for j in {plan.over('cells')}:", "    if may[j] and since[j] < 0:")
     out.add(3, "here = ends[n, 0] * cells + j", "there = here + end_steps[n]")
-    out.add(3, *judging(plan, "flat_u_@[there] - flat_u_@[here]", "here").write)
-    out.add(3, *marking_lines(plan, "n * cells + j", "here"))
+    out.add(3, *sweeps.judging(plan, "flat_u_@[there] - flat_u_@[here]", "here").write)
+    out.add(3, *sweeps.marking_lines(plan, "n * cells + j", "here"))
     return out
 
 
@@ -178,15 +166,17 @@ def _steps(plan: Plan, kind: int, s: int, k: int, slot: Slot) -> list[str]:
     lines = [f"w{s}_{k} = away[{s}, {k}]"]
     if plan.bonds or plan.limits or plan.bonds_first:
         lines.append(f"v{s}_{k} = bonds_away[{s}, {k}]")
-    if kind == WITH_CELLS:
+    if kind == sweeps.WITH_CELLS:
         lines += [f"q{s}_{k}_{side} = cells_away[{s}, {k}, {side}]" for side in (0, 1)]
     return lines
 
 
-def _words(plan: Plan, level: Level, kind: int, s: int, k: int) -> Words:
+def _words(plan: Plan, level: Level, kind: int, s: int, k: int) -> sweeps.Words:
     place, home = f"j + w{s}_{k}", f"j + v{s}_{k}"
-    shares = [f"flat_share[j + q{s}_{k}_{side}]" for side in (0, 1)] if kind == WITH_CELLS else []
-    return Words(
+    shares = (
+        [f"flat_share[j + q{s}_{k}_{side}]" for side in (0, 1)] if kind == sweeps.WITH_CELLS else []
+    )
+    return sweeps.Words(
         f"flat_{level.source}_@[{place}]",
         [f"flat_{array}[{place}]" for array in plan.shown],
         shares,
@@ -293,17 +283,17 @@ def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]
     """Return the source of a module with ``run(step, count, ...)``, which makes `count` steps, and
     the names of the arrays that follow these two. A block that is `alone` synchronises its own
     threads only, which takes much less time."""
-    events = write_events(plan) if plan.judged else None
+    events = sweeps.write_events(plan) if plan.judged else None
     judge = write_bonds(plan) if plan.bonds_first else None
-    sweeps = [write_sweep(plan, level, whole, events) for level in plan.levels]
-    functions = [function for function in (events, judge, *sweeps) if function]
+    moves = [write_sweep(plan, level, whole, events) for level in plan.levels]
+    functions = [function for function in (events, judge, *moves) if function]
     run = Function(plan.shared, "run", "step", "count")
     run.add(0, "me, threads = cuda.grid(1), cuda.gridsize(1)")
     if not alone:
         run.add(0, "everyone = cuda.cg.this_grid()")
     run.add(0, "for moment in range(count):", "    step += 1")
     wait = "cuda.syncthreads()" if alone else "everyone.sync()"
-    writer = ThreadWriter(plan, run, Passes(judge, sweeps), wait)
+    writer = ThreadWriter(plan, run, Passes(judge, moves), wait)
     writer.begin()
     for operation in program_of(plan.scene):
         operation.emit(writer)
@@ -533,7 +523,7 @@ class GpuStepper(Engine):
         if self._plan.judged:
             planes |= flattened({"lost": lost_bits(self._scene, state)})
         if self._plan.tears:
-            planes |= flattened({"torn": torn_marks(self._scene, state)})
+            planes |= flattened({"torn": sweeps.torn_marks(self._scene, state)})
         self._send(planes)
 
     def _fetch(self, state: State) -> None:

@@ -19,15 +19,8 @@ from pbdkit.scene.frame import Frame
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses
 from pbdkit.stepping.frame_following import FollowFrame
+from pbdkit.stepping.numba_engine import sweeps
 from pbdkit.stepping.numba_engine.plan import Plan, banded, frame_order
-from pbdkit.stepping.numba_engine.sweeps import (
-    GENERAL,
-    NOBODY,
-    PLAIN,
-    WITH_CELLS,
-    stress_arrays,
-    tearing_arrays,
-)
 from pbdkit.stepping.program import Program, program_of
 from pbdkit.stepping.rule_evaluation import presence
 from pbdkit.stepping.state import State
@@ -59,9 +52,9 @@ def constant_arrays(plan: Plan) -> Arrays:
     for name, planes in (("field", constants.by_particle), ("limit", constants.by_bond)):
         arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
     if scene.tears:
-        arrays |= tearing_arrays(scene)
+        arrays |= sweeps.tearing_arrays(scene)
     if plan.softens_cells:
-        arrays |= stress_arrays(scene, real)
+        arrays |= sweeps.stress_arrays(scene, real)
     for operation in program_of(scene):
         for name, values in operation.constants().items():
             arrays[name] = np.array([*values, 0.0], real)  # one more, so that none is empty
@@ -275,31 +268,34 @@ def kinds_of(scene: Scene, block: Block, all_general: bool) -> Ints:
     """Return the kind of row for each place of a block."""
     raster, slots = scene.raster, scene.neighbourhood.slots[block.sublattice]
     follows = block.of(raster.kind) == FOLLOWER
-    kinds = np.where(follows, GENERAL, NOBODY)
+    kinds = np.where(follows, sweeps.GENERAL, sweeps.NOBODY)
     fits = follows & (not all_general)
     for present in presence(raster, block, slots):
         fits &= True if present is None else present
     if scene.has_fracture and not scene.experiment.fracture.breaks_frame_bonds():
         for slot in slots:
             fits &= block.seen_through(slot).of(raster.kind) == FOLLOWER
-    kinds[fits] = PLAIN
+    kinds[fits] = sweeps.PLAIN
     if scene.cells:
         precision = scene.experiment.stepping.precision
         for slot in slots:
             for share in scene.cells.beside(slot, block, precision):
-                kinds[fits & (share != 1.0) & (kinds == PLAIN)] = WITH_CELLS
+                kinds[fits & (share != 1.0) & (kinds == sweeps.PLAIN)] = sweeps.WITH_CELLS
             for mixed in scene.cells.mixed:
                 for share in scene.cells.beside(slot, block, precision, mixed):
-                    kinds[fits & (share != 0.0)] = GENERAL
+                    kinds[fits & (share != 0.0)] = sweeps.GENERAL
     return kinds
 
 
 def _lines_of(kinds: Ints) -> Ints:
     """Return the stretches of one kind, in each row along the last axis."""
     padding = [*[(0, 0)] * (kinds.ndim - 1), (0, 1)]
-    closed = np.pad(kinds, padding, constant_values=NOBODY)
+    closed = np.pad(kinds, padding, constant_values=sweeps.NOBODY)
     flat = closed.ravel()
-    for kinds_of_short, neighbour in (([PLAIN], WITH_CELLS), ([PLAIN, WITH_CELLS], GENERAL)):
+    for kinds_of_short, neighbour in (
+        ([sweeps.PLAIN], sweeps.WITH_CELLS),
+        ([sweeps.PLAIN, sweeps.WITH_CELLS], sweeps.GENERAL),
+    ):
         begin, end, kind = _stretches(flat)
         # The last is of nobody, so that no end touches the other.
         touches = (np.roll(kind, 1) == neighbour) | (np.roll(kind, -1) == neighbour)
@@ -308,7 +304,7 @@ def _lines_of(kinds: Ints) -> Ints:
     begin, end, kind = _stretches(flat)
     *lead, first = np.unravel_index(begin, closed.shape)
     lines = np.stack([*lead, first, first + end - begin, kind], axis=1)
-    return np.compress(kind != NOBODY, lines, axis=0).astype(np.int64)
+    return np.compress(kind != sweeps.NOBODY, lines, axis=0).astype(np.int64)
 
 
 def _stretches(flat: Ints) -> tuple[Ints, Ints, Ints]:

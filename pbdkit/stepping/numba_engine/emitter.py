@@ -11,15 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 
 from pbdkit.stepping.kernel import Function, Lines
+from pbdkit.stepping.numba_engine import sweeps
 from pbdkit.stepping.numba_engine.blocking import write_deep_passes, write_piece
 from pbdkit.stepping.numba_engine.plan import Level, Passes, Plan, PlanWriter, goes_deep
-from pbdkit.stepping.numba_engine.sweeps import (
-    GENERAL,
-    write_bond_pass,
-    write_events,
-    write_general,
-    write_row,
-)
 from pbdkit.stepping.program import Program, program_of
 
 Groups = Sequence[tuple[int, int]]
@@ -29,14 +23,14 @@ Groups = Sequence[tuple[int, int]]
 def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, list[str]]:
     """Return the source of a module with ``run(arrays, step, count, chunks, band)``, which makes
     `count` steps, and the names of the arrays."""
-    events = write_events(plan) if plan.judged else None
-    judge = write_bond_pass(plan) if plan.bonds_first else None
+    events = sweeps.write_events(plan) if plan.judged else None
+    judge = sweeps.write_bond_pass(plan) if plan.bonds_first else None
     functions = [function for function in (events, judge) if function]
-    sweeps = list[Function]()
+    moves = list[Function]()
     for level in plan.levels:
         functions += _sweep(plan, level, groups, events)
-        sweeps.append(functions[-1])
-    passes = Passes(judge, sweeps)
+        moves.append(functions[-1])
+    passes = Passes(judge, moves)
     run = Function(plan.shared, "run", "arrays", "step", "count", "chunks", "band")
     writer = LatticeWriter(plan, run, passes)
     pieces = write_piece(plan, program, passes) if goes_deep(plan) else []
@@ -89,14 +83,14 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
     """Return the functions for the rows that occur, and last the one that moves the particles of
     rows with them."""
     out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
-    general, functions = write_general(plan, level, events), list[Function]()
+    general, functions = sweeps.write_general(plan, level, events), list[Function]()
     for n, (s, kind) in enumerate(groups):
         runs = [f"starts[{n}, first_row, 0]", f"starts[{n}, last_row, 1]", "first_row", "last_row"]
-        if kind == GENERAL:
+        if kind == sweeps.GENERAL:
             functions.append(general)
             runs.insert(0, str(s))
         else:
-            functions += write_row(plan, level, s, kind, events)
+            functions += sweeps.write_row(plan, level, s, kind, events)
         out.add(0, functions[-1].call(*runs))
     return [*dict.fromkeys(functions), out]
 

@@ -29,6 +29,7 @@ from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import Followers, GatheringFollowers, MoveFollowers
 from pbdkit.stepping.kernel import Function
+from pbdkit.stepping.numba_engine import sweeps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
     bits_for,
@@ -49,14 +50,6 @@ from pbdkit.stepping.numba_engine.plan import (
     levels_of,
     load_blamed,
     pass_arrays,
-)
-from pbdkit.stepping.numba_engine.sweeps import (
-    contributions,
-    difference,
-    parameters,
-    renew_torn_marks,
-    target_lines,
-    torn_marks,
 )
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.program import Program, foresee, prepare, program_of
@@ -105,19 +98,21 @@ def _write_kernel(plan: Plan) -> tuple[str, list[str]]:
     `first` to `last`, and the names of the arrays."""
     (level,) = plan.levels
     sweep = Function(plan.shared, "sweep", "first_body", "last_body")
-    sweep.add(0, *parameters(plan, level), *plan.each("o@ = flat_v_@"))
+    sweep.add(0, *sweeps.parameters(plan, level), *plan.each("o@ = flat_v_@"))
     sweep.add(0, *(f"a{n} = w{n} = flat_own{n}" for n in range(len(level.seen.own))))
     sweep.add(0, "for e in range(first_body, last_body):")
     sweep.add(1, "row = body[e]", "j = place[row]", f"u = {plan.vector('flat_u_@[j]')}")
     sweep.add(1, *(f"{t} = double(0.0)" for t in level.totals))
     sweep.add(1, "for n in range(first_pair[e], first_pair[e + 1]):")
-    sweep.add(2, "there = place[partner[n]]", difference(plan, level, "flat_u_@[there]"))
+    sweep.add(2, "there = place[partner[n]]", sweeps.difference(plan, level, "flat_u_@[there]"))
     partner_numbers = [f"flat_{array}[there]" for array in plan.shown]
     sweep.add(2, f"r = {plan.vector('rests[#, n]')}")
-    sweep.add(2, contributions(plan, level, "r", "", partner_numbers))
+    sweep.add(2, sweeps.contributions(plan, level, "r", "", partner_numbers))
     sweep.add(2, *(f"{t} = {t} + c{n}" for n, t in enumerate(level.totals)))
     sweep.add(1, "moves = first_pair[e + 1] > first_pair[e]")
-    sweep.add(1, *target_lines(plan, level, plan.each("local[#, row]"), level.totals, "moves"))
+    sweep.add(
+        1, *sweeps.target_lines(plan, level, plan.each("local[#, row]"), level.totals, "moves")
+    )
     run = Function(plan.shared, "run", "arrays", "first_body", "last_body", "chunks")
     write_pass(run, plan, 0, sweep, "first_body", "last_body")
     return write_module(plan, [sweep], run)
@@ -313,7 +308,7 @@ class CompiledStepper(Engine):
             if self._plan.judged:
                 renew_lost_bits(self._arrays["lost"], self._scene, state, rows)
             if self._plan.tears:
-                renew_torn_marks(self._arrays["torn"], self._scene, state, rows)
+                sweeps.renew_torn_marks(self._arrays["torn"], self._scene, state, rows)
             self._extent.take_in_rows(state, rows)
 
     def _begin(self, state: State) -> None:
@@ -321,7 +316,7 @@ class CompiledStepper(Engine):
         if self._plan.judged:
             self._arrays["lost"] = lost_bits(self._scene, state)
         if self._plan.tears:
-            self._arrays["torn"] = torn_marks(self._scene, state)
+            self._arrays["torn"] = sweeps.torn_marks(self._scene, state)
         self._extent.begin(state)
 
     def _some_steps(self, state: State, end: int) -> State:
