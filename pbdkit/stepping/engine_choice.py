@@ -61,7 +61,7 @@ class Choice:
 def choose(scene: Scene) -> Choice:
     """Return the engine that the experiment requests, or the fastest.
 
-    `auto` never selects the GPU, whose speed has not been measured. Raises ExperimentError if a
+    `auto` never selects the GPU: its speed has not been measured. Raises ExperimentError if a
     requested engine is not available.
     """
     solver = scene.experiment.stepping

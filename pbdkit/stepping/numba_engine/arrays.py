@@ -197,7 +197,7 @@ def bits_for(scene: Scene) -> np.dtype[Any]:
 
 
 def lost_bits(scene: Scene, state: State) -> Bits:
-    """Return for each particle an integer whose bit k is set if the bond along slot k is broken, at
+    """Return an integer for each particle, with bit k set if the bond along slot k is broken, at
     both ends."""
     lost = np.zeros(scene.raster.shape, bits_for(scene))
     renew_lost_bits(lost, scene, state, slice(0, lost.shape[1]))

@@ -452,7 +452,7 @@ def blamed(levels: Sequence[Level]) -> Iterator[None]:
 
 
 def _culprit(levels: Sequence[Level], error: BaseException) -> Component:
-    """Return the component whose function is named in an error of the compiler, else the rule."""
+    """Return the component of the function that an error of the compiler names, else the rule."""
     functions, text = functions_of(levels).items(), str(error)
     named = [name for name, of in functions if f"function {of.__qualname__} " in text]
     for operation in program_of(levels[-1].scene):

@@ -333,8 +333,8 @@ RUNS = ("first_run", "last_run", "first_row", "last_row")
 
 
 def parameters(plan: Plan, level: Level) -> list[str]:
-    """Return lines for p of the rule, and of the fracture model, whose numbers are literals: they
-    decide what is computed."""
+    """Return lines for p of the rule, and of the fracture model. Numbers of the latter are
+    literals: they decide what is computed."""
     rule = [] if level.fields else [_rule(level)]
     literal = listed(map(plan.number, plan.scene.constants.fracture))
     return [*rule, f"q = Fracture({literal})"] if plan.model else rule
