@@ -10,7 +10,7 @@ made before the halo is exchanged.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -378,7 +378,7 @@ class Halo:
             None if start is None else joined(self._ranks, start[:, ours], 1, counts)
             for start, ours, counts in zip(state.starts, self._part.ours, self._counts, strict=True)
         )
-        return _each(state, whole, starts)
+        return state.map(whole, starts)
 
     def gathered(self, state: State) -> State | None:
         """Return the state of the whole in the first process; None in the others."""
@@ -386,7 +386,7 @@ class Halo:
         if self._ranks.is_root:
             starts = (None if start is None else np.asarray(start) for start in shares.starts)
             # In the order in which the others send.
-            whole = _each(shares, np.asarray, ())
+            whole = shares.map(np.asarray, ())
             return replace(whole, starts=tuple(starts))
         every: list[Any] = [*shares.arrays(), *(s for s in shares.starts if s is not None)]
         for share in every:
@@ -404,24 +404,6 @@ def _touch(part: Subdomain, other: Subdomain) -> bool:
     return low < high
 
 
-def _each(state: State, function: Callable[[Array], Any], starts: tuple[Any, ...]) -> State:
-    """Return a state with the result of a function for each array."""
-
-    def of(array: Array | None) -> Any:
-        return None if array is None else function(array)
-
-    return replace(
-        state,
-        u=function(state.u),
-        previous=function(state.previous),
-        broken_step=of(state.broken_step),
-        broken_length=of(state.broken_length),
-        starts=starts,
-        bond_values=tuple(map(function, state.bond_values)),
-        particle_values=tuple(map(function, state.particle_values)),
-    )
-
-
 def part_of_state(
     whole: State, axes: int, subdomain: Subdomain, members: Sequence[Indices]
 ) -> State:
@@ -430,7 +412,7 @@ def part_of_state(
     starts_of_part = tuple(
         None if start is None else np.asarray(start)[:, rows] for start, rows in starts
     )
-    return _each(whole, lambda array: subdomain.cut(array, axes), starts_of_part)
+    return whole.map(lambda array: subdomain.cut(array, axes), starts_of_part)
 
 
 SITES_AT_ONCE = 2**22

@@ -5,8 +5,8 @@ checkpoint.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,17 @@ class State:
         """Return whether both can belong to one scene, by the types and shapes of their arrays."""
         layouts = [[(a.dtype, a.shape) for a in state.arrays()] for state in (self, other)]
         return layouts[0] == layouts[1] and len(self.starts) == len(other.starts)
+
+    def map(self, function: Callable[[Any], Any], starts: tuple[Any, ...]) -> State:
+        """Return a state with the result of a function for each array, and with these starts."""
+
+        def of(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(map(of, value))
+            return None if value is None else function(value)
+
+        names = [each.name for each in fields(self) if each.name not in ("step", "starts")]
+        return replace(self, starts=starts, **{name: of(getattr(self, name)) for name in names})
 
     def arrays(self) -> list[Array]:
         """Return the arrays that steps write."""
