@@ -231,17 +231,33 @@ class Moment(ABC):
 
     @abstractmethod
     def rows(self, numbers: tuple[int, ...]) -> NDArray[np.intp]:
-        """Return the rows of the particles with these numbers."""
+        """Return the rows of the particles with these numbers.
+
+        Parameters
+        ----------
+        numbers : tuple of int
+            Particle numbers, from 1.
+        """
 
     @abstractmethod
     def nearest(self, points: tuple[Pair, ...]) -> NDArray[np.intp]:
-        """Return the row of the body particle nearest to each point at rest, of several the lowest
-        number.
+        """Return the row of the body particle nearest to each point at rest.
+
+        Parameters
+        ----------
+        points : tuple of pair of float
+            Points in lattice units; of several particles the one with the lowest number is taken.
         """
 
     @abstractmethod
     def displacement(self, rows: NDArray[np.intp] | None = None) -> Floats:
-        """Return u = x - X of all particles or of some rows, (particle, axis)."""
+        """Return u = x - X, (particle, axis), in lattice units.
+
+        Parameters
+        ----------
+        rows : array of int, optional
+            Rows of particles; by default all.
+        """
 
     @abstractmethod
     def previous_displacement(self) -> Floats:
@@ -249,7 +265,13 @@ class Moment(ABC):
 
     @abstractmethod
     def reference(self, rows: NDArray[np.intp] | None = None) -> Floats:
-        """Return X of all particles or of some rows, (particle, axis)."""
+        """Return X, (particle, axis), in lattice units.
+
+        Parameters
+        ----------
+        rows : array of int, optional
+            Rows of particles; by default all.
+        """
 
     @abstractmethod
     def sum_over_neighbours(
@@ -301,6 +323,11 @@ class Moment(ABC):
         """Return a remembered number of the fracture model, (bond,), or of the rule, (particle,).
 
         Bonds are in the order of the dataset; frame points have the initial value.
+
+        Parameters
+        ----------
+        name : str
+            Name of the number.
         """
 
 
@@ -367,4 +394,14 @@ class Diagnostic(Component):
 
         Values must be finite, except NaN at frame points in variables of the body, and at particles
         that are not `inside` in variables that are not defined outside the outline.
+
+        Parameters
+        ----------
+        now : Moment
+            State of the run.
+
+        Returns
+        -------
+        tuple of array
+            Values in the order of `variables`.
         """

@@ -73,7 +73,13 @@ class FrameSites(ABC):
 
     @abstractmethod
     def body_at(self, site: NDArray[np.int32]) -> Indices:
-        """Return the row of the body particle at each site, (entry, 2); -1 if there is none."""
+        """Return the row of the body particle at each site; -1 if there is none.
+
+        Parameters
+        ----------
+        site : (entry, 2)
+            Site indices.
+        """
 
 
 class FramePolicy(Component):
@@ -114,8 +120,17 @@ class FramePolicy(Component):
 
     @abstractmethod
     def follow(self, frame: FrameSites) -> FrameMap:
-        """Return the map from displacements of the body to those of the frame, with every frame
-        point.
+        """Return the map from displacements of the body to those of the frame.
+
+        Parameters
+        ----------
+        frame : FrameSites
+            Frame points and body particles.
+
+        Returns
+        -------
+        FrameMap
+            Map with an entry for every frame point.
         """
 
 

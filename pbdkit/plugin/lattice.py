@@ -168,8 +168,13 @@ class Cell:
         )
 
     def primitive_step(self, source: int, target: int, cell: Index) -> Index:
-        """Return the offset between two sublattices in the primitive basis; arguments as in
-        `offset`."""
+        """Return the offset between two sublattices in the primitive basis.
+
+        Parameters
+        ----------
+        source, target, cell
+            As in `offset`.
+        """
         start, end = self.sites[source].primitive, self.sites[target].primitive
         along = (sum(map(mul, cell, step)) for step in zip(*self.primitive, strict=True))
         return tuple(map(add, map(sub, end, start), along))
@@ -219,6 +224,18 @@ class Lattice(Component):
     """Positions of sites: a repeat cell with one or more sites, from `origin`, in lattice units.
 
     To add a lattice, write `cell`. A site has an integer index (i, j); (0, 0) lies at `origin`.
+
+    Examples
+    --------
+    A lattice with one site a cell:
+
+    >>> class Sheared(Lattice):
+    ...     type: Literal["sheared"] = "sheared"
+    ...
+    ...     def cell(self):
+    ...         return Cell((Vector(1.0, 0.0), Vector(0.25, 1.0)))
+    >>> [offset.cell for offset in Sheared().cell().offsets(0, 1.0)]
+    [(-1, 0), (1, 0)]
     """
 
     origin: Place = Field((0.0, 0.0), description="Where site (0, 0) lies (lattice units).")
@@ -273,6 +290,20 @@ class NeighbourMetric(Component):
 
     To add a metric, write `shells_around`. Neighbourhood is mutual: if the offset from j to k is
     selected, so must be that from k to j, in the same shell; other metrics are refused.
+
+    Examples
+    --------
+    All neighbours within a radius, in one shell:
+
+    >>> class Within(NeighbourMetric):
+    ...     type: Literal["within"] = "within"
+    ...     radius: float
+    ...
+    ...     def shells_around(self, cell, sublattice):
+    ...         return [cell.offsets(sublattice, self.radius)]
+    >>> square = Cell((Vector(1.0, 0.0), Vector(0.0, 1.0)))
+    >>> [len(shell) for shell in Within(radius=1.5).shells_around(square, 0)]
+    [8]
     """
 
     @abstractmethod
@@ -394,7 +425,13 @@ class Tiling:
         return kinds.pop() if self.beside and len(kinds) == 1 else None
 
     def is_diagonal(self, slot: Slot) -> bool:
-        """Return whether a slot crosses a cell, which is then on both of its sides."""
+        """Return whether a slot crosses a cell, which is then on both of its sides.
+
+        Parameters
+        ----------
+        slot : Slot
+            Slot that is in `beside`.
+        """
         left, right = self.beside[slot]
         return left == right
 

@@ -338,6 +338,11 @@ class MixesCells(Calibrated):
         """Return the weights that act in torn cells alone, the others 0; by default there are none.
 
         They are not linear in the stiffness of a cell: see `spring_share`.
+
+        Parameters
+        ----------
+        slot, setting
+            As in `FollowerRule.weights`.
         """
         return {}
 

@@ -76,7 +76,15 @@ class Quantity:
         return or_text(handler(schema))
 
     def number(self, value: Any, info: ValidationInfo) -> Any:
-        """Return a number in lattice units; values without unit are not changed."""
+        """Return a number in lattice units; values without unit are not changed.
+
+        Parameters
+        ----------
+        value
+            Number, or text with a unit.
+        info : ValidationInfo
+            Context of the validation, with the units of the experiment.
+        """
         if not isinstance(value, str) or not TEXT.fullmatch(value):
             return value
         quantity = self.also if self.also and _is_of(value, self.also.unit) else self

@@ -62,7 +62,20 @@ class Vector(_Plane[T]):
     __array_ufunc__ = None  # array * vector is then computed by the vector
 
     def each(self, function: Callable[..., Any], *vectors: Iterable[Any]) -> Self:
-        """Return the vector of function(component, ...) for each component."""
+        """Return the vector of function(component, ...) for each component.
+
+        Parameters
+        ----------
+        function : callable
+            Function of one component of each vector.
+        *vectors : iterable
+            Further vectors with as many components.
+
+        Examples
+        --------
+        >>> Vector(1.0, -2.0).each(abs)
+        Vector(x=1.0, y=2.0)
+        """
         return self._of([function(*parts) for parts in zip(self, *vectors, strict=True)])
 
     def _of(self, components: list[Any]) -> Self:
@@ -124,20 +137,25 @@ def where(condition: Any, yes: Number, no: Number) -> Number: ...
 def where(condition: Any, yes: Any, no: Any) -> Any:
     """Return `yes` where the condition holds, else `no`, elementwise.
 
-    Elementwise functions choose with this and not with `numpy.where`, which compiled engines do
-    not take for vectors.
+    Elementwise functions choose with this and not with `numpy.where`, which kernels do not accept
+    for vectors.
 
     Parameters
     ----------
-    condition : bool or array of bool
-        A comparison.
+    condition : Condition
+        Comparison.
     yes, no : Number or Vector
         Both numbers, or both vectors.
 
     Returns
     -------
     Number or Vector
-        As `yes` and `no` are.
+        As `yes` and `no`.
+
+    Examples
+    --------
+    >>> where(1.0 > 2.0, Vector(1.0, 0.0), Vector(0.0, 1.0)).each(float)
+    Vector(x=0.0, y=1.0)
     """
     if isinstance(yes, Vector):
         return yes._of([np.where(condition, *parts) for parts in zip(yes, no, strict=True)])
@@ -145,7 +163,18 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def dot(a: Vector[T], b: Vector[T]) -> T:
-    """Return a·b = a_x b_x + a_y b_y, elementwise."""
+    """Return a·b = a_x b_x + a_y b_y, elementwise.
+
+    Parameters
+    ----------
+    a, b : Vector
+        Vectors of one kind.
+
+    Examples
+    --------
+    >>> dot(Vector(1.0, 2.0), Vector(3.0, 4.0))
+    11.0
+    """
     products: list[Any] = [
         component * factor for component, factor in zip(a, cast(Any, b), strict=True)
     ]
@@ -155,12 +184,29 @@ def dot(a: Vector[T], b: Vector[T]) -> T:
 
 
 def squared_length(v: Vector[T]) -> T:
-    """Return v·v, equal to the last bit for v and -v."""
+    """Return v·v, equal to the last bit for v and -v.
+
+    Parameters
+    ----------
+    v : Vector
+        Vector.
+    """
     return dot(v, v)
 
 
 def length(v: Vector[T]) -> T:
-    """Return √(v·v), elementwise."""
+    """Return √(v·v), elementwise.
+
+    Parameters
+    ----------
+    v : Vector
+        Vector.
+
+    Examples
+    --------
+    >>> float(length(Vector(3.0, 4.0)))
+    5.0
+    """
     square: Any = squared_length(v)
     root: T = np.sqrt(square)
     return root

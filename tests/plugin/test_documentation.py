@@ -1,6 +1,7 @@
 """docs/extending tells of every interface, hook and public name, and its examples conform."""
 
 import ast
+import doctest
 import importlib
 import inspect
 import os
@@ -11,7 +12,7 @@ import sys
 import types
 from contextlib import nullcontext
 from pathlib import Path
-from typing import ClassVar, get_origin
+from typing import ClassVar, Literal, get_origin
 
 import pytest
 from interpreted_kernels import interpreting
@@ -275,3 +276,11 @@ def test_the_tutorial_leads_from_a_notebook_to_a_tested_plugin(
     for command in commands:
         result = call(*shlex.split(command))
         assert result.code == 0, result.err
+
+
+@pytest.mark.parametrize("module", ["", ".lattice", ".vector"])
+def test_the_examples_of_docstrings_run(module):
+    source = importlib.import_module(f"pbdkit.plugin{module}")
+    result = doctest.testmod(source, extraglobs={"Literal": Literal})
+    assert result.attempted > 0
+    assert result.failed == 0
