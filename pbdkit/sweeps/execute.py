@@ -10,7 +10,6 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 import time
 from abc import ABC, abstractmethod
 from asyncio import CancelledError
@@ -22,7 +21,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
-from multiprocessing import active_children, get_context, parent_process
+from multiprocessing import active_children, get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
@@ -61,6 +60,7 @@ from pbdkit.sweeps.worker import (
     KEPT,
     LOST,
     MemberReport,
+    begin_worker,
     report_of,
     run_member,
     run_members,
@@ -554,24 +554,10 @@ class _Worker:
     def _current(self) -> ProcessPoolExecutor:
         if self._pool is None:
             earlier = {*active_children()}
-            self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
+            self._pool = ProcessPoolExecutor(1, get_context("spawn"), begin_worker)
             self._begun = self._pool.submit(os.getpid)
             self._processes = {*active_children()} - earlier
         return self._pool
-
-
-def _begin() -> None:
-    """Prepare a worker: Ctrl-C is left to the sweep, and the worker ends with the process of the
-    sweep."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = parent_process()
-    assert parent is not None
-    threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
-
-
-def _end_after(parent: Any) -> None:
-    parent.join()
-    os._exit(1)
 
 
 @contextmanager

@@ -5,11 +5,14 @@ names and shapes as JSON, then the values.
 from __future__ import annotations
 
 import json
+import os
+import signal
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable
 from importlib.metadata import version
+from multiprocessing import parent_process
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -147,6 +150,20 @@ def kept_columns(columns: list[Column], variables: set[str] | None) -> list[Colu
     if "particle" in dims:
         dims.add("axis")
     return [c for c in columns if c in chosen or (c.coordinate and c.dims and {*c.dims} <= dims)]
+
+
+def begin_worker() -> None:
+    """Prepare a worker process: Ctrl-C is left to the sweep, and the worker ends with the process
+    of the sweep."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    assert parent is not None
+    threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
+
+
+def _end_after(parent: Any) -> None:
+    parent.join()
+    os._exit(1)
 
 
 def run_members(jobs: list[Job]) -> list[MemberReport]:

@@ -9,8 +9,10 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
-from copy import deepcopy
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from copy import copy, deepcopy
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path as FilePath
@@ -26,7 +28,7 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Motion, Path
 from pbdkit.model.reading import MAX_BYTES, MAX_NODES, yaml_text
 from pbdkit.plugin.fracture_model import Segment
-from pbdkit.web.view_frames import AdjustableNumber, numbers_of, with_number
+from pbdkit.plugin.schedule import NumberCourse
 
 Way = tuple[float, float]
 
@@ -88,6 +90,148 @@ class Hand(Motion):
     def _add(self, step: int, way: Way) -> None:
         self._steps.append(step)
         self._ways.append(way)
+
+
+ADJUSTABLE = ("rule", "fracture", "solver")
+"""Parts of the experiment with adjustable numbers."""
+SOLVER = {"relaxation": 1.0, "memory": 0.0}
+"""Adjustable numbers of the solver, with their defaults."""
+TEST_FACTOR, TEST_VALUE = 1 + 2**-10, 2**-10
+"""Test factor, and test value instead of zero, by which a number is recognised as adjustable."""
+SPANS = {"solver.relaxation": (0.01, 2.0), "solver.memory": (0.0, 1.0)}
+"""Ranges of the sliders of these numbers."""
+
+
+@dataclass
+class AdjustableNumber:
+    """One number by its path in the file, e.g. ``fracture.thresholds.0``.
+
+    `initial` is the number or schedule of the experiment; `turns` are the steps after which it
+    was turned, each with the value from then on; `bounds` what it has to lie between, and `span`
+    what a slider goes over.
+    """
+
+    name: str
+    initial: float | dict[str, Any]
+    bounds: tuple[float, float]
+    turns: list[tuple[int, float]] = field(default_factory=list)
+
+    @property
+    def where(self) -> tuple[str | int, ...]:
+        """Return the keys of the path."""
+        return tuple(int(key) if key.isdecimal() else key for key in self.name.split("."))
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Return the range of the slider: from zero to twice the initial value, within the
+        bounds."""
+        value = self.at(0)
+        low, high = SPANS.get(self.name, (min(2 * value, 0.0), max(2 * value, 0.0)))
+        if low == high:
+            low, high = 0.0, 1.0
+        closest = (high - low) / 200
+        inner = self.bounds[0] + closest, self.bounds[1] - closest
+        return max(low, min(inner[0], value)), min(high, max(inner[1], value))
+
+    def after(self, step: int) -> float | dict[str, Any]:
+        """Return the value from the next step on: a number or a schedule."""
+        values = [value for when, value in self.turns if when <= step]
+        return values[-1] if values else self.initial
+
+    def at(self, step: int) -> float:
+        """Return the value at the end of a step."""
+        value = self.after(step - 1)
+        return NumberCourse.model_validate(value).at(step) if isinstance(value, dict) else value
+
+    def turn(self, step: int, value: float) -> None:
+        """Change the value after a step."""
+        if self.turns and self.turns[-1][0] == step:
+            self.turns.pop()
+        self.turns.append((step, value))
+
+    def turned(self, value: float) -> dict[str, Any]:
+        """Return a schedule that reaches a value. Experiments whose components use the number
+        before the first step reject it."""
+        return {"steps": [0, 1], "values": [self.at(0), value]}
+
+    def cut_back(self, step: int) -> None:
+        """Remove changes at and after a step."""
+        self.turns = [turn for turn in self.turns if turn[0] < step]
+
+    def written(self, last: int) -> float | dict[str, Any]:
+        """Return the schedule for an experiment file with `last` steps."""
+        turns = [turn for turn in self.turns if turn[0] < last]
+        if not turns:
+            return self.initial
+        first = turns[0][0]
+        knots = self._begun(first)
+        for step, value in turns:
+            if knots[-1][0] < step:
+                knots.append((step, knots[-1][1]))
+            knots.append((step + 1, value))
+        steps, values = zip(*knots, strict=True)
+        return {"steps": list(steps), "values": list(values)}
+
+    def _begun(self, until: int) -> list[tuple[int, float]]:
+        """Return the knots of the initial schedule, up to a step. An interval that ends before its
+        knot is written step by step: interpolation to another knot would differ in the last digits.
+        """
+        if not isinstance(self.initial, dict):
+            return [(until, self.initial)]
+        course = NumberCourse.model_validate(self.initial)
+        pairs = zip(course.steps, course.values, strict=True)
+        knots = [(step, float(value)) for step, value in pairs if step <= until]
+        begin = knots[-1][0] + 1 if knots else until
+        if begin > course.steps[-1]:
+            return knots
+        return knots + [(step, course.at(step)) for step in range(begin, until + 1)]
+
+
+def numbers_of(experiment: Experiment, parts: dict[str, Any]) -> dict[str, AdjustableNumber]:
+    """Return all numbers that may change in time, by name."""
+    numbers = {}
+    for name, value in _candidates(parts):
+        number = AdjustableNumber(name, value, _bounds(experiment, name))
+        with suppress(PbdkitError):
+            experiment.of_parts(
+                with_number(parts, number, number.turned(number.at(0) * TEST_FACTOR or TEST_VALUE))
+            )
+            numbers[name] = number
+    return numbers
+
+
+def with_number(parts: dict[str, Any], number: AdjustableNumber, value: Any) -> dict[str, Any]:
+    """Return the parts with another value; unaffected parts are shared."""
+    *parents, last = number.where
+    parts = dict(parts)
+    container: Any = parts
+    for key in parents:
+        inner = copy(container[key] if isinstance(key, int) else container.get(key, {}))
+        container[key] = inner
+        container = inner
+    container[last] = value
+    return parts
+
+
+def _candidates(parts: dict[str, Any]) -> Iterator[tuple[str, float | dict[str, Any]]]:
+    for part in ADJUSTABLE:
+        fields = parts.get(part, {})
+        for name, value in ((SOLVER | fields) if part == "solver" else fields).items():
+            entries = value if isinstance(value, list) else [value]
+            for n, entry in enumerate(entries):
+                if isinstance(entry, float) or (isinstance(entry, dict) and "steps" in entry):
+                    place = f"{part}.{name}.{n}" if isinstance(value, list) else f"{part}.{name}"
+                    yield place, entry
+
+
+def _bounds(experiment: Experiment, name: str) -> tuple[float, float]:
+    """Return the bounds declared by the model, or infinite ones."""
+    part, key, *_ = name.split(".")
+    fields = type(getattr(experiment, part)).model_fields.items()
+    metadata = [m for n, f in fields if key in (n, f.alias) for m in f.metadata]
+    low = [getattr(m, bound) for m in metadata for bound in ("ge", "gt") if hasattr(m, bound)]
+    high = [getattr(m, bound) for m in metadata for bound in ("le", "lt") if hasattr(m, bound)]
+    return max(low, default=-math.inf), min(high, default=math.inf)
 
 
 NEVER = 2**62 - 1
