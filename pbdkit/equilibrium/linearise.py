@@ -11,6 +11,8 @@ from typing import TypeVar
 import numpy as np
 
 from pbdkit.array_types import Floats
+from pbdkit.equilibrium.contact_system import ContactSystem
+from pbdkit.equilibrium.lattice_system import lattice_system
 from pbdkit.equilibrium.sparse import MatrixSystem
 from pbdkit.equilibrium.system import (
     ALL,
@@ -54,19 +56,15 @@ def linearised(
     if rows.strip:
         return _shared(scene, state, math.ceil(moment), watch, rows)
     if scene.barriers:
-        from pbdkit.equilibrium.contact_system import ContactSystem
-
         return ContactSystem(scene, state, moment, method, watch, moves or Moves(scene))
     step = math.ceil(moment)
 
     def by_matrix() -> System:
         return MatrixSystem(scene, state, method, watch, step)
 
-    if asks_for_grids(scene.experiment, method, scene.raster.count) and find_spec("numba"):
-        from pbdkit.equilibrium.lattice_system import lattice_system
-
-        if system := lattice_system(scene, state, step, watch, moves):
-            return _Replaceable(system, by_matrix, at_rest=not state.u.any())
+    by_grids = asks_for_grids(scene.experiment, method, scene.raster.count) and find_spec("numba")
+    if by_grids and (system := lattice_system(scene, state, step, watch, moves)):
+        return _Replaceable(system, by_matrix, at_rest=not state.u.any())
     return by_matrix()
 
 
@@ -83,8 +81,6 @@ def mismatch_at_rest(scene: Scene, moves: Moves, size: float, method: str, watch
 
 
 def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> System:
-    from pbdkit.equilibrium.lattice_system import lattice_system
-
     system = lattice_system(scene, state, step, watch, rows=rows)
     if system is None:
         raise NotSharedError(NOT_SHARED, ("rule",))
