@@ -93,23 +93,23 @@ class Quantity:
 
 
 LENGTH = Quantity("length", "lattice unit", "mm", length=1)
-"""Quantity of lengths."""
+"""Quantity of a length, in lattice units or mm."""
 PER_LENGTH = Quantity("number per length", "1 / lattice unit", "1/mm", length=-1)
-"""Quantity of inverse lengths."""
+"""Quantity of an inverse length."""
 AREA = Quantity("area", "lattice unit^2", "mm^2", length=2)
-"""Quantity of areas."""
+"""Quantity of an area, in lattice units squared or mm²."""
 STRESS = Quantity("stress", "stress unit", "MPa", youngs_modulus=1)
-"""Quantity of stresses."""
+"""Quantity of a stress, in MPa."""
 FORCE = Quantity(
     "force", "stress unit * thickness unit * lattice unit", "N",
     length=1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
-"""Quantity of forces."""
+"""Quantity of a force, in N."""
 ENERGY = Quantity(
     "energy", "stress unit * thickness unit * lattice unit^2", "mJ",
     length=2, youngs_modulus=1, thickness=1,
 )  # fmt: skip
-"""Quantity of energies."""
+"""Quantity of an energy, in mJ."""
 FRACTURE_ENERGY = Quantity(
     "fracture energy", "stress unit * lattice unit", "N/mm",
     length=1, youngs_modulus=1, also=LENGTH,
@@ -119,7 +119,7 @@ BODY_FORCE = Quantity(
     "force per area", "stress unit * thickness unit / lattice unit", "N/mm^2",
     length=-1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
-"""Quantity of forces per area."""
+"""Quantity of a force per area, in N/mm²."""
 QUANTITIES = {q.lattice: q for q in (LENGTH, AREA, STRESS, FORCE, ENERGY, BODY_FORCE)}
 """Quantities by their unit in datasets."""
 

@@ -195,7 +195,7 @@ def squared_length(v: Vector[T]) -> T:
 
 
 def length(v: Vector[T]) -> T:
-    """Return √(v·v), elementwise.
+    """Return the norm √(v·v), elementwise.
 
     Parameters
     ----------

@@ -8,14 +8,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from operator import add
 from typing import Any
 
 import numpy as np
 
 from pbdkit.array_types import Floats, Indices, Mask
-from pbdkit.lattice.neighbourhood import Neighbourhood
-from pbdkit.lattice.raster import positions
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import FollowerRule, Here, StoresEnergy, Vector
 from pbdkit.plugin.discovery import blaming
@@ -24,6 +21,7 @@ from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.frame_following import FollowFrame
 from pbdkit.stepping.kernel import KernelWriter
+from pbdkit.stepping.neighbour_search import NeighbourSearch
 from pbdkit.stepping.rule_evaluation import (
     Contributions,
     Evaluator,
@@ -171,27 +169,20 @@ class GatheringFollowers(Followers):
     """
 
     def __init__(self, scene: Scene) -> None:
-        raster, near = scene.raster, scene.experiment.neighbours.nearness()
-        assert near
         self._scene, self._evaluator = scene, Evaluator(scene)
         self._none = next(iter(scene.constants.weights.values()))
-        everybody = np.arange(raster.count)
-        self.place, self.body = raster.place_of(everybody), raster.body_rows
-        self._site = raster.cells_of(everybody)
-        local = positions(raster.cell, *self._site)
-        self.X = np.stack(local)
-        self._at = local.each(np.add, raster.lattice.origin)
-        self._centred = local.each(np.subtract, scene.middle)
-        self._rank, self._rest = _tables(scene.neighbourhood)
-        self._scale = np.sqrt(np.array(near.weights))
-        self._radius = near.radius * (1 + 1e-9)
+        self._search = NeighbourSearch(scene)
+        self._place, self._body = self._search.place, self._search.body
+        X = vector(self._search.X)
+        self._at = X.each(np.add, scene.raster.lattice.origin)
+        self._centred = X.each(np.subtract, scene.middle)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Move all from m; there are no bonds that could be broken."""
-        flat, count = new.reshape(len(new), -1), len(self.place)
-        u, previous = m.reshape(len(m), -1)[:, self.place], flat[:, self.place]
-        j, k, rest = self.pairs(m)
-        numbers = [value.ravel()[self.place] for value in state.particle_values]
+        flat, count = new.reshape(len(new), -1), len(self._place)
+        u, previous = m.reshape(len(m), -1)[:, self._place], flat[:, self._place]
+        j, k, rest = self._search.pairs(m)
+        numbers = [value.ravel()[self._place] for value in state.particle_values]
         of_particle = self._scene.constants.of_particle
         shared: tuple[Any, ...] = ()
         if shares_particles(self._evaluator.rule):
@@ -202,54 +193,15 @@ class GatheringFollowers(Followers):
         total = tuple(_summed(part, j, count) for part in parts)
         arguments = Here(vector(u), self._at, self._centred, of_particle(*numbers))
         move = self._evaluator.move(total, arguments)
-        movable = self.body[np.bincount(j, minlength=count)[self.body] > 0]
-        place = self.place[movable]
+        movable = self._body[np.bincount(j, minlength=count)[self._body] > 0]
+        place = self._place[movable]
         self._evaluator.renew_particles(total, arguments, numbers, None)
         for values, renewed in zip(state.particle_values, numbers, strict=True):
             values.reshape(-1)[place] = renewed[movable]
-        flat[:, self.place[self.body]] = u[:, self.body]
+        flat[:, self._place[self._body]] = u[:, self._body]
         solver = self._scene.experiment.stepping
         for plane, here_, step, was in zip(flat, u, move, previous, strict=True):
             plane[place] = target(here_, step, was, solver)[movable]
-
-    def pairs(self, m: Floats) -> tuple[Indices, Indices, Floats]:
-        """Return (j, k, rest) in the configuration m: every body particle j with each of its
-        neighbours k and the rest offset, (axis, pair), sorted by j, slot and k."""
-        from scipy.spatial import cKDTree
-
-        x = self.X + m.reshape(len(m), -1)[:, self.place]
-        tree = cKDTree(x.T * self._scale)
-        pairs = tree.query_pairs(self._radius, output_type="ndarray").astype(np.intp)
-        both = np.concatenate([pairs, pairs[:, ::-1]])
-        j, k = both[np.isin(both[:, 0], self.body)].T
-        rank, rest = self._of_slots(j, k)
-        # One key for (j, slot, k) sorts faster than three.
-        order = np.argsort((j * (len(self._rest[0]) + 1) + rank) * len(self.place) + k)
-        return j[order], k[order], rest[:, order]
-
-    def _of_slots(self, j: Indices, k: Indices) -> tuple[Indices, Floats]:
-        """Return the number of each pair's slot, the largest of all if it has none, and the rest
-        offset, (axis, pair)."""
-        s, *cells = self._site
-        sizes = np.array(self._rank.shape[2:])[:, None]
-        step = np.stack([n[k] - n[j] for n in cells]) + sizes // 2
-        near = ((step >= 0) & (step < sizes)).all(axis=0)
-        rank, rest = np.full(len(j), len(self._rest[0])), self.X[:, k] - self.X[:, j]
-        rank[near] = self._rank[(s[j[near]], s[k[near]], *step[:, near])]
-        has_slot = rank < len(self._rest[0])
-        rest[:, has_slot] = self._rest[:, rank[has_slot]]
-        return rank, rest
-
-
-def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
-    """Return the number of a slot by (sublattice, sublattice, step of cells along each axis), the
-    count of slots if there is none; and the rest offset by that number, (axis, slot)."""
-    slots = [slot for each in neighbourhood.slots for slot in each]
-    reach, size = neighbourhood.reach_in_cells, len(neighbourhood.slots)
-    rank = np.full((size, size, *(2 * n + 1 for n in reach)), len(slots))
-    for number, slot in enumerate(slots):
-        rank[(slot.source, slot.target, *map(add, slot.cell, reach))] = number
-    return rank, np.array([slot.rest for slot in slots]).T
 
 
 def _summed(part: Any, owner: Indices, count: int) -> Any:

@@ -27,8 +27,9 @@ from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.followers import Followers, GatheringFollowers, MoveFollowers
+from pbdkit.stepping.followers import Followers, MoveFollowers
 from pbdkit.stepping.kernel import Function
+from pbdkit.stepping.neighbour_search import NeighbourSearch
 from pbdkit.stepping.numba_engine import sweeps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
@@ -62,13 +63,13 @@ class PairFollowers(Followers):
     """Followers of a scene with re-evaluated neighbours, moved by a kernel."""
 
     def __init__(self, scene: Scene, threads: int) -> None:
-        self._finder = finder = GatheringFollowers(scene)
+        self._search = search = NeighbourSearch(scene)
         self._chunks = 4 * threads
         self._plan = Plan(scene, levels_of(scene), threads > 1)
         self._arrays = rule_arrays(self._plan) | {
-            "place": finder.place,
-            "body": finder.body,
-            "local": finder.X,
+            "place": search.place,
+            "body": search.body,
+            "local": search.X,
         }
         start, none = unmoved_state(scene, (1,) * scene.axes), np.zeros(0, np.intp)
         pairs = {"first_pair": none, "partner": none, "rests": np.zeros((scene.axes, 0))}
@@ -79,12 +80,12 @@ class PairFollowers(Followers):
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Move them with neighbours in the order of the numpy engine."""
-        j, other, rest = self._finder.pairs(m)
-        first = np.searchsorted(j, np.append(self._finder.body, len(self._finder.place)))
+        j, other, rest = self._search.pairs(m)
+        first = np.searchsorted(j, np.append(self._search.body, len(self._search.place)))
         rest = np.ascontiguousarray(rest)
         arrays = self._named(m, new, state, first_pair=first, partner=other, rests=rest)
         arguments = tuple(arrays[name] for name in self._names)
-        self._run(arguments, 0, len(self._finder.body), self._chunks)
+        self._run(arguments, 0, len(self._search.body), self._chunks)
 
     def _named(self, m: Floats, new: Floats, state: State, **pairs: Any) -> Arrays:
         """Return the arrays of the kernel by name: `first_pair` by particle of the body, `partner`
