@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy.linalg  # noqa: F401  # loaded before threads are limited
 
 from pbdkit.array_types import Floats
 from pbdkit.equilibrium.system import one_thread
@@ -60,8 +61,6 @@ def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasse
     ExperimentError
         If the parameters cannot be fitted.
     """
-    import scipy.linalg  # noqa: F401  # libraries that are loaded later would use all threads
-
     classes = (*given_classes(experiment), *components)
     try:
         with one_thread():

@@ -30,6 +30,7 @@ from pbdkit.fitting.observations import (
     FieldObservation,
     Observation,
     TracksObservation,
+    deeper,
 )
 from pbdkit.fitting.problem import Loss
 from pbdkit.model.experiment import Experiment, Version
@@ -185,8 +186,6 @@ class MeasuredField(MeasuredColumns):
         points, displacements = self.rows[:, :2], self.rows[:, 2:]
         inside = np.ones(len(points), bool)
         if self.margin:
-            from pbdkit.fitting.observations import deeper  # shapely is loaded only for a margin
-
             inside = deeper(experiment.body, experiment.lattice, points, self.margin)
         terms = self.distortion.ux, self.distortion.uy
         evidence = FieldEvidence.of(scene, points[inside], displacements[inside], terms)

@@ -31,6 +31,7 @@ from itertools import chain, combinations_with_replacement
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from scipy.special import gammainc, gammaincinv, gammaln
 
 from pbdkit.array_types import Floats, Mask
 from pbdkit.components.diagnostics import reactions
@@ -510,8 +511,6 @@ class WeibullLaw(StrengthLaw):
     @staticmethod
     def variation(first: Floats, second: Floats) -> Floats:
         """Return √(Γ(1 + 2/m)/Γ(1 + 1/m)² - 1)."""
-        from scipy.special import gammaln
-
         return np.asarray(np.sqrt(np.expm1(gammaln(1 + 2 / second) - 2 * gammaln(1 + 1 / second))))
 
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
@@ -522,8 +521,6 @@ class WeibullLaw(StrengthLaw):
         For a modulus, Σ_specimens Σ_b ε^m / s^m has a gamma distribution with the number of
         failures. Moduli are drawn from the marginal density.
         """
-        from scipy.special import gammainc, gammaincinv
-
         count = int(breaks.broke.sum())
 
         def logarithm(log_m: Floats) -> tuple[Floats, Floats]:

@@ -13,9 +13,12 @@ from pbdkit.cli.options import (
     PATH,
     at_option,
     experiment_argument,
+    load_experiment,
     result_argument,
     set_option,
 )
+from pbdkit.cli.output import refuse_output, refuse_unwritable
+from pbdkit.errors import refuse_without
 
 
 @click.command()
@@ -37,14 +40,11 @@ def live(
 
     The page is served to this machine only, under a secret address. Ctrl-C ends it.
     """
-    from pbdkit.api import load
-    from pbdkit.errors import refuse_without
-
     refuse_without("websockets", "live", "live needs websockets")
     from pbdkit.web.server import Conductor, SessionServer
     from pbdkit.web.session import Session
 
-    loaded = load(experiment, settings=settings)
+    loaded = load_experiment(experiment, settings)
     conductor = Conductor(Session(loaded, output))
     server = SessionServer(conductor, loaded.name, port)
 
@@ -79,7 +79,6 @@ def report(
 ) -> None:
     """Write one page to share: the moving lattice, histories, curves, predictions, broken bonds,
     and how to run it again; for a sweep its map and its members. It needs no network."""
-    from pbdkit.cli.output import refuse_output, refuse_unwritable
     from pbdkit.io.open import reading
     from pbdkit.io.other_files import refuse_other_file
     from pbdkit.web.report import BUDGET, report as write

@@ -15,9 +15,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import xarray
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Array
@@ -44,9 +45,6 @@ from pbdkit.sweeps.combine import FILL
 from pbdkit.sweeps.specification import CASE, MESSAGE
 from pbdkit.sweeps.worker import KEPT
 from pbdkit.web.page import packed, page
-
-if TYPE_CHECKING:
-    import xarray
 
 
 def meaning_of(variable: xarray.DataArray) -> str:
@@ -1160,8 +1158,6 @@ def _label(value: Any) -> str:
 
 def _scene(specification: dict[str, Any]) -> Scene | None:
     """Return the scene of the varied experiment, None where the body varies."""
-    import xarray
-
     experiment = specification.get("experiment", {})
     varied = {
         path.split(".")[0] for key in ("vary", "together") for path in specification.get(key, {})

@@ -22,6 +22,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError, PbdkitError
@@ -284,8 +285,6 @@ middle."""
 def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float) -> list[Segment]:
     """Map a line across the deformed body to straight segments at rest, each place by the
     displacement of the nearest particle."""
-    from scipy.spatial import cKDTree
-
     a, b = np.array(line[0]), np.array(line[1])
     count = min(SAMPLES, 2 + int(2 * math.dist(*line) / spacing))
     places = a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
@@ -294,7 +293,7 @@ def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float)
     near = ((positions >= low) & (positions <= high)).all(axis=1)
     if not near.any():
         return []
-    _, nearest = cKDTree(positions[near]).query(places)
+    _, nearest = KDTree(positions[near]).query(places)
     places = places + (reference[near] - positions[near])[nearest]
     corners = _straightened(places, NEAR * spacing)
     points = [(float(x), float(y)) for x, y in places[corners]]
