@@ -19,6 +19,7 @@ ORDER = [
     "memory",
     "progress",
     "communicator",
+    "seeds",
     "hooks",
     "plugin",
     "untrusted_files",

@@ -30,6 +30,7 @@ from pbdkit.errors import did_you_mean
 from pbdkit.plugin.component import Component, Strict
 from pbdkit.plugin.schedule import Course, as_course
 from pbdkit.plugin.units import LENGTH, PATTERN, Quantity, or_text
+from pbdkit.seeds import random_field_seed
 
 Held = Mapping[str, NDArray[np.bool_]]
 """Type of the masks of places inside each region, in the order of the experiment."""
@@ -377,8 +378,7 @@ def _standard(x: Floats, y: Floats, length: float, seed: int, stream: str) -> Fl
     except ImportError:
         raise ValueError("random fields require GSTools: pip install 'pbdkit[random]'") from None
     model = gstools.Gaussian(dim=2, len_scale=length, rescale=1.0)
-    sequence = np.random.SeedSequence(seed, spawn_key=tuple(f"{stream} field".encode()))
-    waves = gstools.SRF(model, seed=int(sequence.generate_state(1)[0]))
+    waves = gstools.SRF(model, seed=random_field_seed(seed, stream))
     return np.asarray(waves.structured((x, y), store=False))
 
 

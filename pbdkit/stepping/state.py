@@ -30,6 +30,7 @@ from pbdkit.plugin.fracture_model import Segment
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
+from pbdkit.seeds import component_generator, initial_generator
 
 BrokenSteps = NDArray[np.integer[Any]]
 """Type of the step at which each bond broke, (plane, cell, cell); -1 for intact bonds."""
@@ -159,7 +160,7 @@ def _displace(scene: Scene, u: Floats) -> None:
     """Write the displacements of body and frame, (axis, flat place)."""
     raster, body = scene.raster, scene.raster.body_rows
     leads = kinds_at(raster, scene.leading, 0)[body] == LEADER
-    generator = np.random.default_rng(scene.experiment.seed)
+    generator = initial_generator(scene.experiment.seed)
     initial = scene.experiment.initial.displacement(raster.reference(body), leads, generator)
     u[:, raster.place_of(body)] = initial.T
     if scene.frame:
@@ -176,7 +177,7 @@ def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Value
     if field == "fracture":
         owners, bonds = describe_bonds(scene), scene.bonds
         place = bonds.plane * math.prod(scene.raster.shape[1:]) + bonds.place
-    generator = generator_for(scene.experiment.seed, field)
+    generator = component_generator(scene.experiment.seed, field)
     with blaming(part, "to draw where its numbers start", field):
         array_of = {number.name: value for number, value in zip(numbers, values, strict=True)}
         for name, value in part.draw(owners, generator).items():
@@ -191,12 +192,6 @@ def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Value
                     f"{bool(np.isfinite(value).all())}; needed are ({len(owners)},) finite numbers"
                 )
             array_of[name].reshape(-1)[place] = value
-
-
-def generator_for(seed: int, part: str) -> np.random.Generator:
-    """Return the random generator of one component of the experiment, by its field; it does not
-    depend on what others draw."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(part.encode())))
 
 
 def describe_particles(scene: Scene) -> Particles:

@@ -31,6 +31,7 @@ from pbdkit.model.validation import brief, fault, report
 from pbdkit.plugin import Component
 from pbdkit.plugin.component import Strict
 from pbdkit.plugin.units import TEXT as WITH_UNIT, Quantity
+from pbdkit.seeds import replicate_seeds
 
 MAX_MEMBERS = 100_000
 """Largest number of members. Each takes about a millisecond for validation, and some kilobytes
@@ -303,18 +304,6 @@ def describe(settings: tuple[MemberSetting, ...]) -> str:
         ", ".join(f"{setting.path}={brief(setting.value)}" for setting in settings)
         or "the experiment"
     )
-
-
-def replicate_seeds(seed: int, count: int) -> list[int]:
-    """Return the seeds of replicates.
-
-    Notes
-    -----
-    The k-th seed is ``SeedSequence(seed).spawn(count)[k].generate_state(1)[0]``.
-    """
-    return [
-        int(sequence.generate_state(1)[0]) for sequence in np.random.SeedSequence(seed).spawn(count)
-    ]
 
 
 def names_of(paths: list[str], reserved: Set[str]) -> dict[str, str]:

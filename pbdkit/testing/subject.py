@@ -48,8 +48,8 @@ from pbdkit.plugin.rule import material_of, shares_particles
 from pbdkit.plugin.units import is_needed
 from pbdkit.scene.frame import sites_of_frame
 from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.seeds import component_generator
 from pbdkit.stepping.rule_evaluation import Evaluator, summed
-from pbdkit.stepping.state import generator_for
 from pbdkit.testing.mechanics import Solid, solids_of
 from pbdkit.testing.states import (
     SEED,
@@ -222,7 +222,7 @@ def _to_draw(part: Component, scene: Scene) -> list[FunctionCall]:
     rows = owners(part, scene)
 
     def draw(**columns: Any) -> Any:
-        return part.draw(type(rows)(**columns), generator_for(SEED, "fracture"))
+        return part.draw(type(rows)(**columns), component_generator(SEED, "fracture"))
 
     return [FunctionCall("draw", dict(vars(rows)), draw)]
 

@@ -10,8 +10,9 @@ from remembering_parts import Tiring, Weakest
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
+from pbdkit.seeds import component_generator
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.state import generator_for, initial_state
+from pbdkit.stepping.state import initial_state
 
 PARTS = [Weakest, Tiring]
 LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
@@ -127,10 +128,10 @@ def test_the_draw_depends_on_the_seed_alone():
         sheet(seed=7, rule=Tiring(spread=0.05), initial={"type": "noise", "amplitude": 0.1})
     )
     np.testing.assert_array_equal(one.onset, crowded.onset)
-    expected = generator_for(7, "fracture").uniform(-1, 1, one.sizes["bond"])
+    expected = component_generator(7, "fracture").uniform(-1, 1, one.sizes["bond"])
     drawn = 0.1 * (1 + 0.3 * expected)
     np.testing.assert_array_equal(np.sort(one.onset), np.sort(drawn))
-    rule = generator_for(7, "rule").uniform(-1, 1, 48)
+    rule = component_generator(7, "rule").uniform(-1, 1, 48)
     body = crowded.kind[0] != 2
     np.testing.assert_array_equal(crowded.zeal[body], 0.9 + 0.05 * rule)
     assert crowded.zeal[~body].isnull().all()
