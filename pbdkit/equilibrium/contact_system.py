@@ -117,7 +117,7 @@ class ContactSystem(System):
 
     @property
     def amplification(self) -> float:
-        """Largest diagonal entry."""
+        """Largest entry of the diagonal."""
         return self._amplification
 
     def _table(self, planes: Floats) -> Floats:

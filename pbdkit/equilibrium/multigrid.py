@@ -261,7 +261,7 @@ class Multigrid(Grids):
 
     @property
     def whole(self) -> Multigrid:
-        """The hierarchy itself."""
+        """The hierarchy itself, which every process has."""
         return self
 
     @property

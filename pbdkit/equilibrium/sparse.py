@@ -388,7 +388,7 @@ class MatrixSystem(System):
 
     @property
     def amplification(self) -> float:
-        """Largest diagonal entry."""
+        """Largest entry of the diagonal."""
         return self._amplification
 
     @property
