@@ -54,7 +54,7 @@ def restore(
             parts = checkpoint.parts(initial, experiment.steps, classes)
             if recorded is not None:
                 parts["kept"] = parts["seen"].recorded = recorded
-    recorder.seen = communicator.bcast(parts.get("seen"))
+    recorder.last_steps = communicator.bcast(parts.get("seen"))
     driver.load_state_dict(parts)
 
 

@@ -374,7 +374,7 @@ def checkpoint_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Chec
     """Return the checkpoint of a run without copying arrays; `rate` is in steps per second."""
     experiment, step = driver.scene.experiment, driver.state.step
     run = driver.state_dict()
-    return Checkpoint.of(experiment, run, recorder.seen, step, driver.automatic, rate)
+    return Checkpoint.of(experiment, run, recorder.last_steps, step, driver.automatic, rate)
 
 
 DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {

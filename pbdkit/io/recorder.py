@@ -221,14 +221,14 @@ class RunOutcome:
 
 
 class Recorder:
-    """Records the run of one scene into a sink; `seen` are the last steps observed and recorded."""
+    """Records the run of one scene into a sink; `last_steps` are those observed and recorded."""
 
     def __init__(self, scene: Scene, sink: Sink) -> None:
         self._scene, self.sink = scene, sink
         self._tables, self._measured = Tables(scene), RecordedVariables(scene)
         self._columns = columns_of(scene)
         self._copies = ConvertedCopies(self._columns)
-        self.seen = RecordedSteps()
+        self.last_steps = RecordedSteps()
         self.warnings: tuple[str, ...] = ()
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
@@ -280,14 +280,16 @@ class Recorder:
         step. Raises FloatingPointError where a recorded value is not finite; then nothing of the
         step is recorded.
         """
-        if (state.step if time is None else time) > self.seen.step or last:
+        if (state.step if time is None else time) > self.last_steps.step or last:
             self._put(state, self._record_of(state, last, time))
 
     def _put(self, state: State, values: Values) -> None:
         if values:
             self.sink.put(self._copies.add_to(values))
         time = values.get("time", state.step)
-        self.seen = RecordedSteps(time, time if "time" in values else self.seen.recorded)
+        self.last_steps = RecordedSteps(
+            time, time if "time" in values else self.last_steps.recorded
+        )
 
     def _record_of(self, state: State, last: bool, time: float | None = None) -> Values:
         """Return the values to be recorded at a step."""
@@ -295,9 +297,9 @@ class Recorder:
         values: Values = {}
         experiment, within_step = self._scene.experiment, time is not None
         time = state.step if time is None else time
-        late = last and time > self.seen.recorded
+        late = last and time > self.last_steps.recorded
         # The first state is always recorded, also of a run that does not begin with step 0.
-        planned = within_step or experiment.records(state.step) or self.seen.recorded < 0
+        planned = within_step or experiment.records(state.step) or self.last_steps.recorded < 0
         recorded = late or (not last and planned)
         if recorded:
             position = moment.position()
@@ -306,7 +308,7 @@ class Recorder:
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {offset + row + 1} at step {state.step}")
             values = {"time": time, "position": position, "kind": moment.kind()}
-            values |= self._measured.remembered(moment, first=self.seen.recorded < 0)
+            values |= self._measured.remembered(moment, first=self.last_steps.recorded < 0)
             values |= self._diagnosed(When.RECORD, moment)
         stepped = recorded or experiment.solver.makes_steps
         if self._measured.every_step and stepped and not last:
@@ -320,7 +322,7 @@ class Recorder:
         """Record the final values, and the attributes with the prediction made before the first
         step; `warnings` then holds warnings about the last state."""
         # Where a run diverged, what broke since the last record is no result.
-        diverged, recorded = outcome.status == "diverged", self.seen.recorded
+        diverged, recorded = outcome.status == "diverged", self.last_steps.recorded
         if state.step < recorded < state.step + 1:
             moment = StateMoment(state, self._tables, time=recorded)
         else:

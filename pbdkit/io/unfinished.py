@@ -67,7 +67,7 @@ def unfinished_dataset(output: Path) -> Any:
     compress = scene.experiment.record.compression == "zlib"
     target = reopen_dataset(file, columns_of(scene), checkpoint, compress=compress)
     recorder = Recorder(scene, Overlay(target))
-    recorder.seen = recorded
+    recorder.last_steps = recorded
     reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
     with suppress(FloatingPointError):  # a state that is not finite is not shown
         recorder.observe(state, last=True)

@@ -192,7 +192,7 @@ class DistributedRecorder(Recorder):
     def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
         """Record as a single process does, without equilibria within steps. An error of one rank is
         raised on all."""
-        if state.step <= self.seen.step and not last:
+        if state.step <= self.last_steps.step and not last:
             return
         recorded = last or self._scene.experiment.records(state.step)
         measured = {When.STEP, When.RECORD} if recorded else {When.STEP}
