@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import chain
 
 from pbdkit.scene.scene import Scene
@@ -45,11 +46,15 @@ MAX_FORESEEN, MAX_VALUES = 64, 2**20
 displacements."""
 
 
-def program_of(scene: Scene, sweep: MoveFollowers | None = None) -> Program:
+def program_of(
+    scene: Scene,
+    sweep: MoveFollowers | None = None,
+    kinds: Iterable[type[Operation]] = ORDER,
+) -> Program:
     """Return the operations that a scene needs, in the order of a step. `sweep` replaces the one
     that moves the followers."""
     operations: list[Operation] = []
-    for kind in ORDER:
+    for kind in kinds:
         operations += [sweep] if sweep and kind is MoveFollowers else kind.of(scene)
     return tuple(operations)
 
@@ -110,7 +115,7 @@ def bends_of(scene: Scene) -> list[int]:
 
 def moves_of(scene: Scene, sweep: MoveFollowers) -> Program:
     """Return the operations that make the moves of a scene's particles, in the order of a step."""
-    return tuple(operation for operation in program_of(scene, sweep) if operation.makes_moves)
+    return program_of(scene, sweep, [kind for kind in ORDER if kind.makes_moves])
 
 
 def hindrance(scene: Scene, mode: Mode) -> Hindrance | None:
