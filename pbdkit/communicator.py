@@ -7,6 +7,7 @@ MPI.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager, nullcontext
 from platform import node
@@ -54,15 +55,12 @@ class Communicator(ABC):
 
     def largest(self, value: float) -> float:
         """Return the largest number of all processes; NaN if one is NaN."""
-        import numpy as np  # a command that ends before a scene is built needs none
+        values = [float(number) for number in self.allgather(value)]
+        return math.nan if any(map(math.isnan, values)) else max(values)
 
-        return float(np.max(self.allgather(value)))
-
+    @abstractmethod
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
         """Return the elementwise minimum over arrays of one shape."""
-        import numpy as np
-
-        return np.asarray(np.min(self.allgather(numbers), axis=0))
 
     def processes_on_machine(self) -> int:
         """Return the number of processes on the machine of this one."""

@@ -488,13 +488,10 @@ def _leaves(data: Any, changes: Mapping[Any, Any], where: Where) -> Iterator[tup
 
 def plain(value: Any) -> Any:
     """Convert arrays and components to the values that a file would contain."""
-    # Imported here: a mistyped name is answered without either.
-    import numpy as np
-    from pydantic import BaseModel
-
-    if isinstance(value, BaseModel):
+    # By their methods: neither pydantic nor numpy is imported to refuse a mistyped name.
+    if hasattr(value, "model_dump") and not isinstance(value, type):
         return value.model_dump(mode="json", by_alias=True)
-    if isinstance(value, (np.ndarray, np.generic)):
+    if hasattr(value, "tolist") and not isinstance(value, type):
         return value.tolist()
     if isinstance(value, Mapping):
         return {str(key): plain(inner) for key, inner in value.items()}

@@ -57,8 +57,8 @@ NO_SWEEP = {
     "other.yaml": "other.yaml: is not a sweep, it has `services`, `volumes`; it requires `experiment` and `vary`",
 }  # fmt: skip
 NO_RESULT = {
-    "experiment.nc": "experiment.nc: is an experiment; `pbdkit run experiment.nc` makes a result of it",
-    "e.json": "e.json: is an experiment; `pbdkit run e.json` makes a result of it",
+    "experiment.nc": "experiment.nc: is an experiment; `pbdkit run experiment.nc` computes its result and prints the path",
+    "e.json": "e.json: is an experiment; `pbdkit run e.json` computes its result and prints the path",
     "sweep.nc": "sweep.nc: is a sweep, no result; `pbdkit sweep sweep.nc` runs it",
     "fit.nc": "fit.nc: is a fit, no result; `pbdkit fit fit.nc` runs it",
     "other.yaml": "other.yaml: is no result: those end in .nc",

@@ -269,7 +269,10 @@ def test_files_in_the_place_of_others_are_recognised(call: Call, tmp_path: Path)
     for command in ("explain", "curve"):
         result = call(command, "e.json")
         assert result.code == 2
-        assert "e.json: is an experiment; `pbdkit run e.json` makes a result of it" in result.err
+        assert (
+            "e.json: is an experiment; `pbdkit run e.json` computes its result and prints the path"
+            in result.err
+        )
 
 
 class Raising(pbdkit.FollowerRule):
