@@ -30,6 +30,7 @@ from pbdkit.cli.options import (
     times_option,
     verbose_option,
 )
+from pbdkit.cli.streams import folder_kept
 from pbdkit.errors import PbdkitWarning
 
 LOOK = [
@@ -102,7 +103,6 @@ def run(
     as_json: bool,
 ) -> int | None:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
-    from pbdkit.cli.output import folder_kept, refuse_output
     from pbdkit.mpi.launch import launched
 
     with launched() as communicator:
@@ -114,7 +114,7 @@ def run(
                 loaded = load_experiment(experiment, settings)
             path = output or Path(loaded.name.replace("/", "-") + ".nc")
             if communicator.is_root:
-                refuse_output(path, force=force, experiment=Path(experiment))
+                call("output:refuse_output", path, force=force, experiment=Path(experiment))
         name = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment
         origin = {"experiment": name, "settings": list(settings)}
         options = {"force": force, "quiet": quiet, "as_json": as_json}

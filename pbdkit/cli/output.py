@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterator
-from contextlib import chdir, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,21 +29,6 @@ def refusals_as(subject: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise StorageError(f"{subject}: {error.strerror}") from None
-
-
-@contextmanager
-def folder_kept() -> Iterator[None]:
-    """Return to the current folder after the block: plugins may change it when they are imported.
-
-    Raises
-    ------
-    StorageError
-        If there is no current folder.
-    """
-    with refusals_as("the current folder"):
-        folder = Path.cwd()
-    with chdir(folder):
-        yield
 
 
 def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:

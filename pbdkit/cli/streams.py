@@ -1,4 +1,4 @@
-"""Standard output and error while the program runs."""
+"""Standard output and error, and the current folder, while the program runs."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import io
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import chdir, contextmanager, suppress
+from pathlib import Path
 from typing import Any, TextIO
 
-from pbdkit.errors import PbdkitError, WriteError
+from pbdkit.errors import PbdkitError, StorageError, WriteError
 
 
 class NoReaderError(PbdkitError):
@@ -49,6 +50,23 @@ def standard_streams() -> Iterator[None]:
         with suppress(Exception):
             sys.stdout.flush()
         sys.stdout, sys.stderr = previous
+
+
+@contextmanager
+def folder_kept() -> Iterator[None]:
+    """Return to the current folder after the block: plugins may change it when they are imported.
+
+    Raises
+    ------
+    StorageError
+        If there is no current folder.
+    """
+    try:
+        folder = Path.cwd()
+    except OSError as error:
+        raise StorageError(f"the current folder: {error.strerror}") from None
+    with chdir(folder):
+        yield
 
 
 def _stream(standard: TextIO | None, kind: type[io.FileIO]) -> TextIO:
