@@ -273,13 +273,7 @@ class Scene:
     def restrict(self, to: Restriction) -> Scene:
         """Return the scene of some rows, of features that have a method `restrict` with what is
         theirs of these rows."""
-
-        def part(value: Any) -> Any:
-            if type(value) is tuple:
-                return tuple(map(part, value))
-            return value.restrict(to) if hasattr(value, "restrict") else value
-
-        values = {each.name: part(getattr(self, each.name)) for each in fields(self)}
+        values = {each.name: _restricted(getattr(self, each.name), to) for each in fields(self)}
         return replace(self, **values | {"raster": to.part})
 
     @property
@@ -338,6 +332,12 @@ class Scene:
     def patches(self) -> tuple[Patch, ...]:
         """Cells with all corners in the body."""
         return patches(self.raster, self.neighbourhood.tiling)
+
+
+def _restricted(value: Any, to: Restriction) -> Any:
+    if type(value) is tuple:
+        return tuple(_restricted(part, to) for part in value)
+    return value.restrict(to) if hasattr(value, "restrict") else value
 
 
 def build_scene(

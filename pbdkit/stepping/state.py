@@ -98,20 +98,21 @@ class State:
 
     def map(self, function: Callable[[Any], Any], starts: tuple[Any, ...]) -> State:
         """Return a state with the result of a function for each array, and with these starts."""
-
-        def of(value: Any) -> Any:
-            if isinstance(value, tuple):
-                return tuple(map(of, value))
-            return None if value is None else function(value)
-
         names = [each.name for each in fields(self) if each.name not in ("step", "starts")]
-        return replace(self, starts=starts, **{name: of(getattr(self, name)) for name in names})
+        parts = {name: _mapped(function, getattr(self, name)) for name in names}
+        return replace(self, starts=starts, **parts)
 
     def arrays(self) -> list[Array]:
         """Return the arrays that steps write."""
         bonds = (self.broken_step, self.broken_length, *self.bond_values)
         carried = (self.u, self.previous, *bonds, *self.particle_values)
         return [array for array in carried if array is not None]
+
+
+def _mapped(function: Callable[[Any], Any], part: Any) -> Any:
+    if isinstance(part, tuple):
+        return tuple(_mapped(function, each) for each in part)
+    return None if part is None else function(part)
 
 
 def _copied(part: Any) -> Any:
