@@ -404,7 +404,7 @@ class PlaceLeaders(LeaderOperation):
     def prepare(self, call: Call) -> None:
         """Compute the displacements and the starts of motions."""
         leaders, call.starts = prescribe(self.scene, call.state, call.step, self._forces)
-        call.leaders = [leaders]
+        call.leaders, call.state = [leaders], replace(call.state, starts=call.starts)
 
     def is_foreseeable(self, step: int) -> bool:
         """Return whether no groups overlap: those that contradict each other are refused in their
@@ -413,8 +413,7 @@ class PlaceLeaders(LeaderOperation):
 
     def foresee(self, call: Call, step: int) -> None:
         """Compute the displacements in a later step."""
-        state = replace(call.state, starts=call.starts)
-        call.leaders.append(prescribe(self.scene, state, step)[0])
+        call.leaders.append(prescribe(self.scene, call.state, step)[0])
 
     def entries(self, call: Call) -> dict[str, Entries]:
         """Return the leaders of each list, their targets (step, axis, leader), and space for their
