@@ -17,6 +17,7 @@ version = release = version_of("pbdkit")
 
 extensions = [
     "myst_nb",
+    "reference_pages",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx_copybutton",
@@ -59,7 +60,11 @@ add_module_names = False
 
 html_theme = "pydata_sphinx_theme"
 html_title = "pbdkit"
+html_logo = "pictures/logo.svg"
+html_favicon = "pictures/logo.svg"
 html_theme_options = {
+    "logo": {"text": f"pbdkit {version}"},
+    "header_links_before_dropdown": 8,
     "navbar_align": "left",
     "show_toc_level": 2,
     "footer_start": ["copyright"],

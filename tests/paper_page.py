@@ -1,9 +1,9 @@
-"""The page docs/reproduction.md: its claims, what was measured of each, and its verdict."""
+"""The page validation/reproduction.md: its claims, what was measured of each, and its verdict."""
 
 from pathlib import Path
 
 DOCS = Path(__file__).parent.parent / "docs"
-PAGE = (DOCS / "reproduction.md").read_text("utf-8")
+PAGE = (DOCS / "validation/reproduction.md").read_text("utf-8")
 
 
 def rows(text):

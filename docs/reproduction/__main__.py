@@ -1,4 +1,4 @@
-"""Makes docs/reproduction.md, docs/anisotropy-and-plasticity.md and their pictures.
+"""Make two pages of validation: reproduction and anisotropy-and-plasticity, and their pictures.
 
 From the root of the repository: ``python docs/reproduction``. Every number is measured anew.
 """
@@ -17,22 +17,22 @@ from claims import Section, counted, render
 from trust import lessons
 
 DOCS = Path(__file__).parent.parent
-PREFACE = """# The paper's claims, measured
+PREFACE = """# Reproduction of the paper
 
-What R. dell'Erba (2018, [doi](https://doi.org/10.1007/s00161-018-0663-5); page and figure numbers
-of the pre-print) says of its model, against what pbdkit computes. Every sentence that we found to
-be testable is quoted in a few words, with what was measured and one of three verdicts: **comes
-out**, of the case as shipped; **comes out only with** a named variant, option or range; **does not
-come out**. A verdict is computed from the numbers beside it. Where a claim failed, thresholds, lag,
-shells, metric, frame and particles around the case were searched. Times of programs are those of
-the pages that are named; all else is measured here.
+R. dell'Erba (2018, [doi](https://doi.org/10.1007/s00161-018-0663-5); page and figure numbers of the
+pre-print) makes statements about the model that can be tested. Each one is quoted here in a few
+words, beside the measurement and one of three verdicts: **reproduced** by the case as shipped;
+**reproduced only with** a named variant, option or range; **not reproduced**. The verdict is
+computed from the numbers beside it. Where a claim failed, thresholds, frame delay, shells, metric,
+frame and particles around the case were varied. Execution times are taken from the pages that are
+named; all other numbers are measured here.
 
-The paper's time t is step t − 1: its figures at time 401 are of step 400. Particles have the
-paper's numbers. Speeds, durations, thresholds and K that the paper does not give are our choice and
-stand in the headers of the experiments ([paper/*](../pbdkit/experiments/paper)).
+The paper's time t is step t − 1: its figures at time 401 show step 400. Particles have the paper's
+numbers. The paper does not give all speeds, durations, thresholds and values of K; the values
+chosen here are listed at the head of each experiment (`paper/*`).
 
-All of this page, its pictures and [that on anisotropy and plasticity](anisotropy-and-plasticity.md)
-are made by one command, with no number typed by hand:
+One command makes this page, its pictures and the page on
+[anisotropy and plasticity](anisotropy-and-plasticity.md); no number is typed by hand:
 
     python docs/reproduction
 """
@@ -57,8 +57,8 @@ def main() -> None:
     found = sections()
     parts = [PREFACE, counted(found) + "\n", *map(render, found)]
     parts.append("## What to know before trusting the paper\n\n" + lessons())
-    (DOCS / "reproduction.md").write_text("\n".join(parts), "utf-8")
-    (DOCS / "anisotropy-and-plasticity.md").write_text(announced.page(), "utf-8")
+    (DOCS / "validation/reproduction.md").write_text("\n".join(parts), "utf-8")
+    (DOCS / "validation/anisotropy-and-plasticity.md").write_text(announced.page(), "utf-8")
 
 
 if __name__ == "__main__":

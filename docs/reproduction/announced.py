@@ -150,7 +150,7 @@ offsets. √(D_x/D_y) is the ratio of the widths of the spot.
 | --- | --- | --- | --- | --- | --- |
 {rows}
 
-![The displacement {STEPS} steps after a point was moved](pictures/reproduction/{picture})
+![The displacement {STEPS} steps after a point was moved](../pictures/reproduction/{picture})
 
 Weighted euclidean neighbours on the square lattice, w_y = 1/4, so that the neighbours two rows up
 and down count as near as those one column away:
@@ -197,9 +197,9 @@ its torn column:
 | --- | {" | ".join("---" for _ in placements)} |
 {chr(10).join(table)}
 
-![The strain that stays, against λ, for three thresholds](pictures/reproduction/{graph})
+![The strain that stays, against λ, for three thresholds](../pictures/reproduction/{graph})
 
-![The pieces at the clamp, step {SETTLED}: λ = 0.8, 1, 1.2](pictures/reproduction/{picture})
+![The pieces at the clamp, step {SETTLED}: λ = 0.8, 1, 1.2](../pictures/reproduction/{picture})
 
 The strain that stays is λ − 1, uniform over the piece, whatever the threshold, and so however far
 the piece was pulled before it tore. It is the effect of a load on the broken edge that never ends,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-OUT, ONLY, NOT = "comes out", "comes out only with", "does not come out"
+OUT, ONLY, NOT = "reproduced", "reproduced only with", "not reproduced"
 VERDICTS = (OUT, ONLY, NOT)
 
 
@@ -43,7 +43,7 @@ def render(section: Section) -> str:
     """Markdown."""
     parts = [f"## {section.title}\n", section.words.strip() + "\n"]
     for file, caption in section.pictures:
-        parts.append(f"![{caption}](pictures/reproduction/{file})\n\n*{caption}*\n")
+        parts.append(f"![{caption}](../pictures/reproduction/{file})\n\n*{caption}*\n")
     parts.append("| the paper says | measured | verdict |\n| --- | --- | --- |")
     parts += [f"| “{c.quote}” | {c.measured} | **{c.verdict}** |" for c in section.claims]
     return "\n".join(parts) + "\n" + (f"\n{section.after}\n" if section.after else "")
@@ -55,6 +55,6 @@ def counted(sections: list[Section]) -> str:
     only = sum(claim.verdict.startswith(ONLY) for claim in claims)
     out = sum(claim.verdict == OUT for claim in claims)
     return (
-        f"Of {len(claims)} claims {out} come out, {only} come out only with what is named there, "
-        f"and {len(claims) - out - only} do not come out."
+        f"Of {len(claims)} claims {out} are reproduced, {only} only with what is named there, "
+        f"and {len(claims) - out - only} are not reproduced."
     )

@@ -40,8 +40,8 @@ def of_the_paper(problem: Problem, cells: int) -> float:
 
 
 def timed() -> dict[str, dict[str, float]]:
-    """Milliseconds to the wanted error, set-up included, out of the table of docs/materials.md."""
-    text = (DOCS / "materials.md").read_text("utf-8")
+    """Read from validation/materials.md the milliseconds to an error, set-up included."""
+    text = (DOCS / "validation/materials.md").read_text("utf-8")
     times = {}
     for problem in ("bar", "cantilever", "hole"):
         (row,) = re.findall(rf"^\| {problem} \| {WANTED} \|(.*)\|$", text, re.M)

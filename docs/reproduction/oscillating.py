@@ -1,4 +1,4 @@
-"""Makes the picture of docs/oscillation.md: ``python docs/reproduction/oscillating.py``.
+"""Makes the picture of docs/validation/oscillation.md: ``python docs/reproduction/oscillating.py``.
 
 Left: the shipped experiment that swings, with the decay of the closed form. Right: for which
 relaxation and memory the barycentre on a square sheet settles, and where its slowest mode swings.

@@ -44,14 +44,15 @@ def _settings() -> list[str]:
         f"({_spans(lagged)}), else all rows part at once; with two shells and no lag at "
         f"{len(twice)} ({_spans(twice)}).",
         "**The paper's program may have moved its frame one step late.** The convexity of case a "
-        "and frame rows that part first with one shell come out with `lag: 1`, and with four "
+        "and frame rows that part first with one shell are reproduced with `lag: 1`, and with four "
         "neighbours and `lag: 0` they do not. The text does not decide it.",
         "**A tenth of a threshold decides what the torn sheet does for hundreds of steps.** "
-        "Figure 21 comes out whole at thresholds 5.1 (`paper/f2-cusp`: a second fracture at step "
+        "Figure 21 is reproduced at thresholds 5.1 (`paper/f2-cusp`: a second fracture at step "
         f"{cusp}, no rebound, back to within {run('paper/f2-cusp').residual():.3f}), where "
         f"one shell rebounds as well ({turn[1]:.2f} to {turn[2]:.2f}); at 5.2 the sheet of two "
         f"shells stays {torn[1]:.2f} off.",
-        f"**The rebound of figure 16** comes out lasting ({low[1]:.2f} to {low[2]:.2f}) only where "
+        f"**The rebound of figure 16** is reproduced as a lasting one ({low[1]:.2f} to "
+        f"{low[2]:.2f}) only where "
         f"bonds to the frame never break, and then the sheet does not come back ({spared:.2f} left "
         "at step 400), against the paper's own words; and case f says that the square lattice has "
         "no rebound.",

@@ -1,7 +1,7 @@
-"""All measurements of docs/performance.md: `python tests/benchmarks`, from the repository's root.
+"""Make all measurements of the performance page: `python tests/benchmarks`, from the root.
 
-Writes docs/performance.json and the tables of docs/performance.md. `--only goals threads` measures
-parts again and keeps the rest.
+Writes performance.json and the tables of performance.md in docs/validation. `--only goals threads`
+measures parts again and keeps the rest.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     chosen = parser.parse_args().only
-    file, page = DOCS / "performance.json", DOCS / "performance.md"
+    file, page = DOCS / "validation/performance.json", DOCS / "validation/performance.md"
     data = json.loads(file.read_text()) if file.exists() else {}
     here = machine()
     for name in chosen:
@@ -98,7 +98,7 @@ def main() -> None:
         file.write_text(json.dumps(data, indent=1) + "\n")
     if page.exists():
         document.refresh(page, data, {*document.TABLES} - document.SCALE)
-        document.refresh(DOCS / "scale.md", data, document.SCALE)
+        document.refresh(DOCS / "validation/scale.md", data, document.SCALE)
 
 
 main()

@@ -3,7 +3,7 @@
 python tests/benchmarks/breaking.py [--turns N] [--only damage threshold]
 
 Processor time of whole searches, from the scene on, imports and compiling done; the best of some
-turns. The damaged sheet is that of docs/fracture.md, in 30 increments.
+turns. The damaged sheet is that of docs/validation/fracture.md, in 30 increments.
 """
 
 from __future__ import annotations

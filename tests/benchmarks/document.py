@@ -1,4 +1,4 @@
-"""The measured tables as Markdown, put between markers in docs/performance.md."""
+"""The measured tables as Markdown, put between markers in docs/validation/performance.md."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ def _weak(found: list[Data]) -> str:
 
 
 SCALE = {"ranks", "weak"}
-"""Those of docs/scale.md."""
+"""Those of docs/validation/scale.md."""
 TABLES: dict[str, Callable[[Any], str]] = {
     "machine": _machine,
     "goals": _goals,

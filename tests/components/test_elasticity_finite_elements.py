@@ -1,7 +1,7 @@
 """The calibrated rules against finite elements: errors, orders and reactions.
 
-Bounds lie a little above what is measured; docs/materials.md says which goals that meets and which
-it misses."""
+Bounds lie a little above what is measured; validation/materials.md lists the goals that are met
+and those that are missed."""
 
 import functools
 import math

@@ -322,7 +322,7 @@ def test_a_bar_bears_its_strength_and_takes_its_energy():
 
 
 def test_a_beam_tears_as_griffith_says():
-    """A sample of `fracture_energy.py`; the whole is in docs/fracture.md."""
+    """A sample of `fracture_energy.py`; the whole is in docs/validation/fracture.md."""
     import fracture_energy
 
     share = fracture_energy.beam(29, far=1.3, count=8)

@@ -1,4 +1,4 @@
-"""docs/reproduction.md: whole, and its most important numbers of variants, measured anew."""
+"""The page docs/validation/reproduction.md, and its main numbers measured again."""
 
 import re
 
@@ -10,10 +10,10 @@ from paper_page import DOCS, PAGE, rows
 import pbdkit
 from pbdkit.model.shipped import shipped_names
 
-OTHER = (DOCS / "anisotropy-and-plasticity.md").read_text("utf-8")
+OTHER = (DOCS / "validation/anisotropy-and-plasticity.md").read_text("utf-8")
 CASES = {"a": 15, "b": 5, "c": 5, "d": 11, "e": 3, "f": 14, "g": 4}
 """At least so many claims a case."""
-VERDICT = re.compile(r"^(comes out|comes out only with \S.*|does not come out)$")
+VERDICT = re.compile(r"^(reproduced|reproduced only with \S.*|not reproduced)$")
 NAMED = sorted(set(re.findall(r"paper/[a-z0-9-]+", PAGE + OTHER)))
 
 
@@ -33,9 +33,9 @@ def test_every_claim_has_numbers_and_one_of_three_verdicts(case):
 
 def test_the_page_counts_its_claims():
     verdicts = [row[2].strip("*") for row in rows(PAGE)]
-    out, fails = verdicts.count("comes out"), verdicts.count("does not come out")
+    out, fails = verdicts.count("reproduced"), verdicts.count("not reproduced")
     total, *counts = map(
-        int, re.search(r"Of (\d+) claims (\d+) .* (\d+) .* (\d+) do", PAGE).groups()
+        int, re.search(r"Of (\d+) claims (\d+) .* (\d+) .* (\d+) are not", PAGE).groups()
     )
     assert (total, counts) == (len(verdicts), [out, total - out - fails, fails])
 
@@ -46,7 +46,7 @@ def test_no_cell_of_a_table_breaks_it():
 
 
 def test_pictures_exist_are_small_and_all_are_shown():
-    shown = re.findall(r"\((pictures/reproduction/[^)]+)\)", PAGE + OTHER)
+    shown = re.findall(r"\(\.\./(pictures/reproduction/[^)]+)\)", PAGE + OTHER)
     assert {DOCS / name for name in shown} == set((DOCS / "pictures/reproduction").iterdir())
     assert all((DOCS / name).stat().st_size <= 150_000 for name in shown)
 

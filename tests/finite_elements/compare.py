@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python tests/finite_elements/compare.py
 
-Prints the tables of docs/materials.md and draws docs/pictures/finite-elements.png. All on one
+Prints the tables of validation/materials.md and draws docs/pictures/finite-elements.png. All on one
 thread, in one process, one after the other; imports and compiling are done before.
 """
 

@@ -1,4 +1,4 @@
-"""Cases 5 to 9, 11, 20, 21 and 24 of the table in docs/stability.md: bodies that do not hang
+"""Cases 5 to 9, 11, 20, 21 and 24 of the table in validation/stability.md: bodies that do not hang
 together, and what is refused, on input or with step and particle."""
 
 import json

@@ -1,4 +1,4 @@
-"""Cases 1, 2, 3, 22 and 25 of the table in docs/stability.md: bodies that are stretched, pushed
+"""Cases 1, 2, 3, 22 and 25 of the stability page: bodies that are stretched, pushed
 through themselves, pulled fast and turned, against the equilibrium that they go to."""
 
 import json
@@ -19,7 +19,7 @@ from property_cases import (
 
 import pbdkit
 
-STABILITY = (Path(__file__).parents[2] / "docs/stability.md").read_text("utf-8")
+STABILITY = (Path(__file__).parents[2] / "docs/validation/stability.md").read_text("utf-8")
 RELAXED = {"type": "stepping", "relaxation": 0.9}
 sheets = pytest.mark.parametrize(
     ("lattice", "neighbours"),

@@ -1,4 +1,4 @@
-"""Cases 10, 12, 18, 19 and 23 of the table in docs/stability.md: what rounding and the order of the
+"""Cases 10, 12, 18, 19 and 23 of the stability page: what rounding and the order of the
 particles may not do, beside naive programs to which they do it."""
 
 import numpy as np

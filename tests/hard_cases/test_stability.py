@@ -1,4 +1,4 @@
-"""Cases 4 and 13 to 17 of the table in docs/stability.md: what grows, what never decays and what
+"""Cases 4 and 13 to 17 of the stability page: what grows, what never decays and what
 does not drift, known before the first step and seen in the run."""
 
 import json

@@ -1,4 +1,4 @@
-"""Every hard case has a row with a number in docs/stability.md, and tests of its own."""
+"""Every hard case has a row with a number in docs/validation/stability.md, and tests of its own."""
 
 import ast
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 CASES = Path(__file__).parent
-PAGE = CASES.parents[1] / "docs" / "stability.md"
+PAGE = CASES.parents[1] / "docs" / "validation" / "stability.md"
 COUNT = 25
 CHECKS = ("raises", "warns", "assert_allclose")
 

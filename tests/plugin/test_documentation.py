@@ -139,7 +139,7 @@ def test_the_example_that_remembers_conforms(interface, tmp_path, monkeypatch, i
 
 @EVERY
 def test_a_page_lists_the_properties_of_its_interface(interface):
-    asked = text_of(interface).split("## What it must hold")[1].split("## ")[0]
+    asked = text_of(interface).split("## Required properties")[1].split("## ")[0]
     told, known = set(re.findall(r"`([a-z-]+)`", asked)), {p.name for p in PROPERTIES}
     some = [p for p in PROPERTIES if len(p.interfaces) < len(INTERFACES)]
     own = {p.name for p in some if interface in p.interfaces}

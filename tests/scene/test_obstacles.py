@@ -329,7 +329,7 @@ def half_widths(cells: int) -> tuple[float, float]:
 
 
 def test_a_disc_on_a_block_is_hertz() -> None:
-    """At 40 cells within 3 % (docs/obstacles.md); here coarser, and quicker."""
+    """At 40 cells within 3 % (docs/validation/accuracy.md); here coarser, and quicker."""
     fitted, hertz = half_widths(14)
     assert fitted == pytest.approx(hertz, rel=0.06)
 
