@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from importlib.metadata import version as version_of
+from importlib.metadata import metadata
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -13,7 +13,9 @@ from gallery_scripts import write_scripts  # noqa: E402
 
 project = "pbdkit"
 copyright = "the pbdkit developers"
-version = release = version_of("pbdkit")
+DISTRIBUTION = metadata("pbdkit")
+version = release = DISTRIBUTION["Version"]
+urls = dict(entry.split(", ") for entry in DISTRIBUTION.get_all("Project-URL") or [])
 
 extensions = [
     "myst_nb",
@@ -72,4 +74,8 @@ html_theme_options = {
     "navigation_with_keys": False,
     "secondary_sidebar_items": ["page-toc"],
 }
+if "Repository" in urls:
+    html_theme_options["icon_links"] = [
+        {"name": "Repository", "url": urls["Repository"], "icon": "fa-solid fa-code-branch"}
+    ]
 html_show_sourcelink = False
