@@ -68,6 +68,7 @@ html_theme_options = {
     "logo": {"text": f"pbdkit {version}"},
     "header_links_before_dropdown": 8,
     "navbar_align": "left",
+    "navbar_persistent": ["search-button"],
     "show_toc_level": 2,
     "footer_start": ["copyright"],
     "footer_end": [],
@@ -78,4 +79,5 @@ if "Repository" in urls:
     html_theme_options["icon_links"] = [
         {"name": "Repository", "url": urls["Repository"], "icon": "fa-solid fa-code-branch"}
     ]
+html_context = {"default_mode": "auto"}
 html_show_sourcelink = False

@@ -1,4 +1,4 @@
-"""Writes the gallery's scripts: of each shipped experiment what it is, its picture, movie, file."""
+"""Write the scripts of the gallery: a page with picture, movie and file for each experiment."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ from imageio_ffmpeg import get_ffmpeg_exe
 
 from pbdkit.model.shipped import shipped_names, shipped_text
 
+FIGSIZE = (5.0, 3.4)
+"""Size of pictures in inches: their labels remain legible in thumbnails."""
+COLORS = {"pe1-intact": "pe1_intact", "pe1": "pe1", "stress": "stress_xx", "displacement": "u"}
+"""Variables for the colours of a picture, by the diagnostic that computes them, best first."""
+END_OF_PULL = 10
+"""Last step in which the leaders of the paper's cases move."""
 GROUPS = {
     "paper": "The paper's cases",
     "material": "Calibrated materials",
@@ -22,10 +28,10 @@ GROUPS = {
     "": "To start with",
 }
 SCRIPT = '''"""
-{name}
+{title}
 {line}
 
-{text}
+``{name}``. {text}
 """
 
 import pbdkit
@@ -48,7 +54,7 @@ moving = ds.pbd.animation({color})
 
 
 def write_scripts(folder: Path) -> None:
-    """A folder a group, a script an experiment."""
+    """Write a folder for each group and a script for each experiment."""
     for name in shipped_names():
         group, _, short = name.rpartition("/")
         place = folder / (group or "start")
@@ -57,36 +63,57 @@ def write_scripts(folder: Path) -> None:
         (place / "GALLERY_HEADER.rst").write_text(f"{title}\n{'=' * len(title)}\n")
         (place / f"plot_{short.replace('-', '_')}.py").write_text(script_of(name))
     (folder / "GALLERY_HEADER.rst").write_text(
-        "Gallery\n=======\n\nEvery experiment that is shipped: its picture, its movie, its file. "
-        "`pbdkit experiments` lists them, `pbdkit init --from paper/a` copies one.\n"
+        "Gallery\n=======\n\nEvery shipped experiment with its picture, its movie and its file. "
+        "``pbdkit init --from paper/a`` copies a file; each page offers its script for download.\n"
     )
 
 
 def script_of(name: str) -> str:
-    """What draws one of them. Where its comment names a command that draws it, that is drawn."""
-    given = shipped_text(name)
-    comment = re.match(r"(?:#.*\n)+", given)
+    """Return the script of one experiment.
+
+    The picture is that of the `pbdkit plot` command in the comment at its head, otherwise a
+    variable that the experiment records.
+    """
+    source = shipped_text(name)
+    comment = re.match(r"(?:#.*\n)+", source)
     text = re.sub(r"^# ?", "", comment[0], flags=re.M) if comment else ""
-    color, times = asked(text)
+    color, times = plot_options(text)
+    color = color or default_color(source)
+    if not times and name.startswith("paper/") and "record:" not in source:
+        times = [END_OF_PULL]
     options = ([f'color="{color}"'] if color else []) + ([f"time={times}"] if times else [])
-    records = "solver: {type: equilibrium" not in given
+    options += [f"figsize={FIGSIZE}"] if len(times) < 2 else []
+    steps = "solver: {type: equilibrium" not in source
+    title = title_of(text) or name
     return SCRIPT.format(
+        title=title,
         name=name,
-        line="=" * len(name),
+        line="=" * len(title),
         text=text.replace("`", "``"),
         draw=f"ds.pbd.plot({', '.join(options)})",
-        movie=MOVIE.format(color=f'color="{color}"' if color else "") if records else "",
-        file=textwrap.indent(given, "#     ", lambda _: True).rstrip(),
+        movie=MOVIE.format(color=f'color="{color}"' if color else "") if steps else "",
+        file=textwrap.indent(source, "#     ", lambda _: True).rstrip(),
     )
 
 
+def title_of(text: str) -> str:
+    """Return the first clause of a comment."""
+    return re.split(r"[.:](?:\s|$)", " ".join(text.split()), maxsplit=1)[0]
+
+
+def default_color(source: str) -> str:
+    """Return the variable of the first suitable diagnostic of an experiment."""
+    diagnostics = re.findall(r"type: ([\w-]+)", source.partition("diagnostics:")[2])
+    return next((COLORS[name] for name in COLORS if name in diagnostics), "")
+
+
 def with_ffmpeg(gallery_conf: dict[str, Any], script: str) -> None:
-    """Tells matplotlib, whose settings are new for each script, what codes movies."""
+    """Set the encoder of movies, since matplotlib's settings are reset for each script."""
     mpl.rcParams["animation.ffmpeg_path"] = get_ffmpeg_exe()
 
 
-def asked(text: str) -> tuple[str, list[int]]:
-    """The colour and the times of the command in a comment."""
+def plot_options(text: str) -> tuple[str, list[int]]:
+    """Return the colour and the times of the `pbdkit plot` command in a comment."""
     command = re.search(r"`(pbdkit plot[^`]*)`", text)
     words = shlex.split(command[1]) if command else []
     options = list(pairwise(words))

@@ -99,6 +99,7 @@ def key_sections(schema: Schema) -> Iterator[str]:
     """Yield the Markdown of each key at the top level of an experiment."""
     models = schema["$defs"]
     required = schema["required"]
+    yield "## Overview\n"
     yield "| key | value | default |\n| --- | --- | --- |"
     for name, value in schema["properties"].items():
         yield f"| `{name}` | {value_text(value, models)} | {default_text(name, value, required)} |"
