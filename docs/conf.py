@@ -61,7 +61,7 @@ autodoc_typehints_format = "short"
 add_module_names = False
 
 html_theme = "pydata_sphinx_theme"
-html_search_scorer = "scorer.js"
+html_search_scorer = str(HERE / "scorer.js")
 html_title = "pbdkit"
 html_logo = "pictures/logo.svg"
 html_favicon = "pictures/logo.svg"
