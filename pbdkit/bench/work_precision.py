@@ -441,7 +441,7 @@ def lines(rows: Sequence[Row]) -> list[str]:
 
 
 def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row]) -> dict[str, Any]:
-    """Return the content of the ``--json`` file (docs/performance.md lists the keys)."""
+    """Return the content of the ``--json`` file (docs/validation/performance.md lists the keys)."""
     machine = {"processor": platform.processor() or platform.machine(), "processors": processors()}
     machine |= {"system": platform.system(), "python": sys.version.split()[0]}
     figures = [{k: v if v != inf else None for k, v in asdict(row).items()} for row in rows]
