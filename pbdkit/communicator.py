@@ -89,4 +89,4 @@ class SerialCommunicator(Communicator):
 
 
 SERIAL: Final = SerialCommunicator()
-"""Default communicator."""
+"""Communicator of a single process, used by default."""
