@@ -46,8 +46,8 @@ class AccessorFinder:
             _register(module)
             sys.meta_path.remove(self)
 
-        # The loader is that of one import alone; its method is replaced on purpose.
-        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
+        # The loader belongs to this import alone, so that its method can be replaced.
+        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]  # on purpose
         return spec
 
 

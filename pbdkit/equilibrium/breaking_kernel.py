@@ -263,7 +263,7 @@ class Pattern:
 
     @property
     def alike(self) -> bool:
-        """Whether all axes follow alike."""
+        """True if each weight is a multiple of the identity: all axes follow in the same way."""
         axes = self.weight.shape[-1]
         return bool((self.weight == self.weight[:, :1, :1] * np.eye(axes)).all())
 
@@ -516,7 +516,7 @@ class Settler:
 
     @property
     def is_small(self) -> bool:
-        """Whether a band serves a body of this size and shape."""
+        """True if the band matrix of the body is small enough to be factorised."""
         return bool(self._of_roles["band"].size <= LARGEST_BAND)
 
     def settle(self, state: State, moment: float, most: int) -> tuple[bool, int]:

@@ -78,7 +78,7 @@ class Descent(KrylovResult):
     steps: list[float] = field(default_factory=list)
     turns: list[float] = field(default_factory=list)
     indefinite: bool = False
-    """Whether a direction of negative curvature was met."""
+    """True once a direction of negative curvature occurred."""
 
     def smallest(self) -> float:
         """Return the smallest eigenvalue of B K in the Krylov space (Lanczos)."""

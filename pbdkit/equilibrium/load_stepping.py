@@ -160,7 +160,7 @@ class Reached(NamedTuple):
     state: State
     at_rest: bool
     is_last: bool = False
-    """Whether nothing remains to be computed."""
+    """True if nothing remains to be computed."""
 
 
 Way = Generator[Reached, None, Certificate]

@@ -93,8 +93,11 @@ class Finder:
 
     @cached_property
     def linear(self) -> bool:
-        """Whether the rule is linear and there are no obstacles. A rule that does not declare
-        itself linear is tested at random displacements of the size of the load."""
+        """True if the rule is linear and there are no obstacles.
+
+        A rule that is not declared linear is tested at random displacements of the size of the
+        load.
+        """
         scene = self.scene
         if scene.barriers:
             return False

@@ -80,7 +80,7 @@ class Subsystem(ABC):
         self._size, self._solver, self._watch, self._borders = size, solver, watch, borders
 
     is_stuck = False
-    """Whether an iteration makes no progress and there is no alternative."""
+    """True if an iteration makes no progress and there is no alternative."""
 
     @abstractmethod
     def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
@@ -143,7 +143,7 @@ class Subsystem(ABC):
 
     @property
     def is_soft(self) -> bool:
-        """Whether some mode is so soft that others may be rigid within rounding."""
+        """True if a mode is so soft that others may be rigid within rounding."""
         return not self._spread < SOFT
 
     @cached_property
@@ -441,7 +441,7 @@ class MatrixSystem(System):
 
     @property
     def is_stuck(self) -> bool:
-        """Whether the iteration of any part makes no progress."""
+        """True if the iteration of any part makes no progress."""
         return any(part.is_stuck for block in self._blocks for _, part in block.parts)
 
     def solve(

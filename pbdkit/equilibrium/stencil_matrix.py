@@ -118,7 +118,7 @@ class PrimitiveRaster:
 
     @property
     def is_the_scenes(self) -> bool:
-        """Whether places are those of the scene's raster."""
+        """True if the places are those of the raster of the scene."""
         return len(self.scene.raster.cell.sites) == 1
 
     def places(self, place: Indices) -> Indices:

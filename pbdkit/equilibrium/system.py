@@ -73,7 +73,7 @@ class Moves:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether moves are evaluated by a compiled engine."""
+        """True if moves are evaluated by a compiled engine."""
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, moment: float) -> Floats:
@@ -312,7 +312,7 @@ class System(ABC):
 
     @property
     def is_stuck(self) -> bool:
-        """Whether an iteration makes no progress and the method allows no other."""
+        """True if an iteration makes no progress and the method allows no other."""
         return False
 
     @property

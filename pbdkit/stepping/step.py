@@ -212,8 +212,8 @@ class Operation(ABC):
     """
 
     makes_moves: ClassVar[bool] = False
-    """Whether it contributes to the move that a rule makes from given positions. An equilibrium is
-    where these moves vanish; the other operations place what is given there, or change bonds."""
+    """True if the operation contributes to the move of a particle from given positions. These moves
+    vanish in equilibrium; the other operations place particles, or change bonds."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
