@@ -1,4 +1,4 @@
-"""Breaking and cutting of bonds in a step (model.md, section 6)."""
+"""Breaking and cutting of bonds in a step, and cells that soften one after the other."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from pbdkit.stepping.step import Call, Hindrance, Mode, Operation, Reach, Step
 Home = tuple[Any, ...]
 """Type of the index of bonds in planes: plane and cells."""
 DIRECTIONS = 8
+"""Number of directions in which the ends of a bond are displaced to test whether it may break."""
 TIE = 1e-6
 """Relative difference of loads up to which cells begin to soften together."""
 CALM = 1e-3
@@ -56,11 +57,11 @@ class Fracturing:
     def break_bonds(
         self, m: NDArray[Any], state: State, step: int, *, in_turn: bool = False
     ) -> None:
-        """Renew the remembered numbers of bonds in the intermediate configuration m in place, and
+        """Update the state variables of bonds in the intermediate configuration m, in place, and
         mark bonds that break, with their length.
 
-        If cells begin to soften `in_turn`, only those with the largest load begin, and none before
-        those that have begun are nearly settled.
+        If cells are to begin to soften `in_turn`, only those with the largest load begin, and none
+        begins before the damage of those that have begun is nearly constant.
         """
         assert state.broken_step is not None
         assert state.broken_length is not None
@@ -95,8 +96,8 @@ class Fracturing:
     def _renewed(
         self, m: NDArray[Any], state: State, when: str, nudge: Vector | None = None
     ) -> Iterator[_Renewed]:
-        """Generate the bonds of each slot, part by part. Remembered numbers are renewed in place,
-        or in copies if all differences are changed by a nudge."""
+        """Generate the bonds of each slot, block by block, with updated state variables. They are
+        updated in place, or in copies if all differences are changed by a `nudge`."""
         assert state.broken_step is not None
         for n, slot, block, breakable in self._breakable:
             target, source = block.seen_through(slot).of(m), block.of(m)
@@ -119,8 +120,9 @@ class Fracturing:
             )
 
     def _hold_back(self, previous: list[NDArray[Any]], parts: Sequence[_Renewed]) -> None:
-        """Restore the numbers of cells that would begin to soften, except those with the largest
-        load; all of them as long as cells that have begun still change."""
+        """Restore the state variables of cells that would begin to soften, except those with the
+        largest load; restore all of them while the damage of cells that have begun still
+        changes."""
         change, largest = 0.0, 0.0
         sides = [[name.endswith(side) for name in self._numbers] for side in ("_left", "_right")]
         waiting = []
@@ -144,15 +146,15 @@ class Fracturing:
                 np.copyto(b, a, where=begins & (load < threshold))
 
     def _load(self, part: _Renewed, side: int) -> NDArray[Any]:
-        """Return the load of the cells on one side of bonds, or on the other side where there is
-        none."""
+        """Return the load of the cells on one side of bonds; at the edge of the body, of those on
+        the other side."""
         loads = [self._evaluator.load(cell, part.limits, part.numbers) for cell in part.cells]
         load: NDArray[Any] = np.where(part.cells[side].share > 0.0, loads[side], loads[1 - side])
         return np.broadcast_to(load, part.intact.shape)
 
 
 class _Renewed(NamedTuple):
-    """Bonds along a slot with their remembered numbers."""
+    """Bonds along a slot with updated state variables."""
 
     home: Home
     d: Vector
@@ -168,7 +170,7 @@ BREAKS_AT_REST = Hindrance("an equilibrium with bonds that break", "fracture")
 
 
 class CutBonds(Operation):
-    """Make the cuts of the beginning of a step."""
+    """Cut bonds at the beginning of a step."""
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -176,18 +178,18 @@ class CutBonds(Operation):
         return bool(scene.experiment.cuts)
 
     def apply(self, step: Step) -> None:
-        """Make them before leaders are placed."""
+        """Cut the bonds before leaders are placed."""
         cut_bonds(self.scene, step.state.broken_step, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write nothing: a call ends before a step that begins with a cut."""
+        """Write nothing: a call never contains a step with a cut except as its first."""
 
     def reads(self, state: State) -> bool:
         """Return whether the next step begins with a cut."""
         return state.step + 1 in self._steps
 
     def prepare(self, call: Call) -> None:
-        """Make the cuts of the first step of a call."""
+        """Cut the bonds of the first step of a call."""
         call.has_cuts = cut_bonds(self.scene, call.state.broken_step, call.step)
 
     def next_change(self, step: int, foreseeable: bool = False) -> float:
@@ -199,7 +201,7 @@ class CutBonds(Operation):
         return self._steps
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Ranks share no equilibrium with bonds that break."""
+        """Return a reason for an equilibrium on several ranks if bonds can break."""
         return BREAKS_AT_REST if mode is Mode.RANKS_AT_REST else None
 
     @property
@@ -208,7 +210,7 @@ class CutBonds(Operation):
 
 
 class BreakBonds(Operation):
-    """Renew what bonds remember in the intermediate configuration, and break them there."""
+    """Update the state variables of bonds in the intermediate configuration, and break bonds."""
 
     @cached_property
     def _fracturing(self) -> Fracturing:
@@ -220,7 +222,7 @@ class BreakBonds(Operation):
         return scene.experiment.fracture.can_break
 
     def apply(self, step: Step) -> None:
-        """Break them before particles move."""
+        """Update and break the bonds before particles move."""
         self._fracturing.break_bonds(step.u, step.state, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
@@ -228,8 +230,8 @@ class BreakBonds(Operation):
         kernel.judge_bonds()
 
     def reach(self, axis: int) -> Reach:
-        """Return distances if bonds are judged before particles move, because moves read the
-        result."""
+        """Return the reach of a pass over bonds that precedes the moves of particles, which read
+        its result."""
         scene, fracture = self.scene, self.scene.experiment.fracture
         if not (isinstance(fracture, RenewsBonds) or scene.tears):
             return Reach()
@@ -238,7 +240,8 @@ class BreakBonds(Operation):
         return Reach(back=back, ahead=ahead, below=forward, above=backward)
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """The stress of cells depends on particles beyond the reach of a pass."""
+        """Return a reason if the model softens cells: their stress depends on particles beyond the
+        reach of a pass."""
         if mode is Mode.RANKS_AT_REST:
             return BREAKS_AT_REST
         softens = isinstance(self.scene.experiment.fracture, SoftensCells)

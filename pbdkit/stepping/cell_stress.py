@@ -48,7 +48,7 @@ class CellBeside:
         ]
 
     def way(self, corner: tuple[int, Index], slot: Slot, shape: tuple[int, ...]) -> int:
-        """Return the difference of flat places from the start of a bond along a slot to a
+        """Return the difference of flat places between the start of a bond along a slot and a
         corner."""
         step = corner[0] - slot.source
         for size, cells in zip(shape[1:], corner[1], strict=True):
@@ -62,13 +62,15 @@ class CellBeside:
 
 
 def sum_in_order(terms: list[Any]) -> Any:
-    """Return the sum in the order of kernels."""
+    """Return the sum, added in the order that kernels use."""
     return sum(terms[1:], terms[0])
 
 
 class CellStresses:
-    """Cells beside the bonds of a scene with a fracture model that softens cells. `ratios` are the
-    stiffnesses over Young's modulus of the cell."""
+    """Cells beside the bonds of a scene whose fracture model softens cells.
+
+    `ratios` are the components of the stiffness over Young's modulus, constant or of each cell.
+    """
 
     def __init__(self, scene: Scene) -> None:
         assert scene.cells
@@ -76,7 +78,7 @@ class CellStresses:
 
     @cached_property
     def ratios(self) -> Stiffness:
-        """The ratios of the rule's material."""
+        """Ratios of the rule's material."""
         rule: Any = self._scene.experiment.rule
         material = material_of(rule)
         assert material is not None
@@ -85,8 +87,8 @@ class CellStresses:
 
     @cached_property
     def ratios_by_cell(self) -> Stiffness:
-        """The ratios of each cell, (kind, sublattice, cell, cell), if cells are of several
-        stiffnesses; those of the rule where there is none."""
+        """Ratios of each cell, (kind, sublattice, cell, cell), if cells differ in stiffness; those
+        of the rule at places without a cell."""
         rule: Any = self._scene.experiment.rule
         base: Any = material_of(rule)
         planes = {name: self._cells.weight * value for name, value in base._asdict().items()}
@@ -102,7 +104,8 @@ class CellStresses:
             else np.zeros(has_stiffness.shape)
         )
         components = dict(planes)
-        if base.xx == base.yy:  # cells that a border cuts count the same whichever axis is x
+        # Cells that a border cuts then have the same stiffness along both axes.
+        if base.xx == base.yy:
             components["xx"] = components["yy"] = (planes["xx"] + planes["yy"]) / 2.0
         modulus = Stiffness(**components).own_modulus(share / (1.0 + share))
         return Stiffness(**{name: plane / modulus for name, plane in planes.items()})
@@ -123,8 +126,8 @@ class CellStresses:
         return self._scene.neighbourhood.tiling
 
     def of(self, u: NDArray[Any], slot: Slot, home: Block) -> tuple[CellStress, CellStress]:
-        """Return the cells to the left and right of the bonds along a slot that start at places of
-        a block."""
+        """Return the cells to the left and right of the bonds along a slot that start in a
+        block."""
         precision = self._scene.experiment.stepping.precision
         shares = self._cells.beside(slot, home, precision, self._cells.share)
         ratios = [self.ratios] * 2

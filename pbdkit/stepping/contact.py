@@ -1,12 +1,13 @@
-"""Contact: particles inside an obstacle are put on its outline after the step, as position-based
-dynamics does it, without friction.
+"""Frictionless contact with obstacles: after each step, particles inside an obstacle are projected
+onto its outline.
 
-A calibrated rule moves a particle by S⁻¹ · force for some matrix S of the particle: of elastic
-rules that is the stiffness with which its neighbours hold it, of springs a multiple of 1. A
-particle goes to the place outside of all obstacles that is nearest in the metric S: the way there
-is S⁻¹ n for a push along the normal n at that place, or normals where obstacles meet, so that what
-is left of the forces at rest is along normals. Where S is a multiple of 1 that is the nearest
-place. A guided particle goes along the axis along which it follows.
+A rule moves a particle by S⁻¹ · force, with a 2 × 2 matrix S of the particle. For calibrated rules
+S is the stiffness by which its neighbours hold it; for springs it is a multiple of the identity. A
+particle is projected onto the nearest point outside all obstacles in the metric S. With the normal
+n at that point the displacement is proportional to S⁻¹ n, or to a combination for several normals
+where obstacles meet, so that the remaining force in equilibrium is along the normals. If S is a
+multiple of the identity, the projection is orthogonal. A guided particle is moved along its free
+axis alone.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from pbdkit.stepping.state import State, unmoved_state
 from pbdkit.stepping.step import PUSHED_BY_COURSES, Call, Cells, Hindrance, Mode, Operation, Step
 
 NUDGE = 0.01
-"""Distance by which a particle is moved to measure what pulls it back, in lattice constants."""
+"""Displacement in lattice constants by which the restoring move of a particle is measured."""
 SAME = 1e-9
-"""Relative difference of two entries of a matrix below which they count as equal."""
+"""Relative difference below which two entries of a matrix count as equal."""
 PARTICLES = 16384
 """Number of particles that are evaluated at once."""
 
 
 def stiffnesses(scene: Scene, place: Indices) -> Floats:
-    """Return S of the particles at some flat places, (particle, axis, axis), with no bond broken;
-    zero where a particle does not move."""
+    """Return S of particles at flat places, (particle, axis, axis), with all bonds intact; zero
+    where a particle does not move."""
     each = scene.raster.kind.size // len(scene.raster.kind)
     S = np.zeros((len(place), scene.axes, scene.axes))
     for s in np.unique(place // each).tolist():
@@ -54,8 +55,8 @@ def stiffnesses(scene: Scene, place: Indices) -> Floats:
 
 
 def _stiffnesses(scene: Scene, place: Indices, sublattice: int) -> Floats:
-    """Return S of particles of one sublattice: the mean of nudges in opposite directions, so that
-    mirrored scenes have mirrored matrices."""
+    """Return S of particles of one sublattice, as the mean over displacements in opposite
+    directions, so that mirrored scenes have mirrored matrices."""
     rest, evaluator = unmoved_state(scene, scene.raster.shape[1:]), Evaluator(scene)
     around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
     if scene.constants.by_particle:
@@ -99,9 +100,11 @@ def compliance(scene: Scene) -> Floats | None:
 
 
 Touching = list[tuple[Indices, Floats]]
-"""Type of the rows at each obstacle, with the normals there, (row, axis)."""
-FREE, ALL_LED = 0, 3
-"""Codes of particles that follow along both axes, and along none; 1 and 2 lead along x and y."""
+"""Type of the rows on the outline of each obstacle, with the normals there, (row, axis)."""
+FREE = 0
+"""Code of particles that are free along both axes; 1 and 2 are led along x and along y."""
+ALL_LED = 3
+"""Code of particles that are led along both axes."""
 
 
 class Contact:
@@ -122,7 +125,7 @@ class Contact:
 
     @cached_property
     def compliance(self) -> Floats | None:
-        """Directional response C of the particles; None if it is the same along all directions."""
+        """Directional response C of the particles; None if it is isotropic."""
         return compliance(self._scene)
 
     def led(self, step: int) -> NDArray[np.int8] | None:
@@ -158,15 +161,15 @@ class Contact:
             flat[:, place] = flat[:, place] + self.ways(u, place, moment)
 
     def ways(self, u: Floats, place: Indices, moment: float) -> Floats:
-        """Return the displacements that push particles at flat places out of the obstacles, (axis,
-        place)."""
+        """Return the displacements, (axis, place), that push particles at flat places out of the
+        obstacles."""
         codes = self.led(math.ceil(moment))
         codes_at = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
         return self._ways(self.positions(u, place), self.compliance_at(place), codes_at, moment)
 
     def ways_of_masses(self, u: Floats, place: Indices, moment: float) -> Floats:
-        """Return those of particles with the same response along all directions, at displacements
-        u, (axis, place)."""
+        """Return the displacements, (axis, place), that push particles with isotropic response out
+        of the obstacles, from displacements u."""
         X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
         at = np.stack([a + b for a, b in zip(X, u, strict=True)])
         return self._ways(at, _alike(len(place)), np.zeros(len(place), np.int8), moment)
@@ -189,8 +192,8 @@ class Contact:
         return way
 
     def positions(self, u: Floats, place: Indices) -> Floats:
-        """Return the positions of particles at flat places, from the lattice's site (0, 0), (axis,
-        place)."""
+        """Return the positions of particles at flat places, relative to the lattice's site (0, 0),
+        (axis, place)."""
         X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
         return np.stack([a + b for a, b in zip(X, u.reshape(len(u), -1)[:, place], strict=True)])
 
@@ -202,8 +205,8 @@ class Contact:
         return C
 
     def touched_at_rest(self, moment: float) -> Iterator[tuple[NDArray[np.intp], ...]]:
-        """Generate the cells of particles that are pushed where they rest, one array for each
-        axis."""
+        """Generate the cells of particles that are pushed in their reference positions, one array
+        for each axis."""
         still = np.zeros((2, *self._scene.raster.shape))
         for _, outline in outlines_at(self._scene.barriers, moment):
             for block in self._blocks():
@@ -256,7 +259,7 @@ class Contact:
             return None
         at = raster.cell.basis[block.sublattice]
         low, high = self._ends(block)
-        # Boxes that do not end are those of the body here, and a little more.
+        # An infinite box is bounded by that of the body here, plus a margin.
         corner = np.clip(corner, low - 1.0, high + 1.0)
         corners = np.array([[corner[i, 0], corner[j, 1]] for i, j in product((0, 1), repeat=2)])
         cells = (corners - at) @ self._inverse - raster.first
@@ -277,7 +280,8 @@ class Contact:
         return inside
 
     def _ends(self, block: Block) -> tuple[Floats, Floats]:
-        """Return (low, high) of the positions of a block's sites, from site (0, 0)."""
+        """Return the bounds (low, high) of the positions of a block's sites, relative to site (0,
+        0)."""
         corners = product(*((a, b - 1) for a, b in zip(block.start, block.stop, strict=True)))
         sites = np.array(list(corners)) + self._scene.raster.first
         at = self._scene.raster.cell.basis[block.sublattice]
@@ -286,7 +290,7 @@ class Contact:
 
 
 def _alike(count: int) -> Floats:
-    """Return C of particles with the same response along all directions, (xx xy yy, particle)."""
+    """Return the isotropic response C of particles, (xx xy yy, particle)."""
     return np.repeat([[1.0], [0.0], [1.0]], count, axis=1)
 
 
@@ -308,7 +312,7 @@ class PushOut(Operation):
         self.contact.push_out(step.new, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write a function of rows that skips those that reach no box of an obstacle."""
+        """Write a function of rows, which skips rows that reach no box of an obstacle."""
         kernel.over_rows("push_out", lambda out: self._write(kernel, out))
 
     def functions(self) -> dict[str, Callable[..., Any]]:
@@ -346,7 +350,8 @@ class PushOut(Operation):
         return [at for each in self.scene.barriers for at in each.group.events(steps)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """The response of particles is computed from the numbers at the beginning."""
+        """Return a reason if state variables change: the response of particles is computed from
+        their initial values."""
         reasons = {
             Mode.GPU: "obstacles push",
             Mode.COURSES: PUSHED_BY_COURSES,
@@ -384,8 +389,8 @@ class PushOut(Operation):
 
 
 def _each_near(low: str, high: str) -> Lines:
-    """Return a loop over the obstacles that sets `near` if the range between two positions may
-    overlap the box of one; not if it is not a number."""
+    """Return the head of a loop over the obstacles that sets `near` if the range between two
+    positions may overlap the box of an obstacle; ranges with NaN do not overlap."""
     return [
         "for w in range(wall_kind.size):",
         f"    if {low}x > edges[w, 2] or {high}x < edges[w, 0] or "

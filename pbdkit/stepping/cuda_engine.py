@@ -60,7 +60,7 @@ from pbdkit.stepping.state import State, unmoved_state
 from pbdkit.stepping.step import Call
 
 THREAD = ("me", "threads")
-"""Arguments of functions: the number of the thread, and the number of threads."""
+"""Arguments of functions: the index of the thread, and the number of threads."""
 Whole = Sequence[tuple[int, int]]
 """Type of the groups of particles that have all neighbours, as (sublattice, kind)."""
 
@@ -104,7 +104,7 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
     if level.scene.experiment.rule.uses_reference:
         out.add(1, *_cells(plan))
     out.depth = 1
-    if plan.tears:  # marked particles are taken as those of which something may be missing
+    if plan.tears:  # Marked particles count as particles whose neighbours may be missing.
         for n, (s, _) in enumerate(whole, 1):
             out.add(0, f"if group == {n} and flat_torn[j]:", f"    group = {len(whole) + 1 + s}")
     for n, (s, kind) in enumerate(whole, 1):
@@ -122,7 +122,7 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
 
 
 def write_bonds(plan: Plan) -> Function:
-    """Return the function by which a thread renews its bonds and breaks them, plane after plane."""
+    """Return the function by which a thread updates and breaks its bonds, plane after plane."""
     out = Function(plan.shared, "judge_bonds", *THREAD)
     out.add(0, sweeps.parameters(plan, plan.levels[-1])[-1])
     out.add(0, "cells = flat_broken.size // len(ends)", "for n in range(len(ends)):")
@@ -161,8 +161,8 @@ def _cells(plan: Plan) -> list[str]:
 
 
 def _steps(plan: Plan, kind: int, s: int, k: int, slot: Slot) -> list[str]:
-    """Return lines for the differences in flat arrays to a neighbour, to the home of its bond and
-    to the cells beside it."""
+    """Return lines for the differences in flat arrays to a neighbour, to the home of its bond, and
+    to the cells beside the bond."""
     lines = [f"w{s}_{k} = away[{s}, {k}]"]
     if plan.bonds or plan.limits or plan.bonds_first:
         lines.append(f"v{s}_{k} = bonds_away[{s}, {k}]")
@@ -219,15 +219,15 @@ class ThreadWriter(PlanWriter):
     operations on different places."""
 
     _list = ""
-    """List of particles that lines have gone through since the last synchronisation."""
+    """List of particles whose loop was written last, since the last synchronisation."""
 
     def __init__(self, plan: Plan, out: Function, passes: Passes, wait: str) -> None:
         super().__init__(plan, out, passes)
         self._wait = wait
 
     def begin(self) -> None:
-        """Write the opening lines of operations, and copy remembered numbers as they are before the
-        step."""
+        """Write the first lines of operations, and copy state variables before the step changes
+        them."""
         self.out.add(1, *self.plan.opening("moment"))
         for m in self.plan.kept:
             self.out.add(1, f"for e in {self.plan.over(f'flat_own{m}.size')}:")
@@ -239,13 +239,13 @@ class ThreadWriter(PlanWriter):
         self.out.add(1, f"{u}, {v} = {v}, {u}")
 
     def wait(self) -> None:
-        """Synchronise all threads, unless nothing was done since."""
+        """Synchronise all threads, unless nothing was written since the last synchronisation."""
         if not self.out.lines[-1].endswith(self._wait):
             self.out.add(1, self._wait)
         self._list = ""
 
     def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
-        """Write the thread's part."""
+        """Write a loop over the entries that belong to the thread."""
         if self._list not in ("", name):
             self.wait()
         self._list = name
@@ -253,16 +253,16 @@ class ThreadWriter(PlanWriter):
         self.out.add(2, *lines)
 
     def judge_bonds(self) -> None:
-        """Write the thread's part."""
+        """Write the call of the pass over the bonds of the thread."""
         if self.passes.judge:
             self._call(self.passes.judge)
 
     def sweep(self, level: int) -> None:
-        """Write the thread's part."""
+        """Write the call of the sweep over the particles of the thread."""
         self._call(self.passes.sweeps[level])
 
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Write the thread's part."""
+        """Write a loop over the frame points of the thread."""
         self.wait()
         self.out.add(1, f"for f in {self.plan.over('points.size')}:")
         self.out.add(2, *mapped("flat_u" if lag else planes))
@@ -270,7 +270,7 @@ class ThreadWriter(PlanWriter):
         self.wait()
 
     def over_rows(self, name: str, write: Callable[[Function], None]) -> None:
-        """Raise NotImplementedError: there are no rows."""
+        """Raise NotImplementedError: a GPU has no rows."""
         raise NotImplementedError(f"{name} on a GPU")
 
     def _call(self, function: Function) -> None:
@@ -281,8 +281,8 @@ class ThreadWriter(PlanWriter):
 
 def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]:
     """Return the source of a module with ``run(step, count, ...)``, which makes `count` steps, and
-    the names of the arrays that follow these two. A block that is `alone` synchronises its own
-    threads only, which takes much less time."""
+    the names of the other arguments, which are arrays. With `alone` a single block is launched,
+    which synchronises its own threads only and takes much less time."""
     events = sweeps.write_events(plan) if plan.judged else None
     judge = write_bonds(plan) if plan.bonds_first else None
     moves = [write_sweep(plan, level, whole, events) for level in plan.levels]
@@ -308,9 +308,9 @@ ALONE = 4096
 
 @dataclass(frozen=True)
 class GpuKernel:
-    """Kernel that is not compiled.
+    """Source of a kernel.
 
-    `names` are those of the arrays that it takes, and `alone` is true if it is for one block.
+    `names` are those of its arrays, and `alone` is true if it runs in a single block.
     """
 
     plan: Plan
@@ -355,7 +355,8 @@ def make_kernel(source: str, functions: Mapping[str, DeviceFunction], threads: i
     most `threads` threads."""
     scope = vars(ModuleType("kernel"))
     scope |= words(_on_device) | {name: _on_device(of) for name, of in functions.items()}
-    # Linked at once: what links later would contract after all.
+    # Devices code is linked at once: the driver could contract operations in code that is linked
+    # later.
     options = {} if is_simulated() else {"lto": False, "launch_bounds": threads}
     scope.update(cuda=cuda, part=_on_device, kernel=cuda.jit(**options))
     exec(compile(source, "<kernel>", "exec"), scope)
@@ -403,7 +404,7 @@ def is_simulated() -> bool:
 
 
 def _on_device(function: DeviceFunction) -> Any:
-    """Return a device function that kernels inline."""
+    """Compile a function for the device, to be inlined in kernels."""
     if is_simulated():
         return function
     _complete_ufuncs()
@@ -462,8 +463,12 @@ def _lowered(
     return find(of, sign.args[0])(context, builder, sign, own)
 
 
-THREADS, MOST_THREADS, SIMULATED_THREADS = 256, 1024, 8
-"""Number of threads of a block if there are several, of a single one, and of the simulator."""
+THREADS = 256
+"""Number of threads of a block if there are several blocks."""
+MOST_THREADS = 1024
+"""Number of threads of a single block."""
+SIMULATED_THREADS = 8
+"""Number of threads in numba's simulator."""
 
 
 class GpuStepper(Engine):
@@ -480,7 +485,7 @@ class GpuStepper(Engine):
         self._program = program_of(scene)
         self._last: State | None = None
         self._sent: Arrays = {}
-        """Arrays of operations that the device has."""
+        """Arrays of operations that are on the device."""
         kernel = kernel_of(scene)
         self._plan, self._names = kernel.plan, kernel.names
         self._device: Arrays = {}
@@ -489,12 +494,12 @@ class GpuStepper(Engine):
             threads = MOST_THREADS if kernel.alone else THREADS
             functions = functions_of(self._plan.levels)
             self._run = make_kernel(kernel.source, functions, threads)
-            # No step is made, so that what does not compile is known before the first.
+            # A call without steps compiles the kernel, so that errors of the compiler occur here.
             first_launch(self._run, self._given(0, 0))
         self._launch = launcher(self._run, *self._blocks(kernel.alone))
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """Return the state after `steps` steps, as many in a launch as operations foresee."""
+        """Return the state after `steps` steps, in as few launches as the operations permit."""
         if state is not self._last:
             self._begin(state)
         end = state.step + steps
@@ -505,11 +510,11 @@ class GpuStepper(Engine):
         return state
 
     def renewed(self, state: State, rows: slice) -> None:
-        """Send the state to the device at the next call."""
+        """Mark the state as changed, so that the next call sends it to the device."""
         self._last = None
 
     def _blocks(self, alone: bool) -> tuple[int, int]:
-        """Return the numbers of blocks and of threads of each."""
+        """Return the number of blocks, and the number of threads of each."""
         size = self._scene.raster.kind.size
         if is_simulated():
             return 1, SIMULATED_THREADS
@@ -518,7 +523,7 @@ class GpuStepper(Engine):
         return min(most_blocks(self._run, THREADS), -(-size // THREADS)), THREADS
 
     def _begin(self, state: State) -> None:
-        """Send all that steps change."""
+        """Send all arrays that steps change."""
         planes = changing_planes(self._plan, state)
         if self._plan.judged:
             planes |= flattened({"lost": lost_bits(self._scene, state)})
@@ -527,7 +532,7 @@ class GpuStepper(Engine):
         self._send(planes)
 
     def _fetch(self, state: State) -> None:
-        """Write what steps have changed over the arrays of a state."""
+        """Copy what steps have changed into the arrays of a state."""
         for name, array in changing_planes(self._plan, state).items():
             if name in self._device:
                 self._device[name].copy_to_host(array)
@@ -555,14 +560,14 @@ class GpuStepper(Engine):
             self._numbered = scene
 
     def _send_call(self, call: Call) -> None:
-        """Send what operations read in a call, unless it is the array that was sent last."""
+        """Send the arrays of operations for a call, except those that are on the device already."""
         arrays = call_arrays(self._plan, self._program, call, by_rows=False)
         changed = {name: a for name, a in arrays.items() if self._sent.get(name) is not a}
         self._sent |= changed
         self._send(flattened(changed))
 
     def _send(self, arrays: Arrays) -> None:
-        """Send the arrays that the kernel takes."""
+        """Send the constant arrays of the kernel."""
         self._device |= {
             name: cuda.to_device(array) for name, array in arrays.items() if name in self._names
         }

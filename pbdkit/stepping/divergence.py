@@ -1,4 +1,4 @@
-"""Detection of runs that diverge, within a hundred steps, and the last good state before."""
+"""Detection of diverging runs within a hundred steps, and recovery of the last good state."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from pbdkit.stepping.state import State, initial_state
 EVERY = 100
 """Interval of checks in steps; recorded steps are checked, too."""
 KEPT_EVERY = 5000
-"""Minimum number of steps between two copies of the state; later steps are repeated to find the
-last good one."""
+"""Minimum number of steps between two copies of the state. Steps after a copy are repeated to find
+the last good state."""
 BEYOND = 1e6
-"""Ratio of a displacement to the size of the body, its start and its leaders' motions above which a
-run diverges."""
+"""Factor by which a displacement exceeds the sum of the sizes of body, initial displacements and
+leaders' motions in a diverging run."""
 SAMPLES = 64
+"""Number of moments at which the motion of a leader group is evaluated."""
 
 
 @dataclass
 class Guard:
-    """Check of states, which takes two passes over the displacements.
+    """Check of states against divergence, in two passes over the displacements.
 
-    A state is good if no displacement exceeds `size`: that of the body, its start and its leaders'
-    motions together. `next_look` is the step of the next check at the latest, `good_step` the last
-    good step, `good_copy` a copy of a good state.
+    A state is good if no displacement exceeds `size`, the sum of the size of the body, its initial
+    displacements and its leaders' motions. `next_look` is the latest step of the next check,
+    `good_step` the last good step, `good_copy` a copy of a good state.
     """
 
     size: float
@@ -46,7 +47,8 @@ class Guard:
 
     def look(self, scene: Scene, state: State, *, note: bool = True) -> None:
         """Raise FloatingPointError, with particle and step, if a displacement is not finite or
-        beyond all bounds. A check that longer runs do not make does not `note` the result."""
+        exceeds the limit. The result of a check that depends on the length of the run is not kept
+        (`note` false)."""
         largest = self.most(state)
         if note:
             self.next_look = next_multiple(state.step)
@@ -71,13 +73,13 @@ class Guard:
         table = scene.raster.table(state.u)
         return (
             scene.raster.particle_offset + int(np.argmax(np.abs(table).max(axis=1))) + 1
-        )  # NaN is largest
+        )  # NaN counts as largest.
 
     def last_good(
         self, scene: Scene, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]
     ) -> State | None:
         """Return the last good state before a step, by repeating steps from the copy, at most
-        `patience` in a call; None if `stopping` becomes true."""
+        `patience` in a call; None if `stopping` returns true."""
         state, self.good_copy = self.good_copy or initial_state(scene), None
         while state.step < self.good_step and not stopping():
             state = engine.advance(state, min(patience, self.good_step - state.step))
@@ -114,7 +116,8 @@ def way_of(leading: Leading | Barrier, steps: int) -> float:
     """Return the largest distance of a group from its start, at some moments."""
     group = leading.group
     last, rests = group.last(steps) - group.from_ + 1, group.motion.rests_after()
-    last = last if rests is None else min(last, rests)  # the same however long the run is
+    # The moments do not depend on the length of the run.
+    last = last if rests is None else min(last, rests)
     if last < 1:
         return 0.0
     looks = {*np.linspace(1, last, SAMPLES).astype(int).tolist(), *group.motion.knots()}

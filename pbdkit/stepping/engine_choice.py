@@ -1,5 +1,5 @@
-"""Choice of the engine that steps a scene and of its threads, with the reason, without loading
-engines that are not chosen."""
+"""Choice of engine and number of threads for a scene, with the reason. Engines that are not chosen
+are not imported."""
 
 from __future__ import annotations
 
@@ -36,22 +36,23 @@ def what_gpus_lack(scene: Scene) -> str:
 
 
 PATIENCE_S = 3.0
-"""Time of the numpy engine above which compiling takes less (measured: importing numba and loading
-a kernel .5 s, compiling a new one 1 to 5 s)."""
-CALL_S, VALUE_S = 25e-6, 2.5e-9
-"""Time of the numpy engine for each step and slot, and for each step, slot and particle
-(measured)."""
+"""Estimated time of the numpy engine in seconds above which the compiled engine is faster in total
+(measured: .5 s to import numba and load a kernel, 1 to 5 s to compile one)."""
+CALL_S = 25e-6
+"""Time of the numpy engine for each step and slot, in seconds (measured)."""
+VALUE_S = 2.5e-9
+"""Time of the numpy engine for each step, slot and particle, in seconds (measured)."""
 KERNEL_S = 2e-9
-"""Time of kernels for each step and particle (measured: 1 to 2 ns, with 4 or 8 neighbours in
-motion)."""
+"""Time of kernels for each step and particle, in seconds (measured: 1 to 2 ns, with 4 or 8
+neighbours in motion)."""
 TWO_THREADS_PAY = 100_000
-"""Number of particles from which a second thread takes less time, with a margin (measured: 40
-000)."""
+"""Number of particles from which two threads are faster than one (measured: 40 000), with a
+margin."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Name of an engine, its threads, and the reason in words."""
+    """Name of an engine, number of threads, and the reason for the choice."""
 
     engine: str
     threads: int
@@ -92,7 +93,8 @@ def _refuse(scene: Scene, refusal: str) -> None:
 
 
 def seconds_of(scene: Scene, choice: Choice) -> float:
-    """Estimate the time of the steps at most, without compiling and recording."""
+    """Return an upper estimate of the time of the steps in seconds, without compilation and
+    recording."""
     if choice.engine == "numpy":
         return _numpy_seconds(scene)
     return KERNEL_S * scene.raster.total * _most_steps(scene) / choice.threads
@@ -128,30 +130,31 @@ def obstacle() -> str:
 
 
 def what_kernels_lack(scene: Scene) -> str:
-    """Return the reason why no kernel follows the time-dependent numbers of a scene; empty if one
-    does, or there are none."""
+    """Return the reason why kernels do not support the time-dependent parameters of a scene; empty
+    if they do, or if there are none."""
     fields = {field for field, _ in scene.experiment.courses}
     mode = Mode.SOLVER_COURSES if fields == {"solver"} else Mode.COURSES
     return reason_against(scene, mode) if fields else ""
 
 
 def _about_passes(scene: Scene) -> str:
-    """Return the reason why each step is a pass over the memory, if several in a pass would be
-    faster."""
+    """Return the reason why each step is a pass of its own over the memory, in scenes in which
+    passes of several steps would be faster; empty otherwise."""
     why = exceeds_cache(scene) and single_steps(scene)
     return f"; one step a pass over the memory: {why}" if why else ""
 
 
 def _numpy_seconds(scene: Scene) -> float:
-    """Estimate the time of the numpy engine at most."""
+    """Return an upper estimate of the time of the numpy engine in seconds."""
     slots = sum(map(len, scene.neighbourhood.slots)) * (2 if scene.has_fracture else 1)
     a_step = slots * (CALL_S + VALUE_S * scene.raster.total / len(scene.neighbourhood.slots))
     return a_step * _most_steps(scene)
 
 
 def _most_steps(scene: Scene) -> float:
-    """Return the largest number of steps: those of the run or, until it is settled, those of a
-    plain barycentre on a body of n cells with one fixed end, (2n)² (2/π)² ln(1 / tolerance)."""
+    """Return the largest number of steps: that of the run or, for a run until convergence, the
+    estimate (2n)² (2/π)² ln(1 / tolerance) for the barycentre rule on a body of n cells with one
+    fixed end."""
     steps, settle = float(scene.experiment.steps), scene.experiment.stepping.settle
     if settle is None:
         return steps

@@ -1,5 +1,5 @@
-"""Followers in a step: the move of the rule, relaxation and memory, with constant neighbours or
-with neighbours that are re-evaluated by distance (model.md, section 4)."""
+"""Moves of followers in a step: the move of the rule, relaxation and momentum. Neighbours are
+constant, or re-evaluated by distance in every step."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from pbdkit.stepping.state import State, shown
 from pbdkit.stepping.step import Call, Cells, Hindrance, Mode, Operation, Reach, Step
 
 REAL = "fiub"
-"""Kinds of numpy types that are real numbers."""
+"""Kinds of numpy data types whose values are real numbers."""
 
 
 class Followers(ABC):
@@ -44,14 +44,15 @@ class Followers(ABC):
         """Write the displacements of all body particles into `new`, from the intermediate
         configuration m.
 
-        `new` contains those of the step before at the beginning. Particles without neighbours stay,
-        and values of leaders are overwritten later. `state` is that at the end of the step before;
-        the remembered numbers of particles are renewed in place.
+        On entry `new` contains the displacements of the step before, from which the momentum is
+        computed. Particles without neighbours stay; values of leaders are overwritten later.
+        `state` is the state at the end of the step before; state variables of particles are updated
+        in place.
         """
 
 
 def target(u: Any, move: Any, before: Any, solver: Stepping) -> Any:
-    """Return u + relaxation · move + memory · (u - before) of one component, elementwise.
+    """Return u + relaxation · move + momentum · (u - before) of one component, elementwise.
 
     Raises ValueError if the move is not one real number for each particle.
     """
@@ -84,7 +85,8 @@ class SlotFollowers(Followers):
         ]
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Move every block from m alone, so that their order does not matter."""
+        """Move the particles block by block. All blocks read m alone, so that their order does not
+        matter."""
         loads = self._scene.loads
         acting = loads.at(state.step + 1, m.dtype) if loads else None
         for around, evaluator, total, values in self._summed(m, state):
@@ -105,7 +107,8 @@ class SlotFollowers(Followers):
         return self._of_all(Evaluator.force, m, state)
 
     def _of_all(self, function: Callable[..., Any], m: Floats, state: State) -> Floats:
-        """Return a function of the sums of contributions, zero for particles without neighbours."""
+        """Return the values of a function of the summed contributions at all particles, zero for
+        particles without neighbours."""
         out = np.zeros_like(m)
         for around, evaluator, total, arguments in self._summed(m, state):
             values = function(evaluator, total, arguments)
@@ -114,8 +117,8 @@ class SlotFollowers(Followers):
         return out
 
     def energy(self, m: Floats, state: State) -> float:
-        """Return the strain energy over Young's modulus and thickness: that of the rule, or -½ Σ
-        u·force."""
+        """Return the strain energy over Young's modulus and thickness: that of the rule if it
+        defines one, otherwise -½ Σ u·force."""
         if not isinstance(self._scene.experiment.rule, StoresEnergy):
             return self._work(m, self.forces(m, state))
         planes, out = self._seen(m, state), np.zeros_like(m[0])
@@ -125,8 +128,8 @@ class SlotFollowers(Followers):
         return float(out.sum())
 
     def _work(self, u: Floats, forces: Floats) -> float:
-        """Return -½ Σ u·force over the body. If the forces have no resultant, u counts from its
-        mean, so that the result does not depend on rigid displacements."""
+        """Return -½ Σ u·force over the body. If the forces have no resultant, the mean of u is
+        subtracted, so that rigid translations do not change the result."""
         place = self._scene.raster.place_of(self._scene.raster.body_rows)
         u, forces = u.reshape(len(u), -1)[:, place], forces.reshape(len(u), -1)[:, place]
         if self._scene.frame is None:
@@ -134,7 +137,8 @@ class SlotFollowers(Followers):
         return -0.5 * float((u * forces).sum())
 
     def _seen(self, m: Floats, state: State) -> Floats:
-        """Return the vectors on which the rule works: displacements, or moves of its inner rule."""
+        """Return the vectors from which the rule computes differences: displacements, or the moves
+        of its inner rule."""
         if self._inner is None:
             return m
         z = self._inner.moves(m, state)
@@ -144,10 +148,11 @@ class SlotFollowers(Followers):
         return z
 
     def _summed(self, m: Floats, state: State) -> Iterator[Summed]:
-        """Generate every block with the sums of contributions and the values at its particles."""
+        """Generate every block with its summed contributions and the values at its particles."""
         planes, previous = self._seen(m, state), state
         if shares_particles(self._scene.experiment.rule):
-            # Neighbours see what was before the step, also where a block has been renewed.
+            # State variables of neighbours are those before the step, also in blocks that have been
+            # updated.
             previous = replace(
                 state, particle_values=tuple(v.copy() for v in state.particle_values)
             )
@@ -178,7 +183,7 @@ class GatheringFollowers(Followers):
         self._centred = X.each(np.subtract, scene.middle)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Move all from m; there are no bonds that could be broken."""
+        """Move all particles from m; bonds do not break in such scenes."""
         flat, count = new.reshape(len(new), -1), len(self._place)
         u, previous = m.reshape(len(m), -1)[:, self._place], flat[:, self._place]
         j, k, rest = self._search.pairs(m)
@@ -205,7 +210,7 @@ class GatheringFollowers(Followers):
 
 
 def _summed(part: Any, owner: Indices, count: int) -> Any:
-    """Return the sum over the pairs of each owner, in their order."""
+    """Return the sum over the pairs of each owner, in the order of the pairs."""
     if isinstance(part, Vector):
         return part.each(lambda values: _summed(values, owner, count))
     return np.bincount(owner, np.broadcast_to(part, owner.shape), count)
@@ -228,8 +233,8 @@ class MoveFollowers(Operation):
         return self._known or (GatheringFollowers if nearness else SlotFollowers)(self.scene)
 
     def apply(self, step: Step) -> None:
-        """Move them from the intermediate configuration. Numbers that are not finite are reported
-        when they are recorded."""
+        """Move the particles from the intermediate configuration. Values that are not finite are
+        reported when they are recorded."""
         quiet = np.errstate(all="ignore", invalid=step.invalid)
         with quiet, blaming(self.scene.experiment.rule, f"at step {step.number}"):
             self._followers.move(step.u, step.new, step.state)
@@ -247,8 +252,8 @@ class MoveFollowers(Operation):
         return len(list(_levels(self.scene)))
 
     def reach(self, axis: int) -> Reach:
-        """Return the distance of neighbours. Moves of an inner rule are made before particles
-        move."""
+        """Return the distance of neighbours. If the rule has an inner rule, the moves of the inner
+        rule are computed before particles move."""
         reach = self.scene.neighbourhood.reach_in_cells[axis]
         if not self.scene.inner:
             return Reach(reach)
@@ -262,7 +267,7 @@ class MoveFollowers(Operation):
         return np.array([slot.cell for slots in self.scene.neighbourhood.slots for slot in slots])
 
     def arrays(self, call: Call) -> dict[str, Any]:
-        """Return the load on each particle, axis by axis."""
+        """Return the load on particles, axis by axis."""
         load = self._load(call)
         if load is not self._last_load:
             self._last_load = load
@@ -285,7 +290,7 @@ class MoveFollowers(Operation):
         return loads.at(call.step, call.state.u.dtype) if loads else None
 
     def next_change(self, step: int, foreseeable: bool = False) -> float:
-        """Return the next change of a load or a number."""
+        """Return the next step in which a load or a parameter changes."""
         courses = self.scene.experiment.courses.values()
         changes = [course.next_change(step) for course in courses]
         changes += [self.scene.loads.next_change(step)] if self.scene.loads else []
@@ -296,7 +301,7 @@ class MoveFollowers(Operation):
         return self.scene.loads.changes(steps) if self.scene.loads else []
 
     def bends(self, steps: int) -> list[int]:
-        """Return the bends of numbers, and of loads while they act."""
+        """Return the kinks of time-dependent parameters, and of loads while they act."""
         courses = self.scene.experiment.courses.values()
         spans = [(course, 0, steps) for course in courses]
         for loading in self.scene.loads.each if self.scene.loads else ():
@@ -305,7 +310,8 @@ class MoveFollowers(Operation):
         return [bend for course, *span in spans for bend in course.bends_within(*span)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Lists of re-evaluated neighbours are made on the host in every step."""
+        """Return a reason if neighbours are re-evaluated, because their lists are computed on the
+        host in every step, or if parameters depend on time in a way that kernels do not support."""
         if self.scene.experiment.neighbours.nearness():
             changing = "numbers change in time, and neighbours are found anew"
             reasons = {
@@ -323,7 +329,8 @@ class MoveFollowers(Operation):
         return self._hindrance_of_courses() if mode is Mode.COURSES else None
 
     def _hindrance_of_courses(self) -> Hindrance | None:
-        """Kernels read numbers that change in time from arrays that all particles share."""
+        """Return a reason if time-dependent parameters are not the same for all particles: kernels
+        read them from arrays that all particles share."""
         scene = self.scene
         courses = scene.experiment.courses
         fields = [field for field, _ in courses if field != "solver"]
@@ -355,7 +362,8 @@ def _levels(scene: Scene) -> Iterator[Scene]:
 
 
 def _differ_in_kernels(scene: Scene, changed: Scene) -> bool:
-    """Return whether scenes that differ in numbers differ in constants that kernels contain."""
+    """Return whether two scenes that differ in parameters differ in constants that are literals in
+    kernels."""
     return any(
         (old.constants.weights, old.constants.fracture)
         != (new.constants.weights, new.constants.fracture)

@@ -1,4 +1,4 @@
-"""The frame in a step: its points follow the body."""
+"""The operation of a step by which frame points follow the body."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pbdkit.stepping.step import Hindrance, Mode, Operation, Reach, Step
 
 
 class FollowFrame(Operation):
-    """Let the points of the frame follow the body: as it is after the step, or lagging, as it was
-    before."""
+    """Move frame points with the body: with its displacements after the step or, with a delay,
+    before the step."""
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -25,14 +25,14 @@ class FollowFrame(Operation):
         return scene.frame is not None
 
     def apply(self, step: Step) -> None:
-        """Let points follow after all particles have been placed."""
+        """Move the frame points after all particles have been placed."""
         frame = self.scene.frame
         assert frame
         body, axes = step.u if frame.map.lag else step.new, len(step.u)
         frame.follow(body.reshape(axes, -1), step.new.reshape(axes, -1))
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Let points follow after all particles have been placed."""
+        """Write the lines that move the frame points."""
         kernel.follow(self.mapped(kernel), "flat_v", self.scene.lag)
 
     def reach(self, axis: int) -> Reach:
@@ -41,15 +41,15 @@ class FollowFrame(Operation):
         return Reach(apart=int(self._spans[axis].max()))
 
     def carries(self) -> Indices:
-        """Return the differences over a point that follows one particle and is a neighbour of
-        another."""
+        """Return the differences of repeat cells between a neighbour of a frame point and the
+        particle that the point follows."""
         frame, kinds = self.scene.frame, self.scene.raster.kind
         assert frame
         places = frame.place[frame.map.point], frame.body_place
         at, body = (np.stack(np.unravel_index(p, kinds.shape)[1:], axis=1) for p in places)
         steps = [np.zeros((0, self.scene.axes), np.intp)]
         for slot in chain(*self.scene.neighbourhood.slots):
-            # The particle at `neighbour` has the frame point along this slot.
+            # Slots lead from the particle at `neighbour` to the frame point.
             neighbour = at - slot.cell
             inside = ((neighbour >= 0) & (neighbour < kinds.shape[1:])).all(axis=1)
             follows = kinds[(slot.source, *neighbour[inside].T)] == FOLLOWER
@@ -80,7 +80,7 @@ class FollowFrame(Operation):
 
     @property
     def _first(self) -> Indices:
-        """The first entry of each point in the map."""
+        """Index of the first entry of each point in the map."""
         assert self.scene.frame
         return np.searchsorted(self.scene.frame.map.point, np.arange(len(self.scene.frame.place)))
 
@@ -90,7 +90,8 @@ class FollowFrame(Operation):
         return np.stack([index[1], index[-1]])
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """A map that changes is an array on the host, and of a whole lattice."""
+        """Return a reason if the map changes: it is then an array on the host, and of the whole
+        lattice."""
         reasons = {
             Mode.COURSES: "numbers change in time by which the frame follows",
             Mode.RANKS: "a frame whose map follows numbers of the rule that change in time",
@@ -99,12 +100,12 @@ class FollowFrame(Operation):
         return Hindrance(reasons[mode], "frame") if changes else None
 
     def emit_for(self, kernel: KernelWriter, planes: str) -> None:
-        """Write the same for planes that are no displacements: the moves of an inner rule."""
+        """Write the lines for planes that are no displacements: the moves of an inner rule."""
         kernel.follow(self.mapped(kernel), planes)
 
     def mapped(self, kernel: KernelWriter) -> Callable[[str], Lines]:
-        """Return a function that returns the lines that compute t_@ of the frame point f from
-        planes."""
+        """Return a function that returns the lines that compute t_@, the displacement of frame
+        point f, from planes."""
 
         def lines(planes: str) -> Lines:
             start = kernel.each(f"t_@ = {kernel.number(0.0)}")
@@ -114,7 +115,7 @@ class FollowFrame(Operation):
         return lines
 
     def _terms(self, kernel: KernelWriter, planes: str) -> Iterator[tuple[str, str]]:
-        """Generate each axis with the term of an entry of the map."""
+        """Generate each axis with its term of an entry of the map."""
         frame = self.scene.frame
         assert frame
         for a, c in enumerate(kernel.each("@")):

@@ -1,8 +1,8 @@
-"""Kernels: the functions that they consist of, and the writer to which operations add their lines.
+"""Kernels: their functions, and the interface of the writers to which operations add lines.
 
-A writer stands for one way to run a step: over the whole lattice, over a tile in a pass of several
-steps, or on the threads of a GPU. The lines are the same for all of them; the loops around the
-lines, and what goes between operations, are the writer's.
+A writer stands for one way of executing a step: on the whole lattice, on a tile in a pass of
+several steps, or on the threads of a GPU. Operations write the same lines in all cases; the writer
+adds loops around these lines, and synchronisation between operations.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ Lines = list[str]
 
 
 class Function:
-    """Function of a kernel: its lines and its own arguments, followed by those of the arguments
-    shared by all functions that its lines use."""
+    """Function of a kernel: its lines, and its arguments. The function's own arguments come first;
+    shared ones follow if a line uses them."""
 
     def __init__(self, shared: Sequence[str], name: str, *own: str) -> None:
         self.shared, self.name, self.own = shared, name, own
@@ -30,13 +30,13 @@ class Function:
 
     @property
     def used(self) -> list[str]:
-        """Shared names that its lines use, as they are or flat."""
+        """Shared names that occur in its lines, as they are or with the prefix of flat arrays."""
         words = self._words() - set(self.own)
         return [name for name in self.shared if {name, f"flat_{name}"} & words]
 
     @property
     def source(self) -> list[str]:
-        """Lines of the function with its head."""
+        """Lines of the function, `def` included."""
         head = f"def {self.name}({', '.join([*self.own, *self.used])}):"
         words = self._words()
         flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.used if f"flat_{n}" in words]
@@ -44,7 +44,7 @@ class Function:
         return ["", "", "@part", head, *lines]
 
     def call(self, *own: str) -> str:
-        """Return a call with values of its own arguments."""
+        """Return a call with the values of its own arguments."""
         return f"{self.name}({', '.join([*own, *self.used])})"
 
     def _words(self) -> set[str]:
@@ -54,10 +54,10 @@ class Function:
 class KernelWriter(ABC):
     """Writes a step of a kernel, operation by operation.
 
-    In lines `flat_u_x` are the displacements along x before the step, by flat place, `flat_v_x`
-    those after it, `flat_own0` the first number that is remembered of particles and `flat_was0`
-    the same as it was before the step. In a pattern `@` stands for the name of an axis, `#` for its
-    number.
+    In the lines of operations `flat_u_x` are the displacements along x before the step, by flat
+    place, `flat_v_x` those after it, `flat_own0` is the first state variable of particles, and
+    `flat_was0` its value before the step. In a pattern `@` stands for the name of an axis, `#` for
+    its number.
     """
 
     keeps_before: ClassVar[bool] = True
@@ -77,37 +77,38 @@ class KernelWriter(ABC):
 
     @abstractmethod
     def row(self, array: str, first: str) -> str:
-        """Return the part of an array that belongs to a row of particles, from column j0 to j1."""
+        """Return the part of an array that belongs to columns j0 to j1 of a row of particles."""
 
     @abstractmethod
     def places(self, sublattice: str) -> Lines:
-        """Return the reference position of particle j of that row, axis by axis."""
+        """Return the reference position of particle j of a row, axis by axis."""
 
     @abstractmethod
     def is_given(self, array: str) -> bool:
-        """Return whether kernels are given an array of that name."""
+        """Return whether an array of that name is an argument of kernels."""
 
     @abstractmethod
     def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
-        """Write a loop over the entries e of a list of flat places, `name[e]`. It goes `ahead` of
-        the particles that move where it changes what they see: displacements before the step."""
+        """Write a loop over the entries e of a list of flat places, `name[e]`. It is placed `ahead`
+        of the moves of particles if it changes the displacements before the step, which these
+        read."""
 
     @abstractmethod
     def judge_bonds(self) -> None:
-        """Write the pass that renews bonds and breaks them, unless the sweep does it as it goes."""
+        """Write the pass that updates and breaks bonds, unless the sweep does both."""
 
     @abstractmethod
     def sweep(self, level: int) -> None:
-        """Write the sweep that makes the moves of a rule: `level` counts rules that work on the
-        moves of another, the innermost first."""
+        """Write the sweep that computes the moves of a rule. Rules that act on the moves of another
+        rule have higher levels; the innermost has level 0."""
 
     @abstractmethod
     def over_rows(self, name: str, write: Callable[[Function], None]) -> None:
-        """Write a function of some rows, and its call for those that motion has reached. Besides
-        the rows, `first_row` to `last_row`, it is given the `moment`: the step of a call, from 0
-        on."""
+        """Write a function of rows, and its call for those rows that motion has reached. Its
+        arguments are the rows, `first_row` to `last_row`, and `moment`, the index of the step in
+        the call."""
 
     @abstractmethod
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Write a loop over the frame points f of some planes: `mapped` are the lines that compute
-        their displacements t_@ from planes. With `lag` they come from before the step."""
+        """Write a loop over the frame points f of some planes. `mapped` are the lines that compute
+        their displacements t_@ from planes; with `lag` from those before the step."""

@@ -1,16 +1,16 @@
 """Leaders in a step: prescribed displacements and directions, and the free component of guided
 particles.
 
-A rule's move is S⁻¹ · force for some 2 × 2 matrix S of the particle. If a guided particle leads
-along axes l and is free along axes f, the move along f without a force there is
+A rule's move is S⁻¹ · force, with a 2 × 2 matrix S of the particle. If a guided particle is led
+along axes l and free along axes f, its move along f is
 
     m_f + S_ff⁻¹ S_fl m_l:
 
-the move along l is the force on the guide. S is computed for calibrated rules; the moves of other
-rules are not corrected. On straight edges S_fl is zero, at corners and in cut cells it is not.
+which follows from S m = force without a force of the guide along f. S is computed for calibrated
+rules; the moves of other rules are not corrected. S_fl is zero on straight edges, and nonzero at
+corners and in cut cells.
 
-Forces on leaders that move by Newton's law are computed at their places alone, by numpy in every
-engine.
+Forces on leaders that move by Newton's law are computed by numpy, in every engine.
 """
 
 from __future__ import annotations
@@ -66,8 +66,9 @@ class Clamps:
         self.numbers = tuple(m for rotation in self._rotations for m in rotation)
 
     def turn(self, state: State, step: int) -> Indices:
-        """Turn the directions of clamped leaders by the rotation of their motions in a step, in
-        place; return their flat places. The first of several groups turns a particle."""
+        """Turn the directions of clamped leaders in place by the rotation of their motions in a
+        step, and return their flat places. A particle of several groups is turned by the first of
+        them."""
         places = [np.zeros(0, np.intp)]
         for leading in self._leading:
             if leading.group.leads(step):
@@ -77,11 +78,11 @@ class Clamps:
         return np.concatenate(places)
 
     def turning(self, step: int) -> bool:
-        """Return whether the motion of any clamped leader turns in a step."""
+        """Return whether the motion of any group of clamped leaders rotates in a step."""
         return any(_angle(each, step) != 0.0 for each in self._leading if each.group.leads(step))
 
     def directions(self, state: State) -> list[Array]:
-        """Return flat views of the numbers that they prescribe."""
+        """Return flat views of the state variables that clamped leaders prescribe."""
         return [state.particle_values[m].reshape(-1) for m in self.numbers]
 
     def _turn(self, state: State, place: Indices, angle: float) -> None:
@@ -101,10 +102,10 @@ def _angle(leading: Leading, step: int) -> float:
 
 
 STRAIGHT = 1e-12
-"""Largest share that counts as zero."""
+"""Magnitude of S_ff⁻¹ S_fl up to which it counts as zero."""
 Slants = dict[tuple[int, int], tuple[Indices, Floats]]
-"""Type of the flat places of guided particles, by (free axis, led axis), with the share of the move
-along the led axis that adds to the move along the free axis."""
+"""Type of the flat places of guided particles, by (free axis, led axis), with the factor by which
+the move along the led axis is added to the move along the free axis."""
 
 
 class Guidance:
@@ -129,7 +130,7 @@ class Guidance:
         return self._at(step)[0]
 
     def slants(self, step: int) -> Slants:
-        """Return their shares, for each pair of axes."""
+        """Return the factors of guided particles for each pair of axes."""
         return self._at(step)[1]
 
     def correct(self, new: Floats, u: Floats, step: int) -> None:
@@ -156,7 +157,7 @@ class Guidance:
         return slants
 
     def shares(self, guided: Guided) -> Floats:
-        """Return S_ff⁻¹ S_fl, zero elsewhere, (particle, free axis, led axis)."""
+        """Return S_ff⁻¹ S_fl, zero for other pairs of axes, (particle, free axis, led axis)."""
         axes = self._scene.axes
         shares = np.zeros((len(guided.place), axes, axes))
         if not self.slanted or not len(guided.place):
@@ -194,11 +195,11 @@ class NewtonForces:
         self.numbers = tuple(masses)
         self._parts = {n: _parts(scene, each.place) for n, each in masses.items()}
         self._contact = Contact(scene) if masses and scene.barriers else None
-        # A rule that works on the moves of another is evaluated everywhere.
+        # A rule with an inner rule is evaluated at all particles.
         self._followers = SlotFollowers(scene) if masses and scene.inner else None
 
     def share(self, n: int) -> Floats:
-        """Return the share of each particle in the force on a group, (particle,)."""
+        """Return the fraction of each particle's force that acts on a group, (particle,)."""
         share = self._scene.leading[n].share
         assert share is not None
         return share
@@ -219,9 +220,9 @@ class NewtonForces:
         return forces
 
     def stopped(self, n: int, velocity: Floats, u: Floats, step: int) -> tuple[Floats, Floats]:
-        """Return the velocities of a group's particles and their displacements at the end of a
-        step, (axis, particle), out of the obstacles: the distance by which they are pushed reduces
-        their velocity, unless an obstacle appears where they are."""
+        """Return the velocities of a group's particles and their displacements, (axis, particle),
+        at the end of a step, outside the obstacles. Their velocity is reduced by the distance by
+        which they are pushed, except by an obstacle that appears in that step."""
         leading = self._scene.leading[n]
         if self._contact is None or len(leading.axes) < self._scene.axes:
             return velocity, u
@@ -232,7 +233,7 @@ class NewtonForces:
 
     def stiffness(self, n: int, state: State, nudge: float) -> float:
         """Return the largest increase of the force on the group for a unit displacement of its
-        particles along the axes along which they lead, while others stay."""
+        particles along their led axes, while all other particles stay."""
         leading, copy = self._scene.leading[n], state.copy()
         flat, force, largest = copy.u.reshape(len(copy.u), -1), self.on(n, state), 0.0
         move = np.random.default_rng(0).uniform(-1.0, 1.0, force.shape)
@@ -262,8 +263,11 @@ def prescribe(
     scene: Scene, state: State, moment: float, forces: NewtonForces | None = None
 ) -> tuple[Leaders, Starts]:
     """Return the leaders of a step with their displacements at its end, or at a moment within it,
-    and the starts of motions: displacements or, by Newton's law with the forces at the end of the
-    step before, velocities."""
+    and the starts of motions.
+
+    The starts are displacements or, for groups that move by Newton's law with the forces at the end
+    of the step before, velocities.
+    """
     leaders: Leaders = []
     starts: list[Floats | None] = []
     step = math.ceil(moment)
@@ -301,8 +305,8 @@ def _pushed(scene: Scene, state: State, forces: NewtonForces, n: int) -> tuple[F
 
 
 def _refuse_contradiction(scene: Scene, leaders: Leaders, step: int) -> None:
-    """Refuse groups that move one particle differently from where it stands, which depends on the
-    run."""
+    """Raise ExperimentError if groups prescribe different displacements of one particle. This
+    depends on the state where motions start from it."""
     size = scene.raster.kind.size
     components = np.concatenate([a * size + at for at, _, axes in leaders for a in axes])
     u = np.concatenate([each.u.ravel() for each in leaders])
@@ -337,16 +341,16 @@ def place(u: Floats, leaders: Leaders) -> None:
 
 
 def placed(u: Floats, leaders: Leaders) -> Leaders:
-    """Return the same particles with their displacements u along the same axes."""
+    """Return leaders with the displacements u at the same places and axes."""
     flat = u.reshape(len(u), -1)
     return [Placed(at, np.array([flat[a, at] for a in axes]), axes) for at, _, axes in leaders]
 
 
 class LeaderOperation(Operation):
-    """Base class of operations on the leaders of a scene.
+    """Base class of operations on leaders.
 
-    Kernels have lists of leaders by the ending of their names: one list for all, or one for each
-    axis if particles may be guided.
+    A kernel has one list of leaders or, if particles may be guided, one for each axis. The names of
+    the lists differ in their endings.
     """
 
     @classmethod
@@ -362,20 +366,21 @@ class LeaderOperation(Operation):
 
 
 class PlaceLeaders(LeaderOperation):
-    """Put the leaders where they are prescribed: the intermediate configuration."""
+    """Place the leaders at their prescribed displacements, which gives the intermediate
+    configuration."""
 
     @cached_property
     def _forces(self) -> NewtonForces:
         return NewtonForces(self.scene)
 
     def apply(self, step: Step) -> None:
-        """Place them before particles move, and note their origins."""
+        """Place the leaders before particles move, and keep their displacements before the step."""
         step.leaders, step.starts = prescribe(self.scene, step.state, step.number, self._forces)
         step.origins = placed(step.u, step.leaders)
         place(step.u, step.leaders)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Place them as arrays have it for each step of a call."""
+        """Write a loop that places the leaders from the arrays of the call."""
         for end, axes in self.endings.items():
             if kernel.keeps_before:
                 lines = kernel.each(f"origins{end}[#, e] = flat_u_@[leaders{end}[e]]", axes)
@@ -384,20 +389,21 @@ class PlaceLeaders(LeaderOperation):
             kernel.listed(f"leaders{end}", *lines, ahead=True)
 
     def opening(self, step: str) -> Lines:
-        """Return lines for the targets of the step."""
+        """Return lines for the prescribed displacements of the step."""
         return [
             f"target{end} = targets{end}[min({step}, targets{end}.shape[0] - 1)]"
             for end in self.endings
         ]
 
     def end_pass(self, kernel: KernelWriter) -> None:
-        """Place the leaders of the step before the last as that step has placed them."""
+        """Write lines that place the leaders of the last step but one, whose displacements are read
+        after the pass."""
         for end, axes in self.endings.items():
             lines = kernel.each(f"flat_v_@[leaders{end}[e]] = target{end}[#, e]", axes)
             kernel.listed(f"leaders{end}", *lines)
 
     def reads(self, state: State) -> bool:
-        """Return whether a motion begins, which starts from the displacements of the state."""
+        """Return whether a motion begins that starts from the displacements of the state."""
         groups = zip(self.scene.leading, state.starts, strict=True)
         return any(begin is None and each.group.leads(state.step + 1) for each, begin in groups)
 
@@ -407,8 +413,8 @@ class PlaceLeaders(LeaderOperation):
         call.leaders, call.state = [leaders], replace(call.state, starts=call.starts)
 
     def is_foreseeable(self, step: int) -> bool:
-        """Return whether no groups overlap: those that contradict each other are refused in their
-        own step."""
+        """Return whether groups have no common particles: contradictions are raised in the step in
+        which they occur."""
         return not self.scene.leaders_overlap
 
     def foresee(self, call: Call, step: int) -> None:
@@ -416,13 +422,13 @@ class PlaceLeaders(LeaderOperation):
         call.leaders.append(prescribe(self.scene, call.state, step)[0])
 
     def entries(self, call: Call) -> dict[str, Entries]:
-        """Return the leaders of each list, their targets (step, axis, leader), and space for their
-        origins."""
+        """Return the leaders of each list, their displacements (step, axis, leader), and space for
+        those before the step."""
         lists, real = {}, call.state.u.dtype
         for end, names in self.endings.items():
             axes = tuple("xyz".index(name) for name in names)
             at, u = _along(axes, call.leaders)
-            if self.scene.leaders_overlap:  # the last group places a particle
+            if self.scene.leaders_overlap:  # The last of several groups places a particle.
                 last = len(at) - 1 - np.unique(at[::-1], return_index=True)[1]
                 at, u = at[np.sort(last)], u[..., np.sort(last)]
             u = np.asarray(u, real)
@@ -438,15 +444,16 @@ class PlaceLeaders(LeaderOperation):
                 yield np.unravel_index(moved, self.scene.raster.shape)[1:]
 
     def fixed_places(self) -> Indices:
-        """Return the places of all groups: leaders may stay where they would not rest."""
+        """Return the places of all leaders, which may be out of equilibrium."""
         return np.concatenate([leading.place for leading in self.scene.leading])
 
     def sweeps(self) -> int:
-        """Return 1 for masses: they see their neighbours before these see them."""
+        """Return 1 if groups move by Newton's law: the forces on them are evaluated before
+        particles move."""
         return int(any(leading.share is not None for leading in self.scene.leading))
 
     def next_change(self, step: int, foreseeable: bool = False) -> float:
-        """Return the next change of any group."""
+        """Return the next step in which any group changes."""
         return min(each.group.next_change(step, foreseeable) for each in self.scene.leading)
 
     def events(self, steps: int) -> list[int]:
@@ -454,7 +461,8 @@ class PlaceLeaders(LeaderOperation):
         return [at for each in self.scene.leading for at in each.group.events(steps)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Forces on masses are computed on the host, from numbers in its arrays."""
+        """Return a reason if groups move by Newton's law: their forces are computed on the host,
+        from state variables there."""
         if not any(isinstance(leading.group.motion, Newton) for leading in self.scene.leading):
             return None
         reasons = {Mode.GPU: "leaders move by Newton's law", Mode.COURSES: PUSHED_BY_COURSES}
@@ -475,8 +483,8 @@ def _along(axes: tuple[int, ...], steps: Sequence[Leaders]) -> tuple[Indices, Fl
 
 
 class GuideLeaders(LeaderOperation):
-    """Put guided particles where they are prescribed after the step, too: along those axes memory
-    carries no motion on."""
+    """Place guided particles along their led axes in the new displacements, so that momentum adds
+    nothing along these axes."""
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -484,23 +492,24 @@ class GuideLeaders(LeaderOperation):
         return has_guides(scene.leading)
 
     def apply(self, step: Step) -> None:
-        """Place them in the displacements after the step."""
+        """Place the guided particles in the displacements after the step."""
         place(step.new, step.leaders)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Place them in the displacements after the step."""
+        """Write a loop that places the guided particles."""
         for end, axes in self.endings.items():
             lines = kernel.each(f"flat_v_@[leaders{end}[e]] = target{end}[#, e]", axes)
             kernel.listed(f"leaders{end}", *lines)
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """The response of particles is computed from the numbers at the beginning."""
+        """Return a reason if state variables change: the response of particles is computed from
+        their initial values."""
         reasons = {Mode.GPU: "leaders lead along an axis", Mode.COURSES: PUSHED_BY_COURSES}
         return Hindrance(reasons[mode], "leaders") if mode in reasons else None
 
 
 class GuideToObstacles(GuideLeaders):
-    """Put guided particles where they are prescribed, before obstacles push them."""
+    """Place guided particles along their led axes before obstacles push them."""
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -522,40 +531,42 @@ class DirectionOperation(Operation):
 
 
 class TurnDirections(DirectionOperation):
-    """Turn the directions of clamped leaders as their motions turn."""
+    """Rotate the directions of clamped leaders with their motions."""
 
     def apply(self, step: Step) -> None:
-        """Turn them before particles move, and note what is prescribed."""
+        """Rotate the directions before particles move, and keep the prescribed values."""
         places = self._clamps.turn(step.state, step.number)
         values = self._clamps.directions(step.state)
         step.directions = [(value, places, value[places]) for value in values]
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write nothing: directions are turned before a call, and none turns during it."""
+        """Write nothing: directions are rotated before a call, and a call contains no later step
+        that rotates them."""
 
     def prepare(self, call: Call) -> None:
-        """Turn them as in a step."""
+        """Rotate the directions in the first step of a call."""
         call.clamps = self._clamps.turn(call.state, call.step)
 
     def is_foreseeable(self, step: int) -> bool:
-        """Return whether none turns in the step."""
+        """Return whether no direction rotates in the step."""
         return not self._clamps.turning(step)
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Directions that are turned on the host are not sent to a GPU."""
+        """Return a reason if directions rotate: the GPU does not receive directions that change on
+        the host."""
         return Hindrance("leaders are clamped", "leaders") if mode is Mode.GPU else None
 
 
 class HoldDirections(DirectionOperation):
-    """Restore the directions that clamped leaders prescribe after the rule has changed them."""
+    """Restore the prescribed directions of clamped leaders after the rule has changed them."""
 
     def apply(self, step: Step) -> None:
-        """Restore them after particles have moved."""
+        """Restore the directions after particles have moved."""
         for values, places, prescribed in step.directions:
             values[places] = prescribed
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Restore those before the step."""
+        """Write a loop that restores the directions."""
         numbers = self.prescribed_numbers()
         lines = (f"flat_own{m}[clamps[e]] = flat_was{m}[clamps[e]]" for m in numbers)
         kernel.listed("clamps", *lines)
@@ -565,12 +576,13 @@ class HoldDirections(DirectionOperation):
         return {"clamps": Entries(call.clamps, {})}
 
     def prescribed_numbers(self) -> tuple[int, ...]:
-        """Return the numbers that are components of directions."""
+        """Return the state variables that are components of directions."""
         return self._clamps.numbers
 
 
 class CorrectGuided(Operation):
-    """Add the effect of prescribed displacements on the free component of guided particles."""
+    """Correct the free component of the moves of guided particles by the effect of the prescribed
+    component."""
 
     makes_moves = True
 
@@ -584,19 +596,19 @@ class CorrectGuided(Operation):
         return Guidance(scene).slanted
 
     def apply(self, step: Step) -> None:
-        """Add it after particles have moved."""
+        """Add the correction after particles have moved."""
         with np.errstate(all="ignore", invalid=step.invalid):
             self._guidance.correct(step.new, step.u, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Add it for each pair of axes."""
+        """Write a loop for each pair of axes."""
         for to, of in permutations(kernel.each("@"), 2):
             move = f"(flat_v_{of}[p] - flat_u_{of}[p])"
             line = f"flat_v_{to}[p] = flat_v_{to}[p] + share_{to}{of}[e] * {move}"
             kernel.listed(f"slant_{to}{of}", f"p = slant_{to}{of}[e]", line)
 
     def entries(self, call: Call) -> dict[str, Entries]:
-        """Return the guided particles with a share, for each pair of axes."""
+        """Return the guided particles with nonzero factors, for each pair of axes."""
         slants, real = (
             self._guidance.slants(call.step) if call.leaders[0] else {},
             call.state.u.dtype,
@@ -610,16 +622,16 @@ class CorrectGuided(Operation):
 
 
 class HoldLeaders(LeaderOperation):
-    """Put the leaders where they are prescribed after the rule has moved them, and restore their
-    origins in the displacements before the step."""
+    """Place the leaders again after the rule has moved them, and restore their displacements before
+    the step."""
 
     def apply(self, step: Step) -> None:
-        """Place and restore them after all particles have moved."""
+        """Place and restore the leaders after all particles have moved."""
         place(step.new, step.leaders)
         place(step.u, step.origins)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Place and restore them after all particles have moved."""
+        """Write loops that place and restore the leaders."""
         for end, axes in self.endings.items():
             lines = kernel.each(f"flat_v_@[leaders{end}[e]] = target{end}[#, e]", axes)
             if kernel.keeps_before:

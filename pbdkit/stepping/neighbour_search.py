@@ -57,8 +57,8 @@ class NeighbourSearch:
         return j[order], k[order], rest[:, order]
 
     def _of_slots(self, j: Indices, k: Indices) -> tuple[Indices, Floats]:
-        """Return the number of each pair's slot, the largest of all if it has none, and the rest
-        offset, (axis, pair)."""
+        """Return the slot of each pair, or the number of slots if it has none, and the rest offset,
+        (axis, pair)."""
         s, *cells = self._site
         sizes = np.array(self._rank.shape[2:])[:, None]
         step = np.stack([n[k] - n[j] for n in cells]) + sizes // 2
@@ -71,8 +71,8 @@ class NeighbourSearch:
 
 
 def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
-    """Return the number of a slot by (sublattice, sublattice, step of cells along each axis), the
-    count of slots if there is none; and the rest offset by that number, (axis, slot)."""
+    """Return two tables: the slot by (sublattice, sublattice, difference of cells along each axis),
+    or the number of slots if there is none; and the rest offset by slot, (axis, slot)."""
     slots = [slot for each in neighbourhood.slots for slot in each]
     reach, size = neighbourhood.reach_in_cells, len(neighbourhood.slots)
     rank = np.full((size, size, *(2 * n + 1 for n in reach)), len(slots))

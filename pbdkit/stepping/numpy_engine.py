@@ -22,12 +22,12 @@ class Engine(ABC):
 
     @abstractmethod
     def advance(self, state: State, steps: int = 1) -> State:
-        """Return the state after a number of steps. It takes over the arrays of `state`, which is
+        """Return the state after a number of steps. The arrays of `state` are reused; `state` is
         invalid afterwards."""
 
     def renewed(self, state: State, rows: slice) -> None:
-        """Update what the engine stores beside the last state after rows of its cells were
-        written."""
+        """Update what the engine stores in addition to the last state, after rows of its cells were
+        overwritten."""
         return
 
 
@@ -45,10 +45,10 @@ class Stepper(Engine):
         self._invalid: Literal["raise", "ignore"] = "raise" if strict else "ignore"
         self._program = program_of(scene, sweep)
         self._numbered = self
-        """Engine with the numbers of the last step."""
+        """Engine with the parameters of the last step."""
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """Make one step after the other, each with the numbers at its end."""
+        """Make the steps, each with the parameters at its end."""
         for _ in range(steps):
             scene = self._scene.at(state.step + 1)
             if scene is not self._scene and scene is not self._numbered._scene:

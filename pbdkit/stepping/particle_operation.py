@@ -29,11 +29,12 @@ class OperateOnParticles(Operation):
 
     @classmethod
     def of(cls, scene: Scene) -> Sequence[Self]:
-        """Return one for each operation of the scene, in their order."""
+        """Return an operation of a step for each particle operation of the scene, in their
+        order."""
         return [cls(scene, number) for number in range(len(scene.operations))]
 
     def apply(self, step: Step) -> None:
-        """Displace the particles after they have moved."""
+        """Displace the particles after the rule has moved them."""
         place = self._operated.place
         u, new = (planes.reshape(len(planes), -1) for planes in (step.u, step.new))
         with np.errstate(all="ignore", invalid=step.invalid):
@@ -42,7 +43,7 @@ class OperateOnParticles(Operation):
             plane[place] = values
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write a loop over its particles."""
+        """Write a loop over the selected particles."""
         n = self._number
         parameters = "".join(f"operation{n}[{m}], " for m in range(len(self._operated.parameters)))
         kernel.listed(
@@ -58,7 +59,7 @@ class OperateOnParticles(Operation):
         return {f"displacement{self._number}": self._operated.operation.displacement}
 
     def component(self) -> Component:
-        """Return the operation of the plugin."""
+        """Return the particle operation of the plugin."""
         return self._operated.operation
 
     def numbers(self) -> dict[str, tuple[str, ...]]:
@@ -74,7 +75,7 @@ class OperateOnParticles(Operation):
         return {f"operands{self._number}": self._operated.place}
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of particles that it moves while all are at rest."""
+        """Generate the cells of particles that it moves in the reference configuration."""
         yield self._moved_at_rest
 
     @cached_property

@@ -40,10 +40,11 @@ ORDER: tuple[type[Operation], ...] = (
     HoldLeaders,
     FollowFrame,
 )
-"""The order of a step: it stands here, and nowhere else."""
-MAX_FORESEEN, MAX_VALUES = 64, 2**20
-"""Maximum number of steps for which the places of leaders are computed in advance, and of their
-displacements."""
+"""Operations in the order of a step, which is defined here alone."""
+MAX_FORESEEN = 64
+"""Maximum number of steps for which the displacements of leaders are computed in advance."""
+MAX_VALUES = 2**20
+"""Maximum number of values of displacements that are computed in advance."""
 
 
 def program_of(
@@ -68,7 +69,8 @@ def prepare(program: Program, state: State) -> Call:
 
 
 def foresee(program: Program, call: Call, end: int) -> int:
-    """Prepare a call for the steps up to `end` that go on in the same way; return their number."""
+    """Prepare a call for the steps up to `end` that need no further work on the host; return their
+    number."""
     step, limit = call.step, end - call.state.step
     steady = steady_steps(program, step, limit)
     if steady > 1:
@@ -90,8 +92,9 @@ def reach_of(scene: Scene, axis: int) -> Reach:
 
 
 def steady_steps(program: Program, step: int, most: int, foreseeable: bool = False) -> int:
-    """Return how many steps from `step` on are alike, from 1 to `most`: leaders and obstacles stay,
-    loads and numbers do not change, and bonds are cut at most at the beginning of the first.
+    """Return the number of equal steps from `step` on, from 1 to `most`. Steps are equal if leaders
+    and obstacles stay, loads and parameters are constant, and bonds are cut at most at the
+    beginning of the first.
 
     Leaders may move if their motion is `foreseeable`.
     """
@@ -101,14 +104,14 @@ def steady_steps(program: Program, step: int, most: int, foreseeable: bool = Fal
 
 def last_event(scene: Scene) -> int:
     """Return the last step of the run, at least 1, in which leaders or obstacles move, roles, loads
-    or numbers change or bonds are cut."""
+    or parameters change, or bonds are cut."""
     events = (operation.events(scene.experiment.steps) for operation in program_of(scene))
     return max([1, *chain(*events), *bends_of(scene)])
 
 
 def bends_of(scene: Scene) -> list[int]:
-    """Return the moments of the run between which numbers and forces change linearly; its end is
-    one where they still change there. The course of a load counts while the load acts."""
+    """Return the moments of the run between which parameters and forces change linearly. The end of
+    the run is one of them if they still change there. Kinks of a load count while the load acts."""
     bends = (operation.bends(scene.experiment.steps) for operation in program_of(scene))
     return [*chain(*bends)]
 
@@ -125,6 +128,6 @@ def hindrance(scene: Scene, mode: Mode) -> Hindrance | None:
 
 
 def reason_against(scene: Scene, mode: Mode) -> str:
-    """Return that reason in words; empty if there is none."""
+    """Return that reason as text; empty if there is none."""
     reason = hindrance(scene, mode)
     return reason.reason if reason else ""

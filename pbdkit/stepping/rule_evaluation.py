@@ -1,8 +1,8 @@
-"""Evaluation of rule and fracture model: what a particle does in a step, given its neighbours.
+"""Evaluation of rules and fracture models for given neighbours.
 
-Stepping, analysis, identification, diagnostics of a material and the conformance suite evaluate
-rule and fracture model here and nowhere else; kernels are generated from the same functions and
-tested against this.
+Stepping, stability analysis, identification, diagnostics and the conformance suite evaluate the
+functions of rule and fracture model here and nowhere else. Kernels are generated from the same
+functions, and their results are compared with those of this module in tests.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ Cells = tuple[CellStress, ...]
 
 @dataclass(frozen=True)
 class Neighbour:
-    """One neighbour of particles, with what functions of the rule receive.
+    """Neighbours of particles along one slot, with the arguments of the rule's functions.
 
-    `r` is its rest offset, `w` the weights of the rule, `present` where it exists (None:
-    everywhere), `broken` where the bond is broken (None: nowhere). With fracture, `c` are the
-    constants of the bond, remembered numbers included. `more` are the weights of cells of further
-    stiffnesses, whose contributions are added. `shared` are the remembered numbers of the particle
-    and of the neighbour, for rules that use them. `torn` is the damage beside the bond, for rules
-    that tear cells; these receive the difference unchanged.
+    `r` is the rest offset, `w` are the weights of the rule, `present` is true where the neighbour
+    exists (None: everywhere), `broken` where the bond is broken (None: nowhere). With fracture, `c`
+    are the constants and state variables of the bond. `more` are the weights of cells with a
+    different stiffness, whose contributions are added. `shared` are the state variables of the
+    particle and of the neighbour, for rules that read both. `torn` is the damage beside the bond,
+    for rules that tear cells; these receive the difference unchanged.
     """
 
     r: Vector
@@ -70,7 +70,7 @@ class Neighbour:
 
 
 class Evaluator:
-    """Rule and fracture model of a scene, with the numbers that their functions receive."""
+    """Rule and fracture model of a scene, with the parameters of their functions."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -88,7 +88,7 @@ class Evaluator:
         return evaluator
 
     def contribution(self, d: Vector, u: Vector, to: Neighbour) -> Contributions:
-        """Return the contribution of a neighbour, or of its substitute at broken bonds."""
+        """Return the contribution of a neighbour or, at broken bonds, of its fictitious point."""
         difference = d if self.tears else self.seen(d, u, to)
         part = as_values(self._of_weights(difference, to, to.w), "gather")
         for w in to.more:
@@ -98,13 +98,13 @@ class Evaluator:
 
     def _of_weights(self, d: Vector, to: Neighbour, w: Any) -> Any:
         """Return the contribution for a difference and weights."""
-        rule: Any = self.rule  # some are given more than others
+        rule: Any = self.rule  # Functions of rules differ in their number of arguments.
         if to.torn is not None:
             return rule.torn(d, to.r, w, to.torn, self._p)
         return rule.gather(d, to.r, w, self._p, *to.shared)
 
     def energy(self, d: Vector, u: Vector, to: Neighbour) -> Contributions:
-        """Return the half of the bond's energy that belongs to this end."""
+        """Return half the energy of a bond, the part of one end."""
         assert isinstance(self.rule, StoresEnergy)
         if self.tears:
             w, t = to.w, to.torn
@@ -118,8 +118,8 @@ class Evaluator:
         return (self.rule.energy(self.seen(d, u, to), to.r, to.w, self._p),)
 
     def seen(self, d: Vector, u: Vector, to: Neighbour) -> Vector:
-        """Return the difference that the rule receives: softened, or that to the fictitious point
-        of a broken bond."""
+        """Return the difference that the rule receives: softened, or to the fictitious point of a
+        broken bond."""
         model = self._model
         if to.broken is None and to.c is None:
             return d
@@ -131,7 +131,7 @@ class Evaluator:
         return d if to.broken is None else where(to.broken, lost, d)
 
     def damage(self, r: Vector, c: Any) -> tuple[Any, Any]:
-        """Return the share of its force that an intact bond with the constants c has lost in the
+        """Return the fraction of its force that an intact bond with the constants c has lost in the
         cells to its left and right."""
         model: Any = self._model
         if isinstance(model, SoftensCells):
@@ -155,15 +155,14 @@ class Evaluator:
         return as_vector(self.rule.force(total, here, self._p), "force", here.u)
 
     def remember(self, total: Contributions, here: Here) -> Contributions:
-        """Return the new values of the particle's numbers that change."""
+        """Return the new values of the state variables of particles that change."""
         assert isinstance(self.rule, RenewsParticles)
         return as_values(self.rule.remember(total, here, self._p), "remember")
 
     def renew_particles(
         self, total: Contributions, here: Here, own: Sequence[Any], where: Mask | None
     ) -> None:
-        """Write the new values over the remembered numbers of particles, in place, where a mask is
-        true."""
+        """Write the new values of state variables of particles in place, where a mask is true."""
         if isinstance(self.rule, RenewsParticles):
             renew(self._of_particle, own, self.remember(total, here), where)
 
@@ -176,15 +175,15 @@ class Evaluator:
         intact: Mask,
         cells: Cells = (),
     ) -> None:
-        """Write the new values over the remembered numbers of bonds, in place, where they are
-        intact; `cells` are those beside the bonds, for a model that softens cells."""
+        """Write the new values of state variables of bonds in place, where they are intact. `cells`
+        are those beside the bonds, for a model that softens cells."""
         if isinstance(self._model, RenewsBonds):
             renew(self._of_bond, own, self.update(d, r, limits, own, cells), intact)
 
     def update(
         self, d: Any, r: Any, limits: Any, own: Sequence[Any], cells: Cells = ()
     ) -> Contributions:
-        """Return the new values of the bonds' numbers that change."""
+        """Return the new values of the state variables of bonds that change."""
         assert isinstance(self._model, RenewsBonds)
         c = self._scene.constants.of_bond(*limits, *shown(own))
         return as_values(self._model.update(d, r, c, self._q, *cells), "update")
@@ -195,13 +194,13 @@ class Evaluator:
         return self._model.load(cell, self._scene.constants.of_bond(*limits, *shown(own)), self._q)
 
     def breaks(self, d: Vector, r: Vector, limits: Any, own: Sequence[Any]) -> Any:
-        """Return whether bonds with these remembered numbers break."""
+        """Return whether bonds with these state variables break."""
         c = self._scene.constants.of_bond(*limits, *shown(own))
         return as_verdict(self._model.breaks(d, r, c, self._q))
 
     def everywhere(self, slots: Iterable[Slot]) -> list[Neighbour]:
-        """Return the neighbours in the middle of a body: all are present, no bond is broken, and
-        remembered numbers have their initial values."""
+        """Return the neighbours in the interior of a body: all are present, no bond is broken, and
+        state variables have their initial values."""
         weights = self._scene.constants.weights
         shared = (self.initial_own(),) * 2 if shares_particles(self.rule) else ()
         return [Neighbour(slot.rest, weights[slot], shared=shared) for slot in slots]
@@ -213,7 +212,7 @@ class Evaluator:
         return self.move(summed((part, None) for part in parts), Here(u, own=self.initial_own()))
 
     def initial_own(self) -> Any:
-        """Return the initial remembered numbers of a particle, unless they are drawn."""
+        """Return the initial state variables of a particle, if they are not drawn at random."""
         initial = (number.initial for number in self._of_particle)
         return self._scene.constants.of_particle(*initial)
 
@@ -238,7 +237,7 @@ def _masked(value: Any, present: Mask) -> Any:
 
 
 BLOCK_CELLS = 16384
-"""Number of places of a block: small enough for its temporaries to stay in the cache."""
+"""Number of places of a block, such that its temporary arrays fit in the cache."""
 Contributing = Callable[[Vector, Vector, Neighbour], Contributions]
 """Type of functions that return the contribution of a neighbour from d and u."""
 
@@ -313,7 +312,7 @@ class Surroundings:
         return Here(vector(shown(self.where.of(u))), *self._reference, numbers)
 
     def own(self, state: State) -> list[NDArray[Any]]:
-        """Return the remembered numbers of the particles; of a block, views into the state."""
+        """Return the state variables of the particles; of a block, views into the state."""
         return [self.where.of(value) for value in state.particle_values]
 
     def sums(self, function: Contributing, u: NDArray[Any], state: State) -> Contributions:
@@ -323,8 +322,8 @@ class Surroundings:
         return summed((function(d, u_own, to), to.present) for d, to in parts)
 
     def _weigh_cells(self, cells: WeighedCells) -> None:
-        """Put the shares of the cells beside each slot into its weights, and add the weights of
-        cells that have a stiffness of their own."""
+        """Multiply the weights of each slot by the area fractions of the cells beside it, and add
+        the weights of cells that have a stiffness of their own."""
         precision = self._scene.experiment.stepping.precision
         beside = cells.beside_each(self.slots, self.where, precision)
         self._weights = [
@@ -339,13 +338,12 @@ class Surroundings:
                     self._more[n] = (*self._more[n], w)
 
     def _remembered(self, where: Where, state: State) -> Any:
-        """Return the remembered numbers of particles by name."""
+        """Return the state variables of particles by name."""
         values = (where.of(value) for value in state.particle_values)
         return self._scene.constants.of_particle(*shown(values))
 
     def _shared(self, slot: Slot, state: State) -> tuple[Any, ...]:
-        """Return the remembered numbers of particles and their neighbours, for rules that use
-        both."""
+        """Return the state variables of particles and their neighbours, for rules that use both."""
         if not shares_particles(self._scene.experiment.rule):
             return ()
         ends = self.where, self.where.seen_through(slot)
@@ -376,8 +374,8 @@ class Surroundings:
         return torn
 
     def _damage(self, bond: CellBond, state: State) -> tuple[NDArray[np.floating[Any]], ...]:
-        """Return the share of their force that bonds have lost in the cells to their left and
-        right, where they are stored: 1 if they are broken."""
+        """Return the fraction of their force that bonds have lost in the cells to their left and
+        right; 1 if they are broken."""
         scene, home = self._scene, self.where
         if bond.home:
             home = home.seen_through(bond.home)
@@ -394,7 +392,7 @@ class Surroundings:
         return tuple(np.where(broken, 1.0, side).astype(precision) for side in softened)
 
     def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:
-        """Return where the bond along a slot is broken, and its constants if the rule receives
+        """Return where the bonds along a slot are broken, and their constants if the rule receives
         them."""
         if state.broken_step is None:
             return None, None
@@ -420,8 +418,8 @@ def blocks(scene: Scene) -> list[Surroundings]:
 
 
 def presence(raster: Raster, place: Where, slots: Sequence[Slot]) -> list[Mask | None]:
-    """Return for each slot where the neighbour exists, None if it does everywhere; only places with
-    a particle count."""
+    """Return for each slot where the neighbour exists, None if it exists at every place with a
+    particle."""
     nobody = place.of(raster.kind) == EMPTY
     planes = (place.seen_through(slot).of(raster.kind) != EMPTY for slot in slots)
     return [None if (present | nobody).all() else present for present in planes]

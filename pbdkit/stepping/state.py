@@ -1,6 +1,4 @@
-"""The state of a run: what it remembers from one step to the next. This, and nothing else, is a
-checkpoint.
-"""
+"""State of a run, passed from step to step. It is complete: a run continues from it exactly."""
 
 from __future__ import annotations
 
@@ -46,7 +44,7 @@ def break_crossed(
 
 
 def cut_bonds(scene: Scene, broken: BrokenSteps | None, step: int) -> bool:
-    """Make the cuts of the beginning of a step in place; return whether there are any."""
+    """Make the cuts at the beginning of a step in place; return whether there are any."""
     segments = [cut.segment for cut in scene.experiment.cuts if cut.at == step]
     if segments:
         assert broken is not None
@@ -55,22 +53,23 @@ def cut_bonds(scene: Scene, broken: BrokenSteps | None, step: int) -> bool:
 
 
 Values = tuple[Array, ...]
-"""Type of the remembered numbers, one array each, in the order of their declarations."""
+"""Type of state variables: one array each, in the order of their declarations."""
 
 
 @dataclass
 class State:
-    """The run at the end of a step.
+    """State of a run at the end of a step.
 
-    `u` is the displacement, (axis, sublattice, cell, cell), zero where no particle is, and
-    `previous` the same at the end of the step before: memory needs it, PE2 shows it, and the next
-    step is written into it. `broken_step` holds, for each plane of bonds (plane, cell, cell), the
-    step at which each broke and -1 where none did, and `broken_length` its length just then in the
-    intermediate configuration, 0 where none broke or was cut; None where nothing can break.
-    `starts` has for each leader group that has begun the displacements from which its motion
-    counts, (axis, particle); of one that moves by Newton's law, the velocities. `bond_values` and
-    `particle_values` are what the fracture model remembers of each bond, as `broken_step` lies, and
-    the rule of each particle, (sublattice, cell, cell).
+    `u` is the displacement, (axis, sublattice, cell, cell), zero at places without particles.
+    `previous` is the displacement at the end of the step before, from which momentum and PE2 are
+    computed; the next step is written into it. `broken_step` has for each plane of bonds, (plane,
+    cell, cell), the step at which each bond broke, -1 for intact bonds, and `broken_length` its
+    length in the intermediate configuration of that step, 0 for intact and cut bonds; both are None
+    if no bond can break. `starts` has for each leader group that has begun the displacements at
+    which its motion started, (axis, particle), or the velocities for one that moves by Newton's
+    law. `bond_values` are the state variables of the fracture model for each bond, as
+    `broken_step`, and `particle_values` those of the rule for each particle, (sublattice, cell,
+    cell).
     """
 
     step: int
@@ -83,8 +82,8 @@ class State:
     particle_values: Values = ()
 
     def copy(self, over: State | None = None) -> State:
-        """Return a copy, written over another state of the same scene if one is given: new memory
-        costs several times as much as copying."""
+        """Return a copy, written over another state of the same scene if one is given; allocating
+        memory takes several times as long as copying."""
         if over is None:
             return replace(self, **{name: _copied(part) for name, part in vars(self).items()})
         for mine, target in zip(self.arrays(), over.arrays(), strict=True):
@@ -92,7 +91,8 @@ class State:
         return replace(over, step=self.step, starts=self.starts)
 
     def fits(self, other: State) -> bool:
-        """Return whether both can belong to one scene, by the types and shapes of their arrays."""
+        """Return whether both states can belong to one scene, by the data types and shapes of their
+        arrays."""
         layouts = [[(a.dtype, a.shape) for a in state.arrays()] for state in (self, other)]
         return layouts[0] == layouts[1] and len(self.starts) == len(other.starts)
 
@@ -136,15 +136,16 @@ def unmoved_state(scene: Scene, cells: Sequence[int]) -> State:
 
 
 def started(scene: Scene, numbers: Sequence[Remembered], shape: Sequence[int]) -> Values:
-    """Return arrays of remembered numbers at their `initial`."""
+    """Return arrays of state variables with their initial values."""
     precision = scene.experiment.stepping.precision
     dtypes = [precision if number.dtype == "f8" else number.dtype for number in numbers]
     return tuple(np.full(shape, n.initial, d) for n, d in zip(numbers, dtypes, strict=True))
 
 
 def initial_state(scene: Scene) -> State:
-    """Return the state at time 0: the body with its initial displacements, the frame following, and
-    bonds across cracks and initial cuts broken at step 0. Nothing has moved before."""
+    """Return the state at time 0: the body has its initial displacements, frame points follow, and
+    bonds across cracks and initial cuts are broken at step 0. Displacements of the step before are
+    the same."""
     experiment, state = scene.experiment, unmoved_state(scene, scene.raster.shape[1:])
     if not experiment.initial.at_rest:
         _displace(scene, state.u.reshape(scene.axes, -1))
@@ -158,7 +159,7 @@ def initial_state(scene: Scene) -> State:
 
 
 def _displace(scene: Scene, u: Floats) -> None:
-    """Write the displacements of body and frame, (axis, flat place)."""
+    """Write the displacements of body and frame, (axis, flat place), into u."""
     raster, body = scene.raster, scene.raster.body_rows
     leads = kinds_at(raster, scene.leading, 0)[body] == LEADER
     generator = initial_generator(scene.experiment.seed)
@@ -169,7 +170,8 @@ def _displace(scene: Scene, u: Floats) -> None:
 
 
 def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Values) -> None:
-    """Write the initial values of the numbers that a component draws; frame points are left out."""
+    """Draw the random initial values of the state variables of a component, without those of frame
+    points."""
     part: FractureModel | FollowerRule = getattr(scene.experiment, field)
     if not (numbers and isinstance(part, Draws)):
         return
@@ -212,10 +214,10 @@ def describe_bonds(scene: Scene) -> Bonds:
 def renew(
     numbers: Sequence[Remembered], own: Sequence[Array], new: Sequence[Any], where: Array | None
 ) -> None:
-    """Write the new values of the numbers that change over the remembered ones, in place, where a
-    mask is true; all are computed before any is written.
+    """Write the new values of the state variables that change, in place, where a mask is true.
 
-    Raises ValueError for another number of values, TypeError for fractions of an integer.
+    Raises ValueError if the number of values differs, TypeError if an integer variable would get a
+    fraction.
     """
     old = [value for number, value in zip(numbers, own, strict=True) if number.changes]
     if len(new) != len(old):
@@ -232,7 +234,7 @@ def renew(
 
 
 def shown(values: Iterable[Any]) -> tuple[Any, ...]:
-    """Return read-only views of arrays, as components receive them; other values unchanged."""
+    """Return read-only views of arrays, for components; other values unchanged."""
     return tuple(_read_only(value) if isinstance(value, np.ndarray) else value for value in values)
 
 

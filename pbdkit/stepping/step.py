@@ -60,7 +60,7 @@ class Mode(Enum):
 PUSHED_BY_COURSES = (
     "numbers change in time by which masses, obstacles or leaders along an axis push"
 )
-"""Reason why kernels do not follow numbers that change in time."""
+"""Reason why kernels do not support some time-dependent parameters."""
 
 
 class Hindrance(NamedTuple):
@@ -79,17 +79,18 @@ class Hindrance(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """Distances along an axis, in repeat cells, at which an operation reads what others write.
+    """Distances along an axis, in repeat cells, over which an operation reads values that others
+    write.
 
     Parameters
     ----------
     reach
         Distance of neighbours.
     back, ahead
-        Distances behind and ahead of a particle at which bonds are judged, or moves of an inner
-        rule made, before it moves.
+        Distances behind and ahead of a particle up to which bonds are updated, or moves of an inner
+        rule computed, before the particle moves.
     below, above
-        Distances below and above at which these in turn read displacements.
+        Distances below and above up to which these read displacements.
     apart
         Distance of frame points from the particles that they follow.
     """
@@ -109,13 +110,14 @@ class Reach(NamedTuple):
 
     @property
     def sight(self) -> int:
-        """Distance at which a step reads beyond judged bonds, or moves of an inner rule."""
+        """Distance up to which a step reads displacements for bonds, or for moves of an inner
+        rule."""
         return max(self.reach - self.ahead, self.above)
 
 
 @dataclass(slots=True)
 class Step:
-    """Step in progress, which the operations change one after the other.
+    """Step in progress, which is passed from operation to operation and modified by each.
 
     Parameters
     ----------
@@ -125,10 +127,9 @@ class Step:
         Displacements at the end of the step before. While particles move, leaders are in place:
         the intermediate configuration.
     new
-        Displacements of one step earlier at the beginning, those at the end of this step at the
-        end.
+        On entry the displacements of one step earlier; at the end those of this step.
     state
-        State at the beginning. What bonds and particles remember is renewed in place.
+        State at the beginning. State variables of bonds and particles are updated in place.
     invalid
         Treatment of operations of the rule that give NaN.
     leaders, origins
@@ -181,7 +182,7 @@ class Call:
 
     @property
     def moments(self) -> range:
-        """Numbers of the steps in which leaders are at different places."""
+        """Numbers of the steps that differ in the displacements of leaders."""
         return range(self.step, self.step + len(self.leaders))
 
 
@@ -207,8 +208,9 @@ Cells = tuple[Indices, ...]
 class Operation(ABC):
     """Part of a step that belongs to one feature of a scene.
 
-    Subclasses define `apply` and `emit`, and override what differs from a feature that reads
-    neighbours nowhere, does the same in each step and moves nothing by itself.
+    Subclasses define `apply` and `emit`. The other methods have defaults for a feature that reads
+    no neighbours, is the same in each step and does not move a body at rest; subclasses override
+    those that differ.
     """
 
     makes_moves: ClassVar[bool] = False
@@ -230,18 +232,19 @@ class Operation(ABC):
 
     @abstractmethod
     def apply(self, step: Step) -> None:
-        """Compute the part of a step by numpy, in place: the reference for every engine."""
+        """Compute the part of a step by numpy, in place. Every engine reproduces it."""
 
     @abstractmethod
     def emit(self, kernel: KernelWriter) -> None:
         """Write the part of a step into a kernel."""
 
     def opening(self, step: str) -> Lines:
-        """Return lines at the beginning of a step; `step` is its number in the call, from 0."""
+        """Return lines at the beginning of a step; `step` is the index of the step in the call."""
         return []
 
     def end_pass(self, kernel: KernelWriter) -> None:
-        """Write what completes displacements before the last step of a pass of several steps."""
+        """Write lines that complete the displacements before the last step of a pass of several
+        steps."""
         return
 
     def functions(self) -> dict[str, Callable[..., Any]]:
@@ -249,8 +252,8 @@ class Operation(ABC):
         return {}
 
     def component(self) -> Component | None:
-        """Return the component to which these functions belong; None if it is the rule or the
-        fracture model, or if they are built in."""
+        """Return the component to which these functions belong; None for those of the rule and the
+        fracture model, and for built-in ones."""
         return None
 
     def numbers(self) -> dict[str, tuple[str, ...]]:
@@ -274,7 +277,7 @@ class Operation(ABC):
         return {}
 
     def prescribed_numbers(self) -> tuple[int, ...]:
-        """Return the remembered numbers of particles that it prescribes."""
+        """Return the state variables of particles that it prescribes."""
         return ()
 
     def reads(self, state: State) -> bool:
@@ -294,37 +297,39 @@ class Operation(ABC):
         return
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of particles at rest that a call moves, neighbours apart."""
+        """Generate the cells of particles at rest that the operation moves in a call, without their
+        neighbours."""
         yield from ()
 
     def fixed_places(self) -> Indices:
-        """Return the flat places of particles that stay in place while it acts."""
+        """Return the flat places of particles that are not moved while it acts."""
         return np.zeros(0, np.intp)
 
     def reach(self, axis: int) -> Reach:
-        """Return the distances along an axis at which it reads what others write."""
+        """Return the distances along an axis over which it reads values that others write."""
         return Reach()
 
     def sweeps(self) -> int:
-        """Return how many times one after the other it evaluates neighbours in a step."""
+        """Return the number of times that it evaluates neighbours in a step, one after the
+        other."""
         return 0
 
     def carries(self) -> Indices:
-        """Return the differences of repeat cell, (difference, axis), over which it carries the
-        motion of a particle on in a step."""
+        """Return the differences of repeat cells, (difference, axis), by which a motion of a
+        particle propagates in a step."""
         return np.zeros((0, self.scene.axes), np.intp)
 
     def next_change(self, step: int, foreseeable: bool = False) -> float:
-        """Return the first step after `step` in which it does something else; infinity if there is
-        none. Motions do not count that are `foreseeable` where particles are prescribed."""
+        """Return the first step after `step` in which the operation changes; infinity if there is
+        none. Motions that are `foreseeable` do not count."""
         return math.inf
 
     def events(self, steps: int) -> list[int]:
-        """Return the steps of a run in which it begins or ceases to do something."""
+        """Return the steps of a run in which the operation begins or ceases to act."""
         return []
 
     def bends(self, steps: int) -> list[int]:
-        """Return the moments of a run between which its numbers change linearly."""
+        """Return the moments of a run between which its parameters change linearly."""
         return []
 
     def hindrance(self, mode: Mode) -> Hindrance | None:

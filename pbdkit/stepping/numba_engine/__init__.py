@@ -1,3 +1,8 @@
-"""The compiled engine: the same elementwise functions, inlined into generated kernels (numba)."""
+"""Compiled engine (numba): kernels generated from the elementwise functions of the components.
+
+`plan` describes the kernel of a scene, `emitter` and `blocking` write its source, `sweeps` the
+lines that move particles, `cache` compiles and stores it, and `engine` makes steps with it. Results
+agree with the numpy engine to the last bit.
+"""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Arrays of kernels by name: constants of a scene, lost bonds, and the stretches of rows whose
-particles have all their neighbours and whole cells."""
+"""Arrays of kernels: constants of a scene, bit masks of broken bonds, and runs of particles that
+all have their neighbours and whole cells."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def constant_arrays(plan: Plan) -> Arrays:
     }
     if scene.cells:
         arrays["share"] = np.array(scene.cells.weight, real)
-        if mixed := scene.cells.mixed:  # those of a cell side by side
+        if mixed := scene.cells.mixed:  # The values of a cell are contiguous.
             arrays["mixed"] = np.stack(mixed, axis=-1).astype(real)
     for name, planes in (("field", constants.by_particle), ("limit", constants.by_bond)):
         arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
@@ -57,7 +57,8 @@ def constant_arrays(plan: Plan) -> Arrays:
         arrays |= sweeps.stress_arrays(scene, real)
     for operation in program_of(scene):
         for name, values in operation.constants().items():
-            arrays[name] = np.array([*values, 0.0], real)  # one more, so that none is empty
+            # One value more, so that no array is empty.
+            arrays[name] = np.array([*values, 0.0], real)
         for name, place in operation.lists().items():
             arrays |= list_arrays(plan, name, Entries(place, {}), by_rows=True)
     for following in FollowFrame.of(scene):
@@ -67,8 +68,8 @@ def constant_arrays(plan: Plan) -> Arrays:
 
 
 def list_arrays(plan: Plan, name: str, entries: Entries, *, by_rows: bool) -> Arrays:
-    """Return a list of particles with its values; `by_rows` sorted, with the first of each row and
-    the columns, for passes of several steps."""
+    """Return a list of particles with its values. With `by_rows`, for passes of several steps, it
+    is sorted, with the first index of each row and the columns."""
     if not by_rows:
         return {name: entries.place, **entries.values}
     order, rows = banded(plan, name, entries.place)
@@ -98,7 +99,8 @@ def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
 
 
 def _of_frame(frame: Frame, order: Indices, real: np.dtype[Any]) -> Arrays:
-    """Return its points in an order, and their entries one after the other."""
+    """Return the frame points in an order, and their entries in the frame's map one after the
+    other."""
     counts = np.bincount(frame.map.point, minlength=len(frame.place))
     entry = np.argsort(np.argsort(order)[frame.map.point], kind="stable")
     return {
@@ -110,7 +112,7 @@ def _of_frame(frame: Frame, order: Indices, real: np.dtype[Any]) -> Arrays:
 
 
 def changing_arrays(plan: Plan) -> Arrays:
-    """Return the arrays that time-dependent numbers change: parameters, and limits of bonds."""
+    """Return the arrays of time-dependent parameters of the rule, and of the limits of bonds."""
     scene, real = plan.scene, plan.scene.experiment.stepping.precision
     slots = scene.neighbourhood.slots
     limits = np.array([scene.constants.limits_of(slot) for slot in padded(slots)], real)
@@ -124,7 +126,7 @@ def changing_arrays(plan: Plan) -> Arrays:
 
 
 def _ratios(plan: Plan) -> Arrays:
-    """Return the stiffness of cells over their Young's modulus, those of a cell side by side."""
+    """Return the stiffness of cells over Young's modulus; the values of a cell are contiguous."""
     stresses, real = CellStresses(plan.scene), plan.scene.experiment.stepping.precision
     if plan.mixed:
         return {"ratios": np.stack(stresses.ratios_by_cell, axis=-1).astype(real)}
@@ -132,8 +134,8 @@ def _ratios(plan: Plan) -> Arrays:
 
 
 def padded(slots: Sequence[tuple[Slot, ...]]) -> list[Slot]:
-    """Return the slots of each sublattice, all of the same number: the first is repeated, and not
-    used, where there are fewer."""
+    """Return equally many slots for each sublattice. Where there are fewer, the first is repeated
+    and not used."""
     width = max(map(len, slots))
     return [slot for each in slots for slot in (*each, *each[:1] * (width - len(each)))]
 
@@ -156,9 +158,9 @@ def _stacked(rows: Sequence[dict[str, Any]], real: np.dtype[Any]) -> Arrays:
 
 
 def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
-    """Return rest offset, weights, and the sign of d at the home of bonds of a slot; and the
-    differences in flat arrays from a particle to the neighbour, to the home of the bond and to the
-    shares of the cells beside it."""
+    """Return rest offset, weights, and sign of d at the home of bonds of a slot; and the
+    differences in flat arrays from a particle to the neighbour, to the home of the bond, and to the
+    area fractions of the cells beside it."""
     scene, shape = plan.scene, plan.scene.raster.shape
     away, (plane, is_home) = slot_step(shape, slot), scene.neighbourhood.home[slot]
     home = plane - (slot.source if is_home else slot.target)
@@ -197,18 +199,18 @@ def bits_for(scene: Scene) -> np.dtype[Any]:
 
 
 def lost_bits(scene: Scene, state: State) -> Bits:
-    """Return an integer for each particle, with bit k set if the bond along slot k is broken, at
-    both ends."""
+    """Return a bit mask for each particle; bit k is set at both ends of a broken bond along slot
+    k."""
     lost = np.zeros(scene.raster.shape, bits_for(scene))
     renew_lost_bits(lost, scene, state, slice(0, lost.shape[1]))
     return lost
 
 
 def renew_lost_bits(lost: Bits, scene: Scene, state: State, rows: slice) -> None:
-    """Write the bits of some rows of cells."""
+    """Update the bit masks of some rows of cells."""
     assert state.broken_step is not None
     around, (height, *across) = scene.neighbourhood, scene.raster.shape[1:]
-    margin, *margins = around.reach_in_cells  # beyond it nobody is
+    margin, *margins = around.reach_in_cells  # No particle has neighbours beyond it.
     first, last = max(rows.start, margin), min(rows.stop, height - margin)
     stop = tuple(size - n for size, n in zip(across, margins, strict=True))
     for s, slots in enumerate(around.slots):
@@ -223,17 +225,17 @@ def renew_lost_bits(lost: Bits, scene: Scene, state: State, rows: slice) -> None
 
 
 SHORT = 4
-"""Number of particles below which stretches are joined with a more general one beside them."""
+"""Number of particles below which a run is merged into an adjacent, more general one."""
 Ints = NDArray[np.integer[Any]]
 
 
 def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[int, int], ...]]:
-    """Return the stretches of one kind that consecutive rows share, sorted by sublattice, kind and
+    """Return the runs of one kind that consecutive rows share, sorted by sublattice, kind and
     place.
 
-    The first array is (run, (leading cells, first row, last row + 1, begin, end)), the second
-    (group, row, 2): the first run that reaches a row of the first axis, and the first that begins
-    there or later. The tuple has the sublattice and kind of each group.
+    The first array is (run, (leading cells, first row, last row + 1, begin, end)). The second is
+    (group, row, 2): the index of the first run that reaches a row of the first axis, and of the
+    first run that begins there or later. The tuple contains the sublattice and kind of each group.
     """
     runs, starts, groups = list[Ints](), list[Ints](), list[tuple[int, int]]()
     rows = np.arange(scene.raster.shape[1] + 1)
@@ -253,7 +255,7 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
 
 
 def _joined(lines: Ints) -> Ints:
-    """Join stretches at the same place of consecutive rows."""
+    """Merge runs at the same place of consecutive rows."""
     *lead, row, begin, end = lines.T
     lines = lines[np.lexsort((row, end, begin, *reversed(lead)))]
     step = np.diff(lines, axis=0)
@@ -288,7 +290,7 @@ def kinds_of(scene: Scene, block: Block, all_general: bool) -> Ints:
 
 
 def _lines_of(kinds: Ints) -> Ints:
-    """Return the stretches of one kind, in each row along the last axis."""
+    """Return the runs of one kind, in each row along the last axis."""
     padding = [*[(0, 0)] * (kinds.ndim - 1), (0, 1)]
     closed = np.pad(kinds, padding, constant_values=sweeps.NOBODY)
     flat = closed.ravel()
@@ -297,7 +299,7 @@ def _lines_of(kinds: Ints) -> Ints:
         ([sweeps.PLAIN, sweeps.WITH_CELLS], sweeps.GENERAL),
     ):
         begin, end, kind = _stretches(flat)
-        # The last is of nobody, so that no end touches the other.
+        # The last column is empty, so that runs of consecutive rows do not touch.
         touches = (np.roll(kind, 1) == neighbour) | (np.roll(kind, -1) == neighbour)
         short = np.isin(kind, kinds_of_short) & (end - begin < SHORT) & touches
         flat = np.repeat(np.where(short, neighbour, kind), end - begin)
@@ -308,6 +310,6 @@ def _lines_of(kinds: Ints) -> Ints:
 
 
 def _stretches(flat: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return (begin, end, value) of the stretches of equal values."""
+    """Return (begin, end, value) of the runs of equal values."""
     begin = np.flatnonzero(np.diff(flat, prepend=-1))
     return begin, np.append(begin[1:], len(flat)), flat[begin]

@@ -1,12 +1,13 @@
-"""Passes of several steps: loops over pieces, tiles and bands, and the writer of a step in a tile.
+"""Passes of several steps over the memory: loops over pieces, tiles and bands, and the writer of a
+step in a tile.
 
 The lattice is cut along its last axis into tiles that stay in the cache, and each tile along its
-first axis into bands. Band after band, every step of a pass moves a part of the tile, at the
-distance of `Skew` behind the step before along both axes; the next tile follows.
+first axis into bands. In each band all steps of the pass are made one after the other; each step is
+shifted by the distance `Skew` against the step before along both axes (time skewing).
 
-On several threads the rows are cut into pieces that are moved in parallel. At their ends each step
-of a piece leaves out as many rows more than the one before as it must not read. These gaps, which
-grow as the pieces shrink, are moved in parallel afterwards.
+On several threads the rows are cut into pieces, which are computed in parallel. At the ends of a
+piece the number of rows decreases from step to step, because the rows of the next piece must not be
+read. The gaps that remain are computed in parallel afterwards.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class TileWriter(PlanWriter):
 
     keeps_before = False
     _is_ahead = True
-    """True if rows and columns are ahead of the particles that move."""
+    """True while lines are written for the rows and columns ahead of the particles that move."""
 
     def __init__(self, plan: Plan, passes: Passes) -> None:
         arguments = "s", "moment", "band_", "tile", "piece", "extent", "boxes"
@@ -51,21 +52,21 @@ class TileWriter(PlanWriter):
         out.add(0, f"j1 = right + {columns.sight}")
 
     def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
-        """Write a loop over the entries in the rows and columns."""
+        """Write a loop over the entries in the present rows and columns."""
         if not ahead:
             self._keep_to_moving()
         self._loop(name, "e", lines)
 
     def judge_bonds(self) -> None:
-        """Write a call ahead of the particles that move."""
+        """Write a call for bonds ahead of the particles that move."""
         if judge := self.passes.judge:
             self._keep_to_moving()
             self.out.add(0, judge.call("i0", "i1", "left", "right"))
             self._move_on()
 
     def sweep(self, level: int) -> None:
-        """Write a call over what motion has reached; of an inner rule ahead of the particles that
-        move."""
+        """Write a call for the particles that motion has reached; for an inner rule ahead of the
+        particles that move."""
         out, first = self.out, 2 * self.plan.scene.axes - 2
         self._keep_to_moving()
         out.add(0, "box = boxes[s].copy()", f"box[{first}] = max(box[{first}], left)")
@@ -82,10 +83,10 @@ class TileWriter(PlanWriter):
         self.out.add(1, self.rows(name, write).call("r0", "r1", "moment + s"))
 
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Write a loop over the points whose last particle is in the range; points with particles
-        on both sides of the end of a piece wait for the gap."""
+        """Write a loop over the frame points whose last particle is in the range. Points with
+        particles on both sides of the end of a piece are computed with the gap."""
         lines = self.each(f"{planes}_@[points[f]] = t_@")
-        if lag:  # where the point was to be after the step before
+        if lag:  # The point has the displacement that was computed for it in the step before.
             lines = self.each(f"{planes}_@[points[f]] = lag_@[f]")
         lines = [*lines, *lag_lines(self, mapped, planes)] if lag else [*mapped(planes), *lines]
         self.out.add(0, f"i1 = min(high, top + {self._skew[0].apart} * (up > 0))")
@@ -109,7 +110,7 @@ class TileWriter(PlanWriter):
             self._is_ahead = False
 
     def _move_on(self) -> None:
-        """Shift the range by the distance of what was done ahead of the particles that move."""
+        """Shift the range back to the particles that move."""
         out, (rows, columns) = self.out, self._skew
         for edge, slope in (("bottom", "down"), ("top", "up")):
             out.add(0, f"{edge} += {rows.back} if {slope} > 0 else {-rows.ahead} * ({slope} < 0)")
@@ -125,7 +126,7 @@ def lag_lines(kernel: KernelWriter, mapped: Callable[[str], Lines], planes: str)
 
 def write_piece(plan: Plan, program: Program, passes: Passes) -> list[Function]:
     """Return the functions for the steps of a pass in a piece, the main one last: rows from `begin`
-    to `end`, with ends that go further `down` or `up` in every step."""
+    to `end`, with ends that move by `down` and `up` in every step."""
     tile = TileWriter(plan, passes)
     tile.begin()
     for operation in program:
@@ -155,15 +156,15 @@ def _exchanged(plan: Plan, call: str) -> str:
 
 
 def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> None:
-    """Write the beginning of a loop over steps: many in a pass, as long as several remain and
-    motion has reached more than stays in the cache."""
+    """Write the beginning of a loop over steps. Passes of many steps are made while many steps
+    remain and motion has reached more than fits in the cache."""
     out, plan = writer.out, writer.plan
-    # numba compiles a function for each literal that it is called with, and again for int64.
+    # numba compiles a function again for each literal argument and for int64; so all are int64.
     out.add(0, "boxes, moment = np.empty((sizes[0], box.size), np.int64), int64(0)")
     out.add(0, "while moment < count:", "    area = 1", "    for e in range(0, box.size, 2):")
     out.add(2, "area *= min(box[e + 1], kind.shape[e // 2 + 1]) - max(box[e], 0)")
     out.add(1, "deep = min(sizes[0], count - moment)")
-    if plan.parallel:  # pieces meet only where there is room for their gaps
+    if plan.parallel:  # Pieces have room for the gaps between them.
         out.add(1, "height = min(box[1], kind.shape[1]) - max(box[0], 0)")
         out.add(1, f"deep = min(deep, height // ({2 * Skew(plan.scene).along[0]} * sizes[4]) - 1)")
     out.add(1, "if deep > 1 and area > sizes[3]:")
@@ -178,7 +179,7 @@ def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> 
         out.add(0, "if deep % 2 == 0:", *(f"    own{m}[:] = was{m}" for m in plan.kept))
     u, v = (", ".join(plan.each(f"{side}_@")) for side in "uv")
     out.add(0, "if deep % 2:", f"    {u}, {v} = {v}, {u}", "moment += deep", "step += deep")
-    # Leaders of the step before the last stand where the last has placed them.
+    # The last step but one has its leaders where the last step has placed them.
     out.add(0, *plan.each("flat_v_@ = v_@.reshape(-1)"))
     out.add(0, *plan.opening("moment - 2"))
     out.depth -= 1
@@ -189,7 +190,8 @@ def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> 
 
 
 def _write_pieces(out: Function, plan: Plan, piece: Function) -> None:
-    """Write one call, or calls for the pieces of the threads and for the gaps between them."""
+    """Write a call for one piece, or calls for the pieces of the threads and for the gaps between
+    them."""
     arguments = ("moment", "deep", "extent", "boxes")
     if not plan.parallel:
         out.add(0, piece.call("(i_low, i_high, int64(0), int64(0))", *arguments))
@@ -204,8 +206,8 @@ def _write_pieces(out: Function, plan: Plan, piece: Function) -> None:
 
 
 def _write_extent(out: Function, plan: Plan) -> None:
-    """Write what each step of a pass has reached, and the largest distance of leaders and frame
-    points from it."""
+    """Write the part of the lattice that each step of a pass has reached, and the largest distance
+    of leaders and frame points from it."""
     up, across = Skew(plan.scene).along
     first = 2 * plan.scene.axes - 2
     out.add(0, "for s in range(deep):", "    for e in range(box.size):")

@@ -1,9 +1,10 @@
-"""The cache of kernels: a folder for each, under a key of everything that it was made of.
+"""Cache of compiled kernels: one folder for each, named by a digest of everything that determines
+it.
 
-The folder has the source, what numba keeps beside it, and the digests of both. What does not agree
-with its digests is never loaded but made anew; where nothing can be kept, or others could write
-there, a kernel is made in memory. Elementwise functions are made ready for numba here, and their
-source is part of the key.
+The folder contains the source, the files of numba, and the digests of both. Files that do not match
+their digests are not loaded; the kernel is compiled again. If nothing can be stored, or other users
+can write to the folder, a kernel is compiled in memory. Elementwise functions are prepared for
+numba here, and their source is part of the key.
 """
 
 from __future__ import annotations
@@ -45,19 +46,19 @@ def _is_vector(kind: Any) -> bool:
 
 
 def _written(kind: Any, arguments: str, component: str, whole: str = "Vector({})") -> Any:
-    """A function of vectors, written out for their components: `component` with `@` for each."""
+    """Return a function of vectors, written out by components; `component` has `@` for each."""
     names = kind.instance_class._fields
     parts = [component.replace("@", name) for name in names]
     scope: dict[str, Any] = {"Vector": kind.instance_class}
     function = eval(f"lambda {arguments}: {whole.format(', '.join(parts))}", scope)
-    # numba wants the signature of the function that is overloaded, annotations included.
+    # numba expects the same signature as that of the overloaded function, annotations included.
     function.__annotations__ = dict.fromkeys([*arguments.split(", "), "return"], "Any")
     return function
 
 
 @overload(where)
 def _where(condition: Any, yes: Any, no: Any) -> Any:
-    # numpy's `where` on single numbers inside numba costs hundreds of times as much.
+    # In compiled code numpy's `where` on scalars takes hundreds of times as long.
     if _is_vector(yes):
         return _written(yes, "condition, yes, no", "yes.@ if condition else no.@")
 
@@ -79,7 +80,7 @@ def _neg(a: Any) -> Any:
 
 
 def _arithmetic(sign: str) -> Function:
-    """An operation on two vectors, or on a vector and a number."""
+    """Return an operation on two vectors, or on a vector and a number."""
 
     def overloaded(a: Any, b: Any) -> Any:
         is_vector_a, is_vector_b = _is_vector(a), _is_vector(b)
@@ -96,16 +97,16 @@ for _operation, _sign in (("add", "+"), ("sub", "-"), ("mul", "*"), ("truediv", 
 
 
 def compiled(function: Function) -> Any:
-    """The function for numba, with every Python function that it reaches made ready.
+    """Return the function compiled by numba, with every Python function that it calls.
 
-    `error_model="numpy"` lets divisions and roots vectorise; fastmath stays off, so that every
-    operation rounds as numpy's does.
+    `error_model="numpy"` allows divisions and roots to be vectorised. fastmath is off, so that
+    every operation is rounded as in numpy.
     """
     return numba.njit(error_model="numpy")(with_helpers_ready(function))
 
 
 def with_helpers_ready(function: Function) -> Function:
-    """Return the function with every Python function that it reaches compilable by numba."""
+    """Return the function after all Python functions that it calls have been compiled by numba."""
     for helper in _reached(function):
         if helper is not function and helper not in _ready:
             register_jitable(helper)
@@ -114,11 +115,11 @@ def with_helpers_ready(function: Function) -> Function:
 
 
 def source_key(*functions: Function) -> str:
-    """Return a digest of the source of functions and of all that they reach, constants included.
+    """Return a digest of the source of functions and of all that they call, constants included.
 
-    Their location counts, too: a stored kernel finds its functions by their modules. If a function
-    reads a value that cannot be identified, the key is new every time, so that a kernel is compiled
-    again rather than out of date.
+    Their location is part of it: a stored kernel imports its functions by their modules. If a
+    function reads a value that cannot be identified, the key is unique, so that the kernel is
+    compiled in every process.
     """
     digest = hashlib.sha256()
     for function in chain.from_iterable(map(_reached, functions)):
@@ -146,12 +147,12 @@ def _content(value: Any) -> str:
 def _source(code: types.CodeType) -> str:
     try:
         return inspect.getsource(code)
-    except (OSError, TypeError):  # written where no file is, as at a prompt
+    except (OSError, TypeError):  # The function was not defined in a file, but at a prompt.
         return repr((code.co_code, code.co_consts, code.co_names))
 
 
 def _reached(function: Function) -> list[Function]:
-    """The function and, once each, every Python function that it reaches by name."""
+    """Return the function and every Python function that it calls by name, each once."""
     functions = [function]
     for member in functions:
         for value in _names(member).values():
@@ -167,31 +168,34 @@ def _names(function: Function) -> dict[str, Any]:
     codes = [function.__code__]
     for code in codes:
         codes += [c for c in code.co_consts if isinstance(c, types.CodeType)]
-    # Sorted, since the order of a set differs from process to process.
+    # Names are sorted, since the order of a set differs between processes.
     names = sorted({name for code in codes for name in code.co_names})
     values = {n: function.__globals__[n] for n in names if n in function.__globals__}
     values |= inspect.getclosurevars(function).nonlocals
     modules = [v for v in values.values() if isinstance(v, types.ModuleType)]
     for module in modules:
         if module.__name__.split(".")[0] not in ("numpy", "math", "numba"):
-            # pbdkit's own are loaded when first used.
+            # pbdkit's own modules are loaded when first used.
             members = {name: getattr(module, name) for name in names if hasattr(module, name)}
             values |= {f"{module.__name__}.{name}": value for name, value in members.items()}
             modules += [v for v in members.values() if isinstance(v, types.ModuleType)]
     return values
 
 
-SOURCE, DIGESTS = "kernel.py", "digests.json"
+SOURCE = "kernel.py"
+"""Name of the file with the source of a kernel."""
+DIGESTS = "digests.json"
+"""Name of the file with the digests of the others."""
 _loaded: dict[tuple[Path, str], Any] = {}
-"""Kernels of this process, by folder and key: reading one again takes several milliseconds."""
+"""Kernels of this process, by folder and key. Loading one again would take several milliseconds."""
 
 
 def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[Any, ...]) -> Any:
-    """The function `run` of a kernel with this source, made before or now, ready for arguments of
-    these types; it is called with them once.
+    """Return the function `run` of a kernel with this source, from the cache or compiled, after a
+    first call with the arguments.
 
-    The key covers the source of every function that rule and fracture model reach, so that an
-    edited rule never runs an old kernel.
+    The key covers the source of every function that rule and fracture model call, so that a kernel
+    is never used for an edited rule.
     """
     interpreted = bool(vars(numba.config)["DISABLE_JIT"])
     processor = cpu_target.target_context.codegen().magic_tuple()
@@ -207,7 +211,7 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
 
 def cache_folder() -> Path | None:
     """Return PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; None if it is not writable,
-    or other users can write to it, whose code would be run."""
+    or if other users can write to it, whose code could be executed."""
     folder = _asked_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -226,15 +230,15 @@ def _asked_folder() -> Path:
 
 
 def _kept(source: str, key: str, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
-    """The kernel as it lies in the cache, or as it is made and laid there; None where neither can
-    be done."""
+    """Return the kernel from the cache, or compile and store it; None if neither is possible."""
     if (cache := cache_folder()) is None:
         return None
     folder = cache / f"kernel_{key}"
     try:
         if kernel := _found(source, folder, names, arguments):
             return kernel
-        with _alone(cache / f".{key}"):  # whoever wants the same meanwhile finds it then
+        # A process that needs the same kernel meanwhile waits, and then loads it.
+        with _alone(cache / f".{key}"):
             kernel = _found(source, folder, names, arguments)
             return kernel or _made(source, folder, names, arguments)
     except (OSError, pickle.PicklingError):
@@ -250,14 +254,14 @@ def _found(source: str, folder: Path, names: dict[str, Any], arguments: tuple[An
 
 
 def _made(source: str, folder: Path, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
-    """A new one, laid into the folder."""
+    """Compile a kernel, store it in the folder and return it."""
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".making-") as name:
         directory = Path(name) / folder.name
         directory.mkdir()
         (directory / SOURCE).write_text(source, encoding="utf-8")
         run = _prepared(source, names, arguments, directory)
         (directory / DIGESTS).write_text(json.dumps(_digests(directory)), encoding="utf-8")
-        if not _is_whole(folder):  # nobody else has been quicker
+        if not _is_whole(folder):  # No other process has stored it meanwhile.
             shutil.rmtree(folder, ignore_errors=True)
             directory.replace(folder)
         return run
@@ -265,8 +269,8 @@ def _made(source: str, folder: Path, names: dict[str, Any], arguments: tuple[Any
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """One process at a time, of those of one machine, so that none makes a kernel
-    that another is making; where files cannot be locked, all at once."""
+    """Lock a path, so that a kernel is not compiled by two processes of a machine at the same time.
+    There is no lock on file systems that do not support locks."""
     with path.open("w") as file:
         with suppress(ImportError, OSError):
             import fcntl
@@ -298,7 +302,7 @@ def _digests(folder: Path) -> dict[str, str]:
 def _prepared(
     source: str, names: dict[str, Any], arguments: tuple[Any, ...], folder: Path | None = None
 ) -> Any:
-    """The kernel after its first call: compiled, or read from its folder."""
+    """Return the kernel after its first call, compiled or loaded from its folder."""
     file = str(folder / SOURCE) if folder else "<kernel>"
     module = ModuleType(folder.name if folder else "kernel")
     scope = vars(module)
@@ -307,7 +311,7 @@ def _prepared(
     scope["KEPT"] = bool(folder)
     if folder:
         module.__file__ = file
-        sys.modules[module.__name__] = module  # numba looks for what it has kept by this name
+        sys.modules[module.__name__] = module  # numba looks up its stored files by this name.
     exec(compile(source, file, "exec"), scope)
     module.run(*arguments)
     return module.run

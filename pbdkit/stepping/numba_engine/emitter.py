@@ -1,9 +1,9 @@
 """Source of the kernel of a scene: sweeps that move particles, and the loop over steps, to which
 each operation adds its lines.
 
-Each row is moved by the shortest code that is valid for it: rest offsets and steps to neighbours
-are literals if all neighbours are present. Numbers that differ between runs (parameters,
-thresholds, places) are arguments.
+Rows whose particles have all their neighbours have rest offsets and steps to neighbours as
+literals; other rows use more general code. Values that differ between runs (parameters, thresholds,
+places) are arguments.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def module_text(
 
 
 def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) -> list[Function]:
-    """Return the functions for the rows that occur, and last the one that moves the particles of
-    rows with them."""
+    """Return the functions for the kinds of rows that occur, and last the one that calls them for
+    all rows."""
     out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
     general, functions = sweeps.write_general(plan, level, events), list[Function]()
     for n, (s, kind) in enumerate(groups):
@@ -96,13 +96,13 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
 
 
 class LatticeWriter(PlanWriter):
-    """Writer of a step on all that motion has reached, operation after operation."""
+    """Writer of a step on all cells that motion has reached, operation after operation."""
 
     _judging: Function | None = None
-    """Pass over bonds for the next sweep."""
+    """Pass over bonds, for the next sweep to include."""
 
     def begin(self) -> None:
-        """Write the names that lines of operations use, and the growth of what motion has
+        """Write the names that the lines of operations use, and extend the box that motion has
         reached."""
         out, plan = self.out, self.plan
         out.add(1, "step += 1")
@@ -126,12 +126,12 @@ class LatticeWriter(PlanWriter):
         self.out.add(1, f"for e in range({name}.size):", *("    " + line for line in lines))
 
     def judge_bonds(self) -> None:
-        """Leave the pass over bonds to the next sweep."""
+        """Keep the pass over bonds for the next sweep."""
         self._judging = self.passes.judge
 
     def sweep(self, level: int) -> None:
-        """Write a call for all rows, or with the pass over bonds band by band, so that what that
-        pass has read and written stays in the cache."""
+        """Write a call for all rows. A pass over bonds alternates with it band by band, so that the
+        data of a band stay in the cache."""
         sweep, judging, self._judging = self.passes.sweeps[level], self._judging, None
         if judging is None:
             write_pass(self.out, self.plan, 1, sweep, "i0", "i1")

@@ -1,10 +1,11 @@
 """Compiled engine: many steps in one call, on the part of the lattice that motion has reached.
 
-At rest a rule moves nothing, exactly; a step can only move particles that bear a load or adjoin one
-that has moved. If the scene implies this, nothing has moved before the leaders do; otherwise the
-first step moves every particle and detects those that are not at rest. From then on the box around
-what has moved, and around leaders, grows by one bond in each step, times the number of rules that
-work on each other's moves. If remembered numbers change, everything is moved in every step.
+In the reference configuration the move of a rule is exactly zero; a step can only move particles
+that bear a load or have a neighbour that has moved. If this follows from the scene, the box of
+moved particles is empty at the beginning; otherwise the first step computes every particle and
+detects those that are not at rest. The box, which includes the leaders, then grows in each step by
+one bond, times the number of nested rules. If state variables change, all particles are computed in
+every step.
 
 If neighbours are re-evaluated, the kernel is a sweep over their list.
 """
@@ -79,7 +80,7 @@ class PairFollowers(Followers):
         self._run = load_blamed(self._plan.levels, source, arguments)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Move them with neighbours in the order of the numpy engine."""
+        """Move the particles, with neighbours in the order of the numpy engine."""
         j, other, rest = self._search.pairs(m)
         first = np.searchsorted(j, np.append(self._search.body, len(self._search.place)))
         rest = np.ascontiguousarray(rest)
@@ -142,7 +143,7 @@ class MotionExtent:
         self._renews = isinstance(experiment.rule, RenewsParticles) or (
             scene.has_fracture and isinstance(experiment.fracture, RenewsBonds)
         )
-        # What rests with some numbers may not with others.
+        # A body that is at rest with some parameters may not be with others.
         self._renews |= any(field != "solver" for field, _ in experiment.courses)
         self._rests = not self._renews and _rests_by_construction(levels)
         self._bond = len(levels) * _growth(program)
@@ -152,12 +153,14 @@ class MotionExtent:
         self._reset(self._whole)
 
     def begin(self, state: State) -> None:
-        """Start from a state of another origin: all of it may move unless it is at rest."""
+        """Start from a state of another origin: the box is the whole lattice unless the body is at
+        rest."""
         self._is_known = self._rests and state.step == 0 and not state.u.any()
         self._reset(np.zeros_like(self._bond) if self._is_known else self._whole)
 
     def take_in_call(self, call: Call, count: int) -> int:
-        """Take in the disturbances of a call; return how many of `count` steps it can make."""
+        """Extend the box by the disturbances of a call; return how many of `count` steps it can
+        make."""
         if not self._is_known:
             return count if self._renews else 1
         for operation in self._program:
@@ -166,14 +169,15 @@ class MotionExtent:
         return count
 
     def take_in_rows(self, state: State, rows: slice) -> None:
-        """Take in what has moved in rows of cells that others have written."""
+        """Extend the box by particles that have moved in rows of cells that other ranks have
+        written."""
         if self._is_known:
             moves = (u[:, :, rows] != 0.0 for u in (state.u, state.previous))
             first, *cells = np.nonzero(np.logical_or(*moves).any(axis=(0, 1)))
             self._join((first + rows.start, *cells))
 
     def take_in_moves(self, after: Floats, before: Floats) -> None:
-        """Take in what the first step has moved."""
+        """Extend the box by the particles that the first step has moved."""
         if self._is_known:
             np.clip(self.box, 0, self._whole.max(), out=self.box)
         elif not self._renews:
@@ -187,20 +191,20 @@ class MotionExtent:
         self.box, self.growth = box.copy(), np.zeros_like(box)
 
     def _join(self, cells: Cells) -> None:
-        """Take in cells that have moved."""
+        """Extend the box by cells that have moved."""
         if not len(cells[0]):
             return
         box = _interleaved([n.min() for n in cells], [n.max() + 1 for n in cells])
-        if not self.box.any():  # nothing has been reached yet
+        if not self.box.any():  # The box is empty.
             self.box, self.growth = box, self._bond
         self.box[::2] = np.minimum(self.box[::2], box[::2])
         self.box[1::2] = np.maximum(self.box[1::2], box[1::2])
 
 
 def _rests_by_construction(levels: Sequence[Level]) -> bool:
-    """Return whether the reference configuration is known to stay: every neighbour is present, all
-    start at rest, no bond is broken or breaks at rest, the rules' moves from there are zero, and
-    neither particles nor bonds have own numbers."""
+    """Return whether the reference configuration is known to be an equilibrium: every neighbour is
+    present, all initial displacements are zero, no bond is broken or breaks at rest, the rules'
+    moves are zero, and neither particles nor bonds have state variables."""
     scene = levels[-1].scene
     experiment, raster, fracture = scene.experiment, scene.raster, scene.experiment.fracture
     cracked = (isinstance(fracture, StartsCracked) and fracture.segments()) or experiment.cuts
@@ -234,22 +238,22 @@ def _interleaved(low: Any, high: Any) -> Box:
 
 
 def _growth(program: Program) -> Box:
-    """Return how many cells a step of a rule carries a motion along each direction."""
+    """Return by how many cells one step extends the box, along each direction."""
     steps = np.concatenate([operation.carries() for operation in program])
     return _interleaved(np.minimum(steps.min(axis=0), 0), np.maximum(steps.max(axis=0), 0))
 
 
 BAND = 16384
-"""Number of places on which bonds are judged before a sweep, on one thread: their data stay in the
-cache. On several threads the time to start them counts, too."""
+"""Number of places whose bonds are updated before the sweep over them, so that their data stay in
+the cache. It is larger on several threads, because of the time to start them."""
 
 
 class CompiledStepper(Engine):
     """Engine that steps a scene with its own kernel.
 
-    Lost bonds are one bit for each bond and end, renewed from a state that does not come from this
-    engine; all other arrays are those of the numpy engine. If neighbours are re-evaluated, the
-    kernel sweeps over their list.
+    Broken bonds are stored in bit masks of the particles, which are computed anew for states of
+    another origin; all other arrays are those of the numpy engine. If neighbours are re-evaluated,
+    the kernel sweeps over their list.
     """
 
     name = "compiled"
@@ -264,7 +268,7 @@ class CompiledStepper(Engine):
         self._program = program_of(scene)
         self._last: State | None = None
         self._numbered = scene
-        """Scene with the numbers that the arrays hold."""
+        """Scene with the parameters that the arrays contain."""
         levels = levels_of(scene)
         self._extent = MotionExtent(levels, self._program)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
@@ -288,11 +292,11 @@ class CompiledStepper(Engine):
         shared = (*plan.shared, *self._named(Call(start)))
         plan = replace(plan, shared=shared)
         source, self._names = write_kernel(plan, self._program, groups)
-        # No step is made, so that what does not compile is known before the first.
+        # A call without steps compiles the kernel, so that errors of the compiler occur here.
         self._run = load_blamed(levels, source, self._arguments(Call(start), 0))
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """Return the state after `steps` steps, as many in a call as operations foresee."""
+        """Return the state after `steps` steps, in as few calls as the operations permit."""
         if self._pairs:
             return self._pairs.advance(state, steps)
         if state is not self._last:
@@ -304,7 +308,7 @@ class CompiledStepper(Engine):
         return state
 
     def renewed(self, state: State, rows: slice) -> None:
-        """Update the bits of lost bonds, the marks of damage and the box of motion."""
+        """Update the bit masks of broken bonds, the marks of damage and the box of motion."""
         if self._pairs is None and state is self._last:
             if self._plan.judged:
                 renew_lost_bits(self._arrays["lost"], self._scene, state, rows)
@@ -346,7 +350,7 @@ class CompiledStepper(Engine):
             self._numbered = scene
 
     def _named(self, call: Call) -> Arrays:
-        """Return the arrays of a kernel that steps in those of the state, by name."""
+        """Return by name the arrays of a kernel that makes steps in the arrays of the state."""
         state = call.state
         return {
             **self._arrays,

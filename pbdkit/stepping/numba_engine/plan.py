@@ -1,5 +1,5 @@
-"""Plan of a kernel: the rules of a scene as its levels, the contents of the kernel, the words of
-its lines, and the sizes of passes of several steps."""
+"""Plan of the kernel of a scene: levels of nested rules, contents of the kernel, expressions of its
+lines, and sizes of passes of several steps."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ from pbdkit.stepping.state import started
 
 @dataclass(frozen=True)
 class Level:
-    """Rule of one sweep, which is that of `scene`. The first level works on displacements, each
-    other on the moves of the one before."""
+    """Rule that is evaluated in one sweep, and its scene. The first level acts on displacements,
+    every further one on the moves of the level before."""
 
     number: int
     scene: Scene
@@ -69,7 +69,7 @@ class Level:
 
     @cached_property
     def seen(self) -> VisibleNumbers:
-        """The numbers that the rule receives."""
+        """State variables and parameters that the rule receives."""
         scene = self.scene
         return numbers_of(scene.experiment, scene.constants, weighs_cells=scene.cells is not None)
 
@@ -80,7 +80,8 @@ class Level:
 
     @property
     def source(self) -> str:
-        """Planes on which it works; the first letter names the vector at a particle."""
+        """Prefix of the planes on which it acts; the first letter names the vector at a
+        particle."""
         return f"z{self.number - 1}" if self.number else "u"
 
     @property
@@ -90,17 +91,17 @@ class Level:
 
 
 MOST_BITS = 32
-"""Number of neighbours of a sublattice up to which slots are written out and lost bonds are
-bits."""
+"""Number of neighbours of a sublattice up to which code is written slot by slot and broken bonds
+are bits."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """Plan of the kernel of a scene.
 
-    `levels` are its rules, the last of which moves the particles; `parallel` is true on several
+    `levels` are its rules, the last of which moves the particles; `parallel` is true for several
     threads; `shared` are the names, mostly of arrays, that all functions may use; `apart` is true
-    if bonds are judged apart from moves, whatever the model; `gpu` is true for a GPU, whose threads
+    if bonds are updated in a separate pass for every model; `gpu` is true for a GPU, whose threads
     take one place after the other from flat arrays.
     """
 
@@ -127,7 +128,7 @@ class Plan:
 
     @property
     def lead(self) -> tuple[str, ...]:
-        """Cell indices of a row of particles."""
+        """Indices of a row of particles in rasters."""
         return ("i", "l")[: self.scene.axes - 1]
 
     @property
@@ -136,7 +137,8 @@ class Plan:
         return max(map(len, self.scene.neighbourhood.slots)) > MOST_BITS
 
     def is_loaded(self, level: Level) -> bool:
-        """Return whether loads act on what moves by the rule of that level: the last alone."""
+        """Return whether loads act on the particles moved by the rule of that level, which is the
+        last."""
         return self.scene.loads is not None and level is self.levels[-1]
 
     @property
@@ -146,18 +148,18 @@ class Plan:
 
     @property
     def bonds(self) -> int:
-        """Number of remembered numbers of each bond."""
+        """Number of state variables of each bond."""
         return sum(number.home is Home.BOND for number in self.levels[-1].seen.bond)
 
     @cached_property
     def prescribed_numbers(self) -> tuple[int, ...]:
-        """The remembered numbers of particles that operations prescribe."""
+        """State variables of particles that operations prescribe."""
         return tuple(chain(*(operation.prescribed_numbers() for operation in self.program)))
 
     @cached_property
     def kept(self) -> tuple[int, ...]:
-        """Remembered numbers of particles of which copies from before the step are needed: all that
-        change if neighbours use them, else those that operations prescribe."""
+        """State variables of particles of which copies from before the step are needed: all that
+        change if neighbours read them, otherwise those that operations prescribe."""
         if not self.shares:
             return self.prescribed_numbers
         numbers = self.levels[-1].seen.own
@@ -165,19 +167,19 @@ class Plan:
 
     @property
     def shares(self) -> bool:
-        """True if neighbours use the remembered numbers of each other."""
+        """True if the rule reads state variables of neighbours."""
         return shares_particles(self.scene.experiment.rule)
 
     @property
     def read(self) -> tuple[str, ...]:
-        """Arrays of the remembered numbers of particles, from before the step if neighbours use
+        """Arrays of the state variables of particles; those from before the step if neighbours read
         them."""
         copies, count = self.kept if self.shares else (), len(self.levels[-1].seen.own)
         return tuple(f"was{m}" if m in copies else f"own{m}" for m in range(count))
 
     @property
     def shown(self) -> tuple[str, ...]:
-        """Arrays that neighbours use of each other."""
+        """Arrays of the state variables that neighbours read."""
         return self.read if self.shares else ()
 
     @property
@@ -187,7 +189,7 @@ class Plan:
 
     @property
     def mixed(self) -> int:
-        """Number of stiffnesses of cells besides that of the rule."""
+        """Number of stiffnesses of cells that differ from that of the rule."""
         return len(self.scene.cells.mixed) if self.scene.cells else 0
 
     @property
@@ -202,7 +204,7 @@ class Plan:
 
     @property
     def bonds_first(self) -> bool:
-        """True if bonds are judged in a pass of their own, and not by the sweep at both ends."""
+        """True if bonds are updated in a separate pass, and not at both ends by the sweep."""
         if self.model is None:
             return False
         renews = isinstance(self.model, RenewsBonds)
@@ -210,7 +212,7 @@ class Plan:
 
     @property
     def judged(self) -> bool:
-        """True if the sweep judges the bonds."""
+        """True if the sweep updates the bonds."""
         return self.model is not None and not (self.bonds_first or self.tears)
 
     @property
@@ -219,11 +221,11 @@ class Plan:
         return "real" if self.scene.experiment.stepping.precision == "float32" else "double"
 
     def over(self, count: str) -> str:
-        """Return a range below a count; on a GPU that of one thread."""
+        """Return a range up to a count; on a GPU the part of one thread."""
         return f"range(me, {count}, threads)" if self.gpu else f"range({count})"
 
     def renumbered(self, scene: Scene) -> Plan:
-        """Return the plan with other numbers."""
+        """Return the plan of a scene that differs in parameters alone."""
         levels, below = list[Level](), scene
         for level in reversed(self.levels):
             levels.insert(0, replace(level, scene=below))
@@ -253,13 +255,14 @@ class Plan:
         return f"Vector({', '.join(map(self.number, values))})"
 
     def row(self, array: str, first: object, step: Sequence[object] | None = None) -> str:
-        """Return the places j0 to j1 of a row, or those a step of cells away."""
+        """Return columns j0 to j1 of a row, or those a step of cells away."""
         *lead, last = step or [0] * self.scene.axes
         at = [_sum(name, m) for name, m in zip(self.lead, lead, strict=True)]
         return f"{array}[{', '.join([str(first), *at])}, {_sum('j0', last)}:{_sum('j1', last)}]"
 
     def local_places(self, s: str) -> list[str]:
-        """Return expressions for X from site (0, 0), in the order of operations of the rasters."""
+        """Return expressions for X relative to site (0, 0), with the order of operations of the
+        rasters."""
         index = [f"{name} + first[{n}]" for n, name in enumerate((*self.lead, "j + j0"))]
         places = []
         for n, along in enumerate(zip(*self.scene.raster.cell.vectors, strict=True)):
@@ -280,21 +283,21 @@ def _sum(name: str, step: object) -> str:
 
 
 def listed(texts: Iterable[str]) -> str:
-    """Return arguments of a named tuple."""
+    """Return the arguments of a named tuple as text."""
     return "".join(f"{text}, " for text in texts)
 
 
 def values(numbers: Sequence[Number], where: dict[Home, str]) -> str:
-    """Return the arguments of a named tuple; `where` has by home the pattern of the expression for
-    its n-th number."""
+    """Return the arguments of a named tuple; `where` has for each home the pattern of the
+    expression for its n-th value."""
     counts = defaultdict[Home, Iterator[int]](count)
     return listed(where[number.home].format(n=next(counts[number.home])) for number in numbers)
 
 
 @dataclass(frozen=True)
 class Passes:
-    """Functions that a step of a kernel calls: the one that judges bonds, if they are judged apart
-    from moves, the sweep of each level, and by name those of operations."""
+    """Functions that a step of a kernel calls: the pass over bonds, if it is separate from the
+    moves, the sweep of each level, and those of operations by name."""
 
     judge: Function | None
     sweeps: Sequence[Function]
@@ -328,7 +331,7 @@ class PlanWriter(KernelWriter):
         return self.plan.number(value)
 
     def row(self, array: str, first: str) -> str:
-        """Return the places j0 to j1 of a row."""
+        """Return the columns j0 to j1 of a row."""
         return self.plan.row(array, first)
 
     def places(self, sublattice: str) -> Lines:
@@ -336,12 +339,16 @@ class PlanWriter(KernelWriter):
         return self.plan.local_places(sublattice)
 
     def is_given(self, array: str) -> bool:
-        """Return whether the name is one that functions share."""
+        """Return whether the name is an argument that functions share."""
         return array in self.plan.shared
 
 
-DEEP, BAND, ROW = 16, 8, 24 * 2**10
-"""Number of steps of a pass and rows of a band, bytes of a row of a tile: all measured."""
+DEEP = 16
+"""Number of steps of a pass (measured)."""
+BAND = 8
+"""Number of rows of a band (measured)."""
+ROW = 24 * 2**10
+"""Number of bytes of a row of a tile (measured)."""
 SHORTEST = 256
 """Minimum number of columns of a tile."""
 
@@ -352,9 +359,9 @@ def goes_deep(plan: Plan) -> bool:
 
 
 def pass_arrays(plan: Plan, pieces: int) -> dict[str, Any]:
-    """Return the constant arrays of passes: the sizes of a pass, with the number of pieces; and of
-    frame points, which are sorted, the first of each row, their columns, and the first rows of the
-    particles that they follow."""
+    """Return the constant arrays of passes: sizes of a pass and number of pieces; and of the sorted
+    frame points the first index of each row, their columns, and the first rows of the particles
+    that they follow."""
     scene = plan.scene
     between = math.prod(scene.raster.shape[2:-1])
     tile = max(SHORTEST, ROW // (cell_bytes(scene) * between))
@@ -371,13 +378,13 @@ def pass_arrays(plan: Plan, pieces: int) -> dict[str, Any]:
 
 
 def frame_order(following: FollowFrame) -> Indices:
-    """Return the order of frame points by the row and column at which they can follow."""
+    """Return the order of frame points by the row and column after which they can be computed."""
     return np.lexsort(following.last_moved[::-1])
 
 
 def banded(plan: Plan, name: str, places: NDArray[np.intp]) -> tuple[Any, dict[str, Any]]:
-    """Return the order of flat places by row and column, and in that order the first of each row
-    and their columns."""
+    """Return the order of flat places by row and column, and in that order the first index of each
+    row and the columns."""
     index = np.unravel_index(places, plan.scene.raster.shape)
     order = np.lexsort((index[-1], index[1]))
     return order, _listed(plan, name, index[1][order], index[-1][order])
@@ -410,8 +417,8 @@ def levels_of(scene: Scene) -> tuple[Level, ...]:
 
 
 def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
-    """Return the elementwise functions by their names in the kernel, those of a rule with the
-    number of its level."""
+    """Return the elementwise functions by their names in the kernel; names of functions of a rule
+    end with the number of its level."""
     parts: dict[str, Any] = {str(level.number): level.scene.experiment.rule for level in levels}
     if levels[-1].scene.has_fracture:
         parts[""] = levels[-1].scene.experiment.fracture
@@ -436,14 +443,14 @@ def load_blamed(
     more: Mapping[str, Callable[..., Any]] | None = None,
 ) -> Any:
     """Return the kernel, with `more` functions than those of its components. Errors of the compiler
-    name the component."""
+    name the component that causes them."""
     with blamed(levels):
         return load_kernel(source, functions_of(levels) | dict(more or {}), arguments)
 
 
 @contextmanager
 def blamed(levels: Sequence[Level]) -> Iterator[None]:
-    """Name the component in errors of the compiler in this context."""
+    """Raise errors of the compiler in this context with the name of the component."""
     try:
         yield
     except Exception as error:
@@ -452,7 +459,8 @@ def blamed(levels: Sequence[Level]) -> Iterator[None]:
 
 
 def _culprit(levels: Sequence[Level], error: BaseException) -> Component:
-    """Return the component of the function that an error of the compiler names, else the rule."""
+    """Return the component of the function that an error of the compiler names; otherwise the
+    rule."""
     functions, text = functions_of(levels).items(), str(error)
     named = [name for name, of in functions if f"function {of.__qualname__} " in text]
     for operation in program_of(levels[-1].scene):
@@ -466,8 +474,8 @@ def _culprit(levels: Sequence[Level], error: BaseException) -> Component:
 
 
 def _parts(scene: Scene) -> tuple[int, ...]:
-    """Return the number of components of each contribution. Results that numpy refuses are refused:
-    a kernel would accept some of them as numbers."""
+    """Return the number of components of each contribution. Raises an error for results that numpy
+    rejects, since a kernel would accept some of them as numbers."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     ones = np.ones(1, experiment.stepping.precision)
     ones_vector: Vector = vector([ones] * scene.axes)

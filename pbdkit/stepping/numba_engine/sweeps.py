@@ -1,17 +1,17 @@
-"""Lines of the sweeps that move particles, and of the pass that judges bonds.
+"""Lines of the sweeps that move particles, and of the pass that updates and breaks bonds.
 
-Rows of particles that have all their neighbours are written slot by slot: rest offsets, steps and
-weights are literals, so that terms that cancel at rest fold away. All other particles are moved in
-a loop over their slots: neighbours may be missing, cells cut, and there may be thousands of slots.
-Particles at edges are few and moved one after the other; if there are too many slots to write out,
-all particles of a row are evaluated slot after slot.
+For particles that have all their neighbours the code is written slot by slot, with rest offsets,
+steps and weights as literals, so that the compiler removes terms that cancel. For all others, with
+missing neighbours, cut cells, or up to thousands of slots, it is a loop over slots. The few
+particles at edges are computed one after the other; if there are too many slots to write out, all
+particles of a row are computed slot after slot.
 
-Few particles have damaged cells around them. A plane of marks records which: the sweep moves all
-others as if no bond could break, and then computes the marked ones in short chunks. A mark stays,
-and is set rather too early than too late: without damage both ways give the same numbers.
+Few particles are next to damaged cells. They are marked in a plane: the sweep moves all others as
+if no bond could break, and then computes the marked ones in short chunks. Marks are never removed
+and may be set too early, because without damage both computations give the same numbers.
 
-Bonds with numbers that change are renewed and broken in a pass before the sweep, where they are
-stored; others by the sweep, which notes what it has broken.
+Bonds whose state variables change are updated and broken in a pass before the sweep. Other bonds
+are broken by the sweep, which records the broken ones.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from pbdkit.stepping.numba_engine.plan import Level, Plan, listed, values
 from pbdkit.stepping.state import State
 
 CHUNK = 64
-"""Number of particles of a row that are computed as torn if one of them is marked."""
+"""Number of particles of a row that are computed with damage if one of them is marked."""
 Marks = NDArray[np.uint8]
 
 
 def damage_word(plan: Plan, broken: str, n: str, bond: str, limit: str, side: int = 0) -> str:
-    """Return an expression for the share of its force that a bond of plane n has lost in the cell
-    on one side, from the expressions for the step at which it broke and, with `{n}` for their
-    numbers, its remembered numbers and its limits."""
+    """Return an expression for the fraction of its force that a bond of plane n has lost in the
+    cell on one side. It is built from the expression for the step at which the bond broke, and from
+    patterns with `{n}` for its state variables and limits."""
     softened = plan.number(0.0)
     if plan.softens_cells:
         softened = bond.format(n=_numbers_of_damage(plan)[side])
@@ -56,15 +56,15 @@ def damage_word(plan: Plan, broken: str, n: str, bond: str, limit: str, side: in
 
 
 def _numbers_of_damage(plan: Plan) -> list[int]:
-    """Return the indices of the remembered numbers of a bond that are the damage on its left and
+    """Return the indices of the state variables of a bond that are the damage on its left and
     right."""
     names = [number.name for number in bond_numbers(plan.scene.experiment)]
     return [names.index(f"damage_{side}") for side in ("left", "right")]
 
 
 def _raised(name: str, other: str) -> str:
-    """Return a line for the larger of two values as a conditional expression, which vectorises:
-    `max` does not."""
+    """Return a line for the larger of two values as a conditional expression; unlike `max` it is
+    vectorised."""
     return f"{name} = {name} if {name} > {other} else {other}"
 
 
@@ -75,7 +75,7 @@ def _damage_at(plan: Plan, home: str, n: str, side: int = 0) -> str:
 
 
 def _chosen(plan: Plan, home: str, n: str, on_right: str) -> str:
-    """Return an expression for the damage of a bond on the side of a variable."""
+    """Return an expression for the damage of a bond on the side that a variable selects."""
     left_damage, right_damage = (_damage_at(plan, home, n, side) for side in (0, 1))
     return (
         f"({right_damage} if {on_right} else {left_damage})" if plan.softens_cells else left_damage
@@ -99,7 +99,7 @@ def damage_lines(plan: Plan) -> list[str]:
 
 
 def torn_at_slot(plan: Plan) -> list[str]:
-    """Return lines for the damage t beside slot k of that particle."""
+    """Return lines for the damage t beside slot k of the particle."""
     sides = (f"around[slot_cells[s, k, {side}]]" for side in (0, 1))
     plane = "slot_planes[s, k]"
     lines = [f"own = {_damage_at(plan, 'home', plane)}", "other = own"]
@@ -114,9 +114,9 @@ def torn_at_slot(plan: Plan) -> list[str]:
 
 
 class RowDamage:
-    """Damage of the cells and bonds around the particles of a row of sublattice s that have all
-    their neighbours, from j0 to j1. `lines` compute it in one loop for each kind: one loop with as
-    many arrays would not vectorise."""
+    """Damage of the cells and bonds around the particles j0 to j1, which have all their neighbours,
+    of a row of sublattice s. `lines` compute it in a loop for each kind, because a single loop with
+    as many arrays is not vectorised."""
 
     def __init__(self, plan: Plan, s: int) -> None:
         self._around = plan.scene.neighbourhood.cells_around[s]
@@ -170,8 +170,8 @@ class RowDamage:
 
 
 def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
-    """Return lines that mark the particles around a damaged bond of plane n, from its flat place
-    among the bonds, and that of its home among the particles."""
+    """Return lines that mark the particles around a damaged bond of plane n. `home` is the flat
+    place of the bond among the bonds, `there` that of its home among the particles."""
     if not plan.tears:
         return []
     words = (_damage_at(plan, home, "n", side) for side in range(1 + plan.softens_cells))
@@ -209,8 +209,9 @@ def stress_lines(plan: Plan, home: str) -> list[str]:
 
 
 def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
-    """Return the tables that these lines read: by plane and side the differences from a bond's home
-    to the corners of the cell, their rates, and the difference to its share."""
+    """Return the tables that the lines of stresses read: by plane and side the differences from a
+    bond's home to the corners of the cell, their rates, and the difference to the area fraction of
+    the cell."""
     assert scene.cells is not None
     stresses, shape = CellStresses(scene), scene.raster.shape
     steps, rates, shares = [], [], []
@@ -274,7 +275,7 @@ def _table_shape(scene: Scene) -> tuple[int, int]:
 
 
 def _way(scene: Scene, s: int, bond: CellBond) -> int:
-    """Return the difference from the flat place of a particle of sublattice s to that of a bond."""
+    """Return the difference between the flat places of a particle of sublattice s and of a bond."""
     shape, home = scene.raster.shape, bond.home
     step, sublattice = (slot_step(shape, home), home.target) if home else (0, s)
     return step + (bond.plane - sublattice) * math.prod(shape[1:])
@@ -282,7 +283,7 @@ def _way(scene: Scene, s: int, bond: CellBond) -> int:
 
 def _mark_steps(scene: Scene) -> NDArray[np.int64]:
     """Return the differences from the flat place of a bond's home to those of all corners of the
-    cells beside it, (plane, step); some twice, so that all planes have as many."""
+    cells beside it, (plane, step); some are repeated, so that all planes have equally many."""
     around, shape = scene.neighbourhood, scene.raster.shape
     rows = []
     for plane in around.planes:
@@ -303,10 +304,10 @@ def torn_marks(scene: Scene, state: State) -> Marks:
 
 
 def renew_torn_marks(marks: Marks, scene: Scene, state: State, rows: slice) -> None:
-    """Write the marks of the particles that have bonds in some rows of cells around them."""
+    """Update the marks of particles near bonds in some rows of cells."""
     assert state.broken_step is not None
     around, (height, *across) = scene.neighbourhood, scene.raster.shape[1:]
-    margin, *margins = around.reach_in_cells  # beyond it nobody is
+    margin, *margins = around.reach_in_cells  # No particle has neighbours beyond it.
     first, last = max(rows.start - margin, margin), min(rows.stop + margin, height - margin)
     stop = tuple(size - n for size, n in zip(across, margins, strict=True))
     softened = isinstance(scene.experiment.fracture, (Softens, SoftensCells))
@@ -323,18 +324,18 @@ def renew_torn_marks(marks: Marks, scene: Scene, state: State, rows: slice) -> N
 
 
 def _changed(scene: Scene, state: State) -> list[tuple[NDArray[Any], Any]]:
-    """Return the remembered numbers of bonds that change, with their initial values."""
+    """Return the state variables of bonds that change, with their initial values."""
     numbers = zip(bond_numbers(scene.experiment), state.bond_values, strict=True)
     return [(value, number.initial) for number, value in numbers if number.changes]
 
 
 RUNS = ("first_run", "last_run", "first_row", "last_row")
-"""Arguments of functions of rows: some runs, and the range of rows of the first axis."""
+"""Arguments of functions of rows: a range of runs, and a range of rows of the first axis."""
 
 
 def parameters(plan: Plan, level: Level) -> list[str]:
-    """Return lines for p of the rule, and of the fracture model. Numbers of the latter are
-    literals: they decide what is computed."""
+    """Return lines for p of the rule, and of the fracture model. Parameters of the fracture model
+    are literals, because they determine the code."""
     rule = [] if level.fields else [_rule(level)]
     literal = listed(map(plan.number, plan.scene.constants.fracture))
     return [*rule, f"q = Fracture({literal})"] if plan.model else rule
@@ -363,7 +364,7 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
 
 
 def write_rows(out: Function, plan: Plan, level: Level, s: str) -> None:
-    """Write the rows of values at the particles from j0 to j1, and of their moves."""
+    """Write the arrays of the values at the particles j0 to j1 of a row, and of their moves."""
     n = level.number
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
@@ -391,8 +392,8 @@ def difference(plan: Plan, level: Level, there: str) -> str:
 
 
 def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -> list[str]:
-    """Return lines for d as the rule receives it at slot k: softened, or that to the fictitious
-    point if the bond `breaks` or is broken `since` a step."""
+    """Return lines for d as the rule receives it at slot k: softened, or the difference to the
+    fictitious point if the bond `breaks` or was broken `since` an earlier step."""
     if plan.model is None or plan.tears:
         return []
     lines = [f"is_lost = {since} >= 0"]
@@ -411,15 +412,16 @@ def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -
 def contributions(
     plan: Plan, level: Level, r: str, weights: str, there: Iterable[str] = (), torn: bool = False
 ) -> str:
-    """Return a line for the contribution of a neighbour, from its remembered numbers if the rule
-    uses them; with the damage t beside the bond if cells are `torn`."""
+    """Return a line for the contribution of a neighbour, with its state variables if the rule uses
+    them, and with the damage t beside the bond if cells are `torn`."""
     return _gathered(plan, level, r, weights, there, "c", torn)
 
 
 def more_contributions(
     plan: Plan, level: Level, r: str, weights: Sequence[str], there: Iterable[str] = ()
 ) -> list[str]:
-    """Return lines for the contributions of cells of further stiffnesses, with these weights."""
+    """Return lines for the contributions of cells with a different stiffness, with these
+    weights."""
     lines = list[str]()
     for w in weights:
         lines.append(_gathered(plan, level, r, w, there, "e", plan.tears))
@@ -439,7 +441,7 @@ def _gathered(
 
 
 def _own(level: Level) -> str:
-    """Return an expression for the remembered numbers of the particle."""
+    """Return an expression for the state variables of the particle."""
     return values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
 
 
@@ -451,9 +453,9 @@ def target_lines(
     movable: str = "",
     otherwise: str = "u.@",
 ) -> list[str]:
-    """Return lines for the displacement and the remembered numbers of the particle after the step,
-    where it is `movable` (everywhere), and `otherwise`. `local` are the components of X from site
-    (0, 0)."""
+    """Return lines for the displacement and the state variables of the particle after the step
+    where it is `movable` (everywhere if None), and the lines `otherwise`. `local` are the
+    components of X relative to site (0, 0)."""
     n, solver = level.number, plan.scene.experiment.stepping
     sums = _pattern(level, totals, "Vector")
     lines = list[str]()
@@ -499,7 +501,7 @@ def _chosen_target(value: str, where: str, otherwise: str) -> str:
 
 
 def _pattern(level: Level, names: list[str], kind: str) -> str:
-    """Return names of components, those of a vector together."""
+    """Return the names of components; those of a vector are combined."""
     components, rest = [], iter(names)
     for size in level.parts:
         group = list(islice(rest, size))
@@ -508,7 +510,7 @@ def _pattern(level: Level, names: list[str], kind: str) -> str:
 
 
 def write_bond_pass(plan: Plan) -> Function:
-    """Return the function that renews the bonds of a range of rows and columns, and breaks them."""
+    """Return the function that updates and breaks the bonds in a range of rows and columns."""
     rows, columns = ("first_row", "last_row"), ("first_column", "last_column")
     out = Function(plan.shared, "judge_bonds", *rows, *columns)
     axes = range(len(plan.axes))
@@ -536,8 +538,8 @@ def write_bond_pass(plan: Plan) -> Function:
 
 
 class Judging(NamedTuple):
-    """Lines for the bond j of plane n: lines that evaluate it, expressions for whether it breaks
-    and whether its remembered numbers differ then, and lines that write both."""
+    """Lines for bond j of plane n: lines that evaluate it, expressions for whether it breaks and
+    whether its state variables change, and lines that write both."""
 
     look: list[str]
     breaks: str
@@ -579,8 +581,8 @@ def _write_judging(out: Function, plan: Plan) -> None:
             f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
     lines = judging(plan, "n@[j] - h@[j]", "base + j")
-    # Loops that look, and vectorise; the last one writes, where there is anything to write. What is
-    # far from breaking is told by lengths alone, which takes half the time.
+    # Loops that only read are vectorised; the last one writes, and runs if there is anything to
+    # write. The first compares lengths alone, which excludes most bonds in half the time.
     out.add(0, "some = 0", "for j in range(j1 - j0):")
     out.add(1, *lines.look, f"some = some | (1 if {lines.breaks}{lines.differ} else 0)")
     out.add(0, "if some:", "    some = 0", "    for j in range(j1 - j0):")
@@ -592,13 +594,14 @@ def _write_judging(out: Function, plan: Plan) -> None:
 
 
 def write_events(plan: Plan) -> Function:
-    """Return the function that notes step and length of the bonds in a row that the sweep has just
-    broken, from their home end; `base` is the row's first place."""
+    """Return the function that records step and length of the bonds in a row that the sweep has
+    just broken, from the end at which a bond is stored; `base` is the first place of the row."""
     out = Function(plan.shared, "note_broken", "s", "base", "width")
     out.add(0, "for here in range(base, base + width):")
     out.add(1, "bits = int64(flat_lost[here])", "for k in range(counts[s]):")
     out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
-    # The home end notes it, or this end where that is no particle of the body.
+    # The end at which the bond is stored records it; the other end does if that is no particle of
+    # the body.
     out.add(2, f"ours = signs[s, k] > 0 or flat_kind[there] != {FOLLOWER}")
     out.add(2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:")
     out.add(3, "flat_broken[home] = step")
@@ -613,10 +616,12 @@ whole cells; with all neighbours and cut cells."""
 
 
 class Words(NamedTuple):
-    """Expressions for one neighbour and its bond: its displacement, with `@` for the axis; its
-    remembered numbers; the shares of the cells beside its slot, none if cells are whole; with `{n}`
-    for their numbers the remembered numbers of the bond, and its limits; and the step at which it
-    broke."""
+    """Expressions for one neighbour and its bond.
+
+    They are its displacement, with `@` for the axis; its state variables; the area fractions of the
+    cells beside its slot, none if cells are whole; the state variables and the limits of the bond,
+    with `{n}` for their indices; and the step at which the bond broke.
+    """
 
     pattern: str
     numbers: Sequence[str]
@@ -651,7 +656,7 @@ def write_row(
 
 
 def _write_neighbours(out: Function, plan: Plan, level: Level, s: int, kind: int) -> list[Words]:
-    """Write the rows of the neighbours of a row; return the expressions for each."""
+    """Write the arrays of the neighbours of a row; return the expressions for each neighbour."""
     slots = plan.scene.neighbourhood.slots[s]
     for k, slot in enumerate(slots):
         pattern = plan.row(f"{level.source}_@", slot.target, slot.cell)
@@ -683,8 +688,8 @@ def write_whole(
     damage: RowDamage | None = None,
 ) -> None:
     """Write the lines, in a loop, for a particle that has all its neighbours, with the expressions
-    for each and for its `lost` bonds. If cells can be torn, particles with a `mark` stay in place
-    or, with the damage around them, the others."""
+    for each and for its `lost` bonds. If cells can be torn, particles with a `mark` are not moved;
+    with a given `damage` only these are."""
     out.add(1, *displacements(plan, level))
     if plan.judged:
         out.add(1, f"bits = int64({lost})", "now = bits")
@@ -699,8 +704,8 @@ def write_whole(
 
 
 def write_torn_row(plan: Plan, level: Level, s: int, kind: int) -> Function:
-    """Return the function that moves the marked particles of such a row, from j0 to j1. All that it
-    reads begins at j0, so that its loops vectorise."""
+    """Return the function that moves the marked particles j0 to j1 of such a row. All arrays begin
+    at j0, so that its loops are vectorised."""
     out = Function(plan.shared, f"torn{level.number}_{s}_{kind}", *plan.lead, "j0", "j1")
     damage = RowDamage(plan, s)
     out.add(0, *parameters(plan, level))
@@ -730,7 +735,7 @@ def _slot_lines(
         Home.FIXED_BOND: words.limit,
     }
     c = f"Constants({values(level.seen.bond, bond)})"
-    # A bond is judged as its home end sees it, so that both ends agree to the last bit.
+    # A bond is evaluated as at its home, so that both ends agree to the last bit.
     _, at_home = plan.scene.neighbourhood.home[slot]
     arguments = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
     literal = level.scene.constants.weights[slot]._asdict()
@@ -751,7 +756,7 @@ def _slot_lines(
 
 
 def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
-    """Return lines for the rows of data of the bonds along a slot, where they are stored."""
+    """Return lines for the arrays of the bonds along a slot."""
     if plan.model is None or plan.tears:
         return []
     plane, at_home = plan.scene.neighbourhood.home[slot]
@@ -764,7 +769,7 @@ def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
 
 
 def _beside(plan: Plan, slot: Slot) -> list[str]:
-    """Return the rows of shares of the cells on both sides of a slot."""
+    """Return the area fractions of the cells on both sides of a slot."""
     assert plan.scene.cells
     rows = []
     for side in plan.scene.cells.tiling.beside[slot]:
@@ -774,7 +779,7 @@ def _beside(plan: Plan, slot: Slot) -> list[str]:
 
 
 def write_general(plan: Plan, level: Level, events: Function | None) -> Function:
-    """Return the function that moves particles of sublattice s."""
+    """Return the function that moves particles of sublattice s that may lack neighbours."""
     out = Function(plan.shared, f"general{level.number}", "s", *RUNS)
     write_row_loop(out, plan, level, "s")
     out.add(0, f"base = {plan.flat('s')}", "width = j1 - j0")
@@ -790,7 +795,7 @@ def write_general(plan: Plan, level: Level, events: Function | None) -> Function
 
 def write_one(out: Function, plan: Plan, level: Level) -> None:
     """Write the lines, in a loop, for one particle of sublattice s."""
-    # -0.0 + x is x, whatever its sign.
+    # -0.0 is the neutral element of addition for both signs of zero.
     out.add(1, *(f"{t} = {plan.real}(-0.0)" for t in level.totals), "near, at_j = 0, base + j")
     if plan.judged:
         out.add(1, "bits = int64(flat_lost[at_j])", "now = bits")
@@ -822,9 +827,9 @@ def _is_slot_after_slot(plan: Plan) -> bool:
 
 
 def _seen(out: Function, plan: Plan, array: str, away: str) -> str:
-    """Return an expression for a value of an array, `away` from the particle's place in flat
-    arrays: looked up, or from a row of them if all particles are evaluated slot after slot. `@` in
-    the name is each axis."""
+    """Return an expression for a value of an array at the flat place `away` from that of the
+    particle: an element, or an element of a row of values if all particles are computed slot after
+    slot. `@` in the name stands for each axis."""
     if not _is_slot_after_slot(plan):
         return f"flat_{array}[at_j + {away}]"
     row = f"row_{array} = flat_{array}[base + {away}:base + {away} + width]"
@@ -838,7 +843,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     named = {Home.SLOT: f"weights{level.number}[s, k, {{n}}]", Home.CELL: "share_{n}"}
     depth = 1 if _is_slot_after_slot(plan) else 2
     if any(number.home is Home.CELL for number in level.seen.weights):
-        for side in (0, 1):  # where cells are cut there are few slots
+        for side in (0, 1):  # Lattices with cut cells have few slots.
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
     numbers = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
     bonds, limits_ = (0, 0) if plan.tears else (plan.bonds, plan.limits)
@@ -871,7 +876,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
 
 
 def _write_mixed(out: Function, plan: Plan, level: Level, shown: Sequence[str]) -> None:
-    """Write the contributions of cells of further stiffnesses, beside which few particles are."""
+    """Write the contributions of cells with a different stiffness, which few particles have."""
     nothing = plan.number(0.0)
     out.add(2, f"if share_0 == {nothing} or share_1 == {nothing}:")
     weights = []

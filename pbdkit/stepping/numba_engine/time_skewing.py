@@ -1,10 +1,10 @@
 """Distances between the steps of a pass over the memory, and whether several steps can be made in a
 pass.
 
-A step s of a pass follows the step before it at a distance: it moves a particle as soon as step s -
-1 has moved all that the particle reads, and overwrites nothing that a step before has to read. Both
-hold if the distance is the reach of operations. Only the order of particles differs: every number
-is the same.
+Step s of a pass follows step s - 1 at a distance. It moves a particle after step s - 1 has moved
+all particles that it reads, and before it overwrites a value no earlier step has to read it. Both
+hold if the distance is the reach of the operations. Only the order of particles differs from
+separate steps: all results are the same.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ from pbdkit.stepping.program import reach_of, reason_against
 from pbdkit.stepping.step import Mode, Reach
 
 CACHE = 2**24
-"""Bytes of displacements up to which one step in a pass is as fast (measured)."""
+"""Number of bytes of displacements up to which passes of one step are as fast (measured)."""
 FARTHEST = 8
-"""Maximum distance in cells between steps of a pass, which grows with that of frame points."""
+"""Maximum distance in cells between steps of a pass; the distance of frame points from their
+particles increases it."""
 MOST_SLOTS = 32
-"""Number of neighbours up to which the memory limits a step, and not the computation."""
+"""Number of neighbours up to which steps are limited by memory bandwidth rather than
+computation."""
 
 
 def cell_bytes(scene: Scene) -> int:
