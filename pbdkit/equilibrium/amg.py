@@ -1,8 +1,9 @@
-"""Algebraic multigrid for sparse matrices of particles with known places, with scipy alone.
+"""Algebraic multigrid for the sparse matrices of particles with known positions, written with scipy
+alone.
 
-The functions of a coarser grid are hats, bilinear in the plane and trilinear in space, around
-points twice as far apart; where a crack cuts a hat, each connected piece is a function of its own.
-Matrices of coarser grids are Galerkin products. docs/decisions/0010 compares it with pyamg.
+The basis functions of a coarser grid are hats, bilinear in the plane and trilinear in space, around
+points of twice the spacing; where a crack cuts a hat, each connected piece is a separate function.
+Matrices of coarser grids are Galerkin products. docs/decisions/0010 compares the result with pyamg.
 """
 
 from __future__ import annotations
@@ -16,20 +17,27 @@ import numpy as np
 from pbdkit.array_types import Floats, Indices, Mask
 
 COARSEST = 400
-"""Unknowns up to which a grid is solved with its inverse."""
+"""Number of unknowns up to which a grid is solved by its inverse."""
 MOST_GRIDS = 20
+"""Maximum number of grids."""
 STRONG = 0.01
-"""Relative size from which on a bond connects."""
-ROUNDS, MARGIN, BAND = 12, 1.1, 5.0
-"""Number of power iterations for the largest eigenvalue, factor on the result, and ratio below it
-up to which eigenvalues are not relaxed."""
+"""Ratio of an off-diagonal entry to the geometric mean of both diagonal entries, above which two
+particles are strongly coupled."""
+ROUNDS = 12
+"""Number of power iterations for the largest eigenvalue."""
+MARGIN = 1.1
+"""Safety factor of the largest eigenvalue."""
+BAND = 5.0
+"""Ratio of the largest eigenvalue to the smallest that relaxation damps."""
 SINGULAR = 1e-9
+"""Relative singular value below which pseudo-inverses discard a mode."""
 
 
 @dataclass(frozen=True)
 class _Level:
-    """One grid: `prolongs` maps values of the next grid to this one, `own` holds the inverses of
-    the diagonal blocks, `largest` is the largest eigenvalue of the matrix times these."""
+    """One grid. `prolongs` interpolates values of the next grid to this one, `own` contains the
+    inverses of the diagonal blocks, and `largest` is the largest eigenvalue of their product with
+    the matrix."""
 
     matrix: Any
     own: Any
@@ -53,7 +61,7 @@ class _Level:
 class SparseGrids:
     """Approximation of A⁻¹ r by one V-cycle in single precision. The matrix has `axes` unknowns for
     each particle, stored next to each other; `places` and `led` (particle, axis of space) are the
-    positions of particles and leaders; `held` marks the unknowns that stand alone and are not
+    positions of particles and leaders; `held` marks prescribed unknowns, which are not
     interpolated."""
 
     def __init__(
@@ -82,7 +90,8 @@ class SparseGrids:
         )
 
     def __call__(self, r: Floats) -> Floats:
-        """Return one cycle from zero; r is scaled, since it may be tiny in single precision."""
+        """Return one cycle from zero; r is scaled, since single precision would lose tiny
+        values."""
         scale = float(np.abs(r).max(initial=0.0))
         if not 0.0 < scale < np.inf:
             return r.copy()
@@ -112,8 +121,8 @@ def _spacing(places: Floats) -> Floats:
 
 def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
     """Return the hats, (unknown, unknown of the next grid), and the points at which they are
-    centred. `at` and `led` are in units of the next grid. A point to which a leader is nearer than
-    any particle has no hat."""
+    centred. `at` and `led` are in units of the next grid. A point has no hat if a leader is nearer
+    to it than any other particle."""
     from scipy.sparse import csr_array, eye_array, kron
 
     low = np.floor(np.minimum(at.min(axis=0), led.min(axis=0, initial=0.0))).astype(int) - 1

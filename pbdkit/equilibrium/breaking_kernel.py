@@ -1,14 +1,14 @@
 """Equilibria of linear rules with breaking bonds, in one compiled call for an increment or several.
 The kernel moves the body to equilibrium, updates and breaks bonds, and repeats both.
 
-The matrix is a band, A c = r with A = 1 - (step operator), with one unknown for each follower and
-axis; or, if all axes move alike and independently, one for each follower, with all axes as right
-sides: `wide` is the number of unknowns of a follower. Row i of a band holds A[i, i - half] to A[i,
-i + half]. Factors are L with ones on the diagonal and U, without exchanges, in its place. A row
-depends on earlier rows only: if bonds have changed, only rows from the first of them on are
-assembled and factorised again, from the moves caused by a displacement of each neighbour by 1 at
-rest, which is exact for linear rules. The general path takes 20 times as long
-(docs/decisions/0010).
+The system is A c = r with a band matrix A = 1 - (step operator). It has one unknown for each
+follower and axis or, if the axes are independent and have equal matrices, one for each follower
+with the axes as right sides: `wide` is the number of unknowns of a follower. Row i of a band holds
+A[i, i - half] to A[i, i + half]. A is factorised in place into L, with ones on the diagonal, and U,
+without pivoting. A row of the factors depends on earlier rows only: if bonds have changed, only the
+rows from the first affected follower on are assembled and factorised again. Their entries are the
+moves at rest for a unit displacement of each neighbour, which is exact for linear rules. The
+general path takes 20 times as long (docs/decisions/0010).
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from pbdkit.stepping.numba_engine.sweeps import write_bond_pass, write_general
 from pbdkit.stepping.state import State, unmoved_state
 
 SAME = 1e-12
-"""Relative difference of entries that counts as rounding, as a share of a move."""
+"""Difference of entries, relative to a move, that counts as rounding."""
 SAFETY = 3.0
 """Safety factor of the estimated spread."""
 
 
 def rows_of(work: Any, count: int, reach: int, wide: int) -> Any:
-    """Return the band of `count` followers, each coupled to those up to `reach` before and after
-    it."""
+    """Return an empty band matrix of `count` followers, each coupled to those up to `reach` before
+    and after it."""
     width = 2 * ((reach + 1) * wide - 1) + 1
     return work[: count * wide * width].reshape(count * wide, width)
 
@@ -133,9 +133,10 @@ def solve(band: Any, inverse: Any, x: Any) -> None:
 def refactor(
     work: Any, blocks: Any, pattern: Any, factors: Any, facts: Any, first: int, is_uniform: bool
 ) -> None:
-    """Update the factors from follower `first` on. `facts` holds the number of unknowns of a
+    """Update the factors from follower `first` on. `facts` contains the number of unknowns of a
     follower, the norm of A⁻¹ for random signs times a safety factor, the largest diagonal entry,
-    and the reach of the band; `is_uniform` is true if all axes of frame points follow alike."""
+    and the half-bandwidth in followers; `is_uniform` is true if frame points follow equally along
+    all axes."""
     diagonal, inverse, signs = factors
     count, axes = blocks.shape[0], blocks.shape[2]
     wide = 1 if is_uniform and are_alike(blocks) else axes
@@ -183,11 +184,14 @@ def norm(table: Any) -> Any:
     return math.sqrt(squares)
 
 
-SETTLING_S, PARTICLE_S = 6e-3, 1e-5
-"""Estimated time of one equilibrium by numpy, and additional time for each particle, in seconds."""
-LITTLE_BY_LITTLE, AT_ONCE = 20, 2
-"""Estimated number of equilibria in an increment if bonds change gradually, and if they only
-break."""
+SETTLING_S = 6e-3
+"""Estimated time of one equilibrium by numpy, in seconds."""
+PARTICLE_S = 1e-5
+"""Estimated additional time for each particle, in seconds."""
+LITTLE_BY_LITTLE = 20
+"""Estimated number of equilibria in an increment if bonds soften gradually."""
+AT_ONCE = 2
+"""Estimated number of equilibria in an increment if bonds only break."""
 
 
 def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
@@ -246,8 +250,9 @@ Entry = tuple[Indices, Indices, Indices, Floats]
 @dataclass(frozen=True)
 class Pattern:
     """Couplings of the followers. `place` is the flat place of each follower. The entries from
-    `first[e]` to `first[e + 1]` belong to follower e: it moves by a `slot` (the last: by itself),
-    with the follower `column`, times a `weight` (entry, axis, axis)."""
+    `first[e]` to `first[e + 1]` belong to follower e: the derivative of its move with respect to a
+    neighbour along `slot` (last: itself), times `weight` (entry, axis, axis), is the coupling to
+    the follower `column`."""
 
     place: Indices
     first: Indices
@@ -263,7 +268,8 @@ class Pattern:
 
     @property
     def alike(self) -> bool:
-        """True if each weight is a multiple of the identity: all axes follow in the same way."""
+        """True if each weight is a multiple of the identity, so that all axes have the same
+        couplings."""
         axes = self.weight.shape[-1]
         return bool((self.weight == self.weight[:, :1, :1] * np.eye(axes)).all())
 
@@ -310,8 +316,8 @@ def _entries(scene: Scene, place: Indices) -> Iterator[Entry]:
 
 
 def _followed(scene: Scene, places: Indices) -> Iterator[tuple[Indices, Indices, Floats]]:
-    """Generate the places that are frame points, by their numbers, with a body place that each
-    follows and its weight: the first of each, then the second, and so on."""
+    """Generate the indices of those places that are frame points, with a body place that each
+    follows and its weight: the first of each point, then the second, and so on."""
     if (frame := scene.frame) is None:
         return
     point_at = np.full(scene.raster.kind.size, -1)
@@ -328,17 +334,23 @@ def _followed(scene: Scene, places: Indices) -> Iterator[tuple[Indices, Indices,
         yield numbers[has], frame.body_place[entry], matrices[entry]
 
 
-GOES_ON, SETTLED, FAILED = 0, 1, 2
-"""Result of a call: bonds may change further, no bond changes any more, or the band does not serve;
-then followers are where they were before the last equilibrium."""
+GOES_ON = 0
+"""Result of a call: bonds may change further."""
+SETTLED = 1
+"""Result of a call: no bond changes any more."""
+FAILED = 2
+"""Result of a call: the band matrix is not accurate enough. Followers are at the last
+equilibrium."""
 ROWS = "int64(0)", "int64(kind.shape[1])"
+"""Arguments for all rows of the lattice."""
 
 
 def write_settling(plan: Plan) -> tuple[str, list[str]]:
     """Return the source of a module with ``run(arrays, step, tolerance, slack, most)``.
 
-    It makes at most `most` equilibria, within the length `tolerance`, and ignores changes of bonds
-    within the share `slack`; it returns the number of changes of bonds and the result.
+    The function computes at most `most` equilibria, to within the length `tolerance`, and ignores
+    relative changes of state variables up to `slack`. It returns the number of changes of bonds,
+    and the result.
     """
     (level,) = plan.levels
     general = write_general(plan, level, None)
@@ -389,7 +401,7 @@ def _write_derivative(plan: Plan, general: Function) -> Function:
 
 
 def _bonds(plan: Plan, pattern: str) -> list[str]:
-    """Return the pattern for each number that bonds remember."""
+    """Return the pattern for each state variable of bonds."""
     return [pattern.replace("#", str(n)) for n in range(plan.bonds)]
 
 
@@ -432,7 +444,7 @@ def _write_changed(plan: Plan) -> Function:
 
 
 def _write_known(plan: Plan, derive: Function) -> Function:
-    """Write the function that updates the factors, and returns whether they serve."""
+    """Write the function that updates the factors, and returns whether they are accurate enough."""
     out = Function(plan.shared, "know")
     out.add(0, "since = place.size", "for e in range(place.size):", "    if stale[e]:")
     out.add(2, derive.call("e", *plan.each("still_@")), "stale[e], since = 0, min(since, e)")
@@ -471,7 +483,9 @@ def _write_settle(plan: Plan, follow: Function, moves: Function) -> Function:
 
 
 FUNCTIONS = (refactor, correct, largest, norm)
+"""Functions that are part of every kernel."""
 MOST_CORRECTIONS = 8
+"""Maximum number of corrections until an equilibrium is reached."""
 LARGEST_BAND = 10_000_000
 """Largest number of entries of a band: 80 MB."""
 OPERATIONS_A_CALL = 100_000_000
@@ -479,8 +493,8 @@ OPERATIONS_A_CALL = 100_000_000
 
 
 class Settler:
-    """Kernel for a linear rule, with its band. Its data depend on the bonds alone, to the last bit;
-    nothing else is stored between two increments.
+    """Kernel for a linear rule, with its band matrix, which depends on the bonds alone, to the last
+    bit; nothing else is stored between two increments.
 
     Raises PluginError for parts that cannot be compiled.
     """
@@ -502,7 +516,7 @@ class Settler:
         size = np.array(scene.raster.shape[1:])
         box = np.stack([np.zeros_like(size), size], axis=1).ravel().astype(np.int64)
         self._constant = constant_arrays(plan) | {"box": box}
-        if plan.tears:  # every follower is taken as torn, and marks are written but not read
+        if plan.tears:  # Every follower counts as marked; marks are written but not read.
             self._constant["torn"] = np.zeros(scene.raster.shape, np.uint8)
         self._roles: tuple[bool, ...] = ()
         self._of_roles: Arrays = {}
@@ -520,11 +534,11 @@ class Settler:
         return bool(self._of_roles["band"].size <= LARGEST_BAND)
 
     def settle(self, state: State, moment: float, most: int) -> tuple[bool, int]:
-        """Move a state, in place, from an equilibrium to that of a moment, until no bond changes
-        any more, at most `most` times.
+        """Move a state, in place, from an equilibrium to that of a moment, and update bonds, until
+        no bond changes or `most` equilibria have been computed.
 
-        Returns whether that is so, and the number of changes of bonds; if the band does not serve,
-        the state is that of the last equilibrium.
+        Returns whether no bond changes any more, and the number of changes of bonds. If the band
+        matrix is not accurate enough, the state is that of the last equilibrium.
 
         Raises ExperimentError for contradicting leaders, and StoppedError.
         """
@@ -552,13 +566,13 @@ class Settler:
         size = count * axes * (2 * ((reach + 1) * axes - 1) + 1)
         self._work = 1 + size * (reach + 1) * axes
         self._roles, self._of_roles = roles, self._arrays_of(pattern, size)
-        # Unlike any bond's, so that all rows are found anew.
+        # Differs from the state of any bond, so that all rows are assembled.
         stale = {"known_broken": np.full_like(state.broken_step, -2)}
         stale |= {f"known{n}": value.copy() for n, value in enumerate(state.bond_values)}
         self._of_roles |= stale
 
     def _arrays_of(self, pattern: Pattern, size: int) -> Arrays:
-        """Return by name the arrays of the kernel that are constant as long as the roles are."""
+        """Return by name the arrays of the kernel that are constant while roles are constant."""
         raster, axes, count = self._scene.raster, self._scene.axes, len(pattern.place)
         s, *cells = np.unravel_index(pattern.place, raster.shape)
         alone = np.stack([cells[0], cells[0] + 1, cells[1], cells[1] + 1], axis=1)
@@ -569,7 +583,7 @@ class Settler:
         planes = [f"{name}_{c}" for name in ("v", "still") for c in self._plan.axes]
         signs = np.random.default_rng(0).choice([-1.0, 1.0], count * axes)
         return {
-            # First a run of each follower by itself.
+            # The first entries are the runs, one of a single place for each follower.
             "runs": np.concatenate([alone, self._runs]).astype(np.int64),
             "body": np.array(self._body, np.int64) + np.array([0, count, count]),
             "place": pattern.place,

@@ -1,17 +1,19 @@
-"""The linear system of an equilibrium before obstacles: an active set.
+"""Linear system of an equilibrium in contact with obstacles, by an active set.
 
-A step puts followers at y = u + move, and those that would enter an obstacle at the place x nearest
-to y that is free, in the metric S of the particle (stepping/contact.py). T = ∂x/∂y is 1 for a
-particle that is free, 0 for one that is held where faces meet, and
+A step displaces followers to y = u + move. Those inside an obstacle are projected onto x, the
+nearest point outside in the metric S of the particle (stepping/contact.py). The derivative T =
+∂x/∂y is 1 for a free particle, 0 for a particle at a corner where faces meet, and
 
     T = t tᵀ S / (t·S t - κ n·S (x - y))
 
-for one on a single face with the normal n, the tangent t and the curvature κ. The linearisation is
+for a particle on a single face with the normal n, the tangent t and the curvature κ. The
+linearisation is
 
-    Ã = 1 - T (1 - A),  A that of the body alone,
+    Ã = 1 - T (1 - A), with the matrix A of the body alone,
 
-so that a correction keeps particles that are held on the outline, free along it: the step of a
-semi-smooth Newton iteration (Hintermüller, Ito, Kunisch), which changes the set until it stays.
+so that corrections leave particles in contact on the outline, along which they are free. This is a
+semi-smooth Newton iteration (Hintermüller, Ito and Kunisch, SIAM J. Optim. 13, 2002), which ends
+when the active set is constant.
 """
 
 from __future__ import annotations
@@ -42,15 +44,17 @@ from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.state import State
 
 WEAK = 1e-6
-"""Stiffness of springs to the positions of particles, relative to that of their neighbours."""
+"""Stiffness of springs to the current positions of particles, relative to that of their
+neighbours."""
 NO_FACE = -1
-"""Number of a face for a particle that is not on any."""
+"""Index of a missing face."""
 REMEDY = "let a leader hold it, or take solver: {type: stepping}"
+"""Remedy for a part that no leader holds."""
 
 
 class ContactSystem(System):
-    """Linear system at a state, with the particles constrained that would enter an obstacle from
-    there."""
+    """Linear system at a state, in which particles that would enter an obstacle from there are
+    constrained."""
 
     def __init__(
         self, scene: Scene, state: State, moment: float, method: str, watch: Watch, moves: Moves
@@ -77,8 +81,7 @@ class ContactSystem(System):
         self._parts = self._split(matrix, is_fixed)
 
     def _split(self, matrix: Any, held: NDArray[np.bool_]) -> list[tuple[Indices, Subsystem]]:
-        """Divide the unknowns into those that leaders or obstacles hold, and each part that nothing
-        holds."""
+        """Divide the unknowns into those that leaders or obstacles hold, and the floating parts."""
         count, label = connected(matrix, strongly=False)
         is_held = np.bincount(label, held, count) > 0.0
         groups = [np.flatnonzero(is_held[label])] if held.any() else []
@@ -89,8 +92,8 @@ class ContactSystem(System):
         ]
 
     def _part(self, matrix: Any, members: Indices, held: bool) -> Subsystem:
-        """Return the system of a part. Held parts have an inverse, unless they have a free motion:
-        then they float."""
+        """Return the system of a part. A part that is held has an inverse, unless it has a free
+        motion; it then counts as floating."""
         part_matrix = matrix if len(members) == matrix.shape[0] else matrix[members][:, members]
         if held:
             coordinates = Coordinates(2, self._X[members[::2] // 2], self._led)
@@ -105,7 +108,7 @@ class ContactSystem(System):
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound: by the solution; that of its rounding by the inverse itself if it is
+        """Kind of the bound: by the solution, or by the inverse for its rounding if the inverse is
         available."""
         ways = {part.bound_kind for _, part in self._parts}
         return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
@@ -133,7 +136,7 @@ class ContactSystem(System):
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Solve part by part."""
+        """Return the solution, computed part by part."""
         r = self._table(moves)
         x = np.zeros_like(r)
         for members, part in self._parts:
@@ -148,7 +151,7 @@ class ContactSystem(System):
         return self._planes(x)
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """Solve by `solve`, which does not use a tolerance."""
+        """Return the solution of `solve`, which does not use a tolerance."""
         return self.solve(moves, 0.0, rounding=PUSH * float(np.abs(moves).max(initial=0.0)))
 
     def pushed_by(self, led: Floats) -> None:
@@ -167,8 +170,8 @@ class ContactSystem(System):
         return math.inf
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Solve once more for the remaining moves, and add the effect of rounding: of displacements
-        for all followers, of positions for those in contact."""
+        """Return the bound from another solution for the remaining moves, plus the effect of
+        rounding: of displacements for all followers, of positions for those in contact."""
         r, far = self._table(moves), [0.0]
         for n, (members, part) in enumerate(self._parts):
             far.append(part.farthest(r[members], rounding * self._share_of_places))
@@ -185,7 +188,7 @@ class ContactSystem(System):
         return self._spreads[n]
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """Check each part by itself."""
+        """Raise ExperimentError if a floating part has moves."""
         r = self._table(moves)
         for members in self._floats:
             if np.abs(r[members]).max(initial=0.0) > 8 * rounding:
@@ -239,9 +242,11 @@ class ContactSystem(System):
 def hold(
     contact: Contact, scene: Scene, u: Floats, place: Indices, moment: float
 ) -> tuple[Indices, Floats]:
-    """Return the faces on which followers at some places rest, moved from displacements u, by
-    number, (follower, 2), and T of each follower, (follower, axis, axis). Missing faces are
-    NO_FACE; of more than two faces the first two count."""
+    """Return the faces on which followers at flat places rest, and T of each follower.
+
+    The followers are moved from displacements u. Faces are (follower, 2), NO_FACE where there is
+    none; of more than two faces the first two are used. T is (follower, axis, axis).
+    """
     y, codes = contact.positions(u, place), contact.led(math.ceil(moment))
     roles = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
     x = y + contact.ways(u, place, moment)
@@ -276,7 +281,7 @@ def _along(face: Face, S: Floats, way: Floats) -> Floats:
 
 
 def _contacting(free: Any, turned: Floats) -> Any:
-    """Return 1 - T (1 - A)."""
+    """Return 1 - T (1 - A), the matrix of a body in contact."""
     from scipy.sparse import bsr_array
 
     rows = np.arange(len(turned) + 1)

@@ -40,13 +40,14 @@ WAYS = {
     "energy": "further iterations, and the energy of the remaining error",
     "nothing to solve": "there are no followers",
 }
+"""Descriptions of the kinds of bounds."""
 CORRECTION = "correction, "
 """Prefix of a kind of bound that applies only to the error that a computed correction leaves."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Bound on the error of an equilibrium.
+    """Error bound of an equilibrium.
 
     `residual` is the largest move of the rule at the state, and `distance` a bound on the distance
     of any follower from equilibrium, both lengths; `share` is the distance relative to the largest
@@ -65,7 +66,7 @@ class Certificate:
     linearised: bool
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the certificate as plain values, for JSON."""
+        """Return the error bound as plain values, for JSON."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -88,10 +89,11 @@ UNKNOWN = Certificate(
     bound="nothing to solve",
     linearised=True,
 )
+"""Error bound before anything is computed."""
 
 
 class UnconvergedError(Exception):
-    """The best state found is not an equilibrium; the error contains its certificate."""
+    """The best state found is not an equilibrium; the error has its error bound."""
 
     def __init__(self, reason: str, certificate: Certificate = UNKNOWN) -> None:
         super().__init__(reason)
@@ -103,8 +105,9 @@ class RoundingError(UnconvergedError):
 
 
 def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
-    """Return the largest prescribed displacement of leaders or of the start. If there is none, the
-    largest displacement caused by loads; without loads, the shortest bond."""
+    """Return the largest prescribed displacement of leaders or of the start. If all are zero,
+    return the largest displacement caused by loads; without loads, the length of the shortest
+    bond."""
     ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
     prescribed = rows.communicator.largest(max([rows.max_norm(start.u), *ways]))
     return prescribed or _way_under_loads(scene, start, rows) or spacing_of(scene)
@@ -112,8 +115,8 @@ def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
 
 def _way_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
     """Return the largest displacement that changes of the loads cause, linearised at rest; 0 if
-    nothing holds the body against them. Obstacles can prevent all of it: then the largest move of
-    the loads without obstacles."""
+    nothing holds the body against them. If obstacles prevent every displacement, return the largest
+    move of the loads without obstacles."""
     steps, moves, ways = scene.experiment.steps, Moves(scene), [0.0]
     rest = replace(rest, u=np.zeros(rest.u.shape))
     moments = {*scene.loads.changes(steps), *bends_of(scene)} if scene.loads else ()
@@ -140,22 +143,24 @@ def broken_bonds(state: State) -> int:
 
 
 LINEAR = 1e-9
-"""Ratio of the remaining moves to the corrected ones below which the rule counts as linear."""
+"""Ratio of the moves after a correction to those before it, below which the rule counts as
+linear."""
 FIRST_ORDER = 2.0
 """Safety factor of bounds of first order."""
 ACCURACY = 1e-8
 """Relative accuracy of linear systems; the bound includes the remaining error."""
 
 CONTRACTION = 0.1
-"""Largest ratio of moves after and before a correction for which the linearisation is valid:
-further corrections, each smaller by this ratio, then amount to a ninth of the first."""
+"""Largest ratio of moves after and before a correction for which the linearisation is valid.
+Further corrections, each smaller by this ratio, then add up to at most a ninth of the first."""
 BENT = "the rule is too nonlinear between the state and equilibrium for a bound"
+"""Reason for an infinite distance under a rule that is too nonlinear."""
 
 
 @dataclass(frozen=True)
 class PredictedEquilibrium:
-    """Predicted equilibrium `u` with the certificate of its error; `obstacle` is the reason of an
-    infinite distance."""
+    """Predicted equilibrium `u` with its error bound; `obstacle` is the reason of an infinite
+    distance."""
 
     u: Floats
     certificate: Certificate
@@ -165,29 +170,14 @@ class PredictedEquilibrium:
 class ErrorBound:
     """Prediction of the equilibrium from states of a scene with the roles of its last step.
 
-    The correction c, A c = move, leads from u to the equilibrium; its error follows from the moves
-    at u + c:
+    The correction c, with A c = move, leads from u to the equilibrium. Its error follows from the
+    moves at u + c: distance ≤ max ‖c‖ + (bound on ‖A⁻¹‖) · ‖move(u + c)‖. If the rule is not
+    linear, A is linearised at u; the second term is then a bound of first order and is doubled, and
+    the correction has to reduce the moves to a tenth.
 
-    distance ≤ max
-
-    c
-
-    + (bound on
-
-    A⁻¹
-
-    ) ·
-
-    move(u + c)
-
-    .
-
-    For rules that are not linear, A is linearised at u, the second term is of first order and
-    doubled, and the correction has to reduce the moves to a tenth.
-
-    A prediction depends on the state alone, so that a resumed run has those of the uninterrupted
-    one. Only factors are stored between two predictions, since iterative solvers depend on earlier
-    solutions.
+    A prediction depends on the state alone, so that a resumed run has the predictions of the
+    uninterrupted one. Only factors of matrices are stored between two predictions, since iterative
+    solvers depend on earlier solutions.
     """
 
     def __init__(self, scene: Scene, scale: float, watch: Watch) -> None:
@@ -199,8 +189,8 @@ class ErrorBound:
     def from_(self, state: State) -> PredictedEquilibrium:
         """Predict the equilibrium from the end of a step; the state is not changed.
 
-        The distance is infinite if no bound is known: for bodies that are pushed on without end,
-        and for parts that nothing holds under rules that are not linear.
+        The distance is infinite if no bound is known: for bodies under a load that nothing
+        balances, and for floating parts under rules that are not linear.
         """
         with one_thread():
             return self._from(state)
@@ -226,7 +216,8 @@ class ErrorBound:
         return linearised(self._scene, at, steps, "auto", self._watch)
 
     def _outlook(self, state: State, system: System, *, anew: bool = False) -> PredictedEquilibrium:
-        """Predict by the system at rest, or by one linearised `anew` at the state."""
+        """Predict by the system at rest or, with `anew`, by a system that is linearised at the
+        state."""
         moves = self._moves.at(state, self._scene.experiment.steps)
         ahead, distance = state.u.copy(), math.inf
         correction, obstacle = self._correction(state, system, moves, anew)
@@ -268,8 +259,8 @@ class ErrorBound:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"
 
     def _is_linear(self, state: State, system: System) -> bool:
-        """Return whether random displacements, of the size of those of the body, cause the moves of
-        the linearisation at rest."""
+        """Return whether the moves at random displacements, of the size of those of the body, agree
+        with the linearisation at rest."""
         size = float(np.abs(state.u).max()) or spacing_of(self._scene)
         probe, steps = random_displacements(self._scene, size), self._scene.experiment.steps
         moves, moved = (
@@ -278,13 +269,17 @@ class ErrorBound:
         return system.mismatch(probe, moves, moved) <= LINEAR
 
 
-FINEST, COARSEST = 256, 4
-"""Divisors of the number of steps since the first check that bound the number of steps to the next
-one."""
+FINEST = 256
+"""Divisor of the number of steps since the first check that gives the minimum number of steps to
+the next check."""
+COARSEST = 4
+"""Divisor of the number of steps since the first check that gives the maximum number of steps to
+the next check."""
 OVERDUE = 4
-"""Ratio of the numbers of steps since the first check at which a bound is computed although steps
-do not shrink (rounding, or a vibrating body)."""
+"""Factor by which the number of steps since the first check increases until a bound is computed
+even if steps do not shrink (because of rounding, or vibrations)."""
 NEVER = 2**62
+"""Number of a step that no run reaches."""
 
 
 @dataclass
@@ -292,16 +287,10 @@ class Pace:
     """Schedule of the checks for a steady state.
 
     If the modes of a symmetric step decay by ρ or faster, the sizes of its steps decay at a rate of
-    at least -ln ρ, which decreases. The extrapolation from two checks,
-
-    distance ≈ ρ / (1 - ρ) ·
-
-    last step
-
-    , ρ from the ratio of two steps,
-
-    is too small, so that a check is early rather than late; it is exact once a single mode is left.
-    It only determines when a bound is worth its cost.
+    at least -ln ρ, which decreases. The distance is extrapolated from two checks: distance ≈ ρ / (1
+    - ρ) · ‖last step‖, with ρ from the ratio of the sizes of two steps. The result is too small, so
+    that a check is early rather than late; it is exact once a single mode remains. The estimate
+    determines when a bound is computed, and not its value.
     """
 
     next_look: int
@@ -319,13 +308,13 @@ class Pace:
     """Number of steps since the first check after which a bound is computed in any case."""
 
     def is_near(self, step: int, longest: float, size: float) -> bool:
-        """Return whether a bound is worth its cost, for a step with a longest displacement
+        """Return whether a bound is to be computed, for a step with a longest displacement
         `longest` and a norm `size` of all displacements."""
         if self.seen:
             self.rate = _rate(self.seen, (step, size))
         self.seen = (step, size)
         elapsed = step - self.begin
-        # Of two states within the tolerance none is farther from the other than twice that.
+        # Two states within the tolerance are at most twice the tolerance apart.
         short = longest <= 2.0 * self.tolerance
         if short and self.overdue is None:
             self.overdue = OVERDUE * elapsed
@@ -373,11 +362,12 @@ def _steps_until(value: float, wanted: float, rate: float) -> float:
 
 
 class SteadyStateMonitor:
-    """Detection of the steady state of a run: roles are constant, leaders rest, no follower is
-    farther from equilibrium than the tolerance, and no bond can break on the way there.
+    """Detection of the steady state of a run.
 
-    If the step depends on the state before it, a body may vibrate about its equilibrium: the
-    displacement that memory and lagging frames may still cause is added to the distance.
+    In a steady state roles are constant, leaders rest, the distance of all followers from
+    equilibrium is within the tolerance, and no bond can break before equilibrium is reached. If the
+    step depends on the state before it, a body may vibrate about its equilibrium: the displacement
+    that momentum and frame delay may still cause is added to the distance.
     """
 
     def __init__(self, scene: Scene, settle: Settle, start: State, watch: Watch) -> None:
@@ -392,13 +382,13 @@ class SteadyStateMonitor:
         self._carrying = _carrying(scene)
         unended = "leaders do not come to rest before its end"
         self.obstacle = "steps are too few" if ends else unended
-        """Reason for which the last check found no steady state."""
+        """Reason why the last check found no steady state."""
 
     def look(self, state: State) -> Certificate | None:
-        """Return the certificate if the end of a step is a steady state.
+        """Return the error bound if the end of a step is a steady state.
 
-        Raises StoppedError if the user interrupts. In both cases the schedule is unchanged, so that
-        another check has the same result.
+        Raises StoppedError if the user interrupts. If there is no bound or the user interrupts, the
+        schedule is unchanged, so that another check has the same result.
         """
         pace, certificate = replace(self.pace), None
         try:
@@ -432,22 +422,14 @@ class SteadyStateMonitor:
             return f"{at} {outlook.obstacle or 'nothing bounds the distance from equilibrium'}"
         if distance > self._tolerance:
             return f"{at} within {distance:.2g} of equilibrium, not within {self._tolerance:.2g}"
-        ahead = 2.0 * distance  # at both ends of a bond
+        ahead = 2.0 * distance  # The distance applies to both ends of a bond.
         if self._fracturing and self._fracturing.may_break(outlook.u, state, ahead):
             return f"{at} a bond may break on the last {distance:.2g} to equilibrium"
         return ""
 
 
 def _carrying(scene: Scene) -> float:
-    """Return the ratio to the last step of the displacement that may follow:
-
-    b
-
-    / (1 -
-
-    b
-
-    ) for memory b, by which each step is b times the last, plus 1 for a frame with lag.
-    """
+    """Return the ratio to the last step of the displacement that may follow it: |b| / (1 - |b|) for
+    momentum b, by which each step is b times the last, plus 1 for a frame with delay."""
     memory = abs(scene.experiment.stepping.memory)
     return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + scene.lag

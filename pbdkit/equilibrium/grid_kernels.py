@@ -1,15 +1,16 @@
 """Compiled loops over the rows of grids: coarsening, fields of iterations, relaxation.
 
-A grid has a `code` by (row, place), the number of the stencil in `own` or -1 where no particle is
-free, and a `kind`, 0 outside, 1 free, 2 leader. `halved` are the axes along which the next grid has
-half the places: its place n lies at 2n - 1, or at n. Fields are planes (axis, row, place), zero
-where no particle is free; the outermost ring is never free.
+A grid has two arrays (row, place): `code` is the index of the stencil in `own`, -1 where no
+particle is free; `kind` is 0 outside, 1 at free particles, 2 at leaders. `halved` are the axes
+along which the next grid has half the places: its place n coincides with 2n - 1, or with n along
+other axes. Fields are planes (axis, row, place), zero where no particle is free; the outermost ring
+is never free.
 
-A row has runs of places that share the stencil `same`, from `begin` to `end`, and single places,
-the lone ones, with separate stencils, `own[which]`. A stencil is 3 × 3 places of 4 numbers, xx, xy,
-yx, yy, row after row. Rows are relaxed in two colours, even and odd, the places of a row from the
-same state; sums are made row by row, so that the result does not depend on the number of rows
-processed at a time.
+A row consists of runs of places, from `begin` to `end`, that share the stencil `same`, and of lone
+places with stencils `own[which]`. A stencil is 3 × 3 places, row by row, of 4 numbers: xx, xy, yx,
+yy. Rows are relaxed in two colours, even and odd, and all places of a row from the same state. Sums
+are computed row by row, so that the result does not depend on the number of rows processed at a
+time.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from numba import njit
 
 KEPT = globals().get("KEPT", False)
+"""True if numba stores the compiled functions on disk."""
 
 
 @njit(cache=KEPT)
@@ -50,8 +52,8 @@ def runs(code, first, begin, end, lone, place, which):
 
 @njit(cache=KEPT)
 def coarse_kinds(kind, halved, out):
-    """Compute the kinds of the next grid. A place outside to which free ones are interpolated is
-    free, unless leaders are nearer."""
+    """Compute the kinds of the next grid. A place outside is free if free places interpolate from
+    it, unless leaders are nearer."""
     a1, b1 = halved
     for n in range(1, out.shape[0] - 1):
         for m in range(1, out.shape[1] - 1):
@@ -94,8 +96,8 @@ def coarse_codes(code, kind, halved, out):
 
 @njit(cache=KEPT)
 def beside(q, half):
-    """Return the two places of the next grid between which the place at distance q lies, and the
-    weight of the first, as numbers of a stencil, -1, 0 or 1."""
+    """Return the two places of the next grid on either side of distance q, and the weight of the
+    first. Places are indices of a stencil: -1, 0 or 1."""
     if not half:
         return q, q, 1.0
     return (q - 1) // 2 if q % 2 else q // 2, (q + 1) // 2, 0.5 if q % 2 else 1.0
@@ -155,7 +157,7 @@ def asymmetry(code, stencils):
 
 @njit(cache=KEPT)
 def symmetrise(code, stencils):
-    """Replace K by (K + Kᵀ) / 2 where stencils are separate."""
+    """Replace K by (K + Kᵀ) / 2 at places with separate stencils."""
     for i in range(1, code.shape[0] - 1):
         for j in range(1, code.shape[1] - 1):
             for s in range(5):
@@ -219,17 +221,13 @@ def run_coarsening():
 
 
 FAST = {"error_model": "numpy", "nogil": True, "cache": KEPT, "fastmath": True}
+"""Options of numba for loops over fields."""
 
 
 @njit(**FAST)
 def descend(a, p, q, x, r, share, out, sums):
-    """Compute x += a p, r -= a q and out = share · r in its precision; sums, by row, are r · r and
-    the largest
-
-    a p
-
-    .
-    """
+    """Compute x += a p, r -= a q and out = share · r in the precision of `out`. `sums`, by row, are
+    r · r and the largest |a p|."""
     sums[:] = 0.0
     for v in range(2):
         for i in range(x.shape[1]):
@@ -300,8 +298,8 @@ def prolong(first, begin, end, lone, place, coarse, halved, x):
 
 @njit(**FAST)
 def differences(still, moved, place, number, share, axis, out):
-    """Write share · (still - moved) at flat places into place `number` of each one's stencil, as
-    the derivative with respect to an axis. Return the largest value."""
+    """Write share · (still - moved) at flat places into entry `number` of their stencils, as the
+    derivative with respect to an axis. Return the largest value."""
     largest = 0.0
     for n in range(place.size):
         for v in range(2):
@@ -342,8 +340,8 @@ total numbers at the end; the stencils, and the inverses of their diagonal block
 
 @njit(**FAST)
 def around(x, i, lo, hi):
-    """Return the rows before, at and after a run, x and y, from one place before it to one
-    after."""
+    """Return the rows before, at and after a run, along x and y, from one place before the run to
+    one after."""
     lo, hi = lo - 1, hi + 1
     previous, following = (
         (x[0, i - 1, lo:hi], x[1, i - 1, lo:hi]),
@@ -354,7 +352,7 @@ def around(x, i, lo, hi):
 
 @njit(**FAST)
 def of_row(c, x, y, j):
-    """Return the product of three places of a row with 12 numbers of a stencil."""
+    """Return the product of three places of a row and the 12 numbers of one row of a stencil."""
     x0, y0, x1, y1, x2, y2 = x[j], y[j], x[j + 1], y[j + 1], x[j + 2], y[j + 2]
     kx = (c[0] * x0 + c[1] * y0) + (c[4] * x1 + c[5] * y1) + (c[8] * x2 + c[9] * y2)
     ky = (c[2] * x0 + c[3] * y0) + (c[6] * x1 + c[7] * y1) + (c[10] * x2 + c[11] * y2)
@@ -445,11 +443,12 @@ def clear(x, i):
 
 @njit(**FAST)
 def relax(grid, b, x, row, weight, start, upwards):
-    """Relax x += weight · D⁻¹ (b - K x) on even rows, then on odd ones; `upwards` in the opposite
-    order. `start`: from x = 0, whatever x contains. `row` is a buffer for one row."""
+    """Relax x += weight · D⁻¹ (b - K x) on even rows, then on odd ones; with `upwards` in the
+    opposite order. With `start` the iteration begins from x = 0, and values of x are ignored. `row`
+    is a buffer for one row."""
     rows = grid.first.size - 1
     for i in range(1 if upwards else 0, rows + 1, 2):
-        # Row i, and the row before it, for which both beside it are now done.
+        # Row i, and row i - 1, whose adjacent rows are now both relaxed.
         if i < rows:
             if start:
                 clear(x, i)

@@ -1,6 +1,7 @@
 """Krylov iterations on stencils, preconditioned by multigrid, with estimates of their error.
 
-The cycle runs in single precision, all else in double; no iteration is lost by that.
+The cycle is computed in single precision and everything else in double precision, which does not
+increase the number of iterations.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ ALIKE = 1e-13
 """Relative size below which the component of a field outside the span of the others counts as
 zero."""
 SLOWEST = 0.9
-"""Slowest rate of decay of the jumps that is extrapolated."""
+"""Largest ratio of successive jumps from which the distance is extrapolated."""
 
 
 def best_of(krylov: LatticeKrylov, near: Sequence[Floats], b: Floats) -> Floats | float:
@@ -78,10 +79,10 @@ class Descent(KrylovResult):
     steps: list[float] = field(default_factory=list)
     turns: list[float] = field(default_factory=list)
     indefinite: bool = False
-    """True once a direction of negative curvature occurred."""
+    """True if a direction of negative curvature has occurred."""
 
     def smallest(self) -> float:
-        """Return the smallest eigenvalue of B K in the Krylov space (Lanczos)."""
+        """Return an estimate of the smallest eigenvalue of B K from the Krylov space (Lanczos)."""
         a, b = np.array(self.steps), np.array(self.turns)
         diagonal = 1.0 / a
         diagonal[1:] += b[1:] / a[:-1]

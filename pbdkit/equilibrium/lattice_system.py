@@ -1,11 +1,12 @@
-"""The linear system of an equilibrium solved on the stencils of its lattice.
+"""Linear system of an equilibrium, solved on the stencils of the lattice.
 
-The error e of a state solves K e = r. Some iterations find most of it; for the rest conjugate
-gradients know its energy, rᵀ B r / λ at most, with the cycle B and the smallest eigenvalue λ of
-B K, of which they have seen enough to estimate it. A place moves by √(g · energy) at most, where g
-is its compliance, extrapolated from coarse grids. That is an estimate, not a proof: λ is halved.
+The error e of a state satisfies K e = r. Some iterations remove most of it. The energy of the
+remaining error is at most rᵀ B r / λ, with the multigrid cycle B and the smallest eigenvalue λ of B
+K, which conjugate gradients estimate (Lanczos). The displacement of a place is at most √(g ·
+energy) with its compliance g, which is extrapolated from coarse grids. These are estimates and not
+rigorous bounds; for safety λ is halved.
 
-The slowest mode of the steps follows by inverse iteration: what remains of v ← A⁻¹ v fades last.
+The slowest mode of the steps is computed by inverse iteration, v ← A⁻¹ v.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 ENOUGH = 8
-"""Number of iterations from which the compliance of a place is estimated."""
+"""Number of iterations by which the compliance of a place is estimated."""
 
 
 def compliance(grids: Multigrid | PartedGrids) -> float:
@@ -107,13 +108,15 @@ def planes_of(matrix: StencilMatrix, field: Floats, shape: tuple[int, ...]) -> F
     return planes
 
 
-MOST_TURNS, TURN = 32, 3
-"""Maximum number of inverse iterations on a coarser grid, and of inner iterations in each."""
+MOST_TURNS = 32
+"""Maximum number of inverse iterations on a coarser grid."""
+TURN = 3
+"""Maximum number of inner iterations in each inverse iteration."""
 
 
 @dataclass(frozen=True)
 class SlowMode:
-    """Mode of the steps as planes, and its slowness 1 / (1 - λ) with the eigenvalue λ."""
+    """Slowest mode of the steps as planes, and its slowness 1 / (1 - λ) with the eigenvalue λ."""
 
     planes: Floats
     slowness: float
@@ -150,10 +153,10 @@ TURNS = 6
 
 
 class LatticeSystem(System):
-    """Linear system solved by multigrid on stencils; `has_leaders` is true if rows of the matrix
-    contain the coupling of followers to leaders too.
+    """Linear system solved by multigrid on stencils; `has_leaders` is true if the matrix contains
+    the coupling of followers to leaders.
 
-    Raises FloatingError if leaders do not hold all of the body.
+    Raises FloatingError if leaders do not hold the whole body.
     """
 
     def __init__(
@@ -180,12 +183,12 @@ class LatticeSystem(System):
 
     @property
     def methods(self) -> str:
-        """Multigrid and the iteration that it preconditions."""
+        """Names of multigrid and of the iteration that it preconditions."""
         return f"multigrid, {self._solver.name}"
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound: by energy for a symmetric matrix, else by the iteration."""
+        """Kind of the bound: by energy for a symmetric matrix, otherwise by the iteration."""
         return "energy" if self._symmetric else "iteration"
 
     @property
@@ -205,7 +208,7 @@ class LatticeSystem(System):
         return self._planes(iteration.x)
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """Solve from the best combination of the fields `near`."""
+        """Return the solution, starting from the best combination of the fields `near`."""
         fields = [free_field_of(self._matrix, v) for v in near]
         return self._planes(self._to_share(self._pull(moves), share, fields))
 
@@ -218,13 +221,14 @@ class LatticeSystem(System):
             self._grids.grid().field(np.float64),
         )
         negative_inverse = inverses(-self._matrix.scale.reshape(-1, 2, 2)).reshape(-1, 4)
-        inverse = np.ascontiguousarray(negative_inverse)  # kernels are compiled for such alone
+        # Kernels are compiled for contiguous arrays alone.
+        inverse = np.ascontiguousarray(negative_inverse)
         kernels().scaled(self._solver.matrix, tuple(inverse[0].tolist()), inverse, pull, out)
         return self._planes(out)
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """Solve with the transpose of A⁻¹ = K⁻¹ S, which is Sᵀ K⁻ᵀ: by the same grids for a
-        symmetric K, else by the grids of the transpose."""
+        """Return Sᵀ K⁻ᵀ weights, the solution with the transpose of A⁻¹ = K⁻¹ S. For a symmetric K
+        the same grids are used, otherwise those of the transpose."""
         b, out = free_field_of(self._matrix, weights), self._grids.grid().field(np.float64)
         solver = self if self._symmetric else self._transposed
         x = solver._to_share(b, share, ())
@@ -237,7 +241,7 @@ class LatticeSystem(System):
         return LatticeSystem(transposed(self._matrix), False, self._shape, self._watch)
 
     def _to_share(self, b: Floats, share: float, near: Sequence[Floats]) -> Floats:
-        """Solve K x = b with an error relative to the largest number of x."""
+        """Return the solution of K x = b with an error relative to the largest number of x."""
         self._watch.begin("solving")
         start = best_of(self._solver, near, b)
 
@@ -265,8 +269,8 @@ class LatticeSystem(System):
         return math.sqrt(solver.dot(difference, difference) / solver.dot(pull, pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the error that some iterations remove, plus the bound on the remaining error;
-        rounding counts as random."""
+        """Return the error that some iterations remove, plus the bound on the remaining error.
+        Rounding errors count as random."""
         remainder, length = self._tracked(self._pull(moves))
         if self._spread is None:
             self._spread = self._spread_of_rounding()
@@ -290,9 +294,9 @@ class LatticeSystem(System):
         """Do nothing: the whole body is held."""
 
     def is_stable(self) -> bool:
-        """Return whether conjugate gradients meet no negative eigenvalue, from the load and from a
-        random right side. For a matrix that is not symmetric, the sign of the eigenvalues nearest
-        to 0 is checked."""
+        """Return whether the matrix has no negative eigenvalue. For a symmetric matrix, conjugate
+        gradients from the load and from a random right side meet no negative curvature. For other
+        matrices the sign of the eigenvalues nearest to 0 is checked."""
         v = self._rows.random(self._shape)
         if self._symmetric:
             try:
@@ -328,13 +332,13 @@ class LatticeSystem(System):
         return iteration
 
     def _farthest(self, energy: float) -> float:
-        """Bound the displacement of any place for a residual with this rᵀ B r."""
+        """Return a bound on the displacement of any place, for a residual with this rᵀ B r."""
         if min(energy, self._compliance) < 0.0:
             raise IndefiniteError
         return math.sqrt(SAFETY / self._smallest * self._compliance * energy)
 
     def _spread_of_rounding(self) -> float:
-        """Bound the displacement that rounding of moves by up to 1 causes."""
+        """Return a bound on the displacement that rounding of moves by up to 1 causes."""
         r = self._pull(np.sign(self._rows.random(self._shape)))
         if self._symmetric:
             return self._farthest(self._solver.dot(r, self._grids.cycle(r.astype(np.float32))))
@@ -357,7 +361,7 @@ class LatticeSystem(System):
 
 
 FAITHFUL = 1e-3
-"""Largest relative mismatch of stencils from differences with moves."""
+"""Largest relative difference between products with stencils from differences and moves."""
 
 
 def lattice_system(
@@ -368,11 +372,11 @@ def lattice_system(
     moves: Moves | None = None,
     rows: Rows = ALL,
 ) -> LatticeSystem | None:
-    """Return the linear system of a scene on stencils; None if it has no such form, or leaders do
-    not hold the body.
+    """Return the linear system of a scene on stencils; None if there is no such system, or if
+    leaders do not hold the body.
 
-    Compiled `moves` serve for differences at a state that is not at rest. With `rows` of one of
-    several processes the system is that at rest.
+    At a state that is not at rest the matrix is assembled by differences of compiled `moves`. With
+    `rows` of one of several processes the system is the one at rest.
     """
     if moves and moves.is_compiled and state.u.any():
         matrix = differenced_matrix(scene, state, step, moves)
@@ -387,7 +391,7 @@ def lattice_system(
         return None
     matrix, is_symmetric = balanced(constrained(matrix, components), rtol, rows)
     try:
-        # What frame points show of leaders is not among the stencils.
+        # Couplings of frame points to leaders are not part of the stencils.
         has_leaders = not (moves or scene.frame)
         system = LatticeSystem(matrix, is_symmetric, state.u.shape, watch, has_leaders, rows)
     except FloatingError:

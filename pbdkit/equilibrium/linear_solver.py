@@ -3,9 +3,9 @@
 Small matrices are inverted. Narrow ones are factorised as bands by LAPACK, with particles in rows
 across the shorter side of the body. Others are factorised by SuperLU, in an order with little
 fill-in: nested dissection (A. George, Nested dissection of a regular finite element mesh, SIAM J.
-Numer. Anal. 10, 1973), where a strip that no coupling crosses divides the body in two, both halves
-are divided in the same way, and the strip is eliminated last. SuperLU itself does not offer this
-order. Large systems are solved by iteration, with multigrid (amg.py) as preconditioner.
+Numer. Anal. 10, 1973), A strip that no coupling crosses divides the body in two; both halves are
+divided in the same way, and the strip is eliminated last. SuperLU itself does not offer this order.
+Large systems are solved by iteration, with multigrid (amg.py) as preconditioner.
 docs/decisions/0010 contains measurements.
 """
 
@@ -33,32 +33,37 @@ MAX_ITERATIONS = 400
 MIN_RESIDUAL = 1e-14
 """Smallest relative residual of iterations."""
 LARGEST_LU = 30_000
-"""Unknowns up to which `auto` takes an LU factorisation."""
+"""Number of unknowns up to which `auto` selects an LU factorisation."""
 LARGEST_COUPLED_LU = 200_000
-"""Unknowns up to which `auto` takes an LU factorisation if the axes are coupled."""
+"""Number of unknowns up to which `auto` selects an LU factorisation if the axes are coupled."""
 WIDEST_BAND = 120
-"""Largest half-bandwidth that is factorised as a band: beyond, factors of a body as long as wide
-take more memory than sparse ones, and soon more time."""
+"""Largest half-bandwidth that is factorised as a band. Beyond it, for a square body, the factors of
+a band matrix take more memory than sparse ones, and soon more time."""
 PIVOT_THRESHOLD = 0.1
-"""Ratio to the largest entry of its column from which a diagonal entry is a pivot."""
+"""Ratio to the largest entry of its column from which a diagonal entry is used as a pivot."""
 PATTERN_ASYMMETRY = 1.2
-"""Largest ratio of the entries of a matrix and its transpose together to those of the matrix for
-its pattern to count as nearly symmetric."""
+"""Largest ratio of the number of nonzeros of A + Aᵀ to that of A for which the pattern counts as
+nearly symmetric."""
 SYMMETRY_RTOL = 1e-12
 """Relative difference up to which a matrix counts as symmetric."""
-FEWEST, LEAF = 1000, 40
-"""Number of places from which dissection pays (measured), and number up to which a part is not
-divided."""
+FEWEST = 1000
+"""Number of places from which nested dissection is faster (measured)."""
+LEAF = 40
+"""Number of places up to which a part is not divided."""
 TINY = 1e-300
+"""Smallest reach of couplings, which makes it positive."""
 WIDEST = 0.25
 """Largest fraction of all places in the first strip of a dissection."""
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Coordinates of the unknowns, `axes` of each particle next to each other: positions of
-    particles and of leaders, (particle, axis of space), and a mask of the `held` unknowns, each
-    alone in its row and column (None if there are none)."""
+    """Coordinates of the unknowns, `axes` for each particle, stored next to each other.
+
+    These are the positions of particles and of leaders, (particle, axis of space), and a mask of
+    the `held` unknowns, whose rows and columns have a diagonal entry alone (None if there are
+    none).
+    """
 
     axes: int
     places: Floats
@@ -78,11 +83,11 @@ class LinearSolver(ABC):
 
     @abstractmethod
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Solve for x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method allows."""
+        """Return x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂, or the best x that the method can reach."""
 
     @abstractmethod
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """Solve Aᵀ x = b in the same way."""
+        """Return the solution of Aᵀ x = b with the same accuracy."""
 
 
 class Dense(LinearSolver):
@@ -94,11 +99,11 @@ class Dense(LinearSolver):
         self.inverse = np.linalg.inv(matrix)
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Multiply by the inverse."""
+        """Return the product with the inverse."""
         return self.inverse @ b
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """Multiply by the transpose of the inverse."""
+        """Return the product with the transpose of the inverse."""
         return self.inverse.T @ b
 
 
@@ -122,11 +127,11 @@ class BandLU(LinearSolver):
             raise np.linalg.LinAlgError(f"the pivot of unknown {info} is zero")
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Solve by the factors."""
+        """Return the solution by the factors."""
         return self._by_factors(b, 0)
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """Solve by the transposed factors."""
+        """Return the solution by the transposed factors."""
         return self._by_factors(b, 1)
 
     def _by_factors(self, b: Floats, trans: int) -> Floats:
@@ -181,11 +186,11 @@ class SparseLU(LinearSolver):
             raise np.linalg.LinAlgError(str(error)) from None
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Solve by the factors."""
+        """Return the solution by the factors."""
         return self._by_factors(b, "N")
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """Solve by the transposed factors."""
+        """Return the solution by the transposed factors."""
         return self._by_factors(b, "T")
 
     def _by_factors(self, b: Floats, how: str) -> Floats:
@@ -198,7 +203,7 @@ class SparseLU(LinearSolver):
 
 class PreconditionedKrylov(LinearSolver):
     """Conjugate gradients for symmetric matrices, GMRES for others; `grids` returns the multigrid
-    preconditioner of a matrix, None for none."""
+    preconditioner of a matrix, or None."""
 
     def __init__(
         self,
@@ -215,7 +220,7 @@ class PreconditionedKrylov(LinearSolver):
         self._most = MAX_ITERATIONS + (0 if grids else 20 * math.isqrt(matrix.shape[0]))
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Iterate until the residual is small enough, or the maximum number of iterations is
+        """Iterate until the residual is small enough or the maximum number of iterations is
         reached."""
         from scipy.sparse.linalg import LinearOperator, cg, gmres
 
@@ -230,14 +235,15 @@ class PreconditionedKrylov(LinearSolver):
             )
 
         def precondition(r: Floats) -> Floats:
-            """Precondition the residual of an iteration of conjugate gradients."""
+            """Return the preconditioned residual."""
             report(float(np.linalg.norm(r)) / whole)
             return self._cycle(r)
 
         first = precondition if self._symmetric else self._cycle
         M = LinearOperator(self._matrix.shape, matvec=first, dtype=float)
         how: dict[str, Any] = {"M": M, "rtol": accuracy, "atol": 0.0}
-        with np.errstate(all="ignore"):  # A that is no matrix for it: what comes out shows it
+        # The preconditioner may be invalid for A; the residual is checked afterwards.
+        with np.errstate(all="ignore"):
             if self._symmetric:
                 x, _ = cg(self._matrix, b, maxiter=self._most, **how)
             else:
@@ -247,7 +253,8 @@ class PreconditionedKrylov(LinearSolver):
         return np.asarray(x)
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """Solve with the preconditioner of the transpose, unless the matrix is symmetric."""
+        """Return the solution with the preconditioner of the transpose, unless the matrix is
+        symmetric."""
         return (self if self._symmetric else self._transposed).solve(b, accuracy)
 
     @cached_property
@@ -262,11 +269,11 @@ def linear_solver(
     coordinates: Coordinates | None = None,
     watch: Watch | None = None,
 ) -> LinearSolver:
-    """Return the solver for a matrix by a method; `auto` is LU up to a number of unknowns and
-    multigrid beyond.
+    """Return the solver for a matrix by a method; `auto` is LU up to a number of unknowns, and
+    multigrid for more.
 
-    `coordinates` are those of the unknowns; multigrid needs them, and orders of elimination follow
-    from them. Raises LinAlgError where the matrix is found to be singular.
+    `coordinates` are those of the unknowns; they are required by multigrid, and determine orders of
+    elimination. Raises LinAlgError if a factorisation finds the matrix to be singular.
     """
     size, coupled = matrix.shape[0], coordinates is not None and coordinates.axes > 1
     if method == "auto":
@@ -305,8 +312,8 @@ def is_nearly_symmetric(matrix: Any) -> bool:
 
 def dissected(matrix: Any, places: Floats) -> Indices | None:
     """Return the unknowns of a sparse matrix in the order of nested dissection. `places` (unknown,
-    axis) are their positions, with those of one place next to each other. None if couplings extend
-    too far, or if there are few places."""
+    axis) are their positions; unknowns of one place are adjacent. None if couplings extend too far,
+    or if there are few places."""
     fresh = np.ones(len(places), bool)
     fresh[1:] = (places[1:] != places[:-1]).any(axis=1)
     sites, every = places[fresh], np.arange(np.count_nonzero(fresh))

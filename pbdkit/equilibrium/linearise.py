@@ -36,6 +36,7 @@ NOT_SHARED = (
     "it must be stable at rest, its frame show particles nearby, and each axis move the other or "
     "neither; run it in one process"
 )
+"""Reason why ranks do not share the equilibrium of an experiment."""
 
 
 def linearised(
@@ -47,11 +48,11 @@ def linearised(
     moves: Moves | None = None,
     rows: Rows = ALL,
 ) -> System:
-    """Return the linear system of a scene at a state with the roles of a moment's step, by a method
-    of the solver; `moves` are reused if they exist.
+    """Return the linear system of a scene at a state, with the roles of the step that contains a
+    moment, by a method of the solver. `moves` are reused if given.
 
-    A scene distributed among processes has a system on stencils only. Raises ExperimentError if
-    there is no unique solution, or none on stencils.
+    A scene that is distributed among processes has a system on stencils alone. Raises
+    ExperimentError if there is no unique solution, or none on stencils.
     """
     if rows.strip:
         return _shared(scene, state, math.ceil(moment), watch, rows)
@@ -88,8 +89,8 @@ def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> 
 
 
 class _Replaceable(System):
-    """System that is replaced by another once its iteration makes no progress, except if the body
-    is unstable at a state that is not at rest."""
+    """System that is replaced by another once its iteration makes no progress, unless the body is
+    unstable at a state that is not at rest."""
 
     def __init__(self, system: System, otherwise: Callable[[], System], *, at_rest: bool) -> None:
         self._system, self._otherwise, self._past = system, otherwise, 0
@@ -98,11 +99,11 @@ class _Replaceable(System):
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Solve by the first system that can."""
+        """Return the solution of the first system that converges."""
         return self._first_able(lambda system: system.solve(moves, tolerance, owed, rounding))
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """Solve by the first system that can."""
+        """Return the solution of the first system that converges."""
         return self._first_able(lambda system: system.answer(moves, share, near))
 
     def pushed_by(self, led: Floats) -> Floats | None:
@@ -110,7 +111,7 @@ class _Replaceable(System):
         return self._system.pushed_by(led)
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """Solve by the first system that can."""
+        """Return the solution of the first system that converges."""
         return self._first_able(lambda system: system.solve_transposed(weights, share))
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
@@ -146,7 +147,7 @@ class _Replaceable(System):
 
     @property
     def is_stuck(self) -> bool:
-        """State of the current system."""
+        """True if the current system makes no progress."""
         return self._system.is_stuck
 
     @property

@@ -1,7 +1,8 @@
 """Load stepping: from the initial state of a scene to the equilibrium of its last step.
 
-The load is divided into increments if bonds can break or rules are not linear. In each the body is
-moved to equilibrium, and bonds that are too long break, until nothing changes.
+The load is divided into increments if bonds can break or rules are not linear. In each increment
+the body is moved to equilibrium and bonds that are too long break, repeatedly, until no bond
+changes.
 """
 
 from __future__ import annotations
@@ -46,19 +47,20 @@ def finder_of(
     rows: Rows = ALL,
 ) -> Finder:
     """Return the search for equilibria of a scene, from its initial state. `compiles` is false if
-    many scenes with different parameters follow, for which compiling the moves does not pay."""
+    many scenes with different parameters follow, for which compiling the moves takes more time than
+    it saves."""
     settings, scale = scene.experiment.solver.equilibrium, scale_of(scene, start, rows)
     length = settings.tolerance * scale
     return Finder(scene, length, scale, settings.method, watch or Watch(), compiles, rows)
 
 
 SAMPLES = 16
-"""Number of parts of an interval in which the path of a leader counts as straight."""
+"""Number of parts of an interval in each of which the path of a leader counts as straight."""
 
 
 def events(scene: Scene) -> list[int]:
     """Return the ends of steps, from 0 to the last change of the load, between which each leader
-    moves by one formula, all roles and uncut bonds are constant, and loads and parameters change
+    moves by a single formula, roles and bonds to cut are constant, and loads and parameters change
     linearly."""
     steps, last = scene.experiment.steps, last_event(scene)
     steps_of_events = {0, last, *bends_of(scene), *(cut.at - 1 for cut in scene.experiment.cuts)}
@@ -73,9 +75,12 @@ def events(scene: Scene) -> list[int]:
 
 
 def moments(scene: Scene, count: int) -> list[float]:
-    """Return the ends of about `count` increments of equal lengths of the path of leaders, as many
-    of the changes of loads and parameters, and all events. An increment is several whole steps, or
-    a step several whole increments; an interval without motion is one increment."""
+    """Return the ends of about `count` increments, and all events.
+
+    The increments are of equal lengths of the path of leaders, and of equal numbers of changes of
+    loads and parameters. An increment consists of several whole steps, or a step of several whole
+    increments; an interval without motion is one increment.
+    """
     ends = events(scene)
     intervals = list(pairwise(ends)) or [(0, ends[-1])]
     shares, ends_of_increments = (
@@ -96,8 +101,8 @@ def moments(scene: Scene, count: int) -> list[float]:
 
 
 def _in_parts(count: int, ways: list[float]) -> list[float]:
-    """Return the number of increments for each interval, in proportion to its path; one each if
-    there is no path at all."""
+    """Return the number of increments in each interval, in proportion to its path; one for each if
+    all paths are zero."""
     whole = sum(ways)
     return [count * way / whole if whole > 0.0 else 1.0 for way in ways]
 
@@ -133,20 +138,24 @@ def changes(scene: Scene, steps: int) -> list[int]:
 VALUES_A_CALL = 200_000_000
 """Number of values times steps in a call of an engine, which takes some tenths of a second."""
 GROWING = 1e-6
-"""Excess over 1 of an eigenvalue from which a mode counts as growing."""
+"""Excess over 1 from which the eigenvalue of a mode counts as growth."""
 RECORD_LAST = "; or record that of the last step alone, `record: {{at: [{}]}}`"
+"""Remedy for equilibria of intermediate steps that do not exist."""
 MOST_SETTLINGS = 2000
 """Maximum number of changes of bonds in an increment."""
-TINY, SMALLEST = 1e-9, 2.0**-12
-"""Relative remainder of a path that is joined to its last part, and smallest part relative to the
-increment."""
+TINY = 1e-9
+"""Relative length of a remainder that is joined to the last part of a path."""
+SMALLEST = 2.0**-12
+"""Smallest part of an increment, relative to it."""
 REMEDY = (
     "To follow what comes after it take solver: {type: stepping, relaxation: auto, memory: auto} "
     "from there; record: {increments: true} keeps the equilibria within steps"
 )
 """Remedy for a body that came apart."""
-MOST_ROUNDS, STEPS_A_ROUND = 40, 50
-"""Maximum number of rounds of steps, and steps in each, if an equilibrium cannot be followed."""
+MOST_ROUNDS = 40
+"""Maximum number of rounds of steps if an equilibrium cannot be followed."""
+STEPS_A_ROUND = 50
+"""Number of steps in a round."""
 
 
 class Reached(NamedTuple):
@@ -167,8 +176,7 @@ Way = Generator[Reached, None, Certificate]
 
 
 class SeparatedError(Exception):
-    """Bonds broke, and the remaining body has no equilibrium; the state is the last one that
-    had."""
+    """Bonds broke, and the remaining body has no equilibrium; the state is the last equilibrium."""
 
 
 def increments(
@@ -183,14 +191,14 @@ def increments(
     equilibrium of its last step, and yield the states on the way. `stops` are steps before the last
     one whose equilibria are included.
 
-    The body is at equilibrium before each change of roles or loads: leaders that start late, and
-    parts that nothing holds, are where slow loading moves them; parts that loads push on without
-    end move as far as steps take them. If bonds can break, and for rules that are not linear,
-    leaders and loads move in increments, within steps too: the body is moved to equilibrium, bonds
-    that are too long break, and both are repeated until no bond breaks.
+    The body is in equilibrium before each change of roles or loads, so that leaders that start
+    later and floating parts are where slow loading moves them. Floating parts under a load are
+    moved by steps. If bonds can break, and for rules that are not linear, leaders and loads move in
+    increments, within steps too: the body is moved to equilibrium, bonds that are too long break,
+    and both are repeated until no bond breaks.
 
     Raises ExperimentError if there is no equilibrium, UnconvergedError, SeparatedError, and
-    StoppedError on interruption: then the state is the last one reached.
+    StoppedError on interruption; the state is then the last one reached.
     """
     settings, steps = scene.experiment.solver.equilibrium, scene.experiment.steps
     for n, driven in enumerate(scene.driven):
@@ -224,10 +232,10 @@ def settle(
 
 
 def settle_at_step(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
-    """Move a state, in place, to equilibrium with leaders, loads and numbers as they are at its
-    step; bonds that are too long there break.
+    """Move a state, in place, to equilibrium with leaders, loads and parameters as they are at its
+    step, and break bonds that are too long there.
 
-    Raises ExperimentError where there is no equilibrium, and UnconvergedError.
+    Raises ExperimentError if there is no equilibrium, and UnconvergedError.
     """
     finder = finder_of(scene, initial_state(scene), watch)
     step = state.step
@@ -242,8 +250,8 @@ def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
 
 
 def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int]) -> Way:
-    """Compute the equilibria of some steps and of the last one; the state itself moves through
-    those after which roles or loads change."""
+    """Compute the equilibria of some steps and of the last one. The state itself is moved to the
+    equilibria before changes of roles or loads."""
     steps, settled, last = scene.experiment.steps, None, last_event(scene)
     for stop in [*stops, steps]:
         for change in changes(scene, stop):
@@ -279,7 +287,7 @@ def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int])
 
 
 def _steps_shrink(scene: Scene, step: int) -> bool:
-    """Return whether no mode grows in steps with the roles of a step, as far as the spectrum is
+    """Return whether steps with the roles of a step have no growing mode, as far as the spectrum is
     known."""
     if excess(scene) or scene.experiment.neighbours.nearness():
         return True
@@ -291,8 +299,8 @@ def _steps_shrink(scene: Scene, step: int) -> bool:
 
 
 def _step_to(last: int, state: State, scene: Scene, finder: Finder) -> Iterator[Reached]:
-    """Make steps, in calls short enough for interruptions: the displacement of parts that are
-    pushed on without end depends on the number of steps."""
+    """Make steps, in calls that are short enough for interruptions. The displacement of floating
+    parts under a load depends on the number of steps."""
     watch, first, engine = finder.watch, state.step, chosen_engine(scene)
     watch.begin("stepping while loads push on what nothing holds")
     a_call = max(1, int(VALUES_A_CALL / state.u.size))
@@ -336,8 +344,8 @@ def _load(
     since: float,
     stops: Sequence[int],
 ) -> Way:
-    """Move in increments to the last motion or change of roles or loads, and break bonds on the
-    way."""
+    """Move in increments to the last motion or change of roles or loads, and break bonds after
+    each."""
     certificate: Certificate | None = None
     last = every[-1]
     every = sorted({*every, *(stop for stop in stops if stop < last)})
@@ -355,10 +363,10 @@ def _load(
         try:
             max_changes = MOST_SETTLINGS
             if since == step - 1 and cut_bonds(scene, state.broken_step, step) and since > 0:
-                # What gives way to a cut does so under the load at which it is made.
+                # Bonds that break because of a cut break under the load at which the cut is made.
                 _settle_bonds_at(scene, state, finder, since, since, max_changes, step)
             settled, changes = quick.settle(state, moment, max_changes) if quick else (False, 0)
-            if not settled or moment == last:  # which is certified
+            if not settled or moment == last:  # It has an error bound.
                 remaining = max(1, max_changes - changes)
                 certificate = _settle_bonds_at(scene, state, finder, since, moment, remaining)
             _refuse_thrown_off(scene, state, farthest)
@@ -377,7 +385,7 @@ def _load(
         since = moment
         if moment < last:
             yield Reached(moment, state, at_rest=True)
-    # Nothing changes any more: recorded steps after that are the same equilibrium.
+    # Nothing changes any more: all later recorded steps are the same equilibrium.
     for stop in (stop for stop in stops if stop >= last):
         state.step = stop
         yield Reached(stop, state, at_rest=True, is_last=True)
@@ -393,7 +401,7 @@ def _torn(state: State) -> int:
 
 def _refuse_thrown_off(scene: Scene, state: State, farthest: float) -> None:
     """Raise NoEquilibriumError if bonds broke and a particle has moved farther than the size of the
-    body and all prescribed displacements together: nothing holds it."""
+    body plus all prescribed displacements, so that nothing holds it."""
     if _torn(state) and not (longest := most_of(state)) <= farthest:
         number = Guard(farthest, 0, 0, None).worst(scene, state)
         raise NoEquilibriumError(
@@ -406,7 +414,7 @@ def _is_worth_keeping(
     state: State, moment: float, finder: Finder, error: NoEquilibriumError | UnconvergedError
 ) -> bool:
     """Return whether the state of a failed increment is an equilibrium except for the tolerance: it
-    has a certificate, and no bond breaks or changes in it."""
+    has an error bound, and no bond breaks or changes in it."""
     if not (isinstance(error, UnconvergedError) and finder.linear and moment == int(moment)):
         return False
     if not math.isfinite(error.certificate.distance):
@@ -476,8 +484,8 @@ def _settle_bonds_at(
 
 def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: float) -> Certificate:
     """Move from the equilibrium of a moment to that of a later one, in parts that are small enough
-    to follow one path. If none is (the body snaps), make steps; if bonds broke, make implicit steps
-    at once."""
+    to follow one path. If none is small enough (snap-through), make steps; if bonds broke, make
+    implicit steps at once."""
     reached, part = since, moment - since
     while True:
         target = moment if reached + part > moment - TINY * part else reached + part
@@ -489,7 +497,7 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         except (NoEquilibriumError, UnconvergedError) as error:
             torn = _torn(start) and not scene.barriers
             if isinstance(error, RoundingError) and not torn:
-                raise  # smaller parts come no nearer
+                raise  # Smaller parts do not reduce the error.
             vars(state).update(vars(start))
             if torn:
                 return _relaxed(scene, state, finder, moment)
@@ -552,7 +560,7 @@ def _stepped(
 
 def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int) -> bool:
     """Return whether bonds break or change at the equilibrium. Changes within the tolerance are
-    discarded, so that the certificate applies to the bonds as they are."""
+    discarded, so that the error bound applies to the bonds as they are."""
     values_before = [value.copy() for value in state.bond_values]
     broken = broken_bonds(state)
     fracturing.break_bonds(state.u, state, step, in_turn=True)

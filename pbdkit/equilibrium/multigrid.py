@@ -1,11 +1,11 @@
 """Geometric multigrid on the stencils of a lattice, in one process or several.
 
-The functions of a coarser grid are bilinear hats; its stencils are Galerkin products. Where one
-direction is much stiffer, only that one is made coarser.
+The basis functions of a coarser grid are bilinear hats; its stencils are Galerkin products. If one
+direction is much stiffer than the other, only that direction is coarsened.
 
-Of several processes each has some rows of the finer grids, with enough rows around its own for a
-cycle to go down and up without those of others, and all have the coarser grids: they communicate
-once where a cycle begins, and once where residuals come together on the first grid that all have.
+If there are several processes, each has a strip of rows of the finer grids, with a halo that is
+wide enough for a cycle without communication, and all have the whole coarser grids. They
+communicate twice in a cycle: at its beginning, and to gather the residuals on the first whole grid.
 """
 
 from __future__ import annotations
@@ -34,12 +34,14 @@ from pbdkit.equilibrium.system import Rows, Strip, coarser_size, outside
 PRECISION = np.float32
 """Floating-point type of cycles."""
 WEIGHT = 0.8
-"""Relaxation factor, below 1 because the places of a row are relaxed at once."""
+"""Relaxation factor. It is below 1 because all places of a row are relaxed simultaneously."""
 STIFFER = 3.0
 """Ratio of stiffness above which only the stiffer direction is coarsened."""
 NARROW = 5
-"""Number of places across, with the ring around, at which a grid is not narrowed any more."""
+"""Number of places along an axis, including the ring of empty places, from which a grid is not
+coarsened along that axis."""
 EVERY = slice(None)
+"""Slice of all rows."""
 
 
 class StencilGrid:
@@ -93,7 +95,7 @@ class StencilGrid:
         return int(along[0] > along[1]), int(along[1] > along[0])
 
     def coarser(self, halved: tuple[int, int], known: slice = EVERY) -> StencilGrid:
-        """Return the next grid, or the `known` rows of it."""
+        """Return the next grid, or its rows `known`."""
         shape = [
             coarser_size(n) if half else n for n, half in zip(self.code.shape, halved, strict=True)
         ]
@@ -120,7 +122,7 @@ class StencilGrid:
             x[self.held] = 0.0
 
     def is_definite_alone(self) -> bool:
-        """Return whether the diagonal block of every place is positive definite, for a symmetric
+        """Return whether the diagonal blocks of all places are positive definite, for a symmetric
         matrix."""
         a, b, c, d = self.stencils[:, OWN].T
         return bool(((a > 0.0) & (a * d > b * c)).all())
@@ -177,8 +179,8 @@ class Grids(ABC):
 
     @abstractmethod
     def is_definite(self) -> bool:
-        """Return whether a symmetric matrix is positive definite, judged by the coarsest grid and
-        by each diagonal block."""
+        """Return whether a symmetric matrix is positive definite on the coarsest grid and in each
+        diagonal block."""
 
 
 def _stiffness(stencil: Floats, axis: int) -> float:
@@ -202,8 +204,7 @@ COARSEST = 200
 TURNS = 30
 """Number of inverse iterations on the coarsest grid."""
 SINGULAR = 1e-12
-"""Reciprocal of the largest condition number of the coarsest grid; a body that is not held exceeds
-it."""
+"""Reciprocal condition number of the coarsest grid below which the body counts as not held."""
 
 
 class FloatingError(Exception):
@@ -233,9 +234,8 @@ class Multigrid(Grids):
         self._inverse, self._gives_way = inverse.astype(PRECISION), inverse.diagonal()
 
     def is_definite(self) -> bool:
-        """Return whether a symmetric matrix is positive definite, judged by the coarsest grid and
-        by each diagonal block. A matrix that is not definite there is not definite on the finest
-        grid."""
+        """Return whether a symmetric matrix is positive definite on the coarsest grid and in each
+        diagonal block. If it is not definite there, it is not definite on the finest grid."""
         K = (self._coarsest + self._coarsest.T) / 2.0
         return self.grid().is_definite_alone() and bool(np.linalg.eigvalsh(K)[0] > 0.0)
 
@@ -261,7 +261,7 @@ class Multigrid(Grids):
 
     @property
     def whole(self) -> Multigrid:
-        """The hierarchy itself, which every process has."""
+        """The hierarchy of whole grids, which is this one."""
         return self
 
     @property
@@ -298,7 +298,7 @@ class Multigrid(Grids):
 
 SMALL = 100 * COARSEST
 """Number of unknowns below which a grid is not distributed: more than four times that of the
-coarsest, so that all processes have two grids at least."""
+coarsest grid, so that at least two grids are whole."""
 
 
 class PartedGrids(Grids):
@@ -360,7 +360,7 @@ class PartedGrids(Grids):
 
     def cycle(self, r: Floats, depth: int = 0) -> Floats:
         """Return one V-cycle from the finest grid; the halo of r is updated. The result is valid in
-        the own rows and in the rows adjacent to them."""
+        the rows of the process and in those adjacent to them."""
         assert depth == 0
         self._rows.exchange_halo(r)
         right_sides = [r, *(level.b for level in self._levels[1:])]

@@ -1,8 +1,8 @@
 """Search for the equilibrium of given roles, bonds and obstacles.
 
-Linear rules need one linearisation, at rest. Other rules are followed from the previous equilibrium
-by Newton's iteration, bodies whose bonds have just broken by pseudo-transient continuation, and
-bodies in contact with obstacles by an active set of constrained particles.
+Linear rules need one linearisation, at rest. For other rules Newton's iteration starts from the
+previous equilibrium, pseudo-transient continuation is used for bodies whose bonds have just broken,
+and an active set of constrained particles for bodies in contact with obstacles.
 """
 
 from __future__ import annotations
@@ -42,39 +42,55 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 MOST_CORRECTIONS = 12
+"""Maximum number of corrections."""
 LOOSEST = 0.1
 """Largest tolerance that messages propose."""
 CONTRACTION = 0.5
-"""Largest ratio of a correction to the last one. Below it there is one equilibrium nearby, to which
-Newton's iteration converges (Deuflhard)."""
-SERVES, NEAR = 0.02, 1e-3
-"""Largest ratio of errors for which a linearisation is used again, and largest relative error of
-corrections."""
+"""Largest ratio of a correction to the last one. Below it Newton's iteration converges to the only
+equilibrium nearby (Deuflhard, Newton Methods for Nonlinear Problems, 2004)."""
+SERVES = 0.02
+"""Largest ratio of errors after and before a correction for which a linearisation is used again."""
+NEAR = 1e-3
+"""Largest relative error of corrections."""
 NOT_LINEAR = "the rule declares itself linear, but its moves differ from the linearisation"
-NUDGE, SHARE = 1e-6, 0.25
-"""Displacement of leaders, in lattice spacings, for derivatives with respect to the load, and
-fraction of the tolerance that linear systems may use."""
+"""Message for a rule that is wrongly declared linear."""
+NUDGE = 1e-6
+"""Displacement of leaders, in lattice spacings, for derivatives with respect to the load."""
+SHARE = 0.25
+"""Fraction of the tolerance that the errors of linear systems may use."""
 UNSTABLE = "the result is not stable"
+"""Message for an unstable equilibrium."""
 ROUNDING = "rounding alone limits the relative distance"
+"""Message for a tolerance that rounding prevents."""
 FIRM = 1e5
-"""Ratio of distance to rounding up to which a body counts as firm. Beyond it the body may be near a
-limit point, so that a smaller increment could converge."""
+"""Largest ratio of distance to rounding error of a body that is not near a limit point. Beyond it a
+smaller increment could converge."""
 MOST_IMPLICIT_STEPS = 200
+"""Maximum number of implicit steps."""
 LEAP = 0.2
 """Longest move of an implicit step, in lattice spacings."""
-LEAST_DAMPING, FASTEST, FALL, SLOWEST = 1e-10, 0.05, 0.5, 2.0
-"""Smallest damping, relative to the stiffness of a particle among others at rest; smallest ratio of
-two dampings; factor on the ratio of the moves; largest ratio of two dampings."""
-NEXT_TO_NOTHING, MUCH = 1e-6, 100.0
-"""Stiffness, as a damping, below which motions are excluded from a certificate, and ratio of the
-moves to those that softer motions allow from which this is tried."""
+LEAST_DAMPING = 1e-10
+"""Smallest damping, relative to the stiffness of a particle in the interior at rest."""
+FASTEST = 0.05
+"""Smallest ratio of a damping to the one before."""
+FALL = 0.5
+"""Factor of the ratio of the moves, if it is below 1, that gives the ratio of two dampings."""
+SLOWEST = 2.0
+"""Largest ratio of a damping to the one before."""
+NEXT_TO_NOTHING = 1e-6
+"""Stiffness, as a damping, below which motions are excluded from an error bound."""
+MUCH = 100.0
+"""Largest ratio of the moves to those of soft motions within the tolerance, for which a bound
+without soft motions is computed."""
 
 
 @dataclass(frozen=True)
 class Finder:
-    """Search for equilibria of a scene within a length, by a method of the solver. Relative numbers
-    refer to the length `scale`; `compiles` is that of the moves; `rows` are those of the scene;
-    `at_rest` is the last system at rest, and `rest` the data on which it depends."""
+    """Search for equilibria of a scene to within a length, by a method of the solver.
+
+    Relative values refer to the length `scale`; `compiles` is that of the moves; `rows` are those
+    of the scene; `at_rest` is the last system at rest, and `rest` are the data on which it depends.
+    """
 
     scene: Scene
     tolerance: float
@@ -121,8 +137,8 @@ class Finder:
             return _Linear(self.at(moment), state, moment).run()
 
     def relax(self, state: State, moment: float) -> Certificate:
-        """Move the followers by implicit steps, for rules that are not linear and a state in which
-        bonds have just broken: to the equilibrium that sufficiently small steps approach.
+        """Move the followers by implicit steps to the equilibrium that sufficiently small steps
+        approach, for rules that are not linear and a state in which bonds have just broken.
 
         Raises UnconvergedError.
         """
@@ -142,8 +158,9 @@ class Finder:
 
 @dataclass(frozen=True)
 class Rest:
-    """Data on which a system at rest depends, so that a later search uses it again: the scene with
-    its parameters, the leading groups, the bonds, and the methods of the solver."""
+    """Data that determine a system at rest, by which a later search detects that it can use the
+    system again: the scene with its parameters, the leading groups, the bonds, and the methods of
+    the solver."""
 
     scene: Scene
     leads: tuple[bool, ...]
@@ -182,7 +199,7 @@ class Search(ABC):
 
     @abstractmethod
     def run(self) -> Certificate:
-        """Move the state to the equilibrium, and return its certificate."""
+        """Move the state to the equilibrium, and return its error bound."""
 
     def _certified(self) -> Certificate:
         certificate = self._certificate(self._distance())
@@ -202,7 +219,8 @@ class Search(ABC):
         return 0.0
 
     def _is_rounding(self, share: float) -> bool:
-        """Return whether rounding, as a relative distance, prevents the tolerance."""
+        """Return whether rounding, as a relative distance, prevents convergence to the
+        tolerance."""
         finite = math.isfinite(self._finder.rows.max_norm(self._residual))
         return (
             finite
@@ -264,7 +282,8 @@ class Search(ABC):
 
     @property
     def _wanted(self) -> float:
-        """Accuracy of linear systems, which leaves room for the other terms of the certificate."""
+        """Accuracy of linear systems, which leaves a part of the tolerance for the other terms of
+        the error bound."""
         return SHARE * self._finder.tolerance
 
     def _rounding(self) -> float:
@@ -275,7 +294,8 @@ class Search(ABC):
 
 
 def _reachable(share: float) -> str:
-    """Return a remedy: a tolerance that can be reached with such a bound, if there is one."""
+    """Return a remedy: a tolerance that can be reached with such a bound, empty if there is
+    none."""
     tolerance = 10.0 ** math.ceil(math.log10(share / SHARE)) if 0.0 < share < math.inf else 1.0
     if tolerance < LOOSEST:
         return f"; take solver.tolerance: {tolerance:.0e}"
@@ -307,7 +327,7 @@ class _Linear(Search):
         self._linear = True
         start = self._residual, self._state.u, self._state.previous
         if self._finder.rows.communicator.any(any(planes.any() for planes in start)):
-            self._correct()  # else nothing is prescribed but rest
+            self._correct()  # Otherwise the initial state is the equilibrium.
         return self._certified()
 
     def _correct(self) -> None:
@@ -373,14 +393,14 @@ class _Newton(Search):
                 distance = self._distance()
             if distance <= self._finder.tolerance or not math.isfinite(distance):
                 return
-            # Solved as well as it is linear (Eisenstat and Walker).
+            # Each solution is as accurate as the moves are linear (Eisenstat and Walker, 1996).
             share = min(NEAR, (distance / previous_distance) ** 2) if previous_distance else NEAR
             wanted = max(self._wanted, share * distance)
             correction = self._system.solve(self._residual, wanted, None, self._rounding())
             previous, size = size, float(np.abs(correction).max(initial=0.0))
             if not size <= CONTRACTION * min(previous, self._load_change or math.inf):
                 if size <= self._floor():
-                    return  # of rounding
+                    return  # The difference is rounding.
                 reason = "corrections do not become smaller"
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
@@ -391,7 +411,8 @@ class _Relaxing(Search):
     """Pseudo-transient continuation (Kelley and Keyes, 1998): implicit steps, (A + damping) c =
     move, with a damping that decreases with the moves.
 
-    Parts that hang by one bond, or that nothing holds, stay where implicit steps move them.
+    Parts that hang by one bond, and floating parts, are moved by implicit steps and by nothing
+    else.
     """
 
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
@@ -430,7 +451,7 @@ class _Relaxing(Search):
         return certificate
 
     def _is_near(self) -> bool:
-        """Return whether the tolerance is reached except for motions of hardly any stiffness."""
+        """Return whether the tolerance is reached except for motions of almost no stiffness."""
         longest, tolerance = self._finder.rows.max_norm(self._residual), self._finder.tolerance
         if longest > MUCH * NEXT_TO_NOTHING * tolerance:
             return False
@@ -442,7 +463,7 @@ class _Relaxing(Search):
 MOST_SETS = 60
 """Maximum number of changes of the active set."""
 LEAST_PART = 2.0**-6
-"""Smallest fraction of a correction that is tried if the whole removes particles from obstacles
+"""Smallest fraction of a correction, tried if the whole correction removes particles from obstacles
 that hold them."""
 
 
@@ -461,13 +482,14 @@ def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:
 
 class _ContactSearch(Search):
     """Newton's iteration with an active set: particles that would enter an obstacle are
-    constrained, until no other would. Parts that nothing holds yet are moved by weak springs."""
+    constrained, until the set is complete. Parts that nothing holds yet are moved by weak
+    springs."""
 
     def run(self) -> Certificate:
         """Correct until the active set and the state converge.
 
-        Raises UnconvergedError if the active set goes on changing, corrections do not shrink once
-        it is constant, or the result is not stable.
+        Raises UnconvergedError if the active set does not become constant, corrections do not
+        shrink afterwards, or the result is not stable.
         """
         contacts, size, went_loose = None, math.inf, False
         system = self._newest()
@@ -492,12 +514,13 @@ class _ContactSearch(Search):
                 and part > LEAST_PART
                 and system.is_loose(self._residual, self._rounding())
             ):
-                part /= 2.0  # farther on what was held would come off again
+                part /= 2.0  # A larger part would remove particles from obstacles that hold them.
                 self._go(-part * correction)
                 system = self._newest()
         if went_loose:
             system.refuse_floats()
-        # What is held stands on its outline, as after a step, and not beside it by what is left.
+        # Particles in contact are placed on the outline, as after a step; the linear solution
+        # leaves them beside it.
         self._shift(system.of_held(self._residual))
         certificate = self._certified()
         if not system.is_stable():

@@ -1,8 +1,8 @@
-"""Linear system of an equilibrium as a sparse matrix, in its diagonal blocks.
+"""Linear system of an equilibrium as a block-triangular sparse matrix.
 
-If x and y do not move each other there are two blocks, often equal; if only one moves the other
-(mixed coordinates), it is solved first. Within a block, all particles that leaders hold are solved
-together, and each part of the body that nothing holds by itself: its matrix is singular.
+If x and y are not coupled there are two diagonal blocks, often equal; if only one is coupled to the
+other (mixed coordinates), it is solved first. Within a block, all particles that leaders hold are
+solved together. Each floating part, whose matrix is singular, is solved separately.
 """
 
 from __future__ import annotations
@@ -40,39 +40,41 @@ SAFETY = 3.0
 ACCURACY = 1e-9
 """Relative accuracy of solutions; a second correction improves it if necessary."""
 ROUGH = 1e-3
-"""Relative accuracy of solutions that only serve a bound."""
+"""Relative accuracy of solutions from which only a bound is computed."""
 TURNS = 20
 """Number of inverse iterations."""
 SOFT = 1e10
-"""Norm of A⁻¹ from which a part may be one that nothing holds."""
+"""Norm of A⁻¹ from which a part may be floating."""
 TOO_SOFT = 1e13
 """Norm of A⁻¹, without the rigid modes, from which these cannot be distinguished from soft modes in
 double precision."""
 NOTHING = 64.0 * float(np.finfo(float).eps)
 """Rounding error of A y and of the push on a rigid mode y, relative to the terms that cancel."""
 RANDOM_SHARE = 0.1
-"""Smallest component of a vector of random numbers along one mode, times the root of their
-number."""
-SHIFT, MODES, MOST_MODES = 1e-13, 6, 96
-"""Shift of a large singular matrix, relative to its largest entry; number of modes among which its
-kernel is searched, and maximum of that number."""
+"""Smallest component of a vector of random numbers along one mode, multiplied by the square root of
+their number."""
+SHIFT = 1e-13
+"""Shift of a large singular matrix, relative to its largest entry."""
+MODES = 6
+"""Number of modes among which the kernel of a matrix is searched first."""
+MOST_MODES = 96
+"""Maximum number of modes among which the kernel is searched."""
 LARGEST_FALLBACK = 400_000
 """Number of unknowns up to which an LU factorisation replaces an iteration that makes no
 progress."""
 
 
 class DriftingError(Exception):
-    """A part that nothing holds is pushed on without end."""
+    """A floating part is under a load that nothing balances."""
 
 
 class TooSoftError(DriftingError):
-    """In double precision a softly held part cannot be distinguished from one that nothing
-    holds."""
+    """In double precision a softly held part cannot be distinguished from a floating part."""
 
 
 class Subsystem(ABC):
     """Linear system A x = r of a part, with a solver for its unknowns and for the borders of A.
-    Without a solver only rest is an equilibrium."""
+    Without a solver only the state at rest is an equilibrium."""
 
     def __init__(
         self, size: int, solver: LinearSolver | None, watch: Watch, borders: int = 0
@@ -84,8 +86,8 @@ class Subsystem(ABC):
 
     @abstractmethod
     def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """Solve for the x to which steps from x = 0 converge; `owed` is the change of the
-        invariants, `rounding` the error of r.
+        """Return the x to which steps from x = 0 converge; `owed` is the change of the invariants,
+        `rounding` the error of r.
 
         Raises DriftingError if there is no such x.
         """
@@ -105,12 +107,7 @@ class Subsystem(ABC):
         return self._solver.iterations if self._solver else 0
 
     def farthest(self, r: Floats, rounding: float) -> float:
-        """Return max
-
-        A⁻¹ r
-
-        plus the effect of rounding of r.
-        """
+        """Return max |A⁻¹ r| plus the effect of rounding of r."""
         if self._solver is None:
             return math.inf if r.any() or rounding else 0.0
         distance = float(np.abs(self._inverted(r)).max(initial=0.0))
@@ -123,7 +120,8 @@ class Subsystem(ABC):
 
     def is_stable(self) -> bool:
         """Return whether no eigenvalue is negative. All eigenvalues of small matrices are computed,
-        of others those nearest to 0, through which they pass with the load."""
+        and those nearest to 0 of others, since eigenvalues change sign through 0 as the load
+        increases."""
         if self._solver is None or self._borders:
             return True
         if isinstance(self._solver, Dense):
@@ -143,7 +141,8 @@ class Subsystem(ABC):
 
     @property
     def is_soft(self) -> bool:
-        """True if a mode is so soft that others may be rigid within rounding."""
+        """True if a mode is so soft that rigid modes cannot be distinguished from it within
+        rounding."""
         return not self._spread < SOFT
 
     @cached_property
@@ -152,8 +151,8 @@ class Subsystem(ABC):
         return self.spread_of(np.ones(self._size, bool))
 
     def spread_of(self, some: Mask) -> float:
-        """Return the maximum norm of A⁻¹ for right sides in some unknowns: from the inverse if it
-        is available, else estimated from random signs, which rounding resembles."""
+        """Return the maximum norm of A⁻¹ for right sides in some unknowns: from the inverse if
+        available, otherwise an estimate from random signs, which resemble rounding errors."""
         if self._solver is None:
             return math.inf if some.any() else 0.0
         if isinstance(self._solver, Dense):
@@ -161,7 +160,8 @@ class Subsystem(ABC):
             return float(inverse[:, some].sum(axis=1).max(initial=0.0))
         self._watch.begin("bounding the error")
         signs = np.random.default_rng(0).choice([-1.0, 1.0], self._size) * some
-        # So accurately that the softest mode, with its share in random numbers, is not left out.
+        # The accuracy is sufficient for the softest mode, which is a small part of the random
+        # numbers.
         accuracy = min(ROUGH, RANDOM_SHARE / math.sqrt(max(1, self._size)))
         return SAFETY * float(np.abs(self._inverted(signs, accuracy)).max(initial=0.0))
 
@@ -194,21 +194,22 @@ class ConstrainedSubsystem(Subsystem):
             raise np.linalg.LinAlgError("singular")
 
     def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """Solve by the method; `owed` is not used, since a held part has no invariants."""
+        """Return the solution by the method; `owed` is not used, since a part that is held has no
+        invariants."""
         if not r.any():
             return np.zeros_like(r)
         self._watch.begin("solving")
         return self._solved(r, ACCURACY, 100 * ACCURACY)
 
     def solve_transposed(self, weights: Floats) -> Floats:
-        """Solve the transposed system by the same method."""
+        """Return the solution of the transposed system by the same method."""
         return self._solved(weights, ACCURACY, 100 * ACCURACY, transposed=True)
 
     def _solved(
         self, b: Floats, accuracy: float, most: float, *, transposed: bool = False
     ) -> Floats:
-        """Solve, by factors if the iteration leaves a residual of more than `most` and the method
-        may be replaced."""
+        """Return the solution. An LU factorisation replaces an iteration that leaves a residual of
+        more than `most`, if the method permits this."""
         matrix = self._matrix.T if transposed else self._matrix
         for _ in range(2):
             assert self._solver is not None
@@ -226,19 +227,14 @@ class ConstrainedSubsystem(Subsystem):
         return x
 
     def _inverted(self, r: Floats, accuracy: float = ROUGH) -> Floats:
-        """Return A⁻¹ r with a low accuracy; infinite if an iteration makes no progress, since its
-        result bounds nothing."""
+        """Return A⁻¹ r with a low accuracy; infinity if an iteration makes no progress, since its
+        result is no bound."""
         x = self._solved(r, accuracy, 2.0 * accuracy)
         return np.full_like(x, math.inf) if self._is_short else x
 
     def farthest(self, r: Floats, rounding: float) -> float:
-        """Return max
-
-        A⁻¹ r
-
-        plus the effect of rounding. The remaining error of an iteration is estimated by solving for
-        its residual.
-        """
+        """Return max |A⁻¹ r| plus the effect of rounding. The remaining error of an iteration is
+        estimated by solving for its residual."""
         x = self._inverted(r)
         distance = float(np.abs(x).max(initial=0.0))
         if isinstance(self._solver, PreconditionedKrylov) and math.isfinite(distance):
@@ -251,12 +247,12 @@ class ConstrainedSubsystem(Subsystem):
 
 
 class SingularSubsystem(Subsystem):
-    """Linear system of a part with modes that no step changes: their invariants Yᵀ u, Yᵀ A = 0, are
-    constant.
+    """Linear system of a part with modes that no step changes: their invariants Yᵀ u, where Yᵀ A =
+    0, are constant.
 
-    `before` is the part of A that multiplies the state before the last one, which contributes to
-    the invariants, K = Yᵀ (1 + before). The system is A x + Y μ = r, K x = k; it has no solver if
-    modes grow or other modes have hardly any stiffness.
+    `before` is the part of A that multiplies the state before the last one. It contributes to the
+    invariants, K = Yᵀ (1 + before). The system is A x + Y μ = r, K x = k. It has no solver if modes
+    grow or other modes have almost no stiffness.
     """
 
     def __init__(self, matrix: Any, before: Any, watch: Watch) -> None:
@@ -279,7 +275,7 @@ class SingularSubsystem(Subsystem):
             self._solver = None
 
     def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """Solve by the method."""
+        """Return the solution by the method."""
         if self._solver is None:
             if r.any():
                 raise TooSoftError
@@ -294,7 +290,8 @@ class SingularSubsystem(Subsystem):
         return x
 
     def solve_transposed(self, weights: Floats) -> Floats:
-        """Solve the transposed system; loads that push the part on without end have no effect."""
+        """Return the solution of the transposed system; loads that the part does not balance have
+        no effect."""
         if self._solver is None:
             return np.zeros_like(weights)
         b = np.append(weights, np.zeros(self._borders))
@@ -303,14 +300,14 @@ class SingularSubsystem(Subsystem):
 
 
 def _left_kernel(matrix: Any) -> Floats:
-    """Return an orthonormal basis, (unknown, mode), of all y with yᵀ A = 0 within rounding. Large
-    matrices need inverse iteration, in which vectors outside the kernel shrink by SHIFT / λ each
-    time."""
+    """Return an orthonormal basis, (unknown, mode), of all y with yᵀ A = 0 within rounding. For
+    large matrices it is computed by inverse iteration, in which vectors outside the kernel shrink
+    by SHIFT / λ each time."""
     size = matrix.shape[0]
     largest = float(abs(matrix).max()) if size else 0.0
     if not largest > 0.0:
         return np.eye(size)
-    # A = 1 - (step operator): the terms that cancel are of size 1, however little they leave.
+    # A = 1 - (step operator): terms of size 1 cancel, however small the result is.
     nothing = NOTHING * max(1.0, float(abs(matrix).sum(axis=1).max()))
     if size <= DENSE:
         vectors, values, _ = np.linalg.svd(dense(matrix))
@@ -334,7 +331,7 @@ def _left_kernel(matrix: Any) -> Floats:
 
 @dataclass
 class DiagonalBlock:
-    """Unknowns of one axis, or of both if they move each other, divided into parts. `into` is the
+    """Unknowns of one axis, or of both if they are coupled, divided into parts. `into` is the
     coupling to the axis solved before."""
 
     axes: list[int]
@@ -346,16 +343,18 @@ DRIFTS = (
     "there is no equilibrium: nothing holds a part of {}, and it is pushed on for ever; let a "
     "leader hold it"
 )
+"""Message for a floating part under a load."""
 SOFT_MESSAGE = (
     "in double precision nothing holds a part of {}: it turns about a single particle, is too "
     "slender, or held by too soft a region; let leaders hold more of it, or take stiffer regions "
     "or fewer particles"
 )
+"""Message for a part that is too soft for double precision."""
 
 
 class MatrixSystem(System):
-    """Linear system by a method of the solver, direct or iterative; with `damping`, that of an
-    implicit step, (A + damping) c = move."""
+    """Linear system by a method of the solver, direct or iterative. With `damping` it is the system
+    of an implicit step, (A + damping) c = move."""
 
     def __init__(
         self,
@@ -378,7 +377,7 @@ class MatrixSystem(System):
         self._both = both = operator.couplings_steady
         first = 1 if both.couples(0, 1) else 0
         self._blocks = [] if both.couples(first, 1 - first) else [self._block([first])]
-        # One axis has a share in the invariants of the other, where it moves it.
+        # If the axes are coupled, the invariants of one contain displacements along the other.
         parts = [part for block in self._blocks for _, part in block.parts]
         floats = any(isinstance(part, SingularSubsystem) for part in parts)
         if not self._blocks or (floats and both.couples(1 - first, first)):
@@ -399,7 +398,7 @@ class MatrixSystem(System):
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound: by the solution; that of its rounding by the inverse itself if it is
+        """Kind of the bound: by the solution, or by the inverse for its rounding if the inverse is
         available."""
         if self._damping:
             return "damped"
@@ -423,7 +422,7 @@ class MatrixSystem(System):
         return planes
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """Check each part by itself."""
+        """Raise ExperimentError if a floating part has moves."""
         table = self._table(moves)
         for block in self._blocks:
             for members, part in block.parts:
@@ -447,7 +446,7 @@ class MatrixSystem(System):
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Solve block by block, and part by part."""
+        """Return the solution, computed block by block and part by part."""
         back = None if owed is None else self._owed(owed)
         return self._planes(self._solved(self._table(moves), back, rounding))
 
@@ -474,14 +473,14 @@ class MatrixSystem(System):
         return solution
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """Solve by `solve`, which does not use a tolerance."""
+        """Return the solution of `solve`, which does not use a tolerance."""
         return self.solve(moves, 0.0, rounding=PUSH * float(np.abs(moves).max(initial=0.0)))
 
     def pushed_by(self, led: Floats) -> None:
         """Return None: leaders are not part of the matrix."""
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """Solve the transposed blocks in reverse order."""
+        """Return the solution of the transposed blocks, in reverse order."""
         table = self._table(weights)
         solution = np.zeros_like(table)
         for block in reversed(self._blocks):
@@ -512,7 +511,8 @@ class MatrixSystem(System):
             return float(np.linalg.norm(difference) / np.linalg.norm(pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Solve once more for the remaining moves, and add the effect of rounding."""
+        """Return the bound from another solution for the remaining moves, plus the effect of
+        rounding."""
         table, bounds = self._table(moves), np.zeros(2)
         for block in self._blocks:
             r = table[:, block.axes].ravel()
@@ -535,8 +535,8 @@ class MatrixSystem(System):
         return f"{len(numbers)} particles (with number {numbers[0]})"
 
     def _following(self, first: int) -> DiagonalBlock:
-        """Return the block of the other axis; it uses the solvers of the first if both are
-        equal."""
+        """Return the block of the other axis. If both are equal, it uses the solvers of the
+        first."""
         other, leader_couplings = 1 - first, self._operator.couplings_leader
         coupled = self._both.couples(other, first)
         into = self._both.entries([other], [first]).matrix() if coupled else None
@@ -555,13 +555,14 @@ class MatrixSystem(System):
         leader_entries = self._operator.couplings_leader.entries(axes)
         count, label = connected(matrix, strongly=False)
         guided, alone = self._guided[:, axes].ravel(), np.zeros(count, bool)
-        # A component that leads stands alone: it goes with its particle, or is left out.
+        # A prescribed component has no couplings: it is grouped with its particle, or left out.
         alone[label[guided]] = True
         if len(axes) > 1:
             label = np.where(guided, label.reshape(-1, 2)[:, ::-1].ravel(), label)
         has_leader = np.zeros(count, bool)
         has_leader[label[leader_entries.rows[leader_entries.values != 0.0]]] = True
-        # What leaders move directly or not is solved together, each part that floats by itself.
+        # Followers that leaders hold, directly or not, are solved together, and each floating part
+        # separately.
         groups = [np.flatnonzero((has_leader & ~alone)[label])] if has_leader.any() else []
         groups += [np.flatnonzero(label == n) for n in np.flatnonzero(~has_leader & ~alone)]
         block = DiagonalBlock(axes, [])
@@ -572,8 +573,8 @@ class MatrixSystem(System):
         return block
 
     def _part(self, matrix: Any, axes: list[int], members: Indices, held: bool) -> Subsystem:
-        """Return the system of a part. Held parts have an inverse, unless leaders leave them a free
-        motion."""
+        """Return the system of a part. A part that is held has an inverse, unless leaders leave it
+        a free motion."""
         if held:
             coordinates = self._coordinates(axes, members)
             with suppress(np.linalg.LinAlgError):
@@ -600,8 +601,8 @@ class MatrixSystem(System):
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
     def _coordinates(self, axes: list[int], members: Indices) -> Coordinates:
-        """Return the coordinates of these unknowns; particles that lead along the only axis are
-        leaders."""
+        """Return the coordinates of these unknowns. Particles whose only axis is prescribed count
+        as leaders."""
         where, is_guided = members[:: len(axes)] // len(axes), self._guided[:, axes]
         positions = self._X[is_guided[:, 0]] if len(axes) == 1 else self._X[:0]
         guided = is_guided[where].ravel() if len(axes) > 1 and is_guided.any() else None

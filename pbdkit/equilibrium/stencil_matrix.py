@@ -1,9 +1,9 @@
 """Stiffness of an equilibrium as stencils on the primitive cells of a lattice.
 
-K = -∂force/∂u, or -∂move/∂u, of the followers. Most have the same stencil of 3 × 3 places with a 2
-× 2 matrix each, which is stored once. Frame points are replaced by the body particles that they
-follow. Components of particles that lead along one axis are constrained: their rows and columns are
-empty. Rows are scaled if that makes K symmetric.
+K = -∂force/∂u, or -∂move/∂u, of the followers. Most followers have the same stencil, 3 × 3 places
+with a 2 × 2 matrix each, which is stored once. Frame points are replaced by the body particles that
+they follow. Prescribed components of guided particles are constrained: their rows and columns are
+empty. Rows are scaled if this makes K symmetric.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 CANDIDATES = 16
-"""Number of each process's most frequent stencils among which the most frequent of all is
-chosen."""
+"""Number of most frequent stencils of each process among which the most frequent stencil overall is
+selected."""
 SAME = 1e-12
 """Relative difference below which two stencils count as one."""
 
@@ -39,7 +39,8 @@ SAME = 1e-12
 @cache
 def kernels() -> SimpleNamespace:
     """Return the compiled functions of grid_kernels.py, loaded when first used."""
-    # Only here: numba is the extra `fast`, and equilibria are found without it too.
+    # Imported here because numba is an optional dependency, and equilibria can be computed without
+    # it.
     from pbdkit.stepping.numba_engine.cache import load_kernel
 
     source = files("pbdkit.equilibrium").joinpath("grid_kernels.py").read_text(encoding="utf-8")
@@ -87,7 +88,7 @@ def _most(own: Integers, tables: tuple[Floats, Floats], rows: Rows) -> tuple[Flo
 
 @dataclass(frozen=True)
 class PrimitiveRaster:
-    """Raster of primitive cells, surrounded by a ring of empty ones; `shape` is (row, place)."""
+    """Raster of primitive cells, surrounded by a ring of empty cells; `shape` is (row, place)."""
 
     shape: Index
     low: Index
@@ -118,7 +119,7 @@ class PrimitiveRaster:
 
     @property
     def is_the_scenes(self) -> bool:
-        """True if the places are those of the raster of the scene."""
+        """True if its places are the same as those of the scene's raster."""
         return len(self.scene.raster.cell.sites) == 1
 
     def places(self, place: Indices) -> Indices:
@@ -147,14 +148,21 @@ def primitive_step(scene: Scene, slot: Slot) -> Index:
     return scene.neighbourhood.cell.primitive_step(slot.source, slot.target, slot.cell)
 
 
-WINDOW, OWN = 9, 4
-"""Number of places of a stencil, and index of the place in the middle."""
-OUTSIDE, FREE, LED = 0, 1, 2
+WINDOW = 9
+"""Number of places of a stencil."""
+OWN = 4
+"""Index of the central place of a stencil."""
+OUTSIDE = 0
+"""Kind of a place without a particle of the body."""
+FREE = 1
+"""Kind of a place with a follower."""
+LED = 2
+"""Kind of a place with a leader."""
 NUDGE = 1e-7
-"""Size of differences in lattice spacings. Rounding and curvature change them by about 1e-7 for
-displacements of up to a hundred spacings."""
+"""Displacement for difference quotients, in lattice spacings. Their errors by rounding and
+curvature are about 1e-7 for displacements of up to a hundred spacings."""
 NOISE = 1e-5
-"""Ratio to the largest entry below which there is no bond."""
+"""Ratio to the largest entry below which an entry counts as zero."""
 SINGULAR = 1e-14
 """Relative size below which a determinant counts as zero."""
 
@@ -189,9 +197,8 @@ class StencilMatrix:
 def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> StencilMatrix | None:
     """Assemble the matrix at a state with the roles of a step.
 
-    Returns None if it has no such form: in space, on lattices with several sites in a primitive
-    cell, for longer bonds, for rules that apply twice, and for frames whose points follow distant
-    particles.
+    Returns None if there is no such matrix: in space, on lattices with several sites in a primitive
+    cell, for longer bonds, for nested rules, and for frames whose points follow distant particles.
     """
     grid = PrimitiveRaster.of(scene)
     if grid is None or scene.inner or scene.experiment.neighbours.nearness():
@@ -200,12 +207,12 @@ def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> S
 
 
 def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> StencilMatrix | None:
-    """Assemble the matrix by differences of the moves, for many particles at once: particles of one
-    of nine groups are three places apart, so that no stencil contains two of them. Each follower
-    has a stencil of its own.
+    """Assemble the matrix by differences of the moves, for a ninth of the particles at once:
+    particles of one of nine groups are three places apart, so that no stencil contains two of them.
+    Each follower has a separate stencil.
 
-    The stencil of a particle that depends on more distant ones is wrong, so that the result has to
-    be compared with moves.
+    The stencil of a particle is wrong if it depends on more distant particles; the result has to be
+    compared with moves.
     """
     grid = PrimitiveRaster.of(scene)
     kind = kinds_of_places(scene.raster, scene.leading, step)
@@ -215,7 +222,7 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     body = np.flatnonzero((kind == FOLLOWER) | (kind == LEADER))
     code = np.full(kind.size, -1, np.int32)
     group, groups = (_number(grid.index(particles).T % 3 - 1) for particles in (place, body))
-    # Where in a stencil the particles of one group lie, seen from those of another.
+    # Index in a stencil of the place that particles of one group have relative to those of another.
     ways = np.stack(np.unravel_index(np.arange(WINDOW), (3, 3)))
     numbers = _number((ways[:, :, None] - ways[:, None] + 1) % 3 - 1)
     stencils, every = np.empty((len(place), WINDOW, 2, 2)), np.arange(len(place))
@@ -287,7 +294,7 @@ class _Assembly:
         return _on(self._grid, code.ravel(), self._kind == LEADER, stencils, scale)
 
     def _add(self, place: Indices, responses: list[LinearResponse]) -> bool:
-        """Add the stencils of one sublattice, and return False if they do not fit."""
+        """Add the stencils of one sublattice; return whether they fit into the window."""
         moves, answers = responses[0], responses[-1]
         stencils = np.zeros((len(answers.centre), WINDOW, 2, 2))
         stencils[:, OWN] = -answers.centre
@@ -312,7 +319,7 @@ class _Assembly:
     def _shown(
         self, place: Indices, answers: LinearResponse, own: Floats
     ) -> tuple[Indices, Floats] | None:
-        """Return the numbers of particles with frame points as neighbours, and their stencils with
+        """Return the indices of particles with frame points as neighbours, and their stencils with
         the contributions of these points; None if a contribution lies outside the window."""
         frame, raster = self._scene.frame, self._scene.raster
         steps = [(slot, slot_step(raster.shape, slot)) for slot in answers.neighbours]
@@ -399,9 +406,9 @@ def constrained(matrix: StencilMatrix, held: Held | None) -> StencilMatrix:
 def with_held(
     code: NDArray[np.int32], stencils: Floats, held: Held
 ) -> tuple[NDArray[np.int32], Floats, NDArray[np.intp]]:
-    """Return code, stencils and the number of the former stencil of each. Places adjacent to
+    """Return code and stencils, and the index of the former stencil of each. Places adjacent to
     constrained components have separate stencils without the columns of these; the rows of
-    constrained components have a number on the diagonal."""
+    constrained components have a diagonal entry."""
     from scipy.ndimage import binary_dilation
 
     is_adjacent = binary_dilation(held.any(axis=0), structure=np.ones((3, 3))) & (code >= 0)
@@ -429,8 +436,8 @@ def without_held(code: NDArray[np.int32], stencils: Floats, held: Held) -> Float
 
 
 def coarser_held(kind: NDArray[np.int8], held: Held, halved: tuple[int, int], below: Any) -> Held:
-    """Return the constrained components of the next grid, of kinds `below`: those at places that
-    lie on constrained ones."""
+    """Return the constrained components of the next grid, of kinds `below`: those whose places
+    coincide with constrained places."""
     coarse = np.zeros((2, *below.shape), bool)
     for axis, component in enumerate(held):
         kinds, out = np.where(component, LED, kind).astype(np.int8), np.zeros_like(below)
@@ -439,11 +446,12 @@ def coarser_held(kind: NDArray[np.int8], held: Held, halved: tuple[int, int], be
     return coarse
 
 
-EXACT, DIFFERENCED = 1e-9, 1e-5
-"""Relative difference up to which a matrix counts as symmetric: one by derivatives, one by
-differences."""
+EXACT = 1e-9
+"""Relative difference up to which a matrix from derivatives counts as symmetric."""
+DIFFERENCED = 1e-5
+"""Relative difference up to which a matrix from differences counts as symmetric."""
 DIGITS = 13
-"""Number of digits of row factors; the others are rounding."""
+"""Number of digits of row factors; further digits are rounding errors."""
 
 
 def is_symmetric(matrix: StencilMatrix, alike: float = EXACT, rows: Rows = ALL) -> bool:
@@ -459,8 +467,8 @@ def balanced(
 ) -> tuple[StencilMatrix, bool]:
     """Return the matrix with rows scaled such that it is symmetric, and whether that is possible.
 
-    The rows of particles with fewer neighbours, each of which has a larger weight, are scaled. A
-    remaining difference is divided between both sides.
+    Rows of particles with fewer neighbours have larger weights and are scaled. A remaining
+    difference is divided equally between both sides.
     """
     if is_symmetric(matrix, rows=rows):
         return matrix, True
@@ -520,16 +528,16 @@ def transposed(matrix: StencilMatrix) -> StencilMatrix:
 
 
 def leads_one_way(matrix: StencilMatrix, rows: Rows = ALL) -> bool:
-    """Return whether one axis moves the other and not the reverse, so that they are better solved
-    in turn."""
+    """Return whether one axis is coupled to the other but not the reverse, so that they are better
+    solved one after the other."""
     ways = matrix.stencils[..., 1], matrix.stencils[..., 2]
     return len({rows.communicator.any(bool(way.any())) for way in ways}) > 1
 
 
 def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: Rows = ALL) -> bool:
-    """Return whether the body is held and has no crack. Every connected part has to touch a leader,
-    or to contain `held` components, along each axis; two neighbours have to be bonded, or to have a
-    common neighbour."""
+    """Return whether the body is held and has no crack. Every connected part has to be adjacent to
+    a leader, or to contain `held` components, along each axis; two neighbours have to be bonded, or
+    to have a common neighbour."""
     from scipy.ndimage import binary_dilation, label
 
     bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
@@ -563,7 +571,7 @@ def _reached(parts: Any, count: int, led: Any, rows: Rows) -> bool:
 def _apart(
     matrix: StencilMatrix, bonds: NDArray[np.bool_], places: tuple[Indices, ...], s: int
 ) -> bool:
-    """Return whether some of the particles with a stencil of their own are separated from their
+    """Return whether some of the particles with a separate stencil are separated from their
     neighbour along place s of it."""
     row, place = places
     down, along = s // 3 - 1, s % 3 - 1
@@ -573,7 +581,7 @@ def _apart(
         return False
     first = matrix.code[row[pairs], place[pairs]]
     second = matrix.code[row[pairs] + down, place[pairs] + along]
-    linked = second < 0  # a leader: nothing moves it
+    linked = second < 0  # A leader: nothing moves it.
     for t in range(9):
         a, b = t // 3 - 1 - down, t % 3 - 1 - along
         if max(abs(a), abs(b)) <= 1:

@@ -2,8 +2,8 @@
 
 `Moves` evaluates the right side by the rule; `System` is the interface of the solvers. `Rows` are
 the rows of the lattice within a process, with the collective operations among the processes that
-share the lattice. Fields are (…, row, place); sums over the whole lattice are made row by row, so
-that they do not depend on the number of processes. Moves and displacements are planes, (axis,
+share the lattice. Fields are (…, row, place); sums over the whole lattice are computed row by row,
+so that they do not depend on the number of processes. Moves and displacements are planes, (axis,
 sublattice, cell, cell), as in a state.
 """
 
@@ -41,14 +41,15 @@ from pbdkit.stepping.step import Step
 LARGEST_BY_NUMPY = 20_000
 """Number of particles beyond which moves are evaluated by the compiled engine."""
 ROUNDING = 4 * float(np.finfo(float).eps)
+"""Relative rounding error of a move."""
 
 
 class Moves:
     """Evaluation of the moves of a scene's followers.
 
-    Moves include relaxation but not memory; frame points follow the body, and obstacles are where
-    they are at a moment. With `compiles` the moves of large bodies are compiled, which takes
-    seconds and pays if many states of one scene are evaluated.
+    Moves include relaxation but not momentum; frame points follow the body, and obstacles have
+    their positions of a moment. With `compiles` the moves of large bodies are compiled, which takes
+    seconds and saves time if many states of one scene are evaluated.
     """
 
     def __init__(self, scene: Scene, *, compiles: bool = True) -> None:
@@ -77,8 +78,8 @@ class Moves:
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, moment: float) -> Floats:
-        """Return the moves at a moment as planes, zero for particles and axes that do not follow. A
-        particle that would enter an obstacle moves onto its outline. Frame points of the state are
+        """Return the moves at a moment as planes, zero for leaders and prescribed axes. A particle
+        that would enter an obstacle moves onto its outline. Frame points of the state are
         updated."""
         moves = self.free(state, moment)
         if self.contact:
@@ -127,7 +128,7 @@ class Moves:
 
 
 def _resting(scene: Scene) -> tuple[Leading, ...]:
-    """Return the leader groups at rest."""
+    """Return the leader groups that do not move."""
     groups = [leading.group.model_copy(update={"motion": Hold()}) for leading in scene.leading]
     pairs = zip(scene.leading, groups, strict=True)
     return tuple(replace(leading, group=group) for leading, group in pairs)
@@ -145,8 +146,7 @@ def random_displacements(scene: Scene, size: float) -> Floats:
 
 
 def coarser_size(size: int) -> int:
-    """Return the number of places of a grid along an axis along which one of `size` places is
-    halved."""
+    """Return the number of places along an axis of the next coarser grid."""
     return (size - 2) // 2 + 3
 
 
@@ -158,10 +158,10 @@ def outside(rows: slice, count: int) -> tuple[slice, slice]:
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of a grid of `count` rows that a process holds, by their numbers in the grid. Arrays
-    start at `low`; the process owns `begin` to `end`, and has the stencils of `first` to `last`.
-    `low` is even where rows are halved, so that row n of the next grid lies at 2n - 1 in the arrays
-    too; this holds for `depth` coarser grids."""
+    """Rows of a grid of `count` rows that a process stores, by their indices in the grid.¶Arrays
+    start at row `low`; the process owns rows `begin` to `end`, and has the stencils of rows `first`
+    to `last`. `low` is even if rows are halved, so that row n of the next grid lies at 2n - 1 in
+    the arrays too; this holds for `depth` coarser grids."""
 
     count: int
     low: int
@@ -183,7 +183,7 @@ class Strip:
 
     def coarser(self, half: int) -> Strip:
         """Return the rows of the next grid. A stencil there depends on two rows on either side of
-        its place if rows are halved, else on one."""
+        its place if rows are halved, otherwise on one."""
         if not half:
             first = self.first + 1 if self.first else 0
             last = self.last - 1 if self.last < self.count else self.last
@@ -201,8 +201,8 @@ class Strip:
 
 
 class Rows:
-    """Rows of a grid within one process: all of them, or, in `pbdkit.mpi.driver`, a strip of those
-    that the processes of a communicator share."""
+    """Rows of a grid within one process: all of them or, in `pbdkit.mpi.driver`, a strip of the
+    rows that the processes of a communicator share."""
 
     strip: Strip | None = None
     """The strip; None for all rows."""
@@ -251,11 +251,12 @@ class Rows:
 
 
 ALL: Final = Rows()
+"""All rows, in a single process."""
 
 
 @cache
 def _libraries(with_scipy: bool) -> ThreadpoolController:
-    """Return a controller of the libraries loaded so far; scipy has one of its own."""
+    """Return a controller of the libraries loaded so far; scipy loads one of its own."""
     return ThreadpoolController()
 
 
@@ -269,14 +270,16 @@ def one_thread() -> AbstractContextManager[object]:
 
 ACCURACY = 1e-2
 """Relative accuracy of rough solutions."""
-FAR, TURNS = 8.0, 4
-"""Ratio of the assumed size of a solution to its size above which it is computed again, and maximum
-number of repetitions."""
+FAR = 8.0
+"""Ratio of the assumed size of a solution to its actual size above which the solution is computed
+again."""
+TURNS = 4
+"""Maximum number of repetitions."""
 
 
 PUSH = 1e-10
-"""Relative error of moves, such as those from differences, that is ignored as a push on a part that
-nothing holds."""
+"""Relative error of moves, as of those from differences, up to which a load on a floating part is
+ignored."""
 
 
 class StuckError(Exception):
@@ -326,16 +329,16 @@ class System(ABC):
     ) -> Floats:
         """Solve for the correction c to within a length.
 
-        `owed` is the state if the step depends on the state before it: the invariants of parts that
-        nothing holds then have to change. `rounding` is the rounding error of the moves.
+        `owed` is the state if the step depends on the state before it: the invariants of floating
+        parts then have to change. `rounding` is the rounding error of the moves.
 
-        Raises ExperimentError if a part is pushed on without end.
+        Raises ExperimentError if a floating part is under a load.
         """
 
     @abstractmethod
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """Solve A x = moves with an error relative to the largest number of x. Solutions `near`, as
-        of similar systems, save iterations."""
+        """Return x with A x = moves, with an error relative to the largest number of x. Solutions
+        `near`, as of similar systems, save iterations."""
 
     @abstractmethod
     def pushed_by(self, led: Floats) -> Floats | None:
@@ -344,21 +347,13 @@ class System(ABC):
 
     @abstractmethod
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """Solve Aᵀ λ = weights with an error relative to the largest number of λ. λ is zero except
-        at followers, and Σ λ · moves = Σ weights · A⁻¹ moves for all moves."""
+        """Return λ with Aᵀ λ = weights, with an error relative to the largest number of λ. λ is
+        zero except at followers, and Σ λ · moves = Σ weights · A⁻¹ moves for all moves."""
 
     @abstractmethod
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
-        """Return
-
-        A c + after - before
-
-        /
-
-        A c
-
-        , the nonlinearity of the moves before and after a displacement c.
-        """
+        """Return ‖A c + after - before‖ / ‖A c‖, the nonlinearity of the moves before and after a
+        displacement c."""
 
     @abstractmethod
     def distance(self, moves: Floats, rounding: float) -> float:
@@ -367,8 +362,8 @@ class System(ABC):
 
     @abstractmethod
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """Raise ExperimentError if a part that nothing holds has moves: its equilibrium is defined
-        for linear rules only."""
+        """Raise ExperimentError if a floating part has moves: its equilibrium is defined for linear
+        rules only."""
 
     @abstractmethod
     def is_stable(self) -> bool:
@@ -377,7 +372,8 @@ class System(ABC):
 
 
 def solved(system: System, moves: Floats, size: float, rows: Rows = ALL) -> Floats:
-    """Solve A x = moves with a relative accuracy, starting from an assumed size of x."""
+    """Return the solution of A x = moves with a relative accuracy, starting from an assumed size of
+    x."""
     solution = system.solve(moves, ACCURACY * size)
     for _ in range(TURNS):
         magnitude = rows.max_norm(solution)
