@@ -1,4 +1,9 @@
-"""Built-in components, registered through the same hook as those of third parties."""
+"""Built-in components: lattices, neighbour metrics, rules, frame policies, fracture models and
+diagnostics.
+
+They implement the interfaces of `pbdkit.plugin` and are registered through the same hook as those
+of plugins.
+"""
 
 from __future__ import annotations
 

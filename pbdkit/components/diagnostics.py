@@ -1,8 +1,6 @@
-"""Built-in diagnostics.
-
-Pseudo-energies, displacements, tracks and broken bonds (model.md, section 8); strain, rotation and
-stress at particles; reactions, strain energy and load curves; contact forces.
-"""
+"""Built-in diagnostics: pseudo-energies, displacements, tracks and broken bonds of the paper;
+strain, rotation and stress at particles; reactions, strain energy and load curves; contact
+forces."""
 
 from __future__ import annotations
 
@@ -329,7 +327,8 @@ class Stress(Diagnostic):
         return _inside(now, xx, yy, xy, np.hypot(deviator, ROOT_3 * xy), principal(xx, yy, xy))
 
     def _subtract(self, now: Moment, lost: Floats, *stress: Floats) -> tuple[Floats, ...]:
-        """Subtract the stress that softened bonds have lost, a first Piola-Kirchhoff stress."""
+        """Subtract the stress that softened bonds have lost, which is a first Piola-Kirchhoff
+        stress."""
         # S = F⁻¹ P
         if self.measure_ == "green-lagrange":
             lost = np.linalg.solve(np.nan_to_num(now.cells.gradient()) + np.eye(2), lost)
@@ -694,7 +693,7 @@ class ContactForces(Diagnostic):
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """Return E t times the contact forces, by obstacle and by particle."""
         forces, touching = forces_on_particles(now), now.touching()
-        on_particles, sums = 0.0 * forces, np.zeros((len(touching), 2))  # NaN at frame points
+        on_particles, sums = 0.0 * forces, np.zeros((len(touching), 2))  # NaN at frame points.
         size = self.youngs_modulus * self.thickness
         for n, pushes in enumerate(contact_pushes(now, touching, forces)):
             np.add.at(on_particles, touching[n].rows, size * pushes)

@@ -60,7 +60,7 @@ def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
     # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
     K = _of_mean_strain(c, CORNERS / (2 * np.array([a, b])), a * b)
     stiffness = c.shear * (a / b + b / a) / 4
-    hourglass = CORNERS.prod(axis=1)  # the mode with zero mean strain
+    hourglass = CORNERS.prod(axis=1)  # The mode with zero mean strain.
     K += stiffness * np.einsum("m,n,ab->manb", hourglass, hourglass, np.eye(2))
     K.flags.writeable = False
     return K
@@ -97,7 +97,7 @@ def bond_weights(slot: Slot, c: Stiffness, cells: Tiling) -> dict[str, float]:
     -------
     dict
         `xx`, `xy`, `yx`, `yy`: the weight of the left cell is [[xx, xy], [yx, yy]], that of the
-        right cell its transpose. A cell on both sides counts half on each.
+        right cell its transpose. If the same cell lies on both sides, each side has half of it.
     """
     left, right = _on_both_sides(slot, c, cells)
     mean = (left + right.T) / 2
@@ -119,8 +119,8 @@ def bond_springs(slot: Slot, c: Stiffness, cells: Tiling) -> float:
     Returns
     -------
     float
-        Stiffness over the modulus and the squared length of the bond. A cell on both sides counts
-        half on each.
+        Stiffness over the modulus and the squared length of the bond. If the same cell lies on both
+        sides, each side has half of it.
 
     Notes
     -----
@@ -215,7 +215,7 @@ def springs_in(stiffness: Floats, c: Stiffness, cells: Tiling) -> Floats:
 
 
 Sums = tuple[Vector, Number, Number, Number]
-"""Σ W d, and the entries xx, xy, yy of Σ W."""
+"""Type of sums: Σ W d, and the entries xx, xy, yy of Σ W."""
 
 
 def torn_pull(d: Vector, r: Vector, w: Weights, t: Torn) -> Vector:
@@ -335,9 +335,9 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """Return the weights xx, xy, yx, yy of the cells beside a bond, and `spring`.
 
-        The weight of the left cell is [[xx, xy], [yx, yy]], that of the right cell its transpose; a
-        cell on both sides counts half on each. `spring` is the stiffness that remains along the
-        bond in a torn cell, over the squared length of the bond.
+        The weight of the left cell is [[xx, xy], [yx, yy]], that of the right cell its transpose.
+        If the same cell lies on both sides, each side has half of it. `spring` is the stiffness
+        that remains along the bond in a torn cell, over the squared length of the bond.
         """
         material, cells = self.material()[1], setting.cells
         springs = {"spring": bond_springs(slot, material, cells)}
@@ -418,7 +418,7 @@ class IsotropicElastic(CellElastic):
             in_plane, out_of_plane = nu / (1 - nu), 1 - nu * nu
         ratios = Stiffness(1.0, 1.0, in_plane, (1 - in_plane) / 2)
         if nu == -1.0:
-            return math.nan, ratios  # the stiffness is singular
+            return math.nan, ratios  # The stiffness is singular.
         return 1 / (out_of_plane * (1 - in_plane * in_plane)), ratios
 
     def through_thickness(self) -> float:

@@ -1,8 +1,8 @@
 """Built-in fracture models.
 
-None; a threshold on length (model.md, section 6); a limit of strain without or with gradual damage;
-and cohesive cells that dissipate a given energy per crack length on every lattice
-(docs/fracture.md).
+They are no fracture; a threshold on length (the paper's section 5); a limit of strain, with or
+without gradual damage; and cohesive cells, which dissipate the same energy per crack length for
+every lattice constant (docs/fracture.md).
 """
 
 from __future__ import annotations
@@ -90,10 +90,10 @@ class NoFracture(FractureModel):
 class Parting(StartsCracked, FractureModel):
     """Base class of the models with fictitious points at m_j + λ R or at X_k.
 
-    The fictitious point in place of a lost neighbour lies at m_j + λ R (`fictitious: cell`;
-    `placement` λ = 1 is the undeformed cell, λ > 1 expands and λ < 1 contracts it) or at X_k
-    (`fictitious: reference`). With `frame_bonds: false` bonds to frame points do not break.
-    `cracks` are segments [[x, y], [x, y]]; bonds that cross them are broken from the start.
+    The fictitious point that replaces the neighbour across a broken bond lies at m_j + λ R
+    (`fictitious: cell`; `placement` λ = 1 is the undeformed cell, λ > 1 expands and λ < 1 contracts
+    it) or at X_k (`fictitious: reference`). With `frame_bonds: false` bonds to frame points do not
+    break. `cracks` are segments [[x, y], [x, y]]; bonds that cross them are broken from the start.
     """
 
     placement: float = Field(
@@ -134,11 +134,11 @@ class Parting(StartsCracked, FractureModel):
 class Threshold(BreaksAtStrain, Parting):
     """A bond breaks when |r + d|² > threshold², with one threshold for each shell.
 
-    This is the model of the paper's section 5. The fictitious point in place of a lost neighbour
-    lies at m_j + λ R (`fictitious: cell`; `placement` λ = 1 is the undeformed cell, λ > 1 expands
-    and λ < 1 contracts it) or at X_k (`fictitious: reference`). With `frame_bonds: false` bonds to
-    frame points do not break. `cracks` are segments [[x, y], [x, y]]; bonds that cross them are
-    broken from the start.
+    This is the model of the paper's section 5. The fictitious point that replaces the neighbour
+    across a broken bond lies at m_j + λ R (`fictitious: cell`; `placement` λ = 1 is the undeformed
+    cell, λ > 1 expands and λ < 1 contracts it) or at X_k (`fictitious: reference`). With
+    `frame_bonds: false` bonds to frame points do not break. `cracks` are segments [[x, y], [x, y]];
+    bonds that cross them are broken from the start.
     """
 
     type: Literal["threshold"] = "threshold"
@@ -391,8 +391,11 @@ def softened(strain: Any, onset: Any, failure: Any, damage: Any) -> Any:
 _FAILURE_STRAIN = Remembered(
     "failure_strain", "strain at which the bond breaks", "1", changes=False
 )
+"""Declaration of the failure strain of a bond."""
 _ONSET_STRAIN = Remembered("onset_strain", "strain at which the bond softens", "1", changes=False)
+"""Declaration of the strain at which a bond softens."""
 _DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is broken", "1")
+"""Declaration of the damage of a bond."""
 
 
 CROSSED = 0.09
@@ -484,7 +487,8 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
     def update(  # type: ignore[override]  # models of SoftensCells receive the cells
         d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
     ) -> tuple[Number, ...]:
-        """Return damage and failure strain in both cells; a single cell counts for both sides."""
+        """Return damage and failure strain in both cells; if there is one cell, both sides have its
+        values."""
         left_damage, left_failure = _of_cell(left, c.damage_left, c.failure_left, r, c)
         right_damage, right_failure = _of_cell(right, c.damage_right, c.failure_right, r, c)
         has_left, has_right = left.share > 0.0, right.share > 0.0
@@ -588,3 +592,4 @@ _NUMBERS = (
     *_pair("damage", "damage of the bond, from 0 to 1 where it is broken, in the cell"),
     *_pair("failure", "strain at which a crack tears the cell, negative along the bond,"),
 )
+"""Declarations of the damage and the failure strain of a bond in the cells on both sides."""

@@ -1,4 +1,4 @@
-"""Frame policies (model.md, section 7): copying and mirroring frames, and bodies without frame."""
+"""Frame policies: frames that copy or mirror the body, and bodies without a frame."""
 
 from __future__ import annotations
 
@@ -68,9 +68,10 @@ class MeanFrame(CopyingFrame):
 
 
 class FirstFrame(CopyingFrame):
-    """Frame points move with the nearest body particle, of several the one of lowest number.
+    """Frame points move with the nearest body particle; among equally near particles with that of
+    the lowest number.
 
-    Case g of the paper.
+    The paper uses this frame in case g.
     """
 
     type: Literal["first"] = "first"
@@ -111,7 +112,7 @@ class MirrorFrame(Anchors, LayeredFrame):
 class Natural(Frameless):
     """No frame points; the body consists of the cells of the lattice.
 
-    A cell that the outline cuts is weighted by the share of its area inside, and all its corners
+    A cell that the outline cuts is weighted by the fraction of its area inside, and all its corners
     are particles of the body, so that curved bodies converge at second order. Free edges are free
     of traction.
     """

@@ -1,4 +1,4 @@
-"""The five plane Bravais lattices (model.md, section 2; the paper's figure 1)."""
+"""The five plane Bravais lattices (figure 1 of the paper)."""
 
 from __future__ import annotations
 
@@ -88,7 +88,8 @@ class Hexagonal(Lattice):
 
 
 def _rows(a: float, b: float) -> Cell:
-    # The primitive basis is along the row and up the slanted line: p = i - floor(j/2), q = j.
+    # The primitive basis is along the row and along the slanted line of sites: p = i - floor(j/2),
+    # q = j.
     return Cell(
         vectors=(Vector(a, 0.0), Vector(0.0, b)),
         sites=(BasisSite(), BasisSite(Vector(a / 2, b / 2), index=(0, 1), primitive=(0, 1))),

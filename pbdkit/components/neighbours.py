@@ -1,4 +1,4 @@
-"""Neighbour metrics: shells of the lattice, or a weighted distance (model.md, section 4)."""
+"""Neighbour metrics: shells of the lattice, or a weighted distance."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Coordination(LatticeNeighbours):
         groups: list[list[Offset]] = []
         room = 8 * self.shells * size_of(cell) / len(cell.sites)
         radius = (room / BALL[cell.axes]) ** (1 / cell.axes)
-        while len(groups) <= self.shells:  # with one more, the shells before it are complete
+        while len(groups) <= self.shells:  # With one more group, all shells before it are complete.
             offsets = [cell.offsets(s, radius) for s in range(len(cell.sites))]
             sorted_offsets = sorted((o for ends in offsets for o in ends), key=lambda o: o.length)
             groups = _ranked(sorted_offsets, [o.length for o in sorted_offsets])
@@ -64,7 +64,8 @@ class Coordination(LatticeNeighbours):
 
 
 class Chebyshev(LatticeNeighbours):
-    """Neighbours by index distance max(|Δp|, |Δq|) in the primitive basis, one shell a distance."""
+    """Neighbours by index distance max(|Δp|, |Δq|) in the primitive basis; a shell is one
+    distance."""
 
     type: Literal["chebyshev"] = "chebyshev"
 
@@ -95,8 +96,8 @@ class Chebyshev(LatticeNeighbours):
 class Euclidean(NeighbourMetric):
     """Neighbours within a weighted distance: √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9).
 
-    A shell consists of the offsets at one distance. Unequal weights make the neighbourhood, and
-    with it the body, anisotropic. With `reevaluate` the neighbours are determined again at every
+    A shell consists of the offsets at one distance. With unequal weights the neighbourhood is
+    anisotropic, and so is the body. With `reevaluate` the neighbours are determined again at every
     step, in the intermediate configuration. More than `MAX_NEIGHBOURS` neighbours are an error.
     """
 
@@ -149,7 +150,7 @@ def size_of(cell: Cell) -> float:
 def cells_within(cell: Cell, radius: float) -> float:
     """Estimate the number of repeat cells within a radius.
 
-    A cell longer than the radius counts along the whole of its longest vector.
+    If a cell vector is longer than the radius, at least one cell is counted along it.
     """
     longest, ball = max(math.hypot(*v) for v in cell.vectors), BALL[cell.axes]
     region = max(ball * radius, 2 * longest) * radius ** (cell.axes - 1)

@@ -1,4 +1,4 @@
-"""Follower rules of the paper (its section 3; model.md, section 5), and a network of springs."""
+"""Follower rules of the paper (its section 3), and a network of springs."""
 
 from __future__ import annotations
 
@@ -144,14 +144,14 @@ TRIANGLE_STIFFNESS = math.sqrt(0.75)
 
 
 class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
-    """Network of springs: each follower moves to the weighted mean of the places its neighbours
-    propose.
+    """Network of springs: each follower moves to the weighted mean of the positions in which single
+    springs would be relaxed.
 
-    A neighbour proposes the place at its rest distance l₀ on the line to the current position, x_k
-    + l₀ (x_j - x_k)/|x_j - x_k|. Weights are equal on the hexagonal lattice with 6 neighbours, 2 :
-    1 for edges and diagonals on the square lattice with 8, and half on free edges. For small strain
-    the network is linear elastic in plane stress with ν = 1/3. Rotations are exact, and the energy
-    of the springs does not increase with relaxation 1.
+    The spring to neighbour k, of rest length l₀, is relaxed at x_k + l₀ (x_j - x_k)/|x_j - x_k|.
+    Weights are equal on the hexagonal lattice with 6 neighbours, 2 : 1 for edges and diagonals on
+    the square lattice with 8, and half on free edges. For small strain the network is linear
+    elastic in plane stress with ν = 1/3. Rotations are exact, and the energy of the springs does
+    not increase with relaxation 1.
     """
 
     type: Literal["springs"] = "springs"

@@ -8,8 +8,8 @@ positive B exists, the inverse of the mobility, with
 and C the elastic constants. Six linear equations determine the three numbers of B: the left side is
 symmetric in a and b (an energy exists), and in two dimensions Huang's relations hold, Γ_xxyy =
 Γ_yyxx, Γ_xxxy = Γ_xyxx, Γ_yyxy = Γ_xyyy (a rigid rotation costs no energy). B = 1 except for rules
-in which x and y approach the same equilibrium at different rates. C is determined up to the time
-that a step represents. Born and Huang, Dynamical Theory of Crystal Lattices, section 27.
+in which x and y approach the same equilibrium at different rates. C is determined except for the
+time that a step represents. See Born and Huang, Dynamical Theory of Crystal Lattices, section 27.
 
 Harmonics of C by direction follow Vannucci, Anisotropic Elasticity, chapter 4.
 """
@@ -33,9 +33,9 @@ MOBILITIES = np.eye(3)[:, [[0, 2], [2, 1]]]
 DIFFUSION = "diffusion"
 """Kind of rules that diffuse each component of the displacement separately."""
 ELASTICITY = "elasticity"
-"""Kind of rules that solve an elastic body."""
+"""Kind of rules whose equilibria are those of an elastic body."""
 NEITHER = "neither"
-"""Kind of rules that are neither."""
+"""Kind of rules that are neither diffusion nor elasticity."""
 SAME = 1e-8
 """Relative tolerance for zero; central differences are accurate to 1e-9."""
 
@@ -109,7 +109,7 @@ class Elasticity:
         """Compute Young's modulus of a bar in plane stress cut along a direction, in units of
         `stiffness`.
 
-        It is 0 if the bar can be stretched at no cost.
+        It is 0 if the bar can be stretched without energy.
         """
         longitudinal, _ = self._strains(degrees)
         return float(np.linalg.det(self.stiffness) / longitudinal) if longitudinal else 0.0
@@ -141,7 +141,7 @@ class Elasticity:
         ).max() else 0.0, transverse
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the constants, and what follows from them, by name."""
+        """Return the constants, and quantities derived from them, by name."""
         pairs = combinations_with_replacement(range(3), 2)
         constants = {f"C{'126'[i]}{'126'[j]}": float(self.stiffness[i, j]) for i, j in pairs}
         return constants | {

@@ -30,11 +30,11 @@ class Identity:
     spacing
         Smallest distance of two sites (lattice units), the unit of length.
     linear
-        Whether finite displacements move particles as infinitesimal ones do.
+        Whether the move is linear in finite displacements.
     turns
         Whether a finite rotation of the neighbours rotates the move.
     symmetric
-        Whether the weight of j for k is that of k for j.
+        Whether particle j has the same weight for k as k has for j.
     rests_at_edges
         Whether a particle at rest does not move if neighbours are missing.
     stencil

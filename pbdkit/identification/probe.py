@@ -71,7 +71,7 @@ class RuleProperties:
         Reasons why the rule is neither diffusion nor elasticity, apart from the response to long
         waves.
     linear
-        Whether finite displacements move particles as infinitesimal ones do.
+        Whether the move is linear in finite displacements.
     turns
         Whether a finite rotation of the neighbours rotates the move.
     symmetric
@@ -206,7 +206,7 @@ def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> Iterator[s
     parameters = ", ".join(scene.experiment.rule.numeric_parameters())
     verdict = f"; no material constant does that: {parameters} is not a Poisson ratio"
     text = f"it depends on the place: the weights at {corner} are not those in the middle"
-    # The effect on a translation is the clearest sign, if there is one.
+    # The effect on a translation is the clearest evidence, if there is one.
     defect = differences[worst, : len(slots[0])].sum(axis=0) + differences[worst, -len(slots)]
     entry = int(np.abs(defect).argmax())
     if abs(defect.ravel()[entry]) >= ROUNDING:

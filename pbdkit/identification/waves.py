@@ -9,24 +9,24 @@ slow waves, in which all sites move nearly alike, satisfy
 
 order by order, with the relative shifts of the sites eliminated (X_0: all alike, Y·X = 1 with Y the
 left null vectors of L(0)). The eigenvalues of the 2 × 2 matrix A(k) are the rates of the slow waves
-to every order: a step removes A(k) u from u. With one site A is L.
+to every order: a step subtracts A(k) u from u. With one site A = L.
 
-A lattice may be described by a larger cell than necessary: two sites a cell for the rows of a
-hexagonal lattice, one of which is the other shifted. Sites that a translation maps onto one
-another, stencil included, count as one site. The remaining ones are the sublattices of a lattice
-with a basis.
+A lattice may be described by a larger cell than necessary, as the hexagonal lattice is by a
+rectangular cell with two sites. Sites that a translation maps onto one another, stencil included,
+count as one site. The remaining ones are the sublattices of a lattice with a basis.
 
 The rate z of a wave is the fraction of it that a step removes. For long waves z = d k² (1 + λ² k²),
 where d is the diffusivity along the direction, of the faster and of the slower wave, and λ² the
 fourth-order length. In gradient elasticity, u'' - l² u'''', λ² is l²; a lattice alone has λ² < 0.
 Along the normal of a family of lattice rows, h apart, interactions with the next row alone give z =
-d s, s = (2 sin(kh/2) / h)², hence λ² = -h²/12. That part belongs to the lattice, and
+d s, s = (2 sin(kh/2) / h)², hence λ² = -h²/12. This part is due to the discreteness of the lattice;
+the rest,
 
     l² = λ² + h²/12
 
-to the material: the contribution of rows beyond the next. It is exactly c D for a rule (1 - P) u +
-c (1 - P)² u whose P couples next rows. It is negative, of the wrong sign for gradient elasticity,
-if rows beyond the next attract.
+is the contribution of rows beyond the next, and a property of the material. It is exactly c D for a
+rule (1 - P) u + c (1 - P)² u whose P couples adjacent rows. If rows beyond the next attract it is
+negative, the wrong sign for gradient elasticity.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def _shortest(vectors: Floats, shifts: Floats) -> Floats:
     cells = np.array([m * a + n * b for m in range(-2, 3) for n in range(-2, 3)])
     reduced = shifts - np.rint(shifts @ np.linalg.inv(np.array([a, b]))) @ np.array([a, b])
     candidates = (cells[:, None] + reduced[None]).reshape(-1, 2)
-    # Nearly equal lengths are ordered by direction, so that rounding has no influence.
+    # Nearly equal lengths are ordered by direction, so that rounding does not affect the order.
     upper = candidates[
         (candidates[:, 1] > NEAR) | ((np.abs(candidates[:, 1]) <= NEAR) & (candidates[:, 0] > NEAR))
     ]
@@ -391,7 +391,7 @@ def fourth_order(waves: SlowWaves, normal: Floats) -> tuple[float, float]:
     _, _, second, third, fourth = waves.series(normal)
     d, vectors = np.linalg.eig(second)
     if abs(d[0] - d[1]) < SAME_CURVATURE * np.abs(d).max():
-        # Both waves are equally fast: the fourth-order term alone separates them.
+        # Both waves are equally fast, and the fourth-order term alone distinguishes them.
         lengths_of_both = np.sort(np.linalg.eigvals(fourth / d.mean()).real)[::-1]
         return float(lengths_of_both[0]), float(lengths_of_both[1])
     inverse = np.linalg.inv(vectors)
@@ -442,7 +442,8 @@ def minimum(
     where, best = low, np.inf
     for _ in range(ROUNDS):
         values = value(grid)
-        # Of points that differ by rounding only the first counts, and none after an equal best.
+        # Among points that differ by rounding only the first counts, and none after an equal best
+        # point.
         candidates = values <= values.min() + ROUNDING * np.abs(values).max()
         index = int(candidates.argmax())
         if best == np.inf or values[index] < best - ROUNDING * abs(best):

@@ -23,11 +23,11 @@ Slots = tuple[tuple[Slot, ...], ...]
 Step = tuple[int, int, Index]
 """Type of a step between sites: source sublattice, target sublattice, repeat cells."""
 Share = NDArray[np.floating[Any]] | float
-"""Type of shares of cells; a single number where all are equal."""
+"""Type of area fractions of cells; a single number if all are equal."""
 CELLS_AT_ONCE = 65536
 """Number of cells processed together, which bounds the size of temporaries."""
 LEVEL = 1e-9
-"""Relative difference of height up to which two corners lie at one level."""
+"""Relative difference of height up to which two corners count as equally high."""
 
 
 @lru_cache(maxsize=32)
@@ -123,13 +123,14 @@ class WeighedCells:
     tiling
         Cells of the lattice.
     share
-        Share of each cell inside the outline, 0 to 1, (kind, sublattice, cell, cell), at the place
-        of its first corner. None if all cells are whole.
+        Area fraction of each cell inside the outline, 0 to 1, (kind, sublattice, cell, cell), at
+        the place of its first corner. None if all cells are whole.
     weight
-        The share times the stiffness of the cell over that of the rule, 0 for the cells in `mixed`.
+        The area fraction times the ratio of the stiffness of the cell to that of the rule, 0 for
+        the cells in `mixed`.
     mixed
-        Shares of the cells with a stiffness not proportional to that of the rule, one array for
-        each of several stiffnesses.
+        Area fractions of the cells whose stiffness is not proportional to that of the rule, one
+        array for each stiffness.
     weights
         Weights of the rule by slot, for each stiffness of `mixed`.
     phase
@@ -160,7 +161,7 @@ class WeighedCells:
         )
 
     def of(self, patch: Patch) -> Floats | float:
-        """Return the shares of the cells of a patch."""
+        """Return the area fractions of the cells of a patch."""
         if self.share is None:
             return 1.0
         return patch.corners[0].of(self.share[patch.polygon.kind])
@@ -179,7 +180,7 @@ class WeighedCells:
         precision
             Floating-point type of the result.
         shares
-            Shares in place of the weights.
+            Area fractions, which replace the weights.
 
         Returns
         -------
@@ -191,7 +192,8 @@ class WeighedCells:
     def beside_each(
         self, slots: Iterable[Slot], where: Where, precision: str, shares: Floats | None = None
     ) -> list[tuple[Share, Share]]:
-        """Return the same for several slots; the same cell beside two of them is one array."""
+        """Return the weights to the left and right of several slots. A cell beside two of the slots
+        is returned as one shared array."""
         values = self.weight if shares is None else shares
         sides = [side for slot in slots for side in self.tiling.beside[slot]]
         cells = {(side.kind, side.first): side for side in sides}
@@ -201,7 +203,7 @@ class WeighedCells:
 
 
 def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:
-    """Return the shares of the cells on one side of a slot."""
+    """Return the area fractions of the cells on one side of a slot."""
     first_corners = where if side.first is None else where.seen_through(side.first)
     share = first_corners.of(shares[side.kind])
     if (share == 1.0).all():
@@ -212,7 +214,7 @@ def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:
 
 
 def whole_cells(raster: Raster, tiling: Tiling) -> WeighedCells:
-    """Return the cells with all corners in the body, each with a share of 1."""
+    """Return the cells with all corners in the body, each with an area fraction of 1."""
     share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *raster.shape))
     for patch in patches(raster, tiling):
         patch.corners[0].of(share[patch.polygon.kind])[...] = patch.whole
@@ -306,8 +308,9 @@ def _around_the_origin(x: Floats) -> Iterator[list[int]]:
     """Generate the polygons that meet at the origin, by their other corners among x,
     counterclockwise.
 
-    x are the surrounding sites, sorted by distance; the nearest site is always a corner. To the
-    left of a side (0, p) lies the polygon whose corners q see the side under the largest angle, of
+    x are the surrounding sites, sorted by distance; the nearest site is always a corner. The
+    polygons are those of the Delaunay tessellation: among the sites q to the left of a side (0, p),
+    the corners of its polygon are those at which the side subtends the largest angle, with the
     cotangent q·(q - p) / p×q.
     """
     side = 0
@@ -365,8 +368,8 @@ class CellBond:
 class CellsAround:
     """Bonds of the cells around the particles of a sublattice.
 
-    `cells` holds the bonds of each cell; `beside` the indices of the cells to the left and right of
-    each slot.
+    `cells` contains the bonds of each cell, and `beside` the indices of the cells to the left and
+    right of each slot.
     """
 
     cells: tuple[tuple[CellBond, ...], ...]

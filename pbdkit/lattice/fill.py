@@ -1,8 +1,8 @@
 """Fill the outline of a body with sites, frame points, whole cells and cut cells.
 
-A cut cell is weighted by the share of its area inside the outline. Cells that would connect the two
-sides of a narrow void are omitted: those whose inside has several parts and, at a particle in the
-void, the cells of all sides but one.
+A cut cell is weighted by the fraction of its area inside the outline. Cells that would connect the
+two sides of a narrow void are omitted: these are cells whose inside is disconnected and, at a
+particle in the void, the cells of all sides but one.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Filling:
     first
         Site index of the first entry of `body`.
     share
-        Shares of the cells inside the outline, at the site of their first corner, (kind, i, j).
-        None if cells are not weighted.
+        Area fractions of the cells inside the outline, at the site of their first corner, (kind, i,
+        j). None if cells are not weighted.
     left_out
         Sites of the first corners of the cells omitted at narrow voids, (cell, axis).
     """
@@ -297,8 +297,8 @@ NEAREST = 0.6
 
 No point of a triangle is farther from its nearest corner than 1/√3 of the longest side."""
 MIN_SHARE = 0.02
-"""Share below which a cell is omitted: corners on a sliver of the body have hardly any stiffness,
-and their displacements are not representative of it."""
+"""Area fraction below which a cell is omitted: corners on a sliver of the body have almost no
+stiffness, and their displacements are not representative of it."""
 CURVATURE_TOLERANCE = 1e-3
 """Deviation from linearity above which a triangle is divided, relative to its width.
 
@@ -306,45 +306,29 @@ The distance is not linear at a corner of the outline, or between two sides of i
 MAX_HALVINGS = 8
 """Maximum number of subdivisions of triangles in which the distance is not linear."""
 FAR = 1e100
-"""Finite substitute for an infinite distance, as that of bodies of given sites, such that
-differences of distances are numbers."""
+"""Finite substitute for infinite distances, as those from bodies of given sites, which makes
+differences of distances defined."""
 KINK = 1 / 32
 """Change of slope of the signed distance along a side of a cell above which more than one line of
 the outline may cross the cell."""
 FINER = 2 * FINE
 """Number of parts along each edge of a triangle in a cell that may have several parts."""
 NOTICEABLE_SHARE = 0.1
-"""Share above which cells omitted at a void are counted. Smaller ones also occur in the corners of
-wide voids and are as negligible as those below `MIN_SHARE`."""
+"""Area fraction above which cells omitted at a void are counted. Smaller ones also occur in the
+corners of wide voids and are as negligible as those below `MIN_SHARE`."""
 INWARD = 1e-3
 """Fraction by which points on the border of a cell are moved towards its centre."""
 NEAR_END = 1 / 64
 """Fraction of a segment at either end that is not searched for a void."""
 TIE_RTOL = 1e-9
-"""Relative difference up to which the shares of two groups of cells count as equal."""
+"""Relative difference up to which the areas of two groups of cells count as equal."""
 
 
 def fill_with_cells(
     body: Body, lattice: Lattice, tiling: Tiling, lines: Lines | None = None
 ) -> Filling:
-    """Find the cells with a share inside the outline; the body consists of all their corners.
-
-    Parameters
-    ----------
-    body
-        The outline. A body of given sites has the whole cells between these.
-    lattice
-        The lattice.
-    tiling
-        Cells of the lattice.
-    lines
-        Lines of sites to fill; all by default.
-
-    Returns
-    -------
-    Filling
-        With shares of cells.
-    """
+    """Find the cells that lie partly or wholly inside the outline. The body consists of all their
+    corners."""
     low, high = window(body, lattice)
     margin = margin_of(tiling)
     low, high = tuple(n - margin for n in low), tuple(n + margin + 1 for n in high)
@@ -355,8 +339,8 @@ def fill_with_cells(
     share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *shape))
     corner, line_count = np.zeros(shape, bool), max(1, SITES_AT_ONCE // math.prod(shape[1:]))
     tolerance, left_out = tolerance_of(body, lattice), []
-    # A particle depends on cells, these on cells with which they share a corner, and these on the
-    # distance at their corners.
+    # A particle depends on its cells, these on cells that share a corner with them, and these on
+    # the distance at their corners.
     padding = max(2 * margin, 4 * _reach_of(tiling))
     for begin in range(low[0], high[0], line_count):
         end = min(begin + line_count, high[0])
@@ -478,8 +462,8 @@ class _Cutter:
         """Find the cells that are connected to others only by a particle outside the outline.
 
         Around such a particle two neighbouring cells are connected if part of the edge between them
-        is inside. Only the connected group with the largest share is retained; if several groups
-        are largest, none is, so that mirror images of a body remain mirror images.
+        is inside. Only the connected group with the largest area is retained. If several groups are
+        largest, none is retained, so that mirror images of a body remain mirror images.
 
         Returns
         -------
@@ -569,9 +553,10 @@ def shares_inside(
     cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
     a, b, c = (distance[corner][..., cut] for corner in small.T)
     parts = _negative_share(a, b, c).reshape(len(small) * distance.shape[1], -1)
-    # Sequential summation: the share of a cell does not depend on the other cells of the call.
+    # Sums are sequential, so that the result for a cell does not depend on the other cells of the
+    # call.
     share[cut] = reduce(np.add, parts) / len(parts)
-    sides = distance[_sides(len(x))]  # side, point, cell
+    sides = distance[_sides(len(x))]  # Axes: side, point, cell.
     length = np.hypot(*(np.roll(c, -1, axis=0) - c for c in (x, y)))[:, None]
     kinks = np.abs(sides[:, 2:] - 2 * sides[:, 1:-1] + sides[:, :-2]) > KINK * length / FINE
     inside = sides[:, :-1] <= 0.0
@@ -591,15 +576,16 @@ def has_pieces(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats)
     """
     n = len(x)
     part = np.arange(FINER)[:, None, None] / FINER
-    sides = (1.0 - part) * np.eye(n) + part * np.roll(np.eye(n), 1, axis=1)  # part, side, corner
+    # Axes: part, side, corner.
+    sides = (1.0 - part) * np.eye(n) + part * np.roll(np.eye(n), 1, axis=1)
     weights = _inward(sides.swapaxes(0, 1).reshape(-1, n))
     border = np.stack([weights @ x, weights @ y])
     distance = signed(*border)
     next_border, next_distance = np.roll(border, -1, axis=1), np.roll(distance, -1, axis=0)
     inside = distance <= 0.0
     is_separated = _is_separated(signed, border, next_border, distance, next_distance)
-    # A connected inside without holes meets the border of the cell in one run, and continues near
-    # each of its corners.
+    # The border of a connected inside without holes is a single run of the border of the cell, and
+    # continues near each of its corners.
     runs = (inside & (next_distance > 0.0)).sum(axis=0)
     is_isolated = (signed(x, y) <= 0.0) & ~inside[::FINER]
     (candidates,) = np.nonzero((runs > 1) | is_separated.any(axis=0) | is_isolated.any(axis=0))
@@ -644,7 +630,8 @@ def _along_sides(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Float
     """Return whether sides of cells, from each corner to the next, are connected inside the
     outline.
 
-    They lie inside, or on the outline towards one of their ends, and no tip of a void touches them.
+    Such a side lies inside, or on the outline near one of its ends, and no tip of a void touches
+    it.
     """
     a = np.stack([x, y])
     part = np.arange(FINER + 1)[:, None, None] / FINER
@@ -789,7 +776,8 @@ def cut_by_border(
     share = (~near & (distance[:, 0] < 0.0)).sum(axis=(0, 1)) / count
     facing = np.zeros((2, 2, len(share)))
     part, triangle, cell = np.nonzero(near)
-    at = np.array([c[small[part].T, triangle, cell] for c in points])  # axis, corner, triangle
+    # Axes: axis, corner, triangle.
+    at = np.array([c[small[part].T, triangle, cell] for c in points])
     distance = distance[part, :, triangle, cell].T
     for level in range(MAX_HALVINGS + 1):
         is_linear = np.abs(distance).min(axis=0) > (np.inf if exaggerates else width)

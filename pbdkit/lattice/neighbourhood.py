@@ -87,16 +87,14 @@ class Neighbourhood:
     @cached_property
     def home(self) -> dict[Slot, tuple[int, bool]]:
         """Plane that stores the bonds of each slot, and whether they are stored at the start of the
-        slot.
-        """
+        slot."""
         ends = enumerate(self.planes)
         return {slot: (n, slot is p.slot) for n, p in ends for slot in (p.slot, p.opposite)}
 
     @property
     def home_reach(self) -> tuple[Index, Index]:
-        """Largest differences of repeat cell, backward and forward, at which bonds of a particle
-        are stored.
-        """
+        """Largest differences of repeat cell, backward and forward, between a particle and the
+        places that store its bonds."""
         steps = [slot.cell for slot, (_, at_start) in self.home.items() if not at_start]
         cells = np.array([(0,) * self.cell.axes, *steps])
         return tuple((-cells.min(axis=0)).tolist()), tuple(cells.max(axis=0).tolist())
@@ -112,7 +110,7 @@ class Neighbourhood:
     def nudge_unit(self) -> float:
         """Power of two near the shortest rest length.
 
-        Perturbations proportional to it scale with the unit of length without rounding.
+        Perturbations proportional to it are independent of the unit of length without rounding.
         """
         return float(2.0 ** round(math.log2(min(map(min, self.shells())))))
 
@@ -207,7 +205,7 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
 def _refuse_unbalanced(slots: tuple[Slot, ...], metric: NeighbourMetric) -> None:
     """Raise ExperimentError if a site is not the barycentre of its neighbours.
 
-    Mutual neighbourhood does not imply this if sites are not centres of inversion.
+    Neighbourhood can be mutual and not balanced if sites are not centres of inversion.
     """
     sums = [math.fsum(along) for along in zip(*(slot.rest for slot in slots), strict=True)]
     if math.hypot(*sums) > BARYCENTRE_RTOL * math.fsum(math.hypot(*slot.rest) for slot in slots):

@@ -25,7 +25,8 @@ from pbdkit.plugin.vector import Vector, vector
 def distinct(numbers: NDArray[np.integer[Any]]) -> Indices:
     """Return the distinct numbers, which are not negative, sorted.
 
-    np.unique would import numpy.ma, which takes a tenth of the time of a small `check`.
+    numpy.unique imports numpy.ma, which takes a tenth of the time of `check` for a small
+    experiment.
     """
     ordered = np.sort(numbers).astype(np.intp, copy=False)
     return ordered[np.diff(ordered, prepend=-1) > 0]
@@ -317,12 +318,13 @@ class Raster:
         return np.asarray(np.count_nonzero(self.kind != EMPTY, axis=axes))
 
     def is_own(self, lines: Indices) -> Mask:
-        """Return which lines of sites belong to this process; each belongs to one process."""
+        """Return a mask of the lines of sites that belong to this process; each line belongs to one
+        process."""
         low, high = self.row_range.own if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
     def sees_frame(self, lines: Indices) -> Mask:
-        """Return the lines of sites with frame points that this process resolves."""
+        """Return the lines of sites whose frame points this process resolves."""
         low, high = self.row_range.framed if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
@@ -468,7 +470,7 @@ class Raster:
         body = np.moveaxis(self.sites == FOLLOWER, axis, 0)
         end = (body[::-1] if last else body).argmax(axis=0)
         end = self.low[axis] + (len(body) - 1 - end if last else end)
-        if axis == 0:  # other processes hold other places of these lines
+        if axis == 0:  # Lines along this axis continue on other processes.
             far = np.where(body.any(axis=0), -end if last else end, NOWHERE)
             far = self.communicator.smallest(far)
             occupied, end = far < NOWHERE, -far if last else far
@@ -503,7 +505,7 @@ class Raster:
 class Restriction:
     """Rows of repeat cells of a raster on a raster of their own.
 
-    Features of a scene have a method `restrict` that returns what is theirs of these rows.
+    Features of a scene have a method `restrict`, which returns the feature of these rows.
 
     Parameters
     ----------
@@ -525,16 +527,16 @@ class Restriction:
     moving: tuple[int, int]
 
     def is_between(self, place: Indices, rows: tuple[int, int]) -> Mask:
-        """Return which flat places of the whole lie in rows."""
+        """Return a mask of the flat places of the whole that lie in rows."""
         row = np.unravel_index(place, self.whole.shape)[1]
         return np.asarray((row >= rows[0]) & (row < rows[1]))
 
     def is_present(self, place: Indices) -> Mask:
-        """Return which flat places of the whole are places of the part."""
+        """Return a mask of the flat places of the whole that are places of the part."""
         return self.is_between(place, self.present)
 
     def is_moving(self, place: Indices) -> Mask:
-        """Return which flat places of the whole have all their neighbours in the part."""
+        """Return a mask of the flat places of the whole whose neighbours are all in the part."""
         return self.is_between(place, self.moving)
 
     def places(self, place: Indices) -> Indices:

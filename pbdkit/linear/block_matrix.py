@@ -1,4 +1,4 @@
-"""Matrices of blocks (axis, axis) between particles, and the same by their entries.
+"""Matrices of blocks (axis, axis) between particles, and their scalar entries.
 
 Small ones are dense arrays, others scipy.sparse.csr_array.
 """
@@ -104,7 +104,7 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Integers]:
         if (longer == reach).all():
             break
         reach = longer
-    first = np.argmax(reach & reach.T, axis=1)  # components are labelled by their lowest unknown
+    first = np.argmax(reach & reach.T, axis=1)  # Components are labelled by their lowest unknown.
     names, label = np.unique(first, return_inverse=True)
     return len(names), label
 

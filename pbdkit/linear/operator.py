@@ -5,7 +5,7 @@ A step maps the displacements of the followers, one unknown a particle and axis,
     u(t+1) = A u(t) + B u(t-1) + C u_L + f
 
 with A = `current`, B = `previous`, C = `leader` and f = `source`. B is empty unless the frame has a
-lag or the solver has memory (momentum). Loads are part of f.
+delay or the solver has momentum. Loads are part of f.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Guiding:
         Identity along the free axes, zero elsewhere.
     turns : (particle, axis, axis)
         T, which maps the unconstrained move of each particle to its constrained move: the identity
-        along free axes, plus the shares of the move along prescribed axes
+        along free axes, plus fractions of the move along prescribed axes
         (`pbdkit.stepping.leaders`).
     """
 
@@ -55,7 +55,7 @@ class Guiding:
         return len(self.guided.place) > 0
 
     def numbers(self, place: Indices) -> Indices:
-        """Return the number of the guided particle at each flat place, -1 where there is none."""
+        """Return the index of the guided particle at each flat place, -1 where there is none."""
         if not self:
             return np.full(len(place), -1)
         order = np.argsort(self.guided.place)
@@ -174,7 +174,7 @@ class StepOperator:
 def step_operator(
     scene: Scene, state: State | None = None, step: int | None = None
 ) -> StepOperator:
-    """Assemble the step operator of a scene, including relaxation, memory and frame.
+    """Assemble the step operator of a scene, including relaxation, momentum and frame.
 
     Parameters
     ----------
@@ -247,7 +247,8 @@ def _followed(scene: Scene) -> BlockMatrix:
 
 
 def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, BlockMatrix]:
-    """Compute the same with the scene's own rule; particles without neighbours do not move."""
+    """Compute moves and couplings with the scene's own rule; particles without neighbours do not
+    move."""
     kind, moves = scene.raster.kind.ravel(), np.zeros((len(place), scene.axes))
     couplings = BlockMatrix((len(place), kind.size), scene.axes)
     moving = np.flatnonzero(has_neighbours(scene, place)).astype(np.int32)

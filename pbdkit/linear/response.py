@@ -1,8 +1,8 @@
 """Linear response of a rule to small displacements, computed from the rule's own functions.
 
 The response of a linear rule is exact in any configuration; other rules are linearised at a state.
-At rest, particles with the same neighbourhood have the same response, so one of each kind is
-evaluated.
+At rest, particles with the same neighbourhood have the same response, so that one particle of each
+kind is evaluated.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ Answer = Callable[[Contributions, Here], Any]
 CHUNK_SIZE = 8192
 """Number of places that are evaluated together, which bounds the size of temporary arrays."""
 FEW = 200
-"""Number of places up to which each is evaluated: to find equal ones takes longer."""
+"""Number of places up to which every place is evaluated, because grouping equal places takes
+longer."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,8 @@ def _group_alike(
     differing = [mask for to in neighbours for mask in (to.present, to.broken) if mask is not None]
     for mask in differing:
         code = 2 * code + mask
-    # More than fits a number, leaving 20 bits for the cut and torn cells around a particle.
+    # The key would exceed an integer; 20 bits are reserved for the cut and torn cells around a
+    # particle.
     if len(differing) > 42:
         return np.arange(len(place)), place
     _, representatives, kind[irregular] = np.unique(code, return_index=True, return_inverse=True)
@@ -214,10 +216,10 @@ def _is_regular(scene: Scene, state: State, sublattice: int) -> Present:
 
 
 class _Followers:
-    """Evaluate the rule at some places for small displacements, all at once: (axis, step, place).
+    """Evaluate the rule at some places for all small displacements at once, (axis, step, place).
 
-    The first step is zero. Steps of the particle along each axis come next, with all neighbours
-    fixed, then those of the neighbour at each slot.
+    The first step is zero. It is followed by displacements of the particle along each axis, with
+    all neighbours fixed, and by those of the neighbour at each slot.
     """
 
     def __init__(self, scene: Scene, state: State, sublattice: int, place: Indices) -> None:
@@ -231,8 +233,8 @@ class _Followers:
         self._shape, self._cache = (steps, len(place)), dict[complex, Contributions]()
 
     def response(self, name: str, finite: bool) -> LinearResponse:
-        """Linearise one quantity; raise ValueError if `finite` is demanded and the result is
-        not."""
+        """Linearise one quantity; raise ValueError if `finite` is true and the result is not
+        finite."""
         answer = {"move": self._evaluator.move, "force": self._evaluator.force}[name]
         evaluate = partial(self._evaluate, answer)
         if self._evaluator.rule.linear:
@@ -245,7 +247,7 @@ class _Followers:
             raise ValueError(f"it returned values of {value.dtype}, not real numbers")
         if finite and not (np.isfinite(value).all() and np.isfinite(derivatives).all()):
             raise ValueError(f"its {name} at rest, or a derivative of it, is not finite")
-        # (mover, place, axis of the answer, axis of u)
+        # Axes: mover, place, axis of the response, axis of u.
         centre, *neighbours = np.moveaxis(
             derivatives[:, 1:].reshape(len(derivatives), -1, len(derivatives), self._shape[1]),
             0,
@@ -264,12 +266,14 @@ class _Followers:
             return answer(self._cache[step], self._local._replace(u=displacement))
 
     def _totals(self, step: complex) -> Contributions:
-        """Return the sums over the neighbours after each step.
+        """Return the sums over the neighbours after each displacement.
 
-        A step of one neighbour changes one contribution only.
+        The displacement of one neighbour changes a single contribution.
         """
         axes = len(self._local.u)
-        count = 1 + 2 * axes  # steps that change a slot's contribution: none, own, neighbour's
+        # Steps that change the contribution of a slot: none, those of the particle, those of the
+        # neighbour.
+        count = 1 + 2 * axes
         own_step, neighbour_step = self._steps(step, 1, count), self._steps(step, 1 + axes, count)
         displacement = self._local.u + own_step
         with np.errstate(all="ignore"):
@@ -293,7 +297,7 @@ class _Followers:
         if isinstance(by_slot[0], Vector):
             return vector(self._total(along, common) for along in zip(*by_slot, strict=True))
         if all(np.ndim(values) < 2 for values in by_slot):
-            return sum(by_slot)  # weights, which no step changes
+            return sum(by_slot)  # Weights, which no step changes.
         shape = (2 * common - 1, self._shape[1])
         by_slot = [
             values if np.shape(values) == shape else np.broadcast_to(values, shape)

@@ -98,7 +98,7 @@ def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | No
 
 
 def slowest_swing(mu: Complex) -> Swing | None:
-    """Return the oscillation of the longest period among modes μ of a step, if any μ is not
+    """Return the mode with the longest period among the eigenvalues μ of a step, or None if all are
     real."""
     swinging = mu[np.abs(mu.imag) > STRAIGHT]
     if not len(swinging):
@@ -108,9 +108,9 @@ def slowest_swing(mu: Complex) -> Swing | None:
 
 
 def swings_below(relaxation: float, memory: float) -> float:
-    """Return the real λ below which modes oscillate, 1 - (1 - √b)² / w, for a memory 0 < b < 1.
+    """Return the real λ below which modes oscillate, 1 - (1 - √b)² / w, for momentum 0 < b < 1.
 
-    They do so down to 1 - (1 + √b)² / w.
+    Modes with λ below 1 - (1 + √b)² / w do not oscillate.
     """
     return 1.0 - float((1.0 - np.sqrt(memory)) ** 2) / relaxation
 
@@ -122,7 +122,8 @@ MAX_MULTIPLICATIONS = 1e9
 """Largest number of multiplications that are spent on one spectrum."""
 
 KRYLOV_VECTORS = 20
-"""Number of Krylov vectors, and thus of multiplications a component beside each matrix product."""
+"""Number of Krylov vectors, which is the number of multiplications per component in addition to
+each matrix product."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,8 @@ class Spectrum:
 
 
 class TooDearError(RuntimeError):
-    """The eigenvalues are too close together for a bounded number of matrix products."""
+    """The eigenvalues are so close together that the maximum number of matrix products is
+    exceeded."""
 
 
 def spectrum(matrix: Any) -> Spectrum:
@@ -180,8 +182,8 @@ def spectrum_of(eigenvalues: Complex, symmetric: bool) -> Spectrum:
 def just_below(matrix: Any, edge: float) -> Complex:
     """Compute the eigenvalue of each large block that is nearest to `edge` from below.
 
-    Eigenvalues are compared by their real part, and found by a shifted inverse iteration. Those of
-    small blocks are in `Spectrum.eigenvalues`.
+    Eigenvalues are compared by their real part, and computed by a shifted inverse iteration. Those
+    of small blocks are in `Spectrum.eigenvalues`.
 
     Raises
     ------
@@ -196,9 +198,9 @@ def just_below(matrix: Any, edge: float) -> Complex:
 
 
 def has_symmetric_rows(matrix: Any) -> bool:
-    """Return whether positive factors of its rows make a sparse matrix symmetric.
+    """Return whether a sparse matrix becomes symmetric by multiplying its rows by positive factors.
 
-    Its eigenvalues are real then.
+    Its eigenvalues are then real.
     """
     from scipy.sparse import diags_array
     from scipy.sparse.csgraph import breadth_first_order
@@ -243,7 +245,8 @@ def _hashable(block: Any) -> tuple[Any, ...]:
 
 
 class _Budget:
-    """Count the multiplications of an iteration, and stop it when they are too many."""
+    """Count of multiplications in an iteration, which ends the iteration with TooDearError if there
+    are too many."""
 
     def __init__(self) -> None:
         self._remaining = MAX_MULTIPLICATIONS

@@ -8,7 +8,8 @@ part: a central difference detects this and replaces the result, with about nine
 
 A step multiplies a displacement exp(iθ·c) over repeat cells c by the symbol, a matrix of blocks
 (axis, axis) over sublattices. The eigenvalues of a finite body lie within the range of those of
-plane waves if its frame copies or mirrors displacements. This bound is computed in milliseconds.
+plane waves if its frame copies or mirrors displacements. This bound is computed within
+milliseconds.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def derivative(moved: Moved, shape: tuple[int, ...], unit: float) -> NDArray[np.
         difference: NDArray[np.float64] = (ahead - behind).real / (2 * small)
         try:
             exact: NDArray[np.float64] = array_of(moved(1j * tiny), shape).imag / tiny
-        except (TypeError, ValueError):  # the function accepts no complex numbers
+        except (TypeError, ValueError):  # The function does not accept complex numbers.
             return difference
     finite = np.isfinite(exact) & np.isfinite(difference)
     scale = np.abs(difference).max(initial=1.0, where=finite)
@@ -75,6 +76,7 @@ def array_of(components: tuple[Any, ...], shape: tuple[int, ...]) -> NDArray[Any
 
 
 NOWHERE = Here(cast(Any, None))
+"""Place of a particle for rules that do not depend on it."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any],
 def _derivatives(scene: Scene, slots: Sequence[Slot], at: Here) -> Floats:
     """Compute the derivatives of the move at rest, (1 + slot, axis of the move, axis of u).
 
-    The first is that with respect to the own displacement. All are evaluated at once.
+    The first is the derivative with respect to the displacement of the particle itself.
     """
     count, axes = 1 + len(slots), scene.axes
     steps = np.eye(count * axes).reshape(count, axes, -1)
@@ -185,7 +187,8 @@ WAVES = 48
 MAX_EVALUATIONS = 100_000
 """Largest number of evaluations of a rule by pairs of neighbours: about half a second."""
 LITTLE_MEMORY = 0.9
-"""Up to which plane waves were seen to bound random bodies (tests/stability/test_forecast.py)."""
+"""Largest momentum for which plane waves bounded the spectra of random bodies
+(tests/stability/test_forecast.py)."""
 
 
 @dataclass(frozen=True)
@@ -220,9 +223,9 @@ class Bound:
 def wave_bound(scene: Scene) -> Bound | None:
     """Compute the bound of plane waves for the scene's rule at rest.
 
-    None for rules that depend on the place or accept no single numbers, for neighbourhoods that are
-    searched at every step or have more than some 300 neighbours, and for frames with a lag: the
-    delay can make modes grow that are no plane waves.
+    None for rules that depend on the place or do not accept scalars, for neighbours that are
+    searched at every step or exceed some 300, and for frames with a delay, which can cause growth
+    of modes that are not plane waves.
     """
     if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MAX_EVALUATIONS:
         return None
@@ -235,7 +238,7 @@ def wave_bound(scene: Scene) -> Bound | None:
     except (
         Exception,
         SystemExit,
-    ):  # a failed prediction must not stop a run; the run itself reports the error
+    ):  # A failed prediction must not stop a run; the run reports the error.
         return None
     if not np.isfinite(eigenvalues).all():
         return None
@@ -247,8 +250,8 @@ def wave_bound(scene: Scene) -> Bound | None:
 def bounds_the_body(scene: Scene) -> bool:
     """Return whether plane waves bound the modes of the finite body.
 
-    Particles with fewer neighbours have modes of their own, and so have bodies of several materials
-    and, with much memory, frames on oblique lattices.
+    They may not if particles lack neighbours, for bodies of several materials and, with large
+    momentum, for frames on oblique lattices.
     """
     reach = scene.neighbourhood.reach
     whole = scene.experiment.frame.depth(reach) >= reach and not scene.experiment.rule.varying

@@ -43,9 +43,9 @@ ROUND_ATOL = 1e-3
 DECIMALS = 2
 """Number of decimals from which on an angle counts as not rounded."""
 LOCKING_FACTOR = 0.07
-"""Relative excess stiffness of a body of n cells across is about this factor times c_shear / λ / n.
-
-λ is the smallest stiffness of a cell, of a mode that extends one axis and contracts the other."""
+"""Factor of the relative excess stiffness in bending, which is about this factor times c_shear / λ
+/ n for a body of n cells across. λ is the smallest stiffness of a cell, of a mode that extends one
+axis and contracts the other."""
 MAX_LOCKING = 0.05
 """Relative excess stiffness above which a warning is issued."""
 
@@ -103,15 +103,16 @@ def locking(
 ) -> Iterator[str]:
     """Generate a warning about cells that lock in bending.
 
-    A material that hardly extends along the diagonals of the lattice is stiff in shear and under
-    equal biaxial strain, and compliant under extension along one axis with contraction along the
-    other. Cells resist hourglass modes by their shear stiffness, and cannot bend without these.
+    A material that is almost inextensible along the diagonals of the lattice is stiff in shear and
+    under equal biaxial strain, and compliant under extension along one axis with contraction along
+    the other. Bending requires hourglass modes of the cells, which their shear stiffness resists
+    (locking).
     """
     rule = experiment.rule
     if not isinstance(rule, MixesCells) or (c := rule.elasticity()) is None:
         return
     values, vectors = np.linalg.eigh([[c.xx, c.xy], [c.xy, c.yy]])
-    if vectors[0, 0] * vectors[1, 0] > -0.25:  # the compliant mode is not of that kind
+    if vectors[0, 0] * vectors[1, 0] > -0.25:  # The compliant mode is of another kind.
         return
     sides = [math.hypot(*vector) for vector in raster.cell.vectors]
     ends = zip(*box, sides, strict=True)
@@ -157,7 +158,8 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
 def carried_by_leaders(
     raster: Raster, leading: Sequence[Leading], loads: Loads | None, steps: int
 ) -> Iterator[str]:
-    """Generate a warning for each load on particles that all lead along it while it acts."""
+    """Generate a warning for each load whose particles all lead along its direction while it
+    acts."""
     for n, loading in enumerate(loads.each if loads else ()):
         load = loading.load
         along = np.flatnonzero(load.force_at(max(load.from_, 1))).tolist()
@@ -244,8 +246,8 @@ def angles_in_radians(experiment: Experiment) -> Iterator[str]:
 
 
 def round_in_radians(angle: float) -> bool:
-    """Return whether an angle is a multiple of 15° up to a full turn, in radians with enough
-    decimals.
+    """Return whether an angle equals a multiple of 15° up to a full turn in radians, given with at
+    least `DECIMALS` decimals.
 
     0.7854 is such an angle, 2.88 is not.
     """

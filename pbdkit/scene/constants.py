@@ -1,7 +1,8 @@
-"""Constants and remembered numbers of elementwise functions, and what each is attached to.
+"""Constants and state variables that elementwise functions receive, and the object to which each
+belongs.
 
 A number belongs to the scene, a slot, a cell, a bond or a particle. New kinds of numbers are
-declared here, with the function that receives them and their name; the numpy engine and the kernels
+declared here, with their name and the function that receives them; the numpy engine and the kernels
 use this description.
 """
 
@@ -54,18 +55,16 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import vector
 
 Declared = tuple[Remembered, ...]
-"""Type of the declarations of remembered numbers."""
+"""Type of the declarations of state variables."""
 
 
 def bond_numbers(experiment: Experiment) -> Declared:
-    """Return the numbers that the fracture model remembers for each bond; none if bonds cannot
-    break.
-    """
+    """Return the declarations of the state variables of bonds; none if bonds cannot break."""
     return _declared(experiment.fracture, "fracture") if experiment.fracture.can_break else ()
 
 
 def particle_numbers(experiment: Experiment) -> Declared:
-    """Return the numbers that the rule remembers for each particle."""
+    """Return the declarations of the state variables of particles."""
     return _declared(experiment.rule, "rule")
 
 
@@ -77,7 +76,8 @@ def _declared(part: FollowerRule | FractureModel, field: str) -> Declared:
 
 
 def remembered_names(experiment: Experiment) -> dict[str, str]:
-    """Return the field of the component that remembers each number, by the name of the number.
+    """Return the field of the component that declares each state variable, by the name of the
+    variable.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: 
     """
     part: TakesFields = getattr(experiment, field)
     cell, regions = experiment.lattice.cell(), dict[str, Mask]()
-    # The maximum distance of the corners of cut cells from the body.
+    # Largest distance from the body of the corners of cut cells.
     reach = max(math.hypot(*vector) for vector in cell.vectors)
     if any(isinstance(varying, ByRegion) for varying in part.varying.values()):
         for name, region in experiment.regions.items():
@@ -269,7 +269,7 @@ def kinds_of(part: TakesFields, values: Values) -> tuple[list[Any], NDArray[np.i
 
 
 WHOLE_CELLS = {"left": 1.0, "right": 1.0}
-"""Shares of the cells on both sides of a bond under frames that do not weight cells."""
+"""Area fractions of the cells on both sides of a bond under frames that do not weight cells."""
 Planes = Mapping[str, Floats]
 """Type of numbers on rasters or planes, by name."""
 
@@ -287,11 +287,11 @@ class SceneConstants:
     fracture
         Parameters ``p`` of the fracture model.
     limits
-        Constants ``c`` of the fracture model without remembered numbers, by slot.
+        Constants ``c`` of the fracture model without state variables, by slot.
     of_bond
-        Named tuple of limits and remembered numbers of a bond, ``c``.
+        Named tuple of limits and state variables of a bond, ``c``.
     of_particle
-        Named tuple of remembered numbers of a particle, ``here.own``.
+        Named tuple of state variables of a particle, ``here.own``.
     by_particle
         Spatially varying parameters of the rule by name, (sublattice, cell, cell).
     by_bond
@@ -419,7 +419,8 @@ def of_material(
 
 
 def _named(kind: str, values: Any, **constants: float) -> Any:
-    """Return a named tuple of Python floats; numpy's would promote single precision to double."""
+    """Return a named tuple of Python floats; with numpy's scalars single precision would be
+    promoted to double."""
     if not isinstance(values, dict):
         raise TypeError(f"it returned {type(values).__name__}, not numbers by name: {{'k': 1.0}}")
     names = (*values, *constants)
@@ -438,15 +439,22 @@ def _refuse_other_names(by_slot: dict[Slot, Any], what: str) -> None:
 
 
 class Home(Enum):
-    """Owner of a number."""
+    """Kind of object to which a number belongs."""
 
     SCENE = "scene"
+    """The whole scene."""
     SLOT = "slot"
+    """A slot."""
     CELL = "cell"
+    """A cell, seen from a slot."""
     BOND = "bond"
+    """A bond, as a state variable."""
     PARTICLE = "particle"
+    """A particle, as a state variable."""
     FIXED_BOND = "bond, by a field"
+    """A bond, as a constant that varies in space."""
     FIXED_PARTICLE = "particle, by a field"
+    """A particle, as a constant that varies in space."""
 
 
 @dataclass(frozen=True)
@@ -458,7 +466,7 @@ class Number:
     name
         Name of the number.
     home
-        What it is attached to.
+        Kind of object to which it belongs.
     changes
         Whether it can change during a run.
     """
@@ -483,11 +491,11 @@ class VisibleNumbers:
     weights
         Weights ``w`` of the rule.
     own
-        Remembered numbers of a particle, ``here.own``.
+        State variables of a particle, ``here.own``.
     fracture
         Parameters ``p`` of the fracture model.
     bond
-        Constants and remembered numbers of a bond, ``c``.
+        Constants and state variables of a bond, ``c``.
     """
 
     rule: Numbers
@@ -580,12 +588,13 @@ def _refuse(experiment: Experiment) -> None:
 
 
 def _knows_varying(fracture: FractureModel, rule: FollowerRule) -> bool:
-    """Return whether bonds break by a stiffness that varies in space."""
+    """Return whether the breaking of bonds depends on a stiffness that varies in space."""
     return isinstance(fracture, KnowsStiffness) and bool(rule.varying)
 
 
 def _draws(part: TakesFields) -> bool:
-    """Return whether constant numbers are drawn from the parameters of a component."""
+    """Return whether constant state variables are drawn at random from the parameters of a
+    component."""
     return isinstance(part, Draws) and any(not number.changes for number in part.remembered())
 
 
@@ -611,9 +620,8 @@ def _by_particle(
 
 
 def _refuse_weights(rule: FollowerRule, values: Values, setting: Setting) -> None:
-    """Raise ExperimentError if weights depend on the values: weights of a slot cannot vary in
-    space.
-    """
+    """Raise ExperimentError if weights depend on the values: the weights of a slot cannot vary in
+    space."""
     slots = [slot for ends in setting.slots for slot in ends]
     parts, _ = kinds_of(rule, {name: _ends(value) for name, value in values.items()})
     weights = [[part.weights(slot, setting) for slot in slots] for part in parts]
@@ -687,10 +695,10 @@ def _limits(slot: Slot, rule: FollowerRule, setting: Setting, fracture: Fracture
 def _refuse_parameters(
     experiment: Experiment, constants: SceneConstants, slot: Slot, values: Values
 ) -> None:
-    """Raise ExperimentError if functions of the fracture model depend on values other than by
-    limits.
+    """Raise ExperimentError if functions of the fracture model depend on varying parameters
+    directly, and not through limits.
 
-    Limits are stored for each bond, parameters once.
+    Limits are stored for each bond, parameters once for all bonds.
     """
     fracture = experiment.fracture
     parts, _ = kinds_of(fracture, {name: _ends(value) for name, value in values.items()})
@@ -747,7 +755,7 @@ def _evaluate_arrays(
     try:
         answer = function(part.model_copy(update=dict(values)))
         result = {name: np.asarray(answer[name], float) for name in names}
-    except Exception:  # evaluated place by place instead
+    except Exception:  # The function is evaluated at each place instead.
         return None
     size = next(iter(values.values())).size
     for n in sorted({0, size // 2, size - 1})[:SAMPLE_COUNT]:

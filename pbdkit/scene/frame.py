@@ -179,7 +179,5 @@ class RasterFrame(FrameSites):
 
 
 def _with_ties(distance: Floats) -> Floats:
-    """Return the distance up to which another particle counts as equally near (model.md, section
-    7).
-    """
+    """Return the distance up to which another particle counts as equally near."""
     return distance * (1 + 1e-9)

@@ -26,13 +26,12 @@ from pbdkit.scene.selection import Selecting, shares_of, spacing
 
 
 def rotations_of(experiment: Experiment) -> tuple[tuple[int, int], ...]:
-    """Return the indices of cosine and sine of each rotation among the numbers remembered by the
-    rule.
+    """Return the indices of cosine and sine of each rotation among the state variables of the rule.
 
     Raises
     ------
     PluginError
-        If the rule does not remember a number of that name, or the number is constant.
+        If the rule has no state variable of that name, or the variable is constant.
     """
     rule = experiment.rule
     if not isinstance(rule, TurnsParticles):
@@ -50,13 +49,13 @@ def rotations_of(experiment: Experiment) -> tuple[tuple[int, int], ...]:
 
 
 def check_directions(experiment: Experiment, *, has_frame: bool) -> None:
-    """Check that the rule has the remembered numbers that the experiment requires.
+    """Check that the rule has the state variables that the experiment requires.
 
     Raises
     ------
     ExperimentError
-        If neighbours without remembered numbers occur under a rule that reads them, or leaders are
-        clamped under a rule without directions.
+        If a rule that reads the state variables of neighbours has neighbours without these, or
+        leaders are clamped under a rule without directions.
     """
     rule = experiment.rule
     if shares_particles(rule):
@@ -94,7 +93,7 @@ class Leading:
     axes
         Indices of the axes along which the group leads.
     share
-        Share of each particle in the force of the group, for motion by Newton's law.
+        Fraction of the force on the group that acts on each particle, for motion by Newton's law.
     """
 
     group: LeaderGroup
@@ -105,8 +104,9 @@ class Leading:
     share: Floats | None = None
 
     def is_in(self, to: Restriction) -> Mask:
-        """Return which particles a part of the lattice has; of masses, which move by the forces of
-        their neighbours, those with all neighbours."""
+        """Return a mask of the particles that lie in a part of the lattice. If the group moves by
+        Newton's law, only particles with all their neighbours count, since the forces of these are
+        needed."""
         return (to.is_present if self.share is None else to.is_moving)(self.place)
 
     def restrict(self, to: Restriction) -> Leading:
@@ -152,7 +152,8 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
 
 
 def _meeting(leading: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
-    """Generate the pairs of groups that lead a particle in the same step with different motions."""
+    """Generate the pairs of groups that prescribe different motions of one particle in the same
+    step."""
     groups, rows = [part.group for part in leading], [part.rows for part in leading]
     kinds = {(group.motion, group.from_): n for n, group in enumerate(groups)}
     kind = np.array([kinds[group.motion, group.from_] for group in groups])
@@ -188,7 +189,7 @@ def _refuse_contradiction(
     a, b = sorted((groups[k], groups[n]), key=lambda leading: leading.group.from_)
     shared = np.intersect1d(a.rows, b.rows)
     begin, end = b.group.from_, min(a.group.last(steps), b.group.last(steps))
-    # b starts from the positions at the end of a, unless both start together.
+    # Motion b starts from the positions at the end of a, unless both start at the same time.
     at = raster.reference(shared)
     start = _offset(a.group, begin - 1, at)
     knots = {g.from_ - 1 + n for g in (a.group, b.group) for n in g.motion.knots()}
@@ -216,7 +217,7 @@ def _refuse_unmeasured(
         return
     try:
         outside = np.flatnonzero(np.isnan(group.motion.at(at)).any(axis=1))
-    except RuntimeError as error:  # of Qhull
+    except RuntimeError as error:  # Raised by Qhull.
         text = f"the points cannot be triangulated: {str(error).strip().splitlines()[0]}"
         raise ExperimentError(text, where) from None
     if len(outside):
@@ -234,7 +235,7 @@ def _refuse_infinite(
 ) -> None:
     last = group.last(steps) - group.from_ + 1
     for n in sorted({1, last, *(k for k in group.motion.knots() if k <= last)}):
-        with np.errstate(all="ignore"):  # overflow is reported below
+        with np.errstate(all="ignore"):  # Overflow is reported below.
             finite = n < 1 or np.isfinite(at + group.motion.offset(n, at)).all()
         if not finite:
             raise ExperimentError(
@@ -251,7 +252,7 @@ def _is_comparable(a: LeaderGroup, b: LeaderGroup, at_rest: bool) -> bool:
     if any(isinstance(group.motion, Newton) for group in (a, b)):
         return False
     turns = any(isinstance(group.motion, Rotation) for group in (a, b))
-    latest = max if a.axes or b.axes else min  # positions along an axis of following are unknown
+    latest = max if a.axes or b.axes else min  # Positions along the free axes of a are unknown.
     return not turns or (at_rest and latest(a.from_, b.from_) == 1)
 
 

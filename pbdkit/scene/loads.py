@@ -1,4 +1,4 @@
-"""Loads on a raster: the share of each particle, and the forces at a moment."""
+"""Loads on a raster: the distribution of each load over particles, and the forces at a moment."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Loading:
     rows, place
         Rows and flat places of its particles.
     share
-        Share of each particle in the force, or its area for a body force.
+        Fraction of the force on each particle, or the area of each particle for a body force.
     """
 
     load: Load
@@ -96,7 +96,7 @@ class Loads:
 
     @property
     def courses(self) -> list[Course[float]]:
-        """Courses of the forces that depend on time."""
+        """Time-dependent forces."""
         return [course for loading in self.each for course in loading.load.courses]
 
     def next_change(self, step: int) -> float:
@@ -115,18 +115,7 @@ class Loads:
 def build_loads(
     raster: Raster, tiling: Tiling, cells: WeighedCells | None, experiment: Experiment
 ) -> Loads | None:
-    """Find the particles of every load, and their shares.
-
-    Returns
-    -------
-    Loads or None
-        None if the experiment has no loads.
-
-    Raises
-    ------
-    ExperimentError
-        If a load selects no particle or a frame point, or a force is not finite.
-    """
+    """Find the particles of every load, and the fraction of the load on each."""
     body, loads = Selecting(raster, experiment.regions), list[Loading]()
     for n, load in enumerate(experiment.loads):
         rows = body.select(load.select, ("loads", n, "select"))

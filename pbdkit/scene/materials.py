@@ -31,10 +31,11 @@ ACROSS = [0, 2]
 ALONG = [1]
 """Indices of the components of equal strain in all layers."""
 ISOTROPY_RTOL = 1e-6
-"""Anisotropy of the normals of a border below which it has no direction, as a square in a cell."""
+"""Relative anisotropy of the integral of n nᵀ below which a border has no main direction, as for a
+square inside a cell."""
 DIRECTIONS = 12
-"""Number of directions over which the stiffness is then averaged; divides the symmetry of every
-lattice."""
+"""Number of directions over which the stiffness of such cells is averaged; it divides the symmetry
+of every lattice."""
 
 
 def layered(outer: Floats, inner: Floats, share: Floats, facing: Floats) -> Floats:
@@ -45,7 +46,7 @@ def layered(outer: Floats, inner: Floats, share: Floats, facing: Floats) -> Floa
     outer, inner
         Stiffness of both materials in each cell, (cell, 3, 3).
     share
-        Share of the inner material, (cell,).
+        Area fraction of the inner material, (cell,).
     facing
         Integral of n nᵀ over the border in each cell with its normals n, (cell, 2, 2).
 
@@ -57,7 +58,7 @@ def layered(outer: Floats, inner: Floats, share: Floats, facing: Floats) -> Floa
     """
     whole = facing[:, 0, 0] + facing[:, 1, 1]
     spread = np.array([facing[:, 0, 0] - facing[:, 1, 1], 2 * facing[:, 0, 1]])
-    # The direction of borders along an axis is exact.
+    # The direction is exact for borders along an axis.
     spread[np.abs(spread) <= 1e-9 * whole] = 0.0
     angle = np.arctan2(spread[1], spread[0]) / 2
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -83,7 +84,7 @@ def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Flo
         Stiffness of both materials, (cell, 3, 3), in the components xx, yy and xy with the
         engineering shear strain.
     share
-        Share of the inner material, (cell,).
+        Area fraction of the inner material, (cell,).
     normal
         Normal of the layers, (cell, 2).
 
@@ -118,9 +119,10 @@ def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Flo
 
 
 def _pieces(c: Floats) -> tuple[Any, Any, Any]:
-    """Return the terms of a material that a laminate averages, in the axes of the layers.
+    """Return the terms of a material that are averaged over the layers, in the axes of the layers.
 
-    They are C_nn⁻¹, C_nn⁻¹ C_nt and C_tt - C_tn C_nn⁻¹ C_nt.
+    They are C_nn⁻¹, C_nn⁻¹ C_nt and C_tt - C_tn C_nn⁻¹ C_nt, with n for the components across the
+    layers and t for the component along them.
     """
     across, coupling = c[:, ACROSS][:, :, ACROSS], c[:, ACROSS][:, :, ALONG]
     compliance = np.linalg.inv(across)
@@ -143,7 +145,7 @@ def _to_layers(normal: Floats) -> Floats:
 STIFFNESS = "stiffness"
 """Name of the parameter that scales the stiffness of cells under every rule."""
 SPRINGS = "springs"
-"""Name of the springs that remain of torn cells with a stiffness of their own."""
+"""Name of the springs that torn cells with a different stiffness retain."""
 PLACES = {
     "xx": (0, 0),
     "yy": (1, 1),
@@ -384,7 +386,7 @@ class _Cells:
         return result
 
     def _factors(self, otherwise: Floats) -> Floats:
-        """Return the average stiffness of the parts of cells, relative to the rule."""
+        """Return the mean stiffness over the parts of each cell, relative to the rule."""
         rule = self.experiment.rule
         field, base = rule.varying[STIFFNESS], getattr(rule, STIFFNESS)
         if not isinstance(field, ByRegion):
@@ -396,9 +398,8 @@ class _Cells:
 
     @cached_property
     def _borders(self) -> list[tuple[str, Floats, Floats]]:
-        """Regions that parameters refer to, with the share of each cell and the orientation of the
-        border.
-        """
+        """Regions that parameters refer to, with the area fraction in each cell and the orientation
+        of the border."""
         return [
             (name, *self._shares(region)) for name, region in regions_of(self.experiment).items()
         ]

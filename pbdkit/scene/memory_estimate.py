@@ -1,8 +1,9 @@
-"""Estimates of the memory that a scene and the linear systems of an equilibrium need, made before
-anything of that size is allocated.
+"""Estimates of the memory of a scene and of the linear systems of an equilibrium, made before
+anything large is allocated.
 
-All were measured as the peak of a fresh process above that of its imports, over sheets of 2500 to a
-million particles: within 15 % of these for compact bodies that leaders hold.
+All coefficients are measured, as the peak memory of a new process minus that after its imports, for
+sheets of 2500 to a million particles. For compact bodies that leaders hold the estimates are within
+15 % of the measured values.
 """
 
 from __future__ import annotations
@@ -24,30 +25,34 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 
-LARGEST_DIRECT, LARGEST_ANEW = 3_000, 20_000
-"""Particles up to which `auto` takes a direct solver, and where systems are set up again and again:
-by differences of moves, which are compiled beyond, or at each change of a bond. What works on
-stencils is compiled once a machine."""
+LARGEST_DIRECT = 3_000
+"""Number of particles up to which `auto` selects a direct solver if the system is set up once."""
+LARGEST_ANEW = 20_000
+"""Number of particles up to which `auto` selects a direct solver if systems are set up repeatedly,
+because the rule is nonlinear or bonds break. Beyond it the moves are compiled."""
 
 KERNELS = 48 * 2**20
-"""Bytes of the compiled functions of grids."""
+"""Number of bytes of the compiled functions of grids."""
 SHARED_STENCILS = 160
-"""Bytes a particle of grids on which most particles share a stencil."""
+"""Number of bytes per particle of grids on which most particles share a stencil."""
 SINGLE_STENCILS = 2300
-"""Bytes a particle of grids on which each particle has a stencil, as with a nonlinear rule."""
-SCALAR_MATRIX, SCALAR_MATRIX_EACH = 900, 112
-"""Bytes a particle, and a neighbour besides, of a matrix and its factors where x and y are solved
-apart."""
+"""Number of bytes per particle of grids on which each particle has a separate stencil, as for a
+nonlinear rule."""
+SCALAR_MATRIX = 900
+"""Number of bytes per particle of a matrix and its factors if x and y are solved separately."""
+SCALAR_MATRIX_EACH = 112
+"""Number of bytes per particle and neighbour of such a matrix and its factors."""
 VECTOR_MATRIX_EACH = 800
-"""Bytes a particle and neighbour of a matrix and its factors where they are coupled."""
+"""Number of bytes per particle and neighbour of a matrix and its factors if x and y are coupled."""
 NONLINEAR_MATRICES = 2
-"""Number of matrices that exist at a time where the rule is nonlinear."""
+"""Number of matrices that exist at the same time if the rule is nonlinear."""
 
 
 def equilibrium_size(
     experiment: Experiment, neighbourhood: Neighbourhood, particles: int, grids: bool
 ) -> int:
-    """Bytes of the systems of an equilibrium, on grids where these serve."""
+    """Return the number of bytes of the linear systems of an equilibrium; with `grids` they are
+    multigrid systems if the method permits."""
     linear = experiment.rule.linear and not experiment.obstacles
     if grids and _on_grids(experiment, neighbourhood, particles):
         return KERNELS + particles * (SHARED_STENCILS if linear else SINGLE_STENCILS)
@@ -60,14 +65,14 @@ def equilibrium_size(
 
 
 def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
-    """Return whether stencils are the best method, where they apply."""
+    """Return whether multigrid on stencils is the requested or the fastest method."""
     once = experiment.rule.linear and not experiment.fracture.can_break
     largest = LARGEST_DIRECT if once else LARGEST_ANEW
     return method == "multigrid" or (method == "auto" and particles > largest)
 
 
 def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> bool:
-    """Return whether the lattice's stencils apply."""
+    """Return whether the experiment can use multigrid on stencils."""
     method, cell = experiment.solver.equilibrium.method, neighbourhood.cell
     if not (asks_for_grids(experiment, method, particles) and find_spec("numba")):
         return False
@@ -82,39 +87,51 @@ def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: i
 
 
 MIB = 2**20
+"""Number of bytes in a mebibyte."""
 SMALLEST = 6 * MIB
-"""Bytes of any scene, however small: tables are built in chunks."""
+"""Number of bytes of the smallest scene: tables are built in chunks."""
 
-# Bytes a particle, measured as the peak of the process over sheets of 90 000 to 500 000.
+# Numbers of bytes per particle, measured as the peak of the process for sheets of 90 000 to 500 000
+# particles.
 WORKSPACE = 20
-"""Building of the tables."""
+"""Temporary arrays while the tables are built."""
 BONDS = 80
-"""Table of bonds and the building of it, for each plane of bonds."""
+"""Table of bonds, and temporary arrays while it is built, for each plane of bonds."""
 CELLS = 110
-"""Number of shares of cells."""
+"""Area fractions of cells."""
 FREE_EDGES = 60
-"""A calibrated rule under a frame with points."""
+"""Weights of a calibrated rule under a frame with points."""
 INNER = 130
-"""A rule on the moves of another."""
+"""Moves of an inner rule."""
 LOADS = 60
 """Loads on all particles."""
 MATERIALS = 250
 """Cells of several materials."""
-GRADIENT, FORCES, TABLES = 250, 160, 40
-"""Diagnostics, the first that applies: the displacement gradient, forces, tables."""
-NEW_NEIGHBOURS, NEW_NEIGHBOURS_EACH = 150, 118
-"""Neighbours found at each step, and each of them."""
+GRADIENT = 250
+"""Displacement gradient at all particles, for diagnostics of strain or stress."""
+FORCES = 160
+"""Forces at all particles, for diagnostics of forces."""
+TABLES = 40
+"""Tables by particle, for other diagnostics."""
+NEW_NEIGHBOURS = 150
+"""Search of neighbours at every step."""
+NEW_NEIGHBOURS_EACH = 118
+"""Search of neighbours at every step, for each neighbour."""
 
 CHUNK_BYTES = 2**20
-"""About a chunk of a file: several entries of a column where they are small, a part of one where
-they are large. Columns take whole chunks. Reading the history of a particle touches one chunk a
-batch, reading a snapshot little more than itself."""
+"""Approximate size of a chunk of a file in bytes. If entries are small, a chunk consists of several
+entries of a variable; if they are large, it is a part of an entry. Reading the time series of a
+particle touches one chunk for each batch of steps, and reading a snapshot little more than the
+snapshot."""
 
 OPEN_CHUNK = 1024
 """Number of entries of a chunk along a dimension of unknown length."""
 
-FILE_OVERHEAD, VARIABLE_OVERHEAD = 40_000, 1500
-"""Bytes of a file besides values: of any, and of each variable that grows or is measured."""
+FILE_OVERHEAD = 40_000
+"""Number of bytes of a file without values."""
+VARIABLE_OVERHEAD = 1500
+"""Number of additional bytes of each variable that grows with the steps or belongs to a
+diagnostic."""
 
 
 class TooLargeError(ExperimentError):
@@ -123,8 +140,9 @@ class TooLargeError(ExperimentError):
 
 @dataclass(frozen=True)
 class Sizes:
-    """Estimates: particles (frame included), bytes of the scene while it runs, bytes of its
-    output. The output is in memory too where a run returns a dataset instead of writing a file."""
+    """Estimates of the size of a scene: number of particles (frame included), bytes of memory
+    during a run, and bytes of its output. If a run returns a dataset instead of writing a file, the
+    output is in memory, too."""
 
     particles: int
     memory: int
@@ -134,8 +152,8 @@ class Sizes:
 def sizes_of(
     experiment: Experiment, neighbourhood: Neighbourhood, particles: int, *, grids: bool = True
 ) -> Sizes:
-    """The sizes of a scene with so many particles; `grids` where its lattice and its leaders let
-    grids find an equilibrium, as far as that is known."""
+    """Return the estimated sizes of a scene with this number of particles. `grids` is false if
+    multigrid is known to be impossible for its lattice or leaders."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
     value = 8 if experiment.stepping.precision == "float64" else 4
     state: float = 2 * 2 * value + experiment.parts_bonds * planes * (4 + value)
@@ -154,7 +172,7 @@ def sizes_of(
 
 
 def _workspace(experiment: Experiment, each: int, planes: float) -> float:
-    """Bytes a particle besides state and table, with `each` neighbours."""
+    """Return the number of bytes per particle besides state and table, with `each` neighbours."""
     rule, frame, diagnostics = experiment.rule, experiment.frame, experiment.diagnostics
     workspace = WORKSPACE + experiment.shows_bonds * planes * BONDS
     workspace += INNER * isinstance(rule, AppliesTwice) + LOADS * bool(experiment.loads)
@@ -174,8 +192,8 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
 
 
 def _output(experiment: Experiment, particles: int, planes: float) -> int:
-    """Bytes of the dataset without its final state, with `planes` bonds a particle, all of which
-    may break."""
+    """Return the number of bytes of the dataset without its final state, for `planes` bonds per
+    particle, all of which may break."""
     fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
     records = experiment.record_count
@@ -204,7 +222,8 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
 
 
 def _in_whole_chunks(count: int, entry: float) -> float:
-    """The bytes of a column of the file with so many entries of so many bytes."""
+    """Return the number of bytes of a variable in the file, with `count` entries of `entry`
+    bytes."""
     batch = max(1, min(int(CHUNK_BYTES // max(entry, 1.0)), count))
     return math.ceil(count / batch) * batch * entry
 
@@ -216,9 +235,9 @@ def refuse_too_large(
     layers: int,
     communicator: Communicator = SERIAL,
 ) -> None:
-    """Raises ExperimentError where the scene, or the parts of it that processes of this machine
-    have, cannot fit into its memory, if the body fills its window of site indices; with Python's
-    integers, as windows can be vast."""
+    """Raise ExperimentError if the scene exceeds the memory of the machine, assuming that the body
+    fills its window of site indices. With several processes, the part of each is compared with its
+    share of that memory. Python's integers are used, as windows can be very large."""
     cell = neighbourhood.cell
     share = len(cell.sites) / math.prod(cell.period)
     particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
@@ -236,14 +255,15 @@ def refuse_too_large(
 
 
 def _bytes_of(dtype: str, value: int) -> int:
-    """Return the bytes of one number; numbers that are not whole take `value`."""
+    """Return the number of bytes of a number. Floating-point numbers have `value` bytes."""
     return value if dtype == "f8" else np.dtype(dtype).itemsize
 
 
 def _bytes_an_entry(
     diagnostic: Diagnostic, particles: int, recorded: int, *, in_mm: bool
 ) -> list[float]:
-    """Return the bytes of each variable in the file; with `in_mm` lengths are stored twice."""
+    """Return the number of bytes of one entry of each variable in the file; with `in_mm` lengths
+    are stored twice."""
     sizes = {"particle": particles, "axis": 2, "principal": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     sizes |= {diagnostic.own_dimension: OPEN_CHUNK}

@@ -281,11 +281,8 @@ def way_out(
 
 
 def clearance(x: Any, y: Any, kinds: Any, points: Any, first: Any, radii: Any) -> Any:
-    """Return 0 at places outside all outlines, otherwise minus the depth in the deepest one.
-
-    `kinds`, `first` and `radii` (inner, outer, size) have a row for each outline; `points` are
-    those of all outlines.
-    """
+    """Return 0 at places outside all outlines, otherwise minus the depth in the outline in which
+    the place is deepest."""
     depth = 0.0
     for w in range(len(kinds)):
         inner, outer = radii[w, 0], radii[w, 1]
@@ -302,8 +299,8 @@ def leave(
     """Return the displacement of one particle to the nearest place outside all outlines.
 
     The displacement is (w_x, w_y), in the metric of the particle, and zero if the particle is
-    outside. The particle follows along both axes (`code` 0), leads along x (1), along y (2) or
-    along both (3).
+    outside. `code` is 0 for a particle that is free along both axes, 1 if it is led along x, 2
+    along y, and 3 along both.
     """
     count, n = 0, 0
     for w in range(len(kinds)):
@@ -330,10 +327,10 @@ def way_between(
     """Return the displacement of one particle inside several outlines to a place outside all of
     them.
 
-    Candidates are the nearest points of faces, and the points where two faces meet, that lie in no
-    outline; for a particle that leads along one axis the points on the line along the other. The
-    nearest candidate is chosen. If none lies outside all outlines, the least deep one is chosen; if
-    there is none at all, the displacement is zero.
+    Candidates are the nearest points of faces, and the points where two faces meet; for a particle
+    that is led along one axis, the points of faces on the line along its free axis. The nearest
+    candidate outside all outlines is chosen or, if there is none, the candidate of smallest depth.
+    Without candidates the displacement is zero.
     """
     best, far, bx, by = -math.inf, math.inf, 0.0, 0.0
     for w in range(len(kinds)):
@@ -393,7 +390,8 @@ def _face(
 
 
 def _nearest_on(face: Any, xx: Any, xy: Any, yy: Any) -> Any:
-    """Return the displacement to the nearest point of a face, twice; NaN if there is none."""
+    """Return the displacements to the at most two nearest points of a face; NaN for a missing
+    point."""
     a, b, c, d, shape = face
     wx, wy = math.nan, math.nan
     if shape == CIRCLE:
@@ -406,9 +404,8 @@ def _nearest_on(face: Any, xx: Any, xy: Any, yy: Any) -> Any:
 
 
 def _meeting(face: Any, other: Any) -> Any:
-    """Return the displacements to the at most two points where two faces meet; NaN if there are
-    none.
-    """
+    """Return the displacements to the at most two points where two faces meet; NaN for a missing
+    point."""
     a, b, c, d, shape = face
     p, q, r, s, like = other
     if shape == NOTHING or like == NOTHING:
@@ -421,7 +418,7 @@ def _meeting(face: Any, other: Any) -> Any:
         if _is_off(t, shape) or _is_off(k, like):
             return math.nan, math.nan, math.nan, math.nan
         return a + t * c, b + t * d, a + t * c, b + t * d
-    if shape == CIRCLE and like == CIRCLE:  # on the line through both points
+    if shape == CIRCLE and like == CIRCLE:  # Both points of intersection lie on this line.
         ux, uy = p - a, q - b
         squared = ux * ux + uy * uy
         if squared == 0.0:
@@ -456,9 +453,8 @@ def _square(wx: Any, wy: Any, xx: Any, xy: Any, yy: Any) -> Any:
 def _to_segment(
     a: Any, b: Any, c: Any, d: Any, xx: Any, xy: Any, yy: Any, low: Any, high: Any
 ) -> Any:
-    """Return the displacement to the nearest point of the line (a, b) + t (c, d) with t in [low,
-    high].
-    """
+    """Return the displacement to the nearest point of the segment (a, b) + t (c, d) with t in [low,
+    high]."""
     sx, sy = yy * c - xy * d, xx * d - xy * c
     t = -(a * sx + b * sy) / (c * sx + d * sy)
     t = where(t < low, low, where(t > high, high, t))
@@ -612,7 +608,7 @@ def _refuse_infinite(barrier: Barrier, steps: int, n: int) -> None:
     group = barrier.group
     last = group.last(steps) - group.from_ + 1
     for k in sorted({1, last, *(k for k in group.motion.knots() if k <= last)}):
-        with np.errstate(all="ignore"):  # overflow is reported below
+        with np.errstate(all="ignore"):  # Overflow is reported below.
             finite = k < 1 or np.isfinite(group.motion.offset(k, barrier.reference)).all()
         if not finite:
             raise ExperimentError(
@@ -640,9 +636,9 @@ def collisions(
 ) -> list[str]:
     """Return a warning for each leader group that moves into an obstacle.
 
-    Obstacles do not act on leaders. Positions are compared where motions change, from rest. Groups
-    that move by Newton's law are stopped by obstacles and are not considered, nor are guided
-    particles that can evade along the axis along which they follow.
+    Obstacles do not act on leaders. Positions are compared at the knots of motions, for a body at
+    rest. Groups that move by Newton's law are not considered, since obstacles stop them; guided
+    particles are not considered if they can evade along their free axis.
     """
     slack = SLACK * math.hypot(*raster.cell.vectors[0])
     warnings = []
@@ -674,7 +670,8 @@ def collisions(
 
 
 def _can_evade(outline: Outline, places: Floats, axis: int) -> Mask:
-    """Return which places, (axis, place), have a place outside the outline along the other axis."""
+    """Return a mask of the places, (axis, place), that have a point outside the outline on the line
+    along their other axis."""
     walls, result = Walls.of([outline]), np.zeros(places.shape[1], bool)
     with np.errstate(all="ignore"):
         for k, at in enumerate(places.T):
@@ -684,7 +681,8 @@ def _can_evade(outline: Outline, places: Floats, axis: int) -> Mask:
 
 
 def _moments(leaders: Leading, barrier: Barrier, steps: int) -> Iterator[int]:
-    """Generate the steps at which both are active: the first, the last, and knots of a motion."""
+    """Generate the steps at which both are active: the first, the last, and the knots of their
+    motions."""
     groups = leaders.group, barrier.group
     begin = max(group.from_ for group in groups)
     end = min(group.last(steps) for group in groups)

@@ -1,4 +1,4 @@
-"""Operations of particles on a raster, with the particles of each."""
+"""Particle operations on a raster, and the particles of each."""
 
 from __future__ import annotations
 

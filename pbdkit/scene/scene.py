@@ -1,5 +1,5 @@
-"""Build the scene of an experiment: neighbours, body and frame on rasters, leaders, loads,
-obstacles.
+"""Scene of an experiment, and its construction: neighbours, body and frame on rasters, leaders,
+loads, obstacles.
 
 Only the parts that the experiment uses are built.
 """
@@ -148,8 +148,8 @@ class Ground:
                 row_range=self._row_range,
             )
         cells, tiling = filling.on(raster, self.neighbourhood.tiling), self.neighbourhood.tiling
-        # Without frame points, a cell with a missing corner does not count: the forces between its
-        # other corners would not balance.
+        # Without frame points, a cell with a missing corner does not count, because the forces
+        # between its other corners would not balance.
         if not (cells or self.layers) and isinstance(self.experiment.rule, MixesCells):
             cells = whole_cells(raster, tiling) if tiling.beside else None
         return raster, cells
@@ -242,7 +242,7 @@ class Scene:
         """Return the scene with its time-dependent parameters at the end of a step, or at a moment
         within it.
 
-        The parameters of the scene itself are those of the end of their time dependence.
+        The scene itself has the final values of its time-dependent parameters.
         """
         courses = self._courses
         if all(course.at(moment) == course.last for course in courses):
@@ -255,7 +255,7 @@ class Scene:
 
     @cached_property
     def _courses(self) -> tuple[Course[float], ...]:
-        """Courses of the parameters that depend on time."""
+        """Time-dependent parameters, by their path in the file."""
         return tuple(self.experiment.courses.values())
 
     @cached_property
@@ -271,8 +271,8 @@ class Scene:
         return replace(self, barriers=(), operations=())
 
     def restrict(self, to: Restriction) -> Scene:
-        """Return the scene of some rows, of features that have a method `restrict` with what is
-        theirs of these rows."""
+        """Return the scene of some rows of the lattice. Each feature with a method `restrict` is
+        restricted to these rows."""
         values = {each.name: _restricted(getattr(self, each.name), to) for each in fields(self)}
         return replace(self, **values | {"raster": to.part})
 
@@ -288,8 +288,8 @@ class Scene:
 
     @cached_property
     def home_reach(self) -> tuple[Index, Index]:
-        """Largest differences of repeat cell, backward and forward, at which bonds of a move are
-        stored.
+        """Largest differences of repeat cell, backward and forward, between a particle and the
+        places that store the bonds on which its move depends.
 
         These are the bonds of the particle or, if cells can be torn, of all cells around it.
         """
@@ -442,8 +442,8 @@ def with_inner(scene: Scene) -> Scene:
     Raises
     ------
     ExperimentError
-        If the frame lags, bonds can break, neighbours are re-evaluated or a rule remembers numbers:
-        the moves of the inner rule are not defined then.
+        If the frame has a delay, bonds can break, neighbours are re-evaluated or a rule has state
+        variables: the moves of the inner rule are not defined then.
     """
     experiment, rule = scene.experiment, scene.experiment.rule
     if not isinstance(rule, AppliesTwice):

@@ -22,9 +22,8 @@ COLLINEAR_RTOL = 1e-9
 
 
 def shares_of(raster: Raster, rows: Indices) -> Floats:
-    """Return the shares of the selected particles of a raster in a force on all selected,
-    (particle,).
-    """
+    """Return the fraction of a force on the selected particles of a raster that acts on each,
+    (particle,)."""
     local = rows[raster.is_own(raster.site_of(rows)[:, 0])]
     parts = raster.communicator.allgather((raster.particle_offset + local, raster.reference(local)))
     numbers, at = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -42,8 +41,9 @@ def shares(at: Floats) -> Floats:
     Returns
     -------
     NDArray
-        Share of each particle, (particle,): half the distance to the next particle on both sides if
-        all lie on a line, otherwise equal shares.
+        Fraction of the force on each particle, (particle,). If all lie on a line it is proportional
+        to half the sum of the distances to the two adjacent particles, otherwise it is the same for
+        all.
     """
     order = np.lexsort(at.T)
     offset = at - at[order[0]]
@@ -110,9 +110,8 @@ class Selecting:
         return distinct(rows)
 
     def _edge(self, edge: str) -> Indices:
-        """Return the body particle of smallest or largest i in every row j, or of j in every column
-        i.
-        """
+        """Return the body particle of smallest or largest i in every row j, or of smallest or
+        largest j in every column i."""
         axis = 0 if edge in ("left", "right") else 1
         return self.raster.ends_of_lines(axis, last=edge in ("right", "top"))
 
@@ -130,9 +129,8 @@ class Selecting:
         return self._body[distance <= 0.0]
 
     def nearest(self, points: Iterable[Pair]) -> Indices:
-        """Return the row of the particle nearest to each point, of several the one of lowest
-        number.
-        """
+        """Return the row of the particle nearest to each point; among equally near particles that
+        of the lowest number."""
         targets, raster = list(points), self.raster
         smallest = self.least_distances(targets)
         numbers = np.full(len(targets), NOWHERE)

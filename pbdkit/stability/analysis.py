@@ -1,9 +1,10 @@
 """Stability analysis of an experiment: spectrum of its step operator, rate of convergence, and what
 limits both.
 
-If the step operator is too large for a matrix, the slowest mode is found by inverse iteration on
-ever finer grids, with multigrid on the lattice's stencils; 1 - λ is accurate to 1 %. The smallest
-eigenvalue is then that of plane waves. Edges without a frame may have smaller ones.
+If the step operator is too large to be stored as a matrix, the slowest mode is computed by inverse
+iteration on finer and finer grids, with multigrid on the lattice's stencils; 1 - λ is accurate to 1
+%. The smallest eigenvalue is then taken from plane waves; edges without a frame may have smaller
+ones.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class Spectra:
 
     @cached_property
     def spectrum(self) -> Spectrum | None:
-        """Return the spectrum of the solver's step, with relaxation, memory and lag.
+        """Return the spectrum of the solver's step, with relaxation, momentum and frame delay.
 
         None if it is unknown; `left_out` gives the reason.
         """
@@ -111,7 +112,7 @@ class Spectra:
     def of_rule(self) -> Spectrum | None:
         """Return the spectrum of the rule's own step, without relaxation and memory.
 
-        None if the frame has a lag, or if the spectrum is unknown.
+        None if the frame has a delay, or if the spectrum is unknown.
         """
         return self._rule_spectrum[0]
 
@@ -124,7 +125,7 @@ class Spectra:
     def _rule_spectrum(self) -> tuple[Spectrum | None, bool]:
         """Compute or estimate the spectrum of the rule's step.
 
-        Large bodies are estimated first, by the grids that solve them.
+        For large bodies an estimate by multigrid is tried first.
         """
         is_large = self.scene.raster.count > LARGEST_ANEW
         if is_large and (result := self.estimate.spectrum):
@@ -141,14 +142,14 @@ class Spectra:
         try:
             with one_thread():
                 return spectrum(matrix())
-        except RuntimeError:  # too expensive, or no convergence of ARPACK
+        except RuntimeError:  # Too expensive, or ARPACK did not converge.
             return None
 
     def rule_matrix(self) -> Any:
         """Return the matrix of the rule's own step.
 
-        Without lag, the coupling with the previous step is -b where particles move, so that the sum
-        of both does not depend on the memory.
+        Without frame delay, the coupling to the previous step is -b for all followers, so that the
+        sum of both couplings does not depend on momentum.
         """
         steady = self.operator.couplings_steady.entries()
         scale, unknowns = (
@@ -164,7 +165,8 @@ class Spectra:
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
 """Fractions to which the slowest mode decays in `Analysis.steps_to`."""
 NEAR = 0.9
-"""Fraction of the bound of plane waves above which edges without a frame need a warning."""
+"""Ratio to the bound of plane waves above which a relaxation causes a warning if edges have no
+frame."""
 
 
 @dataclass(frozen=True)
@@ -344,10 +346,10 @@ class Analysis:
         if 0.0 < memory < 1.0 and rule_spectrum.largest > (
             edge := swings_below(relaxation, memory)
         ):
-            # The slowest modes do not oscillate; those at the limit may not be computed yet.
+            # The slowest modes do not oscillate; those at the limit may not have been computed yet.
             try:
                 eigenvalues = np.append(eigenvalues, just_below(self.spectra.rule_matrix(), edge))
-            except RuntimeError:  # too expensive, or no convergence of ARPACK
+            except RuntimeError:  # Too expensive, or ARPACK did not converge.
                 return None
         return slowest_swing(modes(eigenvalues, relaxation, memory))
 
@@ -386,7 +388,7 @@ class Analysis:
 
     @property
     def _slowness(self) -> float:
-        """Return 1 / (1 - λ) of the slowest decaying mode, without memory."""
+        """Return 1 / (1 - λ) of the slowest decaying mode, without momentum."""
         assert self.spectrum
         rule_spectrum = self.spectra.of_rule or self.spectrum
         decays = 1.0 - rule_spectrum.eigenvalues.real
@@ -440,7 +442,7 @@ class Analysis:
     def _growth(self) -> list[str]:
         """Warn of modes that grow, or never decay."""
         if not self.scene.experiment.solver.makes_steps and self.largest_stable_relaxation:
-            return []  # steps with that relaxation would lead there too
+            return []  # Steps with that relaxation would lead to equilibrium, too.
         if self.stable is False:
             bound = self.largest_stable_relaxation
             remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
@@ -558,7 +560,7 @@ class StabilityEstimate:
             return None
         relative_slowness = self._scene.experiment.stepping.relaxation * mode.slowness
         largest = 1.0 - 1.0 / relative_slowness
-        # A constrained body has no modes that change their sign in every step.
+        # A constrained body has no modes that change sign in every step.
         smallest = (
             max(waves.smallest, -largest) if waves.smallest >= -1.0 - NEUTRAL else waves.smallest
         )

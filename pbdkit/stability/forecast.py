@@ -1,9 +1,10 @@
 """Forecast of a run before its first step: stability, supports, memory and time.
 
-`pbdkit check` reports it, and `pbdkit run` warns of what is known quickly. Leaders with a mass: the
-symplectic Euler method is stable for ω ≤ 2. Supports: a part of the body resists no rigid-body
-motion by itself. If leaders do not constrain such a motion and the loads do work along it, there is
-no equilibrium, and the steps do not converge.
+`pbdkit check` reports the forecast, and `pbdkit run` issues those of its warnings that are computed
+quickly.¶Two of the checks are: steps of leaders with a mass are stable if ω ≤ 2, the limit of the
+symplectic Euler method with a step of 1. A part of the body resists rigid-body motions by its
+supports alone; if leaders do not constrain such a motion and the loads do work along it, there is
+no equilibrium, and steps do not converge.
 """
 
 from __future__ import annotations
@@ -236,7 +237,8 @@ def _too_short(analysis: Analysis) -> list[str]:
 
 
 def _divergence_in_time(scene: Scene) -> list[str]:
-    """Warn of steps that diverge within the run with other parameters than the last."""
+    """Warn of steps that diverge during the run with earlier values of time-dependent
+    parameters."""
     from pbdkit.stability.analysis import Analysis
 
     courses, steps = scene.experiment.courses, scene.experiment.steps
@@ -298,7 +300,7 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
 def refuse_unheld_loads(scene: Scene) -> None:
     """Raise the ExperimentError of the run if loads act on a part of the body without supports.
 
-    Equilibria only: such a part has none.
+    The check applies to equilibria only, which such a part does not have.
     """
     if scene.experiment.solver.makes_steps or not scene.loads:
         return
@@ -323,7 +325,7 @@ def _missing_supports(scene: Scene) -> list[str]:
 
 
 def outlook(scene: Scene) -> list[str]:
-    """Return warnings that are known in less than a second, besides `quick_warnings`.
+    """Return warnings that are computed within a second, in addition to `quick_warnings`.
 
     They concern supports and, for small bodies, what prevents convergence.
     """
@@ -333,7 +335,7 @@ def outlook(scene: Scene) -> list[str]:
     from pbdkit.stability.analysis import Analysis
 
     analysis = Analysis(scene)
-    with suppress(PbdkitError):  # `check` reports the reason
+    with suppress(PbdkitError):  # `check` reports the reason.
         warnings += [*analysis.obstructions(), *_too_short(analysis)]
     return warnings
 
@@ -353,7 +355,7 @@ def refuse_too_much_output(scene: Scene) -> None:
 
 
 MAX_PARTICLES = 20_000
-"""Number of particles above which the body is taken as connected."""
+"""Number of particles above which the body is assumed to be connected."""
 IS_ZERO = 1e-13
 """Relative tolerance for zero eigenvalues of the supports."""
 
@@ -417,7 +419,8 @@ def _parts(scene: Scene) -> Iterator[Indices]:
     body_row[rows] = np.arange(len(rows))
     ends = body_row[scene.bonds.ends]
     ends = ends[(ends >= 0).all(axis=1)]
-    # Imported here: only bodies in several parts need it, and scipy takes long to import.
+    # Imported here because only bodies in several parts need it, and the import of scipy takes
+    # long.
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 

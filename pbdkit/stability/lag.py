@@ -1,19 +1,19 @@
-"""Lag of a body behind its equilibrium while leaders move at a steady speed, computed from the
-influence of leaders and frame points on followers.
+"""Distance of a body from its equilibrium while leaders move at a steady speed.
 
-A step moves the leaders first, then the followers. Frame points are still those of the end of the
-step before, and those that follow leaders show their earlier displacements (with the frame's lag,
-one step earlier still). With S the part of L that acts through frame points,
+In a step the leaders move first, then the followers. Frame points have the displacements of the end
+of the step before, so that those that follow leaders have their earlier displacements (with frame
+delay, of one more step before). With the influence L of leaders on followers, and its part S that
+acts through frame points,
 
     u(t+1) = P u(t) + Q u(t-1) + (L - S) u_L(t+1) + S u_L(t - lag) + s,
 
-and leaders that move by v a step, the equilibrium u* moves by δ, A δ = L v, A = 1 - P - Q. The
-distance e = u* - u obeys
+If leaders move by v in a step, the equilibrium u* moves by δ, with A δ = L v and A = 1 - P - Q. The
+difference e = u* - u obeys
 
     e(t+1) = P e(t) + Q e(t-1) + δ + Q δ - (L - S) v + lag · S v,
 
-and becomes steady: A e = P δ if S = 0 and Q = 0. For the barycentre on a sheet of the square
-lattice, l long between its ends and with spacing h, that is at most 4 v l² / (9 √3 h²).
+and converges to a steady value: A e = P δ if S = 0 and Q = 0. For the barycentre rule on a sheet of
+a square lattice of length l with spacing h, it is at most 4 v l² / (9 √3 h²).
 """
 
 from __future__ import annotations
@@ -101,14 +101,14 @@ def boundary_coupling(scene: Scene, state: State, step: int) -> BoundaryCoupling
 MAX_PRODUCTS = 2e8
 """Largest number of products that are computed for the lag at the end of an interval."""
 EARLY_FRACTION = 0.01
-"""Fraction of 1 / (1 - λ) steps up to which the decay of the distance is negligible."""
+"""Fraction of 1 / (1 - λ), in steps, up to which the decay of the difference is negligible."""
 MIN_ACCURACY = 1e-12
 """Smallest tolerance of the linear solver."""
 
 
 @dataclass(frozen=True)
 class Lag:
-    """Lag of the body in the steps in which a leader moves fastest.
+    """Distance of the body from its equilibrium in the steps in which a leader moves fastest.
 
     Lengths are in lattice units. They hold for linear rules as long as no bond breaks.
 
@@ -137,7 +137,7 @@ class Lag:
         return self.steady if self.reached is None else self.reached
 
     def late(self, bond: float, units: Units | None = None) -> list[str]:
-        """Warn of a lag larger than a bond, in mm if the scene has units."""
+        """Warn of a distance larger than a bond, in mm if the scene has units."""
         if self.size <= bond:
             return []
         mm, unit = in_lengths(units) if units else (1.0, "")
@@ -219,9 +219,9 @@ class Trail:
 def lag_of(
     scene: Scene, state: State, system_at: Callable[[int], System | None], slowness: float
 ) -> Lag | None:
-    """Compute the lag in the fastest interval of two steps or more.
+    """Compute the distance from equilibrium in the fastest interval of at least two steps.
 
-    A displacement in a single step is no speed, and neither is an oscillation.
+    A displacement in a single step, or an oscillation, has no steady speed.
 
     Parameters
     ----------
@@ -272,7 +272,8 @@ def _reached_exactly(scene: Scene, trail: Trail, first: int, steps: int) -> floa
 def _reached_about(
     scene: Scene, trail: Trail, system: System, slowness: float, steps: int
 ) -> float | None:
-    """Compute the same to 10 % if the step has no memory, e = (1 - Pⁿ) A⁻¹ push.
+    """Compute max |e| after some steps to 10 %, by e = (1 - Pⁿ) A⁻¹ push, for steps without
+    momentum.
 
     At first all increments are added; later P is projected on the span of A⁻¹ push and A⁻² push.
     """

@@ -1,9 +1,9 @@
-"""Optimal relaxation w and memory b: the values with which the slowest mode of a rule decays
-fastest, and the choice of `auto` for a scene.
+"""Optimal relaxation w and momentum b, for which the slowest mode of a rule decays fastest, and the
+choice of `auto` for a scene.
 
-A mode with the eigenvalue λ of the rule's own step becomes two, μ² - (1 + b - wz) μ + b = 0 with z
-= 1 - λ: the heavy ball method (Polyak 1964). For real z from m to M the optimum is where the moduli
-at both ends are equal, and both roots meet at an end.
+A mode with the eigenvalue λ of the rule's own step becomes two modes with the eigenvalues μ of μ² -
+(1 + b - wz) μ + b = 0, z = 1 - λ (heavy-ball method, Polyak 1964). For real z from m to M, at the
+optimum the moduli of μ at both ends are equal, and the two roots at an end coincide.
 
 The modes are those of the rule's own step at rest, with the roles of the last step. All are
 computed if the groups of coupled unknowns are small. Otherwise the ends of the spectrum are
@@ -52,7 +52,7 @@ MIN_GAP = 1e-4
 
 
 class StepWeights(NamedTuple):
-    """Parameters of the solver: relaxation w and memory b."""
+    """Parameters of the solver: relaxation w and momentum b."""
 
     relaxation: float
     memory: float
@@ -64,7 +64,7 @@ class StepWeights(NamedTuple):
 
 
 class HopelessError(ValueError):
-    """No relaxation and memory let all modes decay; the message gives the reason."""
+    """No relaxation and momentum let all modes decay; the message gives the reason."""
 
 
 def best_weights(
@@ -77,12 +77,12 @@ def best_weights(
     eigenvalues : (n,)
         Eigenvalues λ of the rule's own step.
     relaxation, memory
-        Prescribed numbers; None for numbers to be chosen.
+        Prescribed values; None for values to be chosen.
 
     Raises
     ------
     HopelessError
-        If no such numbers let all modes decay.
+        If no such values let all modes decay.
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z):
@@ -115,8 +115,8 @@ def _best_for_real(m: float, M: float, w: float | None, b: float | None) -> Step
 
 
 def _best_for_complex(eigenvalues: Complex, w: float | None, b: float | None) -> StepWeights:
-    """Search the optimum: over 1 - √b on a logarithmic scale, and over w below its bound for each
-    b."""
+    """Search for the optimum: over 1 - √b on a logarithmic scale, and for each b over w below its
+    bound."""
 
     def weights_for(memory: float) -> StepWeights:
         if w is not None:
@@ -149,7 +149,7 @@ def _minimise(function: Any, low: float, high: float) -> float:
 
 
 MARGIN = 0.02
-"""Relative margin of the ends of a spectrum from iteration, which may be too close together."""
+"""Relative margin of the ends of a spectrum from iteration, which may underestimate its width."""
 ROUGH = 1e-3
 """Relative accuracy of solutions."""
 MOVES = 24
@@ -226,8 +226,8 @@ def with_solver(scene: Scene, solver: Stepping) -> Scene:
 
 
 def _eigenvalues(scene: Scene, rest: State) -> tuple[Complex, bool]:
-    """Return the relevant eigenvalues of the rule's own step, and whether all others surely lie
-    between."""
+    """Return the relevant eigenvalues of the rule's own step, and whether all others are known to
+    lie between them."""
     kinds = kinds_at(scene.raster, scene.leading, scene.experiment.steps)
     followers = np.flatnonzero(kinds == FOLLOWER)
     if len(followers) <= scene.axes * DENSE:
@@ -245,7 +245,7 @@ def _largest_block_size(entries: CoordinateMatrix) -> int:
 
 def _ends(scene: Scene, rest: State, place: NDArray[np.intp]) -> tuple[Complex, bool]:
     """Return the largest and the smallest 1 - λ, moved apart by a margin, and whether all λ are
-    surely real."""
+    known to be real."""
     from pbdkit.equilibrium.linearise import linearised
     from pbdkit.equilibrium.system import PUSH, Moves, one_thread
 
@@ -300,7 +300,7 @@ def _largest(product: Callable[[Floats], Floats], start: Floats, iterations: int
     basis, hessenberg = [start / np.linalg.norm(start)], np.zeros((iterations + 1, iterations))
     for n in range(iterations):
         v = product(basis[-1])
-        for _ in range(2):  # twice, to remove rounding errors of the orthogonalisation
+        for _ in range(2):  # Repeated, to remove rounding errors of the orthogonalisation.
             coefficients = np.array([vector @ v for vector in basis])
             hessenberg[: n + 1, n] += coefficients
             v = v - coefficients @ np.array(basis)
