@@ -251,7 +251,7 @@ class Rows:
 
 
 ALL: Final = Rows()
-"""All rows, in a single process."""
+"""Rows of a lattice that is stored in a single process."""
 
 
 @cache

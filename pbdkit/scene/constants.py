@@ -442,19 +442,19 @@ class Home(Enum):
     """Kind of object to which a number belongs."""
 
     SCENE = "scene"
-    """The whole scene."""
+    """One value for the whole scene."""
     SLOT = "slot"
-    """A slot."""
+    """One value for each slot."""
     CELL = "cell"
-    """A cell, seen from a slot."""
+    """One value for each cell beside a slot."""
     BOND = "bond"
-    """A bond, as a state variable."""
+    """One value for each bond, as a state variable."""
     PARTICLE = "particle"
-    """A particle, as a state variable."""
+    """One value for each particle, as a state variable."""
     FIXED_BOND = "bond, by a field"
-    """A bond, as a constant that varies in space."""
+    """One value for each bond, constant in time."""
     FIXED_PARTICLE = "particle, by a field"
-    """A particle, as a constant that varies in space."""
+    """One value for each particle, constant in time."""
 
 
 @dataclass(frozen=True)
