@@ -34,7 +34,7 @@ SHORT = 90
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the directives."""
+    """Register the directives with Sphinx."""
     app.add_directive("commands", Commands)
     app.add_directive("keys", Keys)
     return {"parallel_read_safe": True}

@@ -29,7 +29,7 @@ R = TypeVar("R")
 def _method(
     function: Callable[Concatenate[xarray.Dataset, P], R],
 ) -> Callable[Concatenate[PbdAccessor, P], R]:
-    """Return the function as a method whose dataset is that of the accessor."""
+    """Return the function as a method that uses the dataset of the accessor."""
 
     @wraps(function)
     def call(accessor: PbdAccessor, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -104,5 +104,5 @@ class PbdAccessor:
 
     def physical(self) -> xarray.Dataset:
         """The dataset in mm, mm² and, of stresses, forces and energies, MPa, N and mJ, as far as
-        variables say their scale: those of experiments with `units`."""
+        variables have a scale: those of experiments with `units`."""
         return in_physical_units(self._dataset)

@@ -155,7 +155,7 @@ class ReproducibilityWarning(PbdkitWarning):
 
 
 class StorageWarning(PbdkitWarning):
-    """A file has no seal, or a part of it was damaged and is computed anew."""
+    """A file has no seal, or a part of it was damaged and is computed again."""
 
 
 class SweepWarning(PbdkitWarning):

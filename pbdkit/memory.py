@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 LIBRARIES = 2**30
-"""Address space in bytes for the libraries that are loaded (560 MiB were measured with a kernel
-compiled anew). Some of them crash or hang with less."""
+"""Address space in bytes for the libraries that are loaded (560 MiB were measured while a
+kernel was compiled). Some of them crash or hang with less."""
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
 """File with the memory limit of a container."""
 

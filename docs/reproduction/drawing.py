@@ -1,4 +1,4 @@
-"""The pictures: configurations over filled contours, histories, curves. No pyplot, no display."""
+"""Draw configurations over filled contours, histories and curves, without pyplot and display."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -31,8 +31,8 @@ LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
 
 @dataclass(frozen=True)
 class Shot:
-    """One step: positions, kinds and values of particles, the rows of both ends of whole bonds, and
-    of the corners of triangles without a broken side."""
+    """Positions, kinds and values of particles in one step, with the rows of both ends of unbroken
+    bonds, and of the corners of triangles without a broken side."""
 
     position: Floats
     kind: np.ndarray
@@ -42,7 +42,7 @@ class Shot:
 
 
 def shots_of(sheet: Sheet, steps: Sequence[int], color: str) -> list[Shot]:
-    """Recorded steps, with that variable."""
+    """Return recorded steps, with a variable for the colour."""
     recording = Trajectory(sheet.ds, color)
     body = recording.body
     rows = np.flatnonzero(body.inside)
@@ -56,7 +56,7 @@ def shots_of(sheet: Sheet, steps: Sequence[int], color: str) -> list[Shot]:
 
 
 def save(figure: Figure, name: str, folder: Path = FOLDER) -> str:
-    """Writes a PNG with a palette, without date and software, so that a rerun changes nothing."""
+    """Write a PNG with a palette, without date and software, so that a rerun changes nothing."""
     folder.mkdir(parents=True, exist_ok=True)
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.06)
@@ -68,8 +68,8 @@ def save(figure: Figure, name: str, folder: Path = FOLDER) -> str:
 def configurations(
     sheet: Sheet, times: Sequence[int], name: str, color: str = "pe1", over: str = "sheet"
 ) -> str:
-    """Panels of the steps paper time - 1, each with its own scale of the variable. Its contours
-    lie over the sheet as it is; where that folds, over it at `rest`, or over `nothing`."""
+    """Draw panels of the steps paper time - 1, each with its own scale of the variable. Contours
+    are drawn over the current sheet or, if it folds, over it at `rest` or over `nothing`."""
     shots = shots_of(sheet, [time - 1 for time in times], color)
     low = np.min([s.position.min(axis=0) for s in shots], axis=0) - 0.8
     high = np.max([s.position.max(axis=0) for s in shots], axis=0) + 0.8
@@ -98,7 +98,7 @@ def configurations(
 
 
 def _configuration(ax: Axes, shot: Shot, color: str) -> None:
-    """One panel: contours over the unbroken body, bonds, kinds, a scale where it is not flat."""
+    """Draw one panel: contours over the unbroken body, bonds, kinds, and a scale if values vary."""
     values = shot.values[np.unique(shot.triangles)]
     top = float(values.max()) if len(values) else 0.0
     if top > 1e-12:
@@ -128,7 +128,7 @@ def abreast(
     name: str,
     box: tuple[float, float, float, float],
 ) -> str:
-    """One recorded step of several runs, side by side in one box, each with its own scale."""
+    """Draw one recorded step of several runs, side by side, each with its own scale."""
     shots = [shots_of(sheet, [step], color)[0] for sheet in sheets.values()]
     left, right, bottom, top = box
     wide = PAGE_IN / len(shots)
@@ -144,7 +144,7 @@ def abreast(
 
 
 def numbered(sheet: Sheet, name: str) -> str:
-    """The lattice at rest with the numbers of the particles."""
+    """Draw the lattice at rest with the numbers of the particles."""
     figure = Figure((PAGE_IN * 0.72, PAGE_IN * 0.72), layout="constrained")
     ax = figure.add_subplot()
     ax.margins(0.08)
@@ -163,7 +163,7 @@ def numbered(sheet: Sheet, name: str) -> str:
 def histories(
     series: Mapping[str, tuple[Sheet, int, int]], name: str, steps: int, *, log: bool = False
 ) -> str:
-    """x, y and PE1 of one particle against the step, a line a run; (sheet, column, row) each."""
+    """Draw x, y and PE1 of one particle over the step, one line for each (sheet, column, row)."""
     figure = Figure((PAGE_IN, 2.5), layout="constrained")
     panels = [figure.add_subplot(1, 3, n + 1) for n in range(3)]
     for n, (label, (sheet, column, row)) in enumerate(series.items()):
@@ -187,7 +187,7 @@ def histories(
 def curves(
     lines: Mapping[str, tuple[Floats, Floats]], labels: tuple[str, str], name: str, **axis: object
 ) -> str:
-    """One pair of axes with lines of (x, y)."""
+    """Draw one pair of axes with lines of (x, y)."""
     figure = Figure((PAGE_IN * 0.62, 3.0), layout="constrained")
     ax = figure.add_subplot()
     for n, (label, (x, y)) in enumerate(lines.items()):

@@ -1,7 +1,7 @@
-"""Makes the picture of docs/validation/oscillation.md: ``python docs/reproduction/oscillating.py``.
+"""Draw the picture of docs/validation/oscillation.md: ``python docs/reproduction/oscillating.py``.
 
-Left: the shipped experiment that swings, with the decay of the closed form. Right: for which
-relaxation and memory the barycentre on a square sheet settles, and where its slowest mode swings.
+Left: the oscillating shipped experiment, with the decay of the closed form. Right: relaxations and
+memories for which the barycentre on a square sheet converges, and its slowest mode oscillates.
 """
 
 import math
@@ -18,7 +18,7 @@ NAME, PARTICLE, LET_GO = "stability/oscillation", 116, 300
 
 
 def main() -> None:
-    """Writes pictures/oscillation.png."""
+    """Write pictures/oscillation.png with both panels."""
     figure = Figure((7.4, 2.9), layout="constrained")
     left, right = figure.subplots(1, 2)
     _swing(left)
@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def _swing(ax: Axes) -> None:
-    """y of the middle of the sheet after it is let go, and its largest excursion times √b^t."""
+    """Draw y of the middle of the sheet after its release, and the envelope with √b^t."""
     experiment = pbdkit.load(NAME)
     ds = pbdkit.run(experiment, progress=False)
     found = pbdkit.analyse(experiment).swing(1.0, experiment.solver.memory)
@@ -64,7 +64,7 @@ def _region(ax: Axes) -> None:
     ax.plot([1.0], [0.0], "o", color=LINES[5], ms=3.5)
     ax.annotate("the paper's rule", (1.0, 0.0), (-4, -12), textcoords="offset points", fontsize=7)
     ax.text(0.35, 0.2, "creeps", fontsize=7)
-    ax.text(1.1, 0.9, "slowest mode swings", fontsize=7)
+    ax.text(1.1, 0.9, "slowest mode oscillates", fontsize=7)
     ax.text(1.45, -0.55, "diverges\n(w > 1 + b)", fontsize=7)
     ax.set(xlim=(0, 2.2), ylim=(-1.1, 1.1), xlabel="relaxation w", ylabel="memory b")
     ax.set_title("barycentre, square 4, 20 columns", fontsize=8.5)

@@ -1,4 +1,4 @@
-"""Runs of shipped experiments, each once, and what the page reads off them."""
+"""Run shipped experiments, each once, and evaluate the quantities of the page."""
 
 from functools import cache
 from typing import Any
@@ -12,7 +12,7 @@ from pbdkit.model.reading import read_text
 
 Floats = NDArray[np.float64]
 LEADER, BODY = 0, 0
-"""A kind and a role, as the datasets' flags say."""
+"""Values of `kind` and `role` in datasets."""
 COLUMNS = ROWS = 10
 """Every case is a grid of this size; its marked particles are named by column and row from 0."""
 
@@ -27,13 +27,13 @@ class Sheet:
         self.columns, self.rows = (int(n) + 1 for n in self.site[self.body].max(axis=0))
 
     def on_grid(self, values: Floats) -> Floats:
-        """(time, particle, ...) as (time, column, row, ...); the body counts column by column."""
+        """Return (time, particle, ...) as (time, column, row, ...); the body counts by columns."""
         shape = (len(values), self.columns, self.rows, *values.shape[2:])
         return values[:, self.body].reshape(shape)
 
     @property
     def position(self) -> Floats:
-        """(time, particle, axis)."""
+        """Positions of all particles, (time, particle, axis)."""
         return self.ds["position"].transpose("time", "particle", "axis").values
 
     @property
@@ -42,24 +42,24 @@ class Sheet:
         return self.on_grid(self.position - self.ds["reference"].values)
 
     def of(self, variable: str) -> Floats:
-        """A diagnostic of the body, (time, column, row)."""
+        """Return a diagnostic of the body, (time, column, row)."""
         return self.on_grid(self.ds[variable].transpose("time", "particle").values)
 
     def number(self, column: int, row: int) -> int:
-        """The number of a body particle."""
+        """Return the number of a body particle."""
         return int(self.ds["number"].values[(self.site == (column, row)).all(axis=1)][0])
 
     def spread(self) -> float:
-        """The largest difference of u_x between rows of one column, at any step."""
+        """Return the largest difference of u_x between rows of one column, at any step."""
         return float(np.ptp(self.u[..., 0], axis=2).max())
 
     def residual(self) -> float:
-        """The largest |u| of the piece left of the torn column, at the last step."""
+        """Return the largest |u| of the piece left of the torn column, at the last step."""
         return float(np.linalg.norm(self.u[-1, :-1], axis=-1).max())
 
     def longest_bond(self) -> tuple[float, int]:
-        """The length of the longest bond where bonds are judged, and its step: in the intermediate
-        configuration, with the leaders where the step takes them and all else where it was."""
+        """Return the length of the longest bond in an intermediate configuration, and its step: the
+        leaders have their new positions, all other particles the previous ones."""
         place, leads = self.position, self.ds["kind"].values[1:, :, None] == LEADER
         judged = np.where(leads, place[1:], place[:-1])
         across = judged[:, self.ds["bond_ends"].values - 1]
@@ -69,13 +69,13 @@ class Sheet:
 
 @cache
 def run(name: str, *settings: str) -> Sheet:
-    """A shipped experiment with settings, as at the command line; each is run once."""
+    """Run a shipped experiment with settings, as at the command line; each is run once."""
     experiment = pbdkit.load(name, settings=list(settings))
     return Sheet(pbdkit.run(experiment, progress=False))
 
 
 def run_parts(**parts: Any) -> Sheet:
-    """An experiment made of its parts, on the square lattice with the barycentre by default."""
+    """Run an experiment made of its parts, by default the barycentre on the square lattice."""
     usual = {"name": "parts", "lattice": {"type": "square", "a": 1.0}}
     parts = usual | {"rule": {"type": "barycentre"}} | parts
     return Sheet(pbdkit.run(pbdkit.Experiment(**parts), progress=False))
@@ -83,13 +83,13 @@ def run_parts(**parts: Any) -> Sheet:
 
 @cache
 def run_text(text: str) -> Sheet:
-    """An experiment in YAML, as it stands on a page; each is run once."""
+    """Run an experiment in YAML, as printed on a page; each is run once."""
     experiment = pbdkit.Experiment.build(read_text(text, "page"))
     return Sheet(pbdkit.run(experiment, progress=False))
 
 
 def parted(sheet: Sheet) -> list[int | None]:
-    """For each row the step at which its leader lost its last bond to the column beside it."""
+    """Return, for each row, the step at which its leader lost its last bond to the next column."""
     ends, steps = sheet.ds["bond_ends"].values - 1, sheet.ds["broken_step"].values
     last = sheet.columns - 1
     first, second = sheet.site[ends[:, 0]], sheet.site[ends[:, 1]]
@@ -105,14 +105,14 @@ def parted(sheet: Sheet) -> list[int | None]:
 
 
 def edges_first(rows: list[int | None]) -> bool:
-    """Whether both outermost rows part before every other row."""
+    """Return whether both outermost rows part before every other row."""
     late = [10**6 if step is None else step for step in rows]
     return max(late[0], late[-1]) < min(late[1:-1])
 
 
 def rebound(x: Floats, least: float = 0.01) -> tuple[int, float, float] | None:
-    """Step and value of the first low of a series that turns from falling to rising, and the
-    largest value after it, where that is at least `least` more; None where there is no such."""
+    """Return step and value of the first minimum of a series, and the largest value after it, if
+    that is at least `least` more; None if there is no such minimum."""
     change = np.diff(x)
     for low in np.flatnonzero((change[:-1] < -1e-9) & (change[1:] > 1e-9)) + 1:
         if x[low:].max() - x[low] >= least:
@@ -121,7 +121,7 @@ def rebound(x: Floats, least: float = 0.01) -> tuple[int, float, float] | None:
 
 
 def in_the_gap(sheet: Sheet) -> int:
-    """Frame points further than 1.5 from either side of the gap, at the last step."""
+    """Return the number of frame points more than 1.5 from both sides of the gap at the end."""
     x, torn = sheet.position[-1, :, 0], sheet.site[:, 0] == sheet.columns - 1
     low, high = x[sheet.body & ~torn].max(), x[sheet.body & torn].min()
     frame = x[~sheet.body]

@@ -1,7 +1,9 @@
-"""Makes the picture of docs/sweeps.md: ``python docs/reproduction/stability_map.py [FOLDER]``.
+"""Draw the picture of docs/parameter-sweep.md.
 
-Runs the 40 × 40 members of docs/stability-map.yaml that the folder does not hold yet, and draws how
-much of the start is left of each beside the boundary that is predicted before the first step.
+Run it as ``python docs/reproduction/stability_map.py [FOLDER]``.
+
+Runs the 40 × 40 members of docs/stability-map.yaml that the folder does not contain yet, and draws
+which of them decay, beside the boundary that is predicted before the first step.
 """
 
 import sys
@@ -20,7 +22,7 @@ FINE = 221
 
 
 def main(folder: Path | None) -> None:
-    """Writes pictures/stability-map.png, and prints what agrees."""
+    """Write pictures/stability-map.png, and print the number of members that agree."""
     parts = read_file(FILE).data
     del parts["version"]
     found = pbdkit.sweep(**parts, folder=folder)
@@ -29,7 +31,7 @@ def main(folder: Path | None) -> None:
     w, b = found.relaxation.values, found.memory.values
     known = pbdkit.analyse(parts["experiment"])
     predicted = np.array([[known.stable_at(x, y) for y in b] for x in w])
-    print(f"members: {settles.size}, settled: {settles.sum()}")
+    print(f"members: {settles.size}, converged: {settles.sum()}")
     print(f"as predicted: {(settles == predicted).sum()}")
     figure = Figure((4.6, 3.6), layout="constrained")
     ax = figure.subplots()

@@ -1,4 +1,4 @@
-"""How a neighbourhood treats waves of columns."""
+"""Decay of waves of columns, by neighbourhood."""
 
 import math
 
@@ -7,13 +7,14 @@ from runs import Floats, run_parts
 
 
 def softening(ks: Floats, metric: str, shells: int) -> Floats:
-    """(1 - λ(k)) / k² for a wave of columns, relative to long waves; λ its factor in one step."""
+    """Return (1 - λ(k)) / k² of waves of columns, relative to long waves; λ is the factor a
+    step."""
     found = np.array([_decay(float(k), metric, shells) for k in (1e-3, *ks)])
     return found[1:] / found[0]
 
 
 def _decay(k: float, metric: str, shells: int) -> float:
-    """(1 - λ) / k², from two steps: leaders make the wave, then all are followers."""
+    """Return (1 - λ) / k² from two steps: leaders make the wave, then all are followers."""
     columns, middle = 13, 6
     groups = [
         {

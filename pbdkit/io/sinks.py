@@ -125,7 +125,7 @@ class OverlappingSink(KeepingSink):
         self._inner.begin(columns, sizes, planned)
 
     def put(self, values: Values) -> None:
-        """Take over the values, which must not be changed afterwards."""
+        """Store the values, which must not be changed afterwards."""
         large = sum(np.asarray(v).nbytes for v in values.values()) >= LARGE_BYTES
         while self._waiting and self._waiting[0][1].done():
             self._waiting.popleft()[1].result()

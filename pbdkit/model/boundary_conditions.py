@@ -175,8 +175,8 @@ class Driven(Strict):
         return steps if self.until is None else min(self.until, steps)
 
     def next_change(self, step: int, foreseeable: bool = False) -> float:
-        """Return the first step after `step` in which the motion begins or ends, or goes on unless
-        it is `foreseeable`; infinity if there is none.
+        """Return the first step after `step` in which the motion begins, ends or, unless it is
+        `foreseeable`, continues; infinity if there is none.
 
         A motion by Newton's law is not foreseeable.
         """

@@ -165,7 +165,7 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     counts = scene.raster.row_counts
     bounds = bounds_of(counts, parts)
     steps = _steps(each, int(np.diff(bounds).min()))
-    # After the last of these steps all of its own rows are right, and whom frame points follow.
+    # After the last of these steps all of its own rows are right, and what frame points follow.
     looked_at = edge + LOOKED_AT * any(d.local for d in experiment.diagnostics)
     # Bonds from own frame points lead to particles that do not stand still.
     halo = max(steps * each, looked_at, 2 * edge * experiment.shows_bonds) + edge

@@ -157,7 +157,7 @@ def plot_experiment(
     The picture shows the body with its frame and regions, supports and leaders, loads, obstacles,
     cracks and cuts. Arrows are as long in proportion to each other as motions and forces are.
     Coordinates are in mm where the experiment has `units`. `ax` are axes to draw into; without them
-    a figure is made, of that `figsize` in inches, with so many `dpi`.
+    a figure is made, of size `figsize` in inches, with the resolution `dpi`.
 
     Raises ExperimentError where there is no such scene, where space is no plane, and where
     matplotlib is missing.
@@ -201,7 +201,7 @@ def curve(
     `kind` is which, by default the first that the dataset has. `curve(y)` draws a variable over
     the time instead and `curve(x, y)` one over another, one number a step each: a component as
     `reaction_x`, and of what particles have the sum or mean. `group`, `load` and `obstacle` choose
-    the one whose forces are drawn; without them it is the one that goes farthest. Lengths, forces
+    the one to draw; without them it is the one that moves farthest. Lengths, forces
     and energies are in mm, N and mJ where the dataset has their scale. A dataset of a sweep has a
     line a member.
 

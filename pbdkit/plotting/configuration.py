@@ -121,7 +121,7 @@ def difference_of(
     first: xarray.Dataset, second: xarray.Dataset, color: str, time: float | None
 ) -> tuple[xarray.Dataset, str]:
     """Return the second dataset at one step, at rest, with the difference in `color` as an
-    additional variable, for particles whose number is in both; and the name to draw."""
+    additional variable, for particles that have the same number in both; and the name to draw."""
     runs = [of_one_run(dataset) for dataset in (first, second)]
     quantity, _ = (quantity_of(dataset, color) for dataset in reversed(runs))
     if quantity.owner != "particle":

@@ -495,7 +495,7 @@ class Trajectory:
     dataset defines the scale.
 
     Raises ExperimentError for a dataset of several runs, for space that is no plane, and for a
-    quantity that cannot be drawn. Only what is asked for is read.
+    quantity that cannot be drawn. Only the requested values are read.
     """
 
     def __init__(self, dataset: xarray.Dataset, color: str | None = None) -> None:
@@ -580,7 +580,7 @@ class Trajectory:
             values = quantity.values(part) if quantity else None
             for n, row in enumerate(chosen):
                 step = float(self.steps[row])
-                # In which fraction of a step a bond broke is not known but for the last one.
+                # The fraction of a step at which a bond broke is known only for the last one.
                 is_last = row == len(self.steps) - 1
                 broken = broken_by(body.broken_step, math.ceil(step) if is_last else step)
                 yield Snapshot(

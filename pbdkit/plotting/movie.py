@@ -84,7 +84,7 @@ def animate(
     fps : float
         Recorded steps a second.
     every : int
-        Draw each so many recorded steps only, and the last.
+        Interval of the recorded steps that are drawn, besides the last.
     show : callable
         Called with what is done and the share that is done.
     replace : bool

@@ -62,7 +62,7 @@ class AxesCanvas:
         self._ax.add_patch(PathPatch(path, fc=fill, ec=edge, lw=POINTS, zorder=self._next))
 
     def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
-        """Draw an arrow from a place, by so many pixels, y up."""
+        """Draw an arrow from a place; its length is in pixels, y up."""
         if not np.any(way):
             return
         tip = self._unit * (np.asarray(tail) + np.asarray(way) / self.scale)

@@ -168,7 +168,7 @@ class Canvas(Protocol):
         """Fill what lies between closed outlines: an inner one is a hole."""
 
     def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
-        """Draw an arrow from a place, by so many pixels, y up."""
+        """Draw an arrow from a place; its length is in pixels, y up."""
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ class Cell:
 
     Sites have integer indices (i, j). The cell repeats every `period[0]` of i along `vectors[0]`,
     every `period[1]` of j along `vectors[1]` and so on. The site with index (i, j) has the basis
-    site whose `index` is (i mod period[0], j mod period[1]); if there is none, the lattice has a
+    site with the `index` (i mod period[0], j mod period[1]); if there is none, the lattice has a
     hole.
 
     Parameters

@@ -66,7 +66,7 @@ class Course(Strict, Generic[Value]):
     def bends(self) -> tuple[int, ...]:
         """Steps after which the slope changes."""
         knots = list(zip(self.steps, self._values, strict=True))
-        flat = (0.0, False)  # a change whose slope rounds to zero is not flat
+        flat = (0.0, False)  # a change with a slope that rounds to zero is not flat
         slopes = [flat, *(((d - b) / (c - a), d != b) for (a, b), (c, d) in pairwise(knots)), flat]
         pairs = zip(self.steps, pairwise(slopes), strict=True)
         return tuple(step for step, (first, second) in pairs if first != second)
@@ -108,7 +108,7 @@ class NumberCourse(Course[float]):
 
 
 def form_of(value: Any) -> str:
-    """Return the form of a value, PLAIN or COURSE."""
+    """Return the form of a value, `PLAIN` or `COURSE`."""
     return COURSE if isinstance(value, (dict, Course)) else PLAIN
 
 

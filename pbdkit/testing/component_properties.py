@@ -594,7 +594,7 @@ class Alike(np.random.Generator):
     arguments."""
 
     def __getattribute__(self, name: str) -> Any:
-        """Return a method that draws anew at each call and repeats its first number."""
+        """Return a method that draws again at each call and repeats its first number."""
         if name.startswith("_") or not callable(getattr(np.random.Generator, name)):
             return super().__getattribute__(name)
 

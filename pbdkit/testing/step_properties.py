@@ -229,7 +229,7 @@ def continues_where_it_stopped(subject: Subject) -> None:
             expected = measured_by(component, StateMoment(whole, Tables(scene)))
             for name in differing(expected, measured):
                 raise PropertyError(f"`{name}` of a run continued at step {STEPS} is another one")
-    with suppress(PluginError):  # what no dataset can be made of, other properties tell
+    with suppress(PluginError):  # reported by other properties
         _refuse_other_records(subject.scene, Subject(copy, subject.parts).scene)
 
 

@@ -1,7 +1,7 @@
 """Report of a dataset as one self-contained page of HTML: ``pbdkit.report`` and `pbdkit report`.
 
 The sections follow the content of the page: names and units, curves, thinning of steps and
-particles to a budget, bonds, the moving lattice, the experiment, how the body settled, the page of
+particles to a budget, bonds, the moving lattice, the experiment, convergence, the page of
 a run, numbers of sweep members, the page of a sweep, and benchmark tables.
 """
 
@@ -323,7 +323,7 @@ class BondArrays:
 
 def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
     """Return the bonds of a dataset or, where it has no table, of its scene, unless neighbours are
-    found anew; None where neither has any. Lengths are in the units of the page.
+    re-evaluated; None where neither has any. Lengths are in the units of the page.
 
     Raises ExperimentError where dataset and scene do not go together.
     """
@@ -332,7 +332,7 @@ def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
 
 
 def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
-    if dataset.sizes.get("bond") == 0:  # of a body whose particles have no neighbours
+    if dataset.sizes.get("bond") == 0:  # particles without neighbours
         return None
     if scene is not None and "bond_ends" in dataset.variables:
         return _from_bond_table(BondRecords(dataset, scene), dataset)
@@ -769,7 +769,7 @@ def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
 
 
 def _certificate(dataset: xarray.Dataset) -> dict[str, Any]:
-    """Return the certificate of an equilibrium."""
+    """Return the error bound of an equilibrium."""
     certificate = json_attribute(dataset, "certificate")
     entries = [[name.replace("_", " "), value] for name, value in certificate.items()]
     note = (
@@ -1146,7 +1146,7 @@ def _labels(dataset: xarray.Dataset, dim: str) -> list[str]:
     if name not in dataset.variables:
         return [str(n) for n in range(dataset.sizes[dim])]
     values = dataset[name].values
-    if values.dtype.kind == "f":  # what is 0 but for rounding is 0
+    if values.dtype.kind == "f":  # rounding errors are set to 0
         values = np.where(np.abs(values) < 1e-12 * np.abs(values).max(), 0.0, values)
     return [_label(value) for value in values.tolist()]
 

@@ -36,7 +36,7 @@ Way = tuple[float, float]
 class Hand(Motion):
     """Motion of a group led by hand, knot by knot; between knots, and after the last, as `path`.
 
-    The knots grow while it is stepped, so that no engine is made anew for a move of the mouse.
+    The knots grow while it is stepped, so that no engine is rebuilt for a move of the mouse.
     """
 
     type: Literal["hand"] = "hand"
@@ -150,7 +150,7 @@ class AdjustableNumber:
         self.turns.append((step, value))
 
     def turned(self, value: float) -> dict[str, Any]:
-        """Return a schedule that reaches a value. Experiments whose components use the number
+        """Return a schedule that reaches a value. Experiments with components that use the number
         before the first step reject it."""
         return {"steps": [0, 1], "values": [self.at(0), value]}
 

@@ -190,7 +190,7 @@ class Conductor:
                     viewer.tell(message)
         elif what == "leave" and viewer in self._viewers:
             self._viewers.remove(viewer)
-            if not self._viewers:  # nobody is there to see it
+            if not self._viewers:  # no viewer is connected
                 self._try(None, self._session.rest)
         elif isinstance(what, PictureReceived) and viewer:
             viewer.is_ready = True
@@ -272,20 +272,20 @@ class SocketViewer(Viewer):
 
     async def send(self, socket: ServerConnection) -> None:
         """Send queued messages until the connection is closed."""
-        with suppress(ConnectionClosed):  # whoever listens to the socket is told, too
+        with suppress(ConnectionClosed):  # the viewer gets the close event itself
             while (message := await self._waiting.get()) is not None:
                 await socket.send(message)
             await socket.close()
 
     def _put(self, message: str | bytes) -> None:
         def put() -> None:
-            if self._waiting.full():  # nobody takes anything there
+            if self._waiting.full():  # the viewer does not receive messages
                 self._waiting.get_nowait()
                 self._waiting.put_nowait(None)
             else:
                 self._waiting.put_nowait(message)
 
-        with suppress(RuntimeError):  # the loop has been closed: nobody is there any more
+        with suppress(RuntimeError):  # the loop has been closed
             self._loop.call_soon_threadsafe(put)
 
 

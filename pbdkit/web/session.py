@@ -63,7 +63,7 @@ def judged(experiment: Experiment) -> Judgement:
             return Judgement("unknown", f"{size}; use `pbdkit check` for larger ones")
         analysis = Analysis(scene)
         return _worded(analysis)
-    except Exception as error:  # whatever a plugin raises, the session goes on
+    except Exception as error:  # the session survives any error of a plugin
         return Judgement("unknown", str(error) or type(error).__name__)
 
 
@@ -350,8 +350,8 @@ class Session:
     """Steps an experiment without end, and executes commands between two steps.
 
     All changes are recorded in the script; a change made after going back removes later ones.
-    Messages other than pictures are passed to `notify`. Raises ExperimentError for an experiment
-    whose scene cannot be built.
+    Messages other than pictures are passed to `notify`. Raises ExperimentError if the scene of the
+    experiment cannot be built.
     """
 
     experiment: Experiment

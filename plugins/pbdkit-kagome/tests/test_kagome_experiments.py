@@ -1,4 +1,4 @@
-"""The experiments run, and show what the README says of them."""
+"""The experiments run, and show what the README describes."""
 
 import json
 from pathlib import Path

@@ -182,7 +182,7 @@ def test_on_the_honeycomb_the_sublattices_shift_against_each_other():
 @BOTH
 @pytest.mark.parametrize("shells", [1, 2])
 def test_the_barycentre_diffuses_with_a_quarter_of_the_mean_squared_bond(lattice, shells):
-    """Steps to neighbours whose barycentre is the site itself are those of an unbiased walk."""
+    """Steps to neighbours with their barycentre at the site are those of an unbiased walk."""
     neighbours = {"type": "bond-steps", "shells": shells}
     around = BondSteps(shells=shells).shells_around(lattice(a=2.0).cell(), 0)
     squares = [offset.length**2 / 4.0 for shell in around for offset in shell]
@@ -194,7 +194,7 @@ def test_the_barycentre_diffuses_with_a_quarter_of_the_mean_squared_bond(lattice
 
 
 def test_the_flat_band_of_the_kagome_lattice_bounds_its_spectrum():
-    """Alternating moves round a hexagon are seen by nobody outside: P = -1/2, so w < 4/3."""
+    """Alternating moves round a hexagon have no effect outside: P = -1/2, so w < 4/3."""
     asked = experiment(Kagome())
     found = pbdkit.identify(asked, components=COMPONENTS).spectrum
     assert found.smallest == pytest.approx(-0.5, abs=1e-12)
@@ -214,7 +214,7 @@ def test_the_honeycomb_is_bipartite_so_that_its_spectrum_is_symmetric():
 
 
 def test_every_side_gets_an_exact_triangle():
-    """By the honeycomb: bonds that add up to zero exactly, of one length."""
+    """The bonds of the honeycomb add up to zero exactly, and have one length."""
     for a in np.random.default_rng(1).lognormal(0.0, 5.0, 500):
         rests = [offset.rest for offset in Honeycomb(a=a).cell().offsets(0, 1.1 * a)]
         assert (sum(r.x for r in rests), sum(r.y for r in rests)) == (0.0, 0.0)

@@ -18,7 +18,7 @@ RULES = {
 
 
 def cantilever(rule, links):
-    """The dataset of so many links of length 1 beyond the root."""
+    """Return the dataset of a number of links of length 1 beyond the root."""
     springs = rule == "springs"
     first = {"select": {"box": [-1.5, -0.5, 0.5, 0.5]}, "motion": {"type": "hold"}}
     tip = {"type": "displace", "displacement": [0.0, TIP]}
@@ -43,7 +43,7 @@ def cantilever(rule, links):
 
 
 def main():
-    """Prints the table."""
+    """Print the table of errors."""
     print("| links | springs: shape off by | beams: shape off by | beams: force off by |")
     print("| --- | --- | --- | --- |")
     for links in (3, 6, 12):

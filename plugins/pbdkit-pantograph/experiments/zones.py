@@ -25,8 +25,8 @@ FILE = "bias-extension.yaml"
 
 
 class Cells(NamedTuple):
-    """Of every cell: `centre` (cell, axis) in the reference, the angle between its fibres
-    (degrees), its zone; of every link: strain. `length` and `width` of the sheet."""
+    """Cells of a sheet: `centre` (cell, axis) in the reference, the angle between fibres
+    (degrees) and the zone; the strain of every link; `length` and `width` of the sheet."""
 
     centre: np.ndarray
     angle: np.ndarray
@@ -93,7 +93,7 @@ def on_axis(found):
 
 
 def main():
-    """Prints the table."""
+    """Print the table of zones."""
     file, (across, along) = sys.argv[1], (int(n) for n in sys.argv[2:4])
     print("| d / D | A | B | C | theory A, B, C | cos θ on the axis | theory | links |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")

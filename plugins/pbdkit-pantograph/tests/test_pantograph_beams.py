@@ -1,4 +1,4 @@
-"""What beams with pivots do: exact beams, arcs, mechanisms, pivots that resist."""
+"""Test beams with pivots: exact beams, arcs, mechanisms, pivots that resist."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What pbdkit asks of every NeighbourMetric and FollowerRule, one case for each property.
+"""Properties that pbdkit requires of every NeighbourMetric and FollowerRule, one case for each.
 
 On few scenes each, as kernels take seconds to compile: `pbdkit plugins check` tries all.
 """

@@ -79,7 +79,7 @@ def stiffness(ds, whole, size):
 
 
 def main():
-    """Prints both tables."""
+    """Print the tables of chains and of sheets."""
     print("| bonds in series | modulus | mean strength, 500 chains | theory | share |")
     print("| --- | --- | --- | --- | --- |")
     for modulus in (2.0, 4.0, 8.0):

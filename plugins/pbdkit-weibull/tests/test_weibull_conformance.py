@@ -1,4 +1,4 @@
-"""What pbdkit asks of every FractureModel, one case for each property."""
+"""Properties that pbdkit requires of every FractureModel, one case for each."""
 
 from pbdkit_weibull import Weibull
 

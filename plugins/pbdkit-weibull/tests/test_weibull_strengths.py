@@ -26,8 +26,8 @@ def ran(name, *settings):
 
 @pytest.fixture(scope="module")
 def pulled():
-    """Of every chain of n bonds: increment in which it parted, increment, strengths of its bonds,
-    one such triple a seed."""
+    """Return, for every chain of n bonds and every seed, the increment in which the chain parted,
+    the increment, and the strengths of its bonds."""
     return {n: [chains(n, 4.0, seed, steps=STEPS) for seed in SEEDS] for n in (4, 16)}
 
 
@@ -78,11 +78,11 @@ def test_mean_strength_falls_as_the_root_of_the_size(pulled, bonds):
 
 
 def test_large_sheets_are_weaker():
-    """The first bond to break is the weakest of n² in the same strain. Its neighbours take over:
-    the sheet bears more than that, but the less the larger it is."""
+    """The first bond to break is the weakest of n² in the same strain. Its neighbours then bear
+    its load: the sheet is stronger than that bond, but the weaker the larger it is."""
     found = {size: np.array([sheet(size, 4.0, seed) for seed in range(8)]) for size in (3, 9)}
     first, load = found[9].mean(axis=0) / found[3].mean(axis=0)
-    assert first < 0.75  # the theory says 9^(-1/4) = 0.58
+    assert first < 0.75  # 9^(-1/4) = 0.58 in theory
     assert load < 0.95
     for size, strengths in found.items():
         # Of 8 sheets the mean is known to 0.28/√8 = 10 %.
