@@ -479,7 +479,7 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
     def remembered(self) -> tuple[Remembered, ...]:
         """Declare the damage and the failure strain of each bond in the cells on both sides.
 
-        A negative failure strain marks a cell whose crack does not cross the bond.
+        A negative failure strain marks a cell with a crack that does not cross the bond.
         """
         return _NUMBERS
 

@@ -509,7 +509,7 @@ def _factors(matrix: StencilMatrix, rows: Rows) -> Floats | None:
 
 
 def transposed(matrix: StencilMatrix) -> StencilMatrix:
-    """Return Kᵀ, with separate stencils for all places whose neighbours do not all have the most
+    """Return Kᵀ, with separate stencils for all places with a neighbour that does not have the most
     frequent stencil; `scale` is that of K."""
     code, (row, place) = matrix.code, np.nonzero(matrix.code >= 0)
     neighbours = np.stack(

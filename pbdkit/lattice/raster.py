@@ -516,7 +516,7 @@ class Restriction:
     low
         First row, in the whole.
     present, moving
-        Rows with particles, and rows whose particles have all their neighbours, as (first,
+        Rows with particles, and rows in which all particles have all their neighbours, as (first,
         last + 1) in the whole.
     """
 
@@ -549,13 +549,13 @@ class Restriction:
         return rows - self.part.particle_offset + self.whole.particle_offset
 
     def cut(self, planes: Array) -> Array:
-        """Return a copy of the rows of an array whose last axes are those of cells."""
+        """Return a copy of the rows of an array; its last axes are those of cells."""
         axes = len(self.whole.shape) - 1
         return row_view(planes, axes, slice(self.low, self.low + self.part.shape[1])).copy()
 
 
 def row_view(array: Array, axes: int, rows: slice) -> Array:
-    """Return a view of rows of an array whose last `axes` are those of cells."""
+    """Return a view of rows of an array; its last `axes` axes are those of cells."""
     return array[(*(slice(None),) * (array.ndim - axes), rows)]
 
 

@@ -291,7 +291,7 @@ class _Cells:
     x, y
         Coordinates of the corners, (corner, cell).
     inside
-        Mask of the cells whose corners are all in the body, (cell,).
+        Mask of the cells with all corners in the body, (cell,).
     """
 
     experiment: Experiment

@@ -101,7 +101,7 @@ class Plan:
 
     `levels` are its rules, the last of which moves the particles; `parallel` is true for several
     threads; `shared` are the names, mostly of arrays, that all functions may use; `apart` is true
-    if bonds are updated in a separate pass for every model; `gpu` is true for a GPU, whose threads
+    if bonds are updated in a separate pass for every model; `gpu` is true for a GPU, where threads
     take one place after the other from flat arrays.
     """
 
