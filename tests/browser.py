@@ -19,7 +19,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 # can start one here.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Playwright's browser; tests that ask for it are skipped where there is none."""
+    """Yield Playwright's browser; tests that use it are skipped if there is none."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     path = next(filter(None, map(shutil.which, NAMES)), None)
     if path is None:
@@ -32,9 +32,9 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    """An empty page, 1280 pixels wide. At the end nothing may stand in its console, no script may
-    have failed, and it may have asked nobody for anything but the file that was opened and servers
-    of this machine."""
+    """An empty page, 1280 pixels wide. At the end its console must be empty, no script may have
+    failed, and it may have requested nothing except the file that was opened and servers of this
+    machine."""
     context = browser.new_context(viewport={"width": 1280, "height": 900})
     faults: list[str] = []
 
@@ -58,7 +58,7 @@ def page(browser: Any) -> Iterator[Any]:
 
 
 def until(holds: Callable[[], Any], seconds: float = 20.0) -> None:
-    """Waits for that."""
+    """Wait until a condition holds."""
     deadline = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < deadline, "it never came to that"
@@ -66,5 +66,5 @@ def until(holds: Callable[[], Any], seconds: float = 20.0) -> None:
 
 
 def until_page(page: Any, expression: str) -> None:
-    """As `wait_for_function`, which the page's policy does not let evaluate."""
+    """Wait like `wait_for_function`, which the page's policy does not allow to evaluate."""
     until(lambda: page.evaluate(expression))

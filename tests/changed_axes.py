@@ -1,4 +1,4 @@
-"""The same experiment in other lengths, at another place, mirrored or turned.
+"""Experiments in other units of length, at another place, mirrored or turned.
 
 A `Change` maps places to `factor` · M x + `shift`, with a matrix M that exchanges or reverses axes.
 `changed` writes the experiment that belongs to it, for all features of `crossed_scenes`, and
@@ -42,7 +42,7 @@ class Change:
 
     @property
     def swaps(self) -> bool:
-        """Whether x becomes y."""
+        """Return whether x becomes y."""
         return self.axes[0][0] == 0
 
     def place(self, x: Any) -> list[float]:
@@ -62,12 +62,12 @@ class Change:
         return "yx"["xy".index(name)] if self.swaps else name
 
     def reverses(self, name: str) -> bool:
-        """Whether positive along the axis becomes negative."""
+        """Return whether the positive direction of the axis becomes negative."""
         return bool(self.matrix[:, "xy".index(name)].sum() < 0)
 
 
 def applies_to(change: Change, experiment: Tree) -> bool:
-    """Whether the lattice, and what is drawn in an order, has a counterpart."""
+    """Return whether the lattice, and what is drawn in an order, has a counterpart."""
     if change.axes == KEEP:
         return True
     if "scatter" in experiment.get("fracture", {}):
@@ -179,8 +179,8 @@ class _Changed:
         return found
 
     def field(self, asked: Any, value: Any) -> Any:
-        """What stands in place of a number; random fields as they were drawn, unless lengths alone
-        change."""
+        """Return the replacement of a number; random fields are as they were drawn, unless lengths
+        alone change."""
         change = self.change
         if "correlation_length" not in asked:
             return asked
@@ -289,7 +289,8 @@ POWERS = {
     "load_displacement": 1,
     "strain_energy": 2,
 }
-"""What is compared: vectors that turn with the axes, the energy, and their powers of length."""
+"""The compared quantities: vectors that turn with the axes, the energy, and their powers of
+length."""
 
 
 SMALL = {1: 1e-2, 2: 1e-4}
@@ -298,8 +299,8 @@ some hundredths of a spacing."""
 
 
 def differences(first: Any, second: Any, change: Change) -> dict[str, float]:
-    """How far the variables of two datasets are apart, as shares of their largest values; bonds
-    that broke in one alone, and steps that only one has, as counts."""
+    """Return the differences of the variables of two datasets, relative to their largest values;
+    bonds that broke in one alone, and steps that only one has, as counts."""
     found: dict[str, float] = {"steps": float(abs(first.sizes["time"] - second.sizes["time"]))}
     if found["steps"]:
         return found

@@ -1,4 +1,4 @@
-"""What several test modules share."""
+"""Commands, folders and results that several test modules share."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """What every worker, and every process that a test starts, finds in its environment: one folder
-    of compiled kernels, kept from run to run, and one thread of linear algebra, as the systems here
-    are small and the workers take the processors; and they keep the bytecode that they make."""
+    """The environment of every worker, and of every process that a test starts: one folder of
+    compiled kernels, kept from run to run, and one thread of linear algebra, as the systems here
+    are small and the workers take the processors; and bytecode is kept."""
     if cache := getattr(config, "cache", None):
         os.environ.setdefault("PBDKIT_CACHE_DIR", str(cache.mkdir("kernels")))
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -44,7 +44,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What is there by now stays to the end: nobody need look through it for garbage again."""
+    """Exclude the present objects, which live until the end, from later garbage collection."""
     gc.collect()
     gc.freeze()
 
@@ -55,7 +55,7 @@ Install = Callable[..., None]
 
 
 class Result(NamedTuple):
-    """What a call of the program left behind."""
+    """The result of a call of the program."""
 
     code: int
     out: str
@@ -105,7 +105,8 @@ def tensile() -> dict[str, Any]:
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """``install("pbdkit-x", source)``: a distribution whose entry point is a module of that source.
+    """``install("pbdkit-x", source)`` adds a distribution with a module of that source as its entry
+    point.
 
     It is found in this process and in those that it starts.
     """
@@ -176,7 +177,7 @@ def call(
     capsys: pytest.CaptureFixture[str],
     tensile: dict[str, Any],
 ) -> Call:
-    """Calls the program in a folder that is empty but for e.json, the tensile experiment."""
+    """Call the program in a folder that contains only e.json, the tensile experiment."""
     folder = tmp_path / "work"
     folder.mkdir()
     monkeypatch.chdir(folder)

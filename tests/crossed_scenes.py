@@ -55,7 +55,7 @@ PAIRS = frozenset(
     if len({name.split(": ")[0] for name in pair} & KINDS.keys()) == 2
     or not all(name.split(": ")[0] in KINDS for name in pair)
 )
-"""All but those of two rules, two frames or two fracture models."""
+"""All features except those of two rules, two frames or two fracture models."""
 
 FRACTURES = tuple(f"fracture: {name}" for name in KINDS["fracture"])
 OF_FRACTURE = ("fracture field by region", "fracture number in time", "scatter", "cracks")
@@ -73,7 +73,7 @@ NUMBERS = {
     "strain-gradient": ("stiffness", "poisson_ratio"),
     "mixed-coordinate": ("K",),
 }
-"""The parameters of rules that fields and courses take the place of."""
+"""Parameters of rules that fields and time-dependent values can replace."""
 
 
 ANEW = "reevaluate"
@@ -156,11 +156,11 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (("motion: newton",), ("solver settle", "solver: equilibrium"), "have no final position that"),
     (("solver: equilibrium",), OF_STEPS, r"solver\.[a-z]+: unknown key"),
 )
-"""Features of two groups of which no two go together, and what the refusal says."""
+"""Features of two groups of which no two can be combined, and the message of the refusal."""
 
 
 def refusal_of(pair: Iterable[str]) -> str | None:
-    """What the refusal of two features says; None where they go together."""
+    """Return the message that refuses two features; None if they can be combined."""
     one, other = pair
     for first, second, words in REFUSALS:
         if (one in first and other in second) or (other in first and one in second):
@@ -189,8 +189,8 @@ def completed(features: Iterable[str]) -> Features:
 
 
 def placement_changes(features: Features) -> bool:
-    """Whether the one number left to change in time is where fictitious points stand, which have no
-    place under rules of forces."""
+    """Return whether the one number left to change in time is the placement of fictitious points,
+    which does not exist under rules of forces."""
     models = {"fracture: threshold"}
     if "fracture field by region" in features:
         models |= {"fracture: strain"}
@@ -233,7 +233,7 @@ class _Writer:
             sides = {"width": self.columns - 0.6, "height": (self.rows - 1) * self.height + 0.3}
             self.outline = {"type": "rectangle", **sides, "origin": [0.3, -0.4]}
         self.amount = self.draw.choice([0.0613, 0.0471, 0.0837])
-        """The displacement of the leaders, of which bonds whose limits are low break some."""
+        """Displacement of the leaders, which breaks some of the bonds with low limits."""
 
     def has(self, *features: str) -> bool:
         return not self.features.isdisjoint(features)
@@ -311,7 +311,7 @@ class _Writer:
         return written
 
     def field(self, feature: str, value: float) -> dict[str, Any]:
-        """What stands in place of a number."""
+        """Return the replacement of a number."""
         if feature.endswith("in time"):
             return {"steps": [0, 5], "values": [value, 0.75 * value]}
         if feature.endswith("by region"):
@@ -442,7 +442,7 @@ class _Writer:
 
 
 def fits(features: Features) -> bool:
-    """Whether a scene can have them all, besides what is refused in pairs."""
+    """Return whether a scene can have all of them, besides what is refused in pairs."""
     complete = completed(features)
     for part in KINDS:
         if sum(f.startswith(f"{part}: ") for f in complete) > 1:
@@ -456,7 +456,7 @@ def fits(features: Features) -> bool:
 
 
 LARGEST = 9
-"""So many features has a scene: with more the laws that hold of it are few."""
+"""Number of features of a scene: with more, few laws hold."""
 
 
 def covering(seed: int = 0, tries: int = 12) -> Iterator[Features]:

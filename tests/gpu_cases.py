@@ -1,5 +1,5 @@
-"""Scenes for the GPU engine. As a script: steps them in the simulator beside numpy, in a process of
-its own, as numba asks for (NUMBA_ENABLE_CUDASIM=1)."""
+"""Scenes for the GPU engine. As a script this steps them in the simulator beside numpy, in a
+process of its own, as numba requires (NUMBA_ENABLE_CUDASIM=1)."""
 
 import os
 
@@ -129,7 +129,7 @@ def scene_of(given):
 
 
 def scenes():
-    """By name; each has something that others have not."""
+    """Return the scenes by name; each has a feature that others do not have."""
     found = {name: scene_of(sheet(**SMALL | parts)) for name, parts in SHEETS.items()}
     found |= {name: scene_of(given) for name, given in OTHERS.items()}
     return found | {"in space": test_axes.scene("numpy", 1.2)}

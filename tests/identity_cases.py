@@ -1,4 +1,4 @@
-"""What the tests of identity share: lattices, neighbours and rules, of third parties too."""
+"""Lattices, neighbours and rules, of third parties too, that the tests of identity share."""
 
 import math
 from typing import Any, ClassVar, Literal
@@ -60,7 +60,7 @@ class Honeycomb(pbdkit.Lattice):
 
 
 class Mean(pbdkit.FollowerRule):
-    """What the others below change: the mean of the differences."""
+    """Base of the rules below: the mean of the differences."""
 
     @staticmethod
     def gather(d, r, w, p):
@@ -103,7 +103,7 @@ class Twice(Mean):
 
 
 class Odd(Mean):
-    """What y does to x, x does to y with the other sign."""
+    """The effect of y on x is that of x on y with the other sign."""
 
     type: Literal["odd"] = "odd"
 
@@ -163,7 +163,7 @@ class Bent(Mean):
 
 
 class Idle(Mean):
-    """Stays."""
+    """Does not move particles."""
 
     type: Literal["idle"] = "idle"
 
@@ -194,7 +194,7 @@ class Sloping(Mean):
 
 
 class Failing(Mean):
-    """Cannot."""
+    """Raises an error at each call."""
 
     type: Literal["failing"] = "failing"
 

@@ -60,7 +60,7 @@ modes: 1
 """,
 }
 FILES["sampled.yaml"] = FILES["fit.yaml"] + "sampler: {walkers: 4, steps: 10}\n"
-"""What the commands below are given."""
+"""Files that the commands below use."""
 INTERRUPTED = """
 import os, signal, click
 echo = click.echo
@@ -93,7 +93,7 @@ class Case:
 
     @property
     def arguments(self) -> list[str]:
-        """What follows the name of the interpreter."""
+        """Return the arguments after the name of the interpreter."""
         return ["-c", self.call] if "pbdkit." in self.call else ["-m", "pbdkit", *self.call.split()]
 
 
@@ -101,7 +101,7 @@ RESULTS = (
     Case("run start", told="complete"),
     Case("run torn.yaml", told="complete"),
 )
-"""What the other commands are tried on."""
+"""Arguments with which the other commands are tried."""
 CASES = (
     Case("check start", told="start: valid"),
     Case("resume start.nc --steps 220", told="complete"),
@@ -140,11 +140,11 @@ CASES = (
         "run start -o ranks.nc", ("mpi",), "no MPI library", 2, {"PMI_SIZE": "2", "PMI_RANK": "0"}
     ),
 )
-"""What is tried, in this order."""
+"""Cases that are tried, in this order."""
 
 
 def main() -> int:
-    """Make the environments, try the cases, and return 1 where one came out otherwise."""
+    """Make the environments, try the cases, and return 1 if one had an unexpected result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--each", action="store_true", help="Each extra alone in place of `all`.")
     each = parser.parse_args().each
@@ -182,7 +182,8 @@ def _wheel(folder: Path) -> Path:
 
 
 def _environment(folder: Path, base: Path | None, *wanted: str) -> Path:
-    """Make an environment with what is wanted, on top of another, and return its interpreter."""
+    """Make an environment with the requested packages, on top of another, and return its
+    interpreter."""
     venv.create(folder, with_pip=False)
     python = folder / "bin" / "python"
     if base:
@@ -198,7 +199,7 @@ def _pip(*arguments: str) -> None:
 
 
 def _faults(name: str, extras: set[str], python: Path, folder: Path) -> list[str]:
-    """A line for each case that comes out otherwise than it should with these extras."""
+    """Return a line for each case with an unexpected result with these extras."""
     folder.mkdir()
     for file, text in FILES.items():
         (folder / file).write_text(text)

@@ -11,8 +11,8 @@ import pytest
 
 @contextmanager
 def interpreting() -> Iterator[None]:
-    """For as long as this lasts, here and in processes that are started: to compile each kernel
-    takes seconds. `stepping/numba_engine/test_engine` says which are compiled."""
+    """Interpret kernels within this context, here and in processes that are started: compiling each
+    of them takes seconds. `stepping/numba_engine/test_engine` lists those that are compiled."""
     with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
         patch.setattr("numba.config.DISABLE_JIT", 1)
         patch.setenv("NUMBA_DISABLE_JIT", "1")

@@ -19,7 +19,7 @@ class Drag(ParticleOperation):
 
 
 class Wind(ParticleOperation):
-    """Particles go on by so much in every step."""
+    """Displacement of particles by a constant in every step."""
 
     type: Literal["wind"] = "wind"
     speed: float = 0.01

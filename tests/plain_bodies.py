@@ -1,8 +1,8 @@
 """The bodies of docs/model.md, section 3, in plain loops (see plain_loops.py).
 
-Every outline is told by its depth at a point: positive inside, negative outside, 0 on it, and near
-it the distance to it (at a corner no more than a factor short of it). A grid has no outline: its
-sites are in, all others out.
+Every outline is defined by its depth at a point: positive inside, negative outside, 0 on it, and
+near it the distance to it (at a corner no more than a factor short of it). A grid has no outline:
+its sites are in, all others out.
 """
 
 import math
@@ -46,7 +46,8 @@ def distance_to_edge(p: Point, a: Point, b: Point) -> float:
 
 
 def right_of_edge(p: Point, a: Point, b: Point) -> bool:
-    """Whether the ray from p to +x meets the edge: a is above p and b is not, or b and not a."""
+    """Return whether the ray from p to +x meets the edge: a is above p and b is not, or b and not
+    a."""
     if (a[1] > p[1]) == (b[1] > p[1]):
         return False
     lower, upper = (a, b) if a[1] < b[1] else (b, a)
@@ -61,11 +62,12 @@ def polygon_depth(shape: Part, p: Point) -> float:
 
 
 def notch_depth(shape: Part, s: float, t: float) -> float:
-    """What a dogbone lacks of its box, at distances s along and t across from its centre.
+    """Return the depth in the part of its box that a dogbone lacks, at distances s along and t
+    across from its centre.
 
-    Above the gauge's straight edge as far as it goes, then what lies inside the fillet's circle,
-    whose centre stands above that edge's end by the radius, and above that centre as far as the
-    quarter circle reached. The box cuts it off at half its width.
+    Above the gauge's straight edge as far as it goes, then the inside of the fillet's circle, with
+    its centre above that edge's end by the radius, and above that centre as far as the quarter
+    circle reached. The box cuts it off at half its width.
     """
     radius = float(shape["radius"])
     s_centre, t_edge = shape["gauge_length"] / 2, shape["gauge_width"] / 2
@@ -101,7 +103,7 @@ def polygon_box(shape: Part) -> Box:
 
 
 def depth(shape: Part, p: Point) -> float:
-    """How deep p lies inside the outline, below 0 outside it."""
+    """Return the depth of p inside the outline, below 0 outside it."""
     if shape["type"] == "rectangle":
         return rectangle_depth(shape, p)
     if shape["type"] == "disc":
@@ -135,7 +137,7 @@ def grid_sites(shape: Part) -> list[Site]:
 
 
 def sites_in_box(lattice: Lattice, box: Box) -> list[Site]:
-    """All sites in the box, and some around it."""
+    """Return all sites in the box, and some around it."""
     (x0, y0), (x1, y1) = box
     row_ends = sorted((y - lattice.origin[1]) / lattice.second[1] for y in (y0, y1))
     sites = []

@@ -1,4 +1,4 @@
-"""Points, lattices and who neighbours whom on them, in plain loops (see plain_loops.py).
+"""Points, lattices and the neighbours on them, in plain loops (see plain_loops.py).
 
 Sections of model.md: 2 lattices, `read_lattice`, `site_point`; 4 neighbours, `shells_of`,
 `coordination_shells`, `chebyshev_shells`, `euclidean_shells`, `site_after`, `rest_offset`;
@@ -139,8 +139,8 @@ def within_radius(offset: Point, near: Part) -> bool:
 def euclidean_shells(lattice: Lattice, near: Part) -> dict[Site, int]:
     """Section 4: rank of the distinct weighted distances within the radius.
 
-    The radius bounds both coordinates of an offset; q steps up the second vector reach its
-    height, p steps along the first what is left of its width.
+    The radius bounds both coordinates of an offset; q steps up the second vector reach its height,
+    p steps along the first the rest of its width.
     """
     radius, weights = float(near["radius"]), point(near["weights"])
     if min(weights) <= 0:

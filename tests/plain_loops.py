@@ -85,7 +85,8 @@ class Copied(NamedTuple):
 
 
 class Body(NamedTuple):
-    """All that is fixed at step 0; lists run over the particles in the order of their numbers."""
+    """All quantities that are fixed at step 0; lists run over the particles in the order of their
+    numbers."""
 
     lattice: Lattice
     sites: list[Site]
@@ -99,7 +100,7 @@ Bond = tuple[int, int]
 
 
 def nearest(place: Point, members: list[int], X: list[Point]) -> list[int]:
-    """All members that tie for the least distance, by the tolerance of section 7."""
+    """Return all members that tie for the least distance, by the tolerance of section 7."""
     least = min(distance(X[j], place) for j in members)
     return [j for j in members if distance(X[j], place) <= least * (1 + 1e-9) + 1e-12]
 
@@ -178,7 +179,7 @@ def neighbours_of(
 
 
 def build_body(experiment: Part) -> Body:
-    """Sections 1, 3, 7: body and frame sites, numbered by i, then j; who neighbours whom."""
+    """Sections 1, 3, 7: body and frame sites, numbered by i, then j, and their neighbours."""
     lattice, frame = read_lattice(experiment["lattice"]), experiment["frame"]
     fracture, shells = experiment["fracture"], shells_of(lattice, experiment["neighbours"])
     shell_count = max(shells.values(), default=0)
@@ -235,8 +236,8 @@ def leader_position(group: Part, j: int, step: int, history: list[list[Point]]) 
 
 
 def crosses(crack: tuple[Point, Point], P: Point, Q: Point) -> bool:
-    """Whether P and Q are on two sides of the crack's line, which counts as its left, and the
-    crack's ends not strictly on one side of theirs."""
+    """Return whether P and Q are on two sides of the crack's line, which counts as its left, and
+    the crack's ends not strictly on one side of theirs."""
     a, b = crack
     parted = (side(a, b, P) >= 0) != (side(a, b, Q) >= 0)
     from_a, from_b = side(P, Q, a), side(P, Q, b)

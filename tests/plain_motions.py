@@ -27,7 +27,8 @@ def turned(p: Point, centre: Point, degrees: float) -> Point:
 
 
 def displaced(start: Point, motion: Part, count: int) -> Point:
-    """Where a motion has taken a particle from its start in its step number count, from 1."""
+    """Return the displacement that a motion has given a particle in its step number count, from
+    1."""
     if motion["type"] == "hold":
         return start
     if motion["type"] == "velocity":

@@ -11,9 +11,9 @@ def plus(a, b):
 
 
 def simulate(sizes, groups, steps, threshold=None):
-    """u of every particle, body and frame, in the order of the numbers, after each step; and the
-    bonds that broke, as pairs of sites with their step. `groups` are (sites, velocity, steps): who
-    leads, by how much a step, and for how many steps; then they hold."""
+    """Return u of every particle, body and frame, in the order of the numbers, after each step; and
+    the bonds that broke, as pairs of sites with their step. `groups` are (sites, velocity, steps):
+    the leaders, their displacement per step, and the number of steps; then they hold."""
     body = set(product(*map(range, sizes)))
     window = list(product(*(range(-1, n + 1) for n in sizes)))
     u = dict.fromkeys(window, (0.0, 0.0, 0.0))

@@ -80,12 +80,12 @@ BROKEN = {
     "parameter without a schema": ("from collections.abc import Callable" + changed("strength: float = 1.0", "strength: Callable = print"), "TypeError: the parameters of Rule cannot be described in a JSON Schema: "),
     "twice a type": (rule("twice", "class Twin(Rule):\n    pass\n").replace("[Rule]", "[Rule, Twin]"), "it has two classes with the type 'twice'; change the type of one of them"),
 }  # fmt: skip
-"""By kind: the source, and how the reason that pbdkit gives begins."""
+"""Sources by kind, and the beginnings of the reasons that pbdkit gives."""
 
 NEWER = "pbdkit_api = 2\n" + rule("newer")
 
 
 def listed(call: Callable[..., Any]) -> dict[str, dict[str, str]]:
-    """What `plugins list` says of each plugin, by distribution."""
+    """Return the rows of `plugins list` for each plugin, by distribution."""
     rows = json.loads(call("plugins", "list", "--json").out)
     return {row["distribution"]: row for row in rows if row["interface"] == "plugin"}

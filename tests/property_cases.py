@@ -1,4 +1,4 @@
-"""What the property tests share: small experiments, all combinations, and states made by hand."""
+"""Small experiments, all combinations, and states made by hand, which the property tests share."""
 
 from collections.abc import Iterable
 from itertools import combinations, product
@@ -95,8 +95,8 @@ def scene_of(columns: int = 6, rows: int = 5, **parts: Any) -> Scene:
 
 
 def state_with(scene: Scene, u: Any) -> State:
-    """The state, at step 0 and at rest, whose body has displacements u, (body particle, axis); the
-    frame follows by its map."""
+    """Return the state, at step 0 and at rest, in which the body has displacements u, (body
+    particle, axis); the frame follows by its map."""
     state = initial_state(scene)
     raster, frame = scene.raster, scene.frame
     for axis in (0, 1):
@@ -125,12 +125,12 @@ def advanced(scene: Scene, u: Any, steps: int) -> Any:
 
 
 def body_sites(scene: Scene) -> Any:
-    """(body particle, index)."""
+    """Return the sites of the body, (body particle, index)."""
     return scene.raster.site_of(scene.raster.body_rows)
 
 
 def followers_of(scene: Scene) -> Any:
-    """Which body particles no group leads in step 1, as positions among the body."""
+    """Return the body particles that no group leads in step 1, as positions among the body."""
     led = [leading.rows for leading in scene.leading]
     return np.flatnonzero(~np.isin(scene.raster.body_rows, np.concatenate([[], *led])))
 
@@ -148,9 +148,10 @@ def step_map(scene: Scene) -> Any:
 
 
 def layers_from(scene: Scene, row: int) -> Any:
-    """(body particle,): how many layers each is from the leader in that row. A layer is one bond,
-    or a frame point that follows the one and is a neighbour of the other (model.md, section 5).
-    The frame moves last in a step: from a leader, who moves first, it is one layer more."""
+    """Return the distance of each body particle, in layers, from the leader in that row. A layer is
+    one bond, or a frame point that follows the one and is a neighbour of the other (model.md,
+    section 5). The frame moves last in a step: from a leader, which moves first, it is one layer
+    more."""
     kind, ends = scene.raster.table_kind, scene.bonds.ends
     near = np.zeros((len(kind), len(kind)), bool)
     near[ends[:, 0], ends[:, 1]] = near[ends[:, 1], ends[:, 0]] = True

@@ -30,8 +30,8 @@ POWERS_OF_TWO = (2.0**-30, 2.0**20, 2.0**-13, 2.0**30)
 ANY_LENGTHS = (1e-9, 1e6, 3.7, 1e9)
 FAR = (2.0**14 + 0.3, -3e4)
 EXACT, ROUNDING, SINGLE, FOUND = 0.0, 1e-9, 1e-4, 1e-7
-"""How far results may be apart: to the bit, by rounding, by rounding in single precision, and by
-what equilibria are found to."""
+"""Tolerances of results: to the bit, by rounding, by rounding in single precision, and by the
+tolerance of equilibria."""
 LONGEST = 1e6
 """The largest internal length that strain-gradient takes, in lattice units."""
 
@@ -49,12 +49,12 @@ def _known(text: str) -> Any:
 
 
 def known(experiment: Tree) -> Any:
-    """The same, made once."""
+    """Return the same, computed once for each experiment."""
     return _known(json.dumps(experiment))
 
 
 def tolerance(experiment: Tree, *, exact: bool = False) -> float:
-    """How far the results of the same scene, told otherwise, may be apart."""
+    """Return the tolerance between results of the same scene in another description."""
     solver = experiment["solver"]
     if solver["type"] == "equilibrium":
         return FOUND
@@ -64,7 +64,8 @@ def tolerance(experiment: Tree, *, exact: bool = False) -> float:
 
 
 def _is_rounded(experiment: Tree) -> bool:
-    """Whether areas, distances or measured fields are computed, which powers of two round too."""
+    """Return whether areas, distances or measured fields are computed, which powers of two round
+    too."""
     motions = [group["motion"]["type"] for group in experiment["leaders"]]
     return bool(experiment.get("loads") or experiment.get("obstacles") or "measured" in motions)
 
@@ -98,7 +99,7 @@ def of_units(experiment: Tree, n: int) -> Faults:
 
 
 def of_places(experiment: Tree, n: int = 0) -> Faults:
-    """Moved far away."""
+    """Compare with the same experiment far away."""
     return keeps_answers(experiment, Change(shift=FAR), "moved")
 
 
@@ -135,7 +136,7 @@ def _different(one: Any, other: Any, what: str) -> Faults:
 
 
 def of_stopping(experiment: Tree, n: int) -> Faults:
-    """Left at some step, kept, and gone on with in a scene made anew: the same bits."""
+    """Stop at some step, store the state, and resume in a rebuilt scene: the bits are the same."""
     if experiment["solver"]["type"] != "stepping":
         return []
     step = 1 + n % (experiment["steps"] - 3)
@@ -199,7 +200,7 @@ def last_moment(experiment: Tree) -> tuple[Scene, StateMoment]:
 
 
 def _modulus(experiment: Tree) -> float:
-    """What forces over Young's modulus and thickness are multiplied with in a dataset."""
+    """Return the factor of forces in a dataset, over Young's modulus and thickness."""
     return 200.0 * 2.0 if "units" in experiment else 1.0
 
 
@@ -208,7 +209,7 @@ def _is_torn(experiment: Tree) -> bool:
 
 
 def has_laws_of_mechanics(experiment: Tree) -> bool:
-    """Whether the rule has forces, and edges are free: copying frames pull."""
+    """Return whether the rule has forces, and edges are free: copying frames pull."""
     natural = experiment["frame"]["type"] == "natural"
     return natural and experiment["rule"]["type"] in CALIBRATED
 
@@ -249,4 +250,4 @@ LAWS: dict[str, Callable[[Tree, int], Faults]] = {
     "balance": of_balance,
     "stiffness": of_stiffness,
 }
-"""By name; each is given the experiment, and a number that draws what the law leaves open."""
+"""Laws by name; each gets the experiment, and a number that draws what the law leaves open."""

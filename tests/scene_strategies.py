@@ -1,4 +1,4 @@
-"""Experiments drawn at random over everything that the plain loops know.
+"""Experiments drawn at random over everything that the plain loops implement.
 
 Steps are few and thresholds lie off round numbers, so that no unstable mode and no tie between a
 length and a threshold magnifies rounding into a difference.
@@ -12,8 +12,8 @@ from pbdkit.plugin.registry import Registry
 
 
 def samples(count, **more):
-    """Settings for a test that draws so many scenes where the profile draws 100, otherwise in
-    proportion, but at least two."""
+    """Return the settings for a test that draws this number of scenes if the profile draws 100,
+    otherwise in proportion, but at least two."""
     return settings(
         max_examples=max(2, count * settings().max_examples // 100),
         deadline=None,
@@ -27,7 +27,7 @@ AT_LENGTH = settings().max_examples > 100
 
 
 def in_turn(values, every, first=0):
-    """One in so many of the values of a parametrised test; all of them in the profile `long`."""
+    """Return a share of the values of a parametrised test; all of them in the profile `long`."""
     values = list(values)
     return values if AT_LENGTH else values[first::every]
 
@@ -298,7 +298,7 @@ def calibrated_experiments(draw):
 
 @st.composite
 def of_calibrated_bonds(draw, lattice, near):
-    """Fracture whose lost bonds exert nothing."""
+    """Draw a fracture model in which lost bonds exert no force."""
     spares, limit = draw(st.booleans()), draw(st.floats(0.02, 0.4))
     kind = draw(one_of(["threshold", "strain", "damage"]))
     if kind == "threshold":

@@ -1,5 +1,5 @@
-"""What sensitivities of equilibria are compared with: equilibria found anew where a number is a
-little more or less, by a dense matrix of the moves and a chord iteration, to rounding.
+"""References for sensitivities of equilibria: equilibria for slightly changed numbers, by a dense
+matrix of the moves and a chord iteration, to rounding.
 
 ``python tests/sensitivity_cases.py`` prints the worst error by rule and frame.
 """
@@ -22,7 +22,7 @@ from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import initial_state
 
 WEIGHTS = (3 / 4, -3 / 20, 1 / 60)
-"""Of central differences of order 6, over 1 to 3 steps to both sides."""
+"""Weights of central differences of order 6, over 1 to 3 steps to both sides."""
 STEP, MOST, NEAR = 5e-3, 60, 1e-10
 """The step as a share of a value, iterations, and below what way one that grows is rounding."""
 EIGHT = {"type": "chebyshev", "shells": 1}
@@ -69,7 +69,7 @@ RULES = {
         GRADIENT, LOADED, ("rule.length", "rule.poisson_ratio", "rule.stiffness", FORCE, ANGLE)
     ),
 }  # fmt: skip
-"""By name: the rule, what else differs from SHEET, and the parameters."""
+"""Cases by name: the rule, the other differences from SHEET, and the parameters."""
 FRAMES = ("none", "natural", "mean", "first", "mirror")
 BY_DISTANCE = (
     "barycentre", "mean-displacement", "distance-weighted", "mixed-coordinate",
@@ -80,7 +80,7 @@ REFUSED = {
     "natural": (BY_DISTANCE, "is not defined by cells"),
     "mirror": (ON_TRIANGLES, "requires a square or rectangular lattice"),
 }
-"""The rules that do not take a frame, and what is said then."""
+"""Rules that do not accept a frame, with the message."""
 RIGHT = {"select": {"edge": "right"}}
 ROD = {"type": "elastic", "poisson_ratio": 0.3}
 LINE = [[4.0, -1.0], [4.0, 1.3], [4.0, 4.0]]
@@ -121,7 +121,7 @@ MORE = {
         RIGHT | {"axes": ["x"], "motion": TURNED},
     ]},
 }  # fmt: skip
-"""What differs from SHEET, for parameters of other parts, and of leaders along one axis."""
+"""Differences from SHEET, for parameters of other parts, and of leaders along one axis."""
 
 
 def case(rule, frame, **more):
@@ -136,7 +136,8 @@ def other_case(frame, parts):
 
 
 def paths_of(rule, frame):
-    """All parameters with one frame; with others some of the rule, which act on the frame too."""
+    """Return all parameters with one frame; with others some of the rule, which act on the frame
+    too."""
     paths = RULES[rule][2]
     full = frame == ("mean" if rule in BY_DISTANCE else "natural")
     return paths if full else paths[: max(1, len(paths) - 3)]
@@ -210,7 +211,7 @@ class Plain:
         return np.linalg.inv(np.stack(columns, axis=1))
 
     def _settled(self, scene):
-        """Where nothing moves, from where that was before; as near as rounding lets it."""
+        """Find the equilibrium from the previous one, as near as rounding permits."""
         moves, _ = self._moves_of(scene)
         x, best = self._start.copy(), np.inf
         for _ in range(MOST):

@@ -1,4 +1,4 @@
-"""The first calls of Python users, and what is said of wrong ones."""
+"""The first calls of Python users, and the messages of wrong ones."""
 
 import inspect
 import pickle
@@ -198,7 +198,7 @@ def test_a_dataset_is_saved_as_a_sealed_result(ds, call, tmp_path, monkeypatch):
 
 
 def test_warnings_are_silenced_one_by_one(tensile):
-    """Of a body whose waves grow and a region that nothing names, the class of each."""
+    """A body with growing waves and an unused region has a warning of the class of each."""
     parts = tensile | {"solver": {"type": "stepping", "relaxation": 2.5}, "steps": 2}
     parts["regions"] = {"nowhere": {"type": "disc", "radius": 1.0, "centre": [4.5, 4.5]}}
     with pytest.warns(pbdkit.PbdkitWarning) as told:

@@ -81,13 +81,14 @@ def test_no_files_import_each_other_in_a_circle():
 
 
 def calls_of(method, path):
-    """How often a file calls the method; what it writes as text, kernels, is no call."""
+    """Return the number of calls of the method in a file; text that it writes for kernels does not
+    count."""
     called = (n.func for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call))
     return sum(isinstance(f, ast.Attribute) and f.attr == method for f in called)
 
 
 def test_rules_are_evaluated_in_one_place():
-    """Whatever is added, values by bond or a third axis, is told to the evaluator alone."""
+    """The evaluator alone implements further features, such as values by bond or a third axis."""
     outside = [path for path in FILES if "components" not in path.relative_to(PACKAGE).parts]
     found = {str(p.relative_to(PACKAGE)): calls_of("gather", p) for p in outside}
     assert {path: n for path, n in found.items() if n} == {"stepping/rule_evaluation.py": 1}

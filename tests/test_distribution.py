@@ -1,4 +1,4 @@
-"""What the distributions say of themselves: one licence, one version, dependencies told once."""
+"""Metadata of the distributions: one licence, one version, dependencies in one place."""
 
 import re
 import tomllib

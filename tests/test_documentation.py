@@ -1,4 +1,4 @@
-"""What the documentation shows, runs."""
+"""Commands and code blocks of the documentation run."""
 
 import re
 import shlex
@@ -56,15 +56,15 @@ def is_sweep(code):
 
 
 def save_experiments(page):
-    """The page's own experiments, each as NAME.yaml in the current folder, and its sweeps, which
-    say in their first line what they are called."""
+    """Save the page's own experiments, each as NAME.yaml in the current folder, and its sweeps,
+    which have their name in their first line."""
     for code in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S):
         (name,) = re.findall(r"\A# (\S+)\.yaml" if is_sweep(code) else r"(?m)^name: (\S+)", code)
         Path(f"{name}.yaml").write_text(code)
 
 
 def install(page):
-    """What the page runs as it installs pbdkit: its other blocks go on from that result."""
+    """Run the experiments of the installation on the page: its other blocks use their results."""
     for name in re.findall(r"&& \.venv/bin/pbdkit run (\S+)$", page.read_text(), re.M):
         assert CliRunner().invoke(program, ["run", name]).exit_code == 0
 
@@ -208,7 +208,8 @@ ELSEWHERE = {
     "pbdkit resume sheet.nc || pbdkit run sheet.yaml": "`test_restart`",
     'eval "$(_PBDKIT_COMPLETE': "`cli/test_command_line` asks for completions",
 }
-"""What commands in pages are not run here begin with, and who runs them, or why nobody does."""
+"""Beginnings of commands in pages that are not run here, with the test that runs them, or the
+reason why none does."""
 COMMAND = re.compile(r"^ {4}((?:pbdkit|python3?|pip|pytest|nox|bash|eval|ruff|mypy|pre-commit) .*)")
 
 

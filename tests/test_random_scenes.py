@@ -35,8 +35,8 @@ def test_fracture_matches_the_plain_loops(experiment):
 
 
 def run_unless_refused(experiment):
-    """Random leaders may select nobody, name frame points or contradict each other, bodies may be
-    empty, and mirrors need full rectangles: such scenes are not what is tested here."""
+    """Random leaders may select no particle, name frame points or contradict each other, bodies may
+    be empty, and mirrors need full rectangles: such scenes are not tested here."""
     try:
         return pbdkit.run(experiment, progress=False)
     except pbdkit.ExperimentError:

@@ -1,4 +1,4 @@
-"""A run that is left and gone on with is the uninterrupted one, bit for bit."""
+"""A run that is stopped and resumed is the uninterrupted one, bit for bit."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def stopping_after(looks: int) -> Watch:
 
 
 def run_in_parts(given: dict[str, Any], path: Path, looks: Iterator[int]) -> int:
-    """Stops the run after so many looks, and so on; how often it was gone on with."""
+    """Stop the run at intervals of some checks; return how often it was resumed."""
     scene = scene_of(given)
     sink = OverlappingSink(NetcdfSink(path, False, scene.experiment.record.compression))
     report = record(Simulation.of_scene(scene, watch=stopping_after(next(looks))), sink)
@@ -97,7 +97,8 @@ def run_in_parts(given: dict[str, Any], path: Path, looks: Iterator[int]) -> int
 
 
 def contents(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """All variables, those of the final state too, and attributes but when it was made."""
+    """Compare all variables, those of the final state too, and attributes except the time of
+    creation."""
     with h5netcdf.File(path, "r") as file:
         groups = [file, *file.groups.values()]
         values = {f"{g.name}{n}": v[...] for g in groups for n, v in g.variables.items()}
@@ -145,8 +146,8 @@ def test_any_run_in_parts_is_the_whole_run(tmp_path_factory: Any, given: dict[st
 def test_a_run_is_gone_on_with_from_any_commit(
     tensile: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What lies in the folder after each commit, as a kill leaves it, is enough; what was written
-    behind it does no harm."""
+    """The files in the folder after each commit, as a kill leaves them, are sufficient; bytes after
+    it do no harm."""
     given = tensile | RUNS["everything"] | {"fracture": FRACTURE, "steps": 5}
     monkeypatch.setattr(netcdf_sink, "EVERY_S", 0.0)
     monkeypatch.setattr(netcdf_sink, "SHARE", 0)
@@ -269,7 +270,7 @@ BLOCK: dict[str, Any] = {
     "solver": {"type": "stepping", "relaxation": 0.8, "settle": {"tolerance": 0.1}},
     "record": {"every": 50},
 }
-"""Settles within 60 steps, unless something is to happen later."""
+"""The run converges within 60 steps, unless there are later events."""
 TURNS = {"type": "rotation", "centre": [0.0, 3.0], "angle": 2.0, "steps": 130}
 LATER: dict[str, dict[str, Any]] = {
     "nothing": {},
@@ -334,7 +335,7 @@ LATER: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("later", LATER)
 @pytest.mark.filterwarnings("ignore:.* (begins|after the last step)")
 def test_a_run_that_settles_is_continued_to_the_longer_one(later: str, tmp_path: Path) -> None:
-    """Whether or not the shorter run has settled, what is to happen after it still does."""
+    """Events after the shorter run take place, whether or not it has converged."""
     given, whole = BLOCK | LATER[later] | {"steps": 400}, tmp_path / "whole.nc"
     outcome = record(Simulation.of_scene(scene_of(given)), NetcdfSink(whole)).outcome
     assert outcome.status == "settled"
@@ -386,7 +387,7 @@ def test_a_run_that_is_stopped_at_its_last_look_settles_all_the_same(tmp_path: P
 
 @pytest.mark.filterwarnings("ignore:.* starts after the last step")
 def test_an_interrupted_run_is_not_taken_for_a_shorter_one(tmp_path: Path) -> None:
-    """One of 100 steps would have settled before the load that the longer one waits for."""
+    """A run of 100 steps would have converged before the load of the longer one."""
     given, part = BLOCK | LATER["a load"] | {"record": {"every": 1}}, tmp_path / "part.nc"
     record(
         Simulation.of_scene(scene_of(given | {"steps": 900}), watch=stopping_after(40)),
@@ -411,7 +412,7 @@ def test_the_search_for_an_equilibrium_does_not_become_another_one(
 
 
 def test_weights_that_were_chosen_are_those_of_the_longer_run(tmp_path: Path) -> None:
-    """Roles that change between the ends of both runs ask for others."""
+    """If roles change between the ends of both runs other groups are needed."""
     solver = {"type": "stepping", "relaxation": "auto", "memory": "auto"}
     given = BLOCK | {"solver": solver}
     whole, part = tmp_path / "whole.nc", tmp_path / "part.nc"
@@ -444,7 +445,7 @@ def test_weights_that_were_chosen_are_those_of_the_longer_run(tmp_path: Path) ->
 
 
 def test_a_distance_that_is_infinite_can_be_gone_on_with(tmp_path: Path) -> None:
-    """A body that loads push and nobody holds has no equilibrium."""
+    """A body that loads push and that no leader holds has no equilibrium."""
     given = BLOCK | {
         "rule": {"type": "springs"},
         "leaders": [],

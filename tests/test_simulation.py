@@ -1,4 +1,4 @@
-"""One run: states come one after the other, and whoever wants to keep them does."""
+"""One run: states follow one after the other, and the caller may keep them."""
 
 from __future__ import annotations
 
@@ -101,8 +101,7 @@ def test_a_run_goes_on_from_a_state(tensile: dict[str, Any], solver: str) -> Non
 def test_all_that_decides_when_a_run_settles_is_data(
     tensile: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run that is left, and gone on with from its state, guard and pace, ends where it would
-    have."""
+    """A run that is stopped, and continued from its state, guard and pace, has the same end."""
     # Calls are not cut short where the machine is busy.
     monkeypatch.setattr("pbdkit.simulation.LONGEST_CALL_S", 1e6)
     given = tensile | {"solver": SOLVERS["settle"], "steps": 5000, "record": {"at": [0]}}
@@ -226,7 +225,7 @@ TRACK = {"type": "track", "numbers": [13]}
 
 
 def same_values(one: Any, other: Any) -> None:
-    """Of two datasets, every variable but when and how they ended."""
+    """Assert that all variables of two datasets are equal, except time and reason of their end."""
     assert {*one.variables} == {*other.variables}
     for name, variable in one.variables.items():
         np.testing.assert_array_equal(variable, other.variables[name])

@@ -89,7 +89,7 @@ def test_sound_files_pass(bare):
 
 
 def test_the_child_finds_this_pbdkit_from_anywhere(bare):
-    """As where Python was started beside the package, and left for another folder."""
+    """Python was started beside the package, and the folder was changed."""
     code = "import os, sys, pbdkit; os.chdir('/'); pbdkit.open(sys.argv[1]).close()"
     done = subprocess.run(
         [sys.executable, "-c", code, bare],
@@ -114,7 +114,7 @@ def test_more_than_a_file_can_hold_is_refused(bare, tmp_path):
 
 
 def test_a_large_file_is_read_in_pieces(tmp_path):
-    """What the child takes is a piece, and not the file."""
+    """The child process takes memory for a piece, and not for the whole file."""
     import numpy as np
 
     path, values = tmp_path / "large.nc", np.zeros((300, 2**17))

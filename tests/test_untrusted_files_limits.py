@@ -122,7 +122,7 @@ def test_what_a_file_cannot_hold_or_has_elsewhere_is_refused_sealed_and_not(
 
 
 def reseal(path: Path, change: Any) -> None:
-    """Change a sealed result, and seal it again, as anybody can."""
+    """Change a sealed result, and seal it again, which needs no secret."""
     with FileIO(path, "r+b") as file:
         file.truncate(seal_of(file).size)
     with h5py.File(path, "r+") as file:

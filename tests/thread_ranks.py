@@ -15,7 +15,7 @@ PATIENCE_S = 120.0
 
 
 class ThreadComm:
-    """Of one thread; all share `boxes`, a queue for each pair."""
+    """Communicator of one thread; all share `boxes`, a queue for each pair."""
 
     def __init__(self, rank: int, size: int, boxes: dict[tuple[int, int], Queue[Any]]) -> None:
         self.rank, self.size, self._boxes = rank, size, boxes
@@ -56,14 +56,15 @@ class ThreadComm:
 
 
 class Request:
-    """What is waited for."""
+    """A request for a pending message."""
 
     def __init__(self, wait: Callable[[], None]) -> None:
         self.Wait = wait
 
 
 def on_ranks(size: int, work: Callable[[DistributedExecution], Any]) -> list[Any]:
-    """What the work comes to in each of so many processes; raises what the first of them raises."""
+    """Return the results of the work in each of a number of processes; raise the first
+    exception."""
     boxes: dict[tuple[int, int], Queue[Any]] = {
         (a, b): Queue() for a in range(size) for b in range(size)
     }

@@ -1,4 +1,4 @@
-"""A frame whose map has full matrices, that differ from point to point, and far entries."""
+"""A frame with a map of full matrices, that differ from point to point, and far entries."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""What to measure against: a barycentre sweep written by hand, and the memory's own speed."""
+"""Baselines for measurements: a barycentre sweep written by hand, and the speed of the memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sweep(ux, uy, vx, vy):
 
 
 def sweeping(size: int, steps: int):
-    """A call makes so many sweeps of size² particles. The loop over steps is Python's: inside the
+    """Make `steps` sweeps of size² particles in a call. The loop over steps is Python's: inside the
     compiled function it made the sweeps slower, and a call costs a thousandth of a sweep."""
     ux, uy, vx, vy = np.random.default_rng(0).random((4, size + 2, size + 2)) * 0.01
 
@@ -35,8 +35,8 @@ def sweeping(size: int, steps: int):
 
 
 class Copying:
-    """A call reads 16 bytes and writes 16 for each of size² particles, so many times, as every step
-    must, by plain copying on one thread or two."""
+    """Copying of 16 bytes read and 16 written for each of size² particles, once for each step, on
+    one thread or two. Every step must do this."""
 
     def __init__(self, size: int, times: int, threads: int = 1):
         self.planes = np.random.default_rng(0).random((2, 2, size, size))

@@ -1,4 +1,4 @@
-"""Equilibria of sheets whose bonds break: by a kernel of their own and by numpy, in turns.
+"""Compare equilibria of sheets with breaking bonds, by the compiled kernel and by numpy, in turns.
 
 python tests/benchmarks/breaking.py [--turns N] [--only damage threshold]
 

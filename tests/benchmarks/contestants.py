@@ -1,4 +1,4 @@
-"""Those who solve the finite-element problems: pbdkit here, scikit-fem in a process of its own."""
+"""Solvers of the finite-element problems: pbdkit here, scikit-fem in a process of its own."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def gridded(problem: Problem, cells: int, scene: Scene, state: State) -> Any:
 
 @contextmanager
 def contestants() -> Iterator[dict[str, Contestant]]:
-    """All of them, by name; scikit-fem's only where its environment can be had."""
+    """Yield all solvers by name; those of scikit-fem only if its environment is available."""
     found = {name: own(name) for name in OWN}
     python = python_with(*PACKAGES)
     if not python:

@@ -31,8 +31,8 @@ UNITS = np.array([1e6, 1e6, 1e9, 1e9, 1e9, 1e9])
 
 
 def cost() -> dict[str, Any]:
-    """For each engine the fit with its largest and its typical deviation; set-up, records, and
-    whole runs foretold."""
+    """Return, for each engine, the fit with its largest and its typical deviation, and predictions
+    of set-up, records and whole runs."""
     found: dict[str, Any] = {engine: _fit(engine) for engine in SIZES}
     found["setup_ns_a_particle"] = _setup()
     found["file_ms"] = _run(10, {"steps": 1})[0] * 1e3
@@ -42,14 +42,14 @@ def cost() -> dict[str, Any]:
 
 
 def _terms(particles: int, neighbours: int) -> list[float]:
-    """What the seconds of a step are a linear function of."""
+    """Return the terms of which the seconds of a step are a linear function."""
     far, farther = (32 * particles > cache for cache in (SECOND_CACHE, THIRD_CACHE))
     near = [1.0, neighbours, particles, particles * neighbours]
     return [*near, particles * far, particles * farther]
 
 
 def _fit(engine: str) -> dict[str, Any]:
-    """By non-negative least squares of the relative deviations."""
+    """Fit by non-negative least squares of the relative deviations."""
     points = [(n * n, k, _step(engine, n, k)) for n in SIZES[engine] for k in (4, 8, 24)]
     rows = np.array([_terms(n, k) for n, k, _ in points])
     seconds = np.array([s for *_, s in points])
@@ -81,7 +81,8 @@ def _setup() -> float:
 
 
 def _record() -> float:
-    """What a record costs a particle: every step of a run recorded, against the last alone."""
+    """Measure the cost of a record for each particle: a run that records every step, against one
+    that records the last alone."""
     often, seldom = (_run(500, {"steps": 21, "record": {"every": e}})[0] for e in (1, 21))
     return (often - seldom) / 20 / 500**2 * 1e9
 

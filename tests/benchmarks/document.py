@@ -229,7 +229,7 @@ def _weak(found: list[Data]) -> str:
 
 
 SCALE = {"ranks", "weak"}
-"""Those of docs/validation/scale.md."""
+"""Scales measured for docs/validation/scale.md."""
 TABLES: dict[str, Callable[[Any], str]] = {
     "machine": _machine,
     "goals": _goals,

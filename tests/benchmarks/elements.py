@@ -33,9 +33,10 @@ from pbdkit.scene.scene import build_scene
 
 CELLS = (10, 20, 40, 80, 160, 320, 640)
 TURNS, ENOUGH_S = 7, 2.0
-"""So many turns, fewer of what takes long; pbdkit's first may compile, so that it has two."""
+"""Number of turns, and seconds after which there are fewer; the first contestant of pbdkit may
+compile, so that it has two."""
 PATIENCE_S, GROWTH = 15.0, 6.0
-"""What would take longer at the next size, by its growth, is left out."""
+"""Contestants that would take longer at the next size, predicted by their growth, are left out."""
 WANTED = {1e-3: 4.0, 2e-4: 10.0}
 """Errors, and by how many times pbdkit is to be faster there."""
 
@@ -59,7 +60,7 @@ class Row:
 
 
 def elements() -> dict[str, Any]:
-    """All rows, times to errors against goals, and errors against goals."""
+    """Measure all rows, times to errors against goals, and errors against goals."""
     with threadpool_limits(1), contestants() as found:
         rows = [row for problem in PROBLEMS for row in _of_problem(problem, found)]
         goals = [goal for problem in PROBLEMS[:3] for goal in _times(problem, rows)]

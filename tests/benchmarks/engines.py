@@ -52,7 +52,7 @@ def threads() -> list[dict[str, Any]]:
 
 
 def limit() -> list[dict[str, Any]]:
-    """How near the sweeps come to reading and writing every displacement once."""
+    """Compare the sweeps with reading and writing every displacement once."""
     found = []
     for size, steps in ((1000, 32), (3000, 16)):
         copies = max(2, 10**7 // size**2)

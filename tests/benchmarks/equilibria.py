@@ -129,7 +129,7 @@ def axes_apart(K: Any, f: Any) -> Callable[[], object]:
 
 
 def peak(work: Callable[[], object]) -> int:
-    """Bytes."""
+    """Return the peak of allocated memory in bytes."""
     tracemalloc.start()
     try:
         work()

@@ -36,7 +36,7 @@ def _cell(row: Data, rows: list[Data]) -> str:
 
 
 def _leads(row: Data, rows: list[Data]) -> bool:
-    """Whether nobody has less error in less time, at any size."""
+    """Return whether no other program has less error in less time, at any size."""
     return not any(
         other is not row
         and not other["reason"]

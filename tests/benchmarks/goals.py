@@ -39,7 +39,7 @@ BUSY = "measured while other programs computed: the second processor was not fre
 
 @dataclass(frozen=True)
 class Goal:
-    """A goal with what was measured. `at_most` tells on which side of `goal` it is met."""
+    """A goal with its measurement. `at_most` is true if the measurement must not exceed `goal`."""
 
     name: str
     goal: float
@@ -92,7 +92,7 @@ def against_bare() -> Iterator[Goal]:
 
 
 def against_plain() -> Iterator[Goal]:
-    """What a scene holds besides, against the same scene without."""
+    """Measure the additional memory of a scene, against the same scene without the feature."""
     steps, size, turns = 4, 1000, 60
     for name, goal, parts, plain, changed in (
         ("elastic under the natural frame against elastic", 1.7, NATURAL, CELLS, None),

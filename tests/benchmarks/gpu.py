@@ -15,7 +15,7 @@ SIZE, FEW, MANY, TURNS = 3000, 100, 1100, 5
 
 
 def gpu() -> list[dict[str, Any]] | None:
-    """None where there is nothing to measure on, which is said."""
+    """Return None, after a message, if there is no device to measure."""
     if missing := what_is_missing():
         print(f"gpu: not measured: {missing}")
         return None

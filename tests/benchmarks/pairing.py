@@ -36,7 +36,7 @@ def ratio(first: Work, second: Work, turns: int = 9) -> Ratio:
 
 
 def of_times(first: list[float], second: list[float]) -> Ratio:
-    """The same of times taken in turns."""
+    """Return the ratio of times taken in turns."""
     single = [a / b for a, b in zip(first, second, strict=True)]
     low, _, high = statistics.quantiles(single, n=4)
     return Ratio(min(first) / min(second), low, high, min(first), min(second))
@@ -68,8 +68,8 @@ def best(work: Work, turns: int = 5) -> float:
 
 
 def wait_for_quiet(patience_s: float = 20.0) -> bool:
-    """Waits until nobody else computes, for what needs every processor; False if that took too
-    long."""
+    """Wait until no other process computes, for measurements on all processors; return False if
+    that took too long."""
     end = time.monotonic() + patience_s
     while _busy(0.5) > 0.1:
         if time.monotonic() > end:

@@ -1,4 +1,5 @@
-"""The same sheet in other programs, each in a virtual environment and a process of its own."""
+"""Measure the same sheet in other programs, each in a virtual environment and a process of its
+own."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ PAUSE_S = 0.01
 
 
 def ranks() -> dict[str, Any] | None:
-    """None where there is no mpiexec, which is said."""
+    """Return None, after a message, if there is no mpiexec."""
     if not shutil.which("mpiexec"):
         print("ranks: not measured: there is no mpiexec: pip install mpich")
         return None
@@ -40,7 +40,7 @@ def ranks() -> dict[str, Any] | None:
 
 
 def weak_scaling() -> list[dict[str, float]] | None:
-    """None where there is no mpiexec, which is said."""
+    """Return None, after a message, if there is no mpiexec."""
     if not shutil.which("mpiexec"):
         print("weak: not measured: there is no mpiexec: pip install mpich")
         return None
@@ -49,7 +49,7 @@ def weak_scaling() -> list[dict[str, float]] | None:
 
 
 def _on(size: int, what: str) -> list[Any]:
-    """What the processes of a launch have noted, by rank."""
+    """Return what the processes of a launch have recorded, by rank."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, __file__, what, folder]
         subprocess.run([*(["mpiexec", "-n", str(size)] * (size > 1)), *command], check=True)
@@ -57,7 +57,7 @@ def _on(size: int, what: str) -> list[Any]:
 
 
 class Sharing:
-    """A sheet under way on all ranks; a call makes so many steps more."""
+    """A sheet in motion on all ranks; a call makes further steps."""
 
     def __init__(self, ranks: DistributedExecution, parts: dict[str, Any]) -> None:
         scene = scene_of(parts)
@@ -77,7 +77,8 @@ class Sharing:
 
 
 def speed(ranks: DistributedExecution) -> dict[str, float]:
-    """Best seconds of so many steps, in turns; while one process works the others sleep."""
+    """Return the best seconds of a number of steps, in turns; while one process works the others
+    sleep."""
     shared = Sharing(ranks, moving(SIZE))
     alone = (
         [Running(moving(SIZE), STEPS, threads=n) for n in (1, 2)]
@@ -114,8 +115,8 @@ def _timed(
 
 
 def weak(ranks: DistributedExecution) -> list[dict[str, float]]:
-    """Of parts of a million particles with a neighbour on either side: what their steps between two
-    exchanges take, an exchange with one neighbour, and as many steps of such a body alone."""
+    """Measure parts of a million particles with a neighbour on either side: their steps between two
+    exchanges, an exchange with one neighbour, and as many steps of such a body alone."""
     return [_weak(ranks, rows, MILLION // rows) for rows in ROWS]
 
 

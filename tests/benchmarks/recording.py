@@ -1,5 +1,5 @@
-"""What recording costs: pbdkit's file, written as `pbdkit run` does, against writing the same bytes
-with nothing around them."""
+"""Measure the cost of recording: pbdkit's file, written as `pbdkit run` does, against writing the
+same bytes with nothing around them."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ RULES = {
         "solver": {"type": "stepping", "relaxation": 0.05},
     },
 }
-"""Every shipped rule."""
+"""Parts of an experiment for every shipped rule."""
 OWN = {"rule": {"type": "own-barycentre"}}
 
 
@@ -135,7 +135,7 @@ def moving(size: int, **parts: Any) -> dict[str, Any]:
 
 
 def pulled(size: int) -> dict[str, Any]:
-    """The same at rest, pulled at its right edge for ten steps."""
+    """Return the same sheet at rest, pulled at its right edge for ten steps."""
     pull = {"type": "velocity", "velocity": [0.35, 0.0], "steps": 10}
     leaders = [{"select": {"edge": "right"}, "motion": pull, "until": 10}]
     return moving(size, leaders=leaders, initial={"type": "reference"})
@@ -148,7 +148,7 @@ def scene_of(parts: dict[str, Any]):
 
 
 class Running:
-    """A sheet under way; a call makes so many steps more."""
+    """A sheet in motion; a call makes further steps."""
 
     def __init__(
         self,
@@ -170,9 +170,9 @@ class Running:
 
 
 class Moved(Running):
-    """A call makes its steps in arrays made anew, and `seconds` says how long the steps took. Where
-    arrays happen to lie in memory makes more than what is to be compared: the best of many calls
-    is free of it."""
+    """A call makes its steps in newly allocated arrays, and `seconds` is their time. The place of
+    arrays in memory has more effect than the differences to be measured; the best of many calls is
+    free of it."""
 
     seconds = 0.0
 

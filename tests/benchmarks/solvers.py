@@ -1,10 +1,10 @@
-"""Linear systems off the lattice's stencils: solvers of pbdkit, scipy and pyamg, one after another.
+"""Compare solvers of pbdkit, scipy and pyamg on linear systems without the lattice's stencils.
 
 python tests/benchmarks/solvers.py [--size N] [--only PART_OF_A_NAME ...]
 
-Processor time of set-up and of one solution, one thread. Iterations go on to a relative residual of
-1e-9 in the norm of each preconditioner; the residual that is left is printed. The results and what
-follows from them stand in docs/decisions/0010-solvers-of-equilibria.md.
+Processor time of set-up and of one solution, one thread. Iterations end at a relative residual of
+1e-9 in the norm of each preconditioner; the final residual is printed. The results and the
+conclusions are in docs/decisions/0010-solvers-of-equilibria.md.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def system(n: int, parts: dict[str, Any]) -> tuple[Any, Coordinates]:
 
 
 def by_band(A: Any, at: Coordinates) -> Solver:
-    """LAPACK's band."""
+    """Solve with LAPACK's band matrices."""
     order, half = band_order(A, at)
     factors = BandLU(A, order, half)
     return lambda: f"half-bandwidth {half}", lambda b: factors.solve(b, 0.0)
@@ -140,7 +140,7 @@ def iterated(A: Any, cycle: Callable[[Any], Any]) -> Solver:
 
 
 def by_own_multigrid(A: Any, at: Coordinates) -> Solver:
-    """amg.py."""
+    """Solve with the multigrid of amg.py."""
     return iterated(A, at.grids(A))
 
 

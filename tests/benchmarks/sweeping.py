@@ -1,4 +1,4 @@
-"""What the small runs of a sweep cost: ``python tests/benchmarks/sweeping.py``.
+"""Measure the cost of the small runs of a sweep: ``python tests/benchmarks/sweeping.py``.
 
 1000 runs of paper/a over its relaxation with two workers, against the same by `pbdkit.run` in one
 process, of which a sample is timed before and after. Goals: 1.7 times faster, and a store of 10 MB

@@ -1,11 +1,11 @@
-"""`pbdkit fit plate-with-hole` against finite-element model updating of the same specimen.
+"""Compare `pbdkit fit plate-with-hole` with finite-element model updating of the same specimen.
 
     python tests/benchmarks/updating.py [--turns N] [--plain]
 
 Values with their errors, discretisation errors of both, and times of whole calls, from the file to
 values and errors, taken in turns on one thread. Each lattice of pbdkit has for its rival the
 coarsest mesh of quadratic elements whose field of displacements is at least as exact. `--plain`
-also times elements that are assembled anew for every state, with derivatives by differences. Needs
+also times elements that are assembled again for every state, with derivatives by differences. Needs
 scikit-fem.
 """
 
@@ -61,7 +61,7 @@ def described(a: float) -> dict[str, Any]:
 
 
 def own(a: float) -> Found:
-    """By pbdkit."""
+    """Return the estimates of pbdkit."""
     found = pbdkit.fit(described(a))
     poisson, young = found.values[RATIO], found.youngs_modulus
     assert young
@@ -81,7 +81,8 @@ def end(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def on_lattice(a: float) -> tuple[np.ndarray, float]:
-    """What pbdkit has at the points, (axis · point,), and the force on the right end."""
+    """Return pbdkit's displacements at the points, (axis · point,), and the force on the right
+    end."""
     experiment, y = described(a)["experiment"], np.arange(0.0, HEIGHT + a / 2, a)
     for leader, x in zip(experiment["leaders"], (0.0, LENGTH), strict=True):
         at = np.column_stack([np.full_like(y, x), y])
@@ -105,7 +106,7 @@ def on_lattice(a: float) -> tuple[np.ndarray, float]:
 
 @cache
 def on_mesh(n: int) -> tuple[np.ndarray, float]:
-    """The same of elements."""
+    """Return the displacements and the force of finite elements."""
     plate = Plate(n)
     stiffness, at = plate.stiffness(lame(POISSON)), plate.basis.doflocs
     both = end(*at)
@@ -125,7 +126,7 @@ def off(found: tuple[np.ndarray, float]) -> Off:
 
 
 def rivals() -> dict[float, tuple[Off, int]]:
-    """Of each spacing the error, and the coarsest mesh that is as exact."""
+    """Return, for each spacing, the error and the coarsest mesh that is as exact."""
     of_meshes = {n: off(on_mesh(n)) for n in MESHES}
     for n, error in of_meshes.items():
         print(f"error of quadratic elements, {n} over the height | {worded(error)}", flush=True)
@@ -225,7 +226,7 @@ def compared(a: float, n: int, turns: int, plain: bool) -> Iterator[str]:
 
 
 def main() -> None:
-    """All rows."""
+    """Print all rows of the comparison."""
     asked = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     asked.add_argument("--turns", type=int, default=5)
     asked.add_argument("--plain", action="store_true")

@@ -346,8 +346,8 @@ NEEDED = {
     "status e.nc": ({"numpy"}, {"pbdkit.plugin", "pbdkit.components"}),
     "verify e.nc": ({"numpy", "pydantic"}, {"pbdkit.stepping", "pbdkit.equilibrium"}),
 }
-"""Of commands, and of an import, the libraries that are loaded, all others left out, and parts of
-pbdkit that are not."""
+"""Return, for commands and an import, the libraries that are loaded, and the parts of pbdkit that
+are not."""
 
 
 @pytest.mark.parametrize(("asked", "needed"), NEEDED.items(), ids=NEEDED)
@@ -429,7 +429,7 @@ def test_the_set_up_is_drawn_before_the_run(call: Call) -> None:
 
 
 def completed(*words: str) -> list[str]:
-    """What the tabulator key offers after these words in bash."""
+    """Return the completions of the tabulator key after these words in bash."""
     asked = {"_PBDKIT_COMPLETE": "bash_complete", "COMP_WORDS": " ".join(["pbdkit", *words])}
     environment = os.environ | asked | {"COMP_CWORD": str(len(words))}
     command = [sys.executable, "-m", "pbdkit"]

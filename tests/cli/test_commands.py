@@ -42,7 +42,7 @@ def source(name: str = "shear", target: str = "pbdkit_target:shear", does: str =
 
 @pytest.fixture
 def add(install: Install) -> Install:
-    """``add("pbdkit-x", source)``: a distribution whose entry point is for commands."""
+    """``add("pbdkit-x", source)`` adds a distribution with an entry point for commands."""
     install("pbdkit-target", TARGET)
 
     def of(distribution: str, text: str, version: str = "1.0") -> None:

@@ -1,4 +1,4 @@
-"""What the tabulator key offers on a line that has been begun."""
+"""Test completions of the tabulator key on a line that has been begun."""
 
 # ruff: noqa: E501  (a row of a table is a line)
 
@@ -28,7 +28,8 @@ Offered = Callable[..., list[str]]
 
 @pytest.fixture
 def offered(call: Any, monkeypatch: pytest.MonkeyPatch) -> Offered:
-    """What is offered for the last of some words, in the folder of `call`, which has a result."""
+    """Return the completions of the last of some words, in the folder of `call`, which has a
+    result."""
     call("run", "e.json", "--set", "diagnostics=[{type: pe1}, {type: displacement}]", "--quiet")
 
     def complete(*words: str) -> list[str]:
@@ -133,7 +134,7 @@ def test_damaged_results_offer_nothing_and_say_nothing(offered: Offered) -> None
 
 
 def test_little_is_imported(call: Any) -> None:
-    """The two lines as a shell asks: neither xarray nor what computes."""
+    """Test the two lines that a shell runs: they import neither xarray nor the numerical code."""
     call("run", "e.json", "--quiet")
     for words in (["run", "e.json", "--set", "ru"], ["plot", "tensile.nc", "--color", "p"]):
         asked = {"_PBDKIT_COMPLETE": "bash_complete", "COMP_WORDS": " ".join(["pbdkit", *words])}

@@ -1,4 +1,5 @@
-"""Where results go: what is never replaced, what a failed run leaves, and what is said before."""
+"""Outputs: files that are never replaced, files that a failed run leaves, and messages before a
+run."""
 
 from __future__ import annotations
 
@@ -56,7 +57,7 @@ def test_only_plain_files_that_are_not_the_experiment_are_replaced(
 
 
 def test_a_device_is_not_replaced() -> None:
-    """Asked of the check alone: a command that failed it would cost this machine its device."""
+    """Replace the check alone: a command that failed it would cost this machine its device."""
     with pytest.raises(pbdkit.ExperimentError, match="is a device, which is not replaced"):
         refuse_output(Path(os.devnull), force=True)
 
@@ -252,7 +253,7 @@ def test_an_interruption_that_python_makes_something_else_of(body: str) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="limits on address space are Linux's")
 @pytest.mark.parametrize(("mib", "code"), [(100, 6), (900, 6), (1030, 2), (1300, 0)])
 def test_little_memory_is_told_in_a_line(call: Call, mib: int, code: int) -> None:
-    """Libraries that get none spin, or end the process: they are not asked."""
+    """Libraries that get no memory spin, or end the process: they are not called."""
     limit = f"import resource as r; r.setrlimit(r.RLIMIT_AS, ({mib} * 2**20,) * 2)"
     program = f"{limit}; from pbdkit.__main__ import main; main()"
     done = subprocess.run(

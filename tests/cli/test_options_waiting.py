@@ -1,4 +1,4 @@
-"""Whoever waits at a terminal is told what for, and nobody else is told anything."""
+"""A user who waits at a terminal gets a message, and no other output has it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextmanager
 def looking(shown: io.StringIO) -> Iterator[io.StringIO]:
-    """Here, and not in a fixture: between the two pytest takes stderr back."""
+    """Replace stderr here, and not in a fixture: between the two pytest takes it back."""
     with redirect_stderr(shown):
         yield shown
 

@@ -1,4 +1,4 @@
-"""No plugin brings a command down; what is wrong with it is said where it matters."""
+"""No plugin brings a command down; its faults are reported where they matter."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ EVERY_COMMAND = {
 }
 DEAR = {"bench", "plot", "animate", "curve", "report"}
 CHEAP = [name for name in EVERY_COMMAND if name not in DEAR]
-"""Those that take no second."""
+"""Commands that take less than a second."""
 
 
 @pytest.fixture
@@ -94,7 +94,8 @@ def test_all_broken_plugins_together_stop_no_command(
 @pytest.mark.usefixtures("healthy")
 @pytest.mark.parametrize("kind", BROKEN)
 def test_no_broken_plugin_stops_a_command(install: Install, call: Call, kind: str) -> None:
-    """A run, whose result others read, and a quarter of the other commands, each in its turn."""
+    """Choose a run, of which others read the result, and a quarter of the other commands, each in
+    its turn."""
     source, reason = BROKEN[kind]
     run, *others = CHEAP
     tried = [run, *in_turn(others, 4, first=[*BROKEN].index(kind) % 4)]

@@ -112,7 +112,7 @@ def test_experiments_that_say_the_same_are_equal():
 
 
 def read_only(rng):
-    """A vector of two arrays that nobody can write to."""
+    """Return a vector of two arrays that are read-only."""
     return Vector(*map(locked, rng.normal(size=(2, 4, 3))))
 
 

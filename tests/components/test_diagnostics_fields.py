@@ -149,7 +149,7 @@ GRADIENTS = {
 @pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=GRADIENTS)
 @pytest.mark.parametrize("name", SHEARED)
 def test_stresses_of_affine_deformations_are_those_of_hookes_law(name, gradient):
-    """All components, von Mises of the tensor in space, and principal values in the plane."""
+    """Test all components, von Mises of the tensor in space, and principal values in the plane."""
     rule, law, stiffness = SHEARED[name]
     given = experiment(initial={"type": "affine", "gradient": gradient}) | SQUARE | {
         "body": DISC | {"radius": 3.2}, "rule": rule, "frame": NATURAL, "diagnostics": FIELDS,

@@ -93,7 +93,8 @@ def test_the_work_of_the_leaders_is_the_strain_energy(name):
 @pytest.mark.parametrize("body", [GRID, DISC], ids=["grid", "disc"])
 @pytest.mark.parametrize("lattice", LATTICES)
 def test_all_leader_groups_together_exert_nothing(lattice, body):
-    """Forces and torques of three, which share particles; nobody else is in equilibrium yet."""
+    """Test forces and torques of three bodies that share particles; no other particle is in
+    equilibrium yet."""
     box = {"box": [1.0, 1.0, 2.5, 2.2]}
     leaders = [
         {"select": {"edge": "left"}, "motion": HOLD},
@@ -150,7 +151,7 @@ def test_springs_have_the_energy_of_their_definition(lattice):
 
 @pytest.mark.parametrize("lattice", SPRINGS)
 def test_the_reaction_of_springs_is_the_slope_of_their_energy(lattice):
-    """By central differences, far from rest: a stretch of a third and a turn."""
+    """Test by central differences, far from rest: a stretch of a third and a turn."""
     given = SPRINGS[lattice] | {"rule": {"type": "springs"}}
 
     def energy(x):
@@ -281,7 +282,7 @@ def test_forces_of_neighbours_that_come_and_go_are_refused():
 
 
 class Forceless(pbdkit.plugin.Calibrated, pbdkit.FollowerRule):
-    """A calibrated rule that does not say what its forces are."""
+    """A calibrated rule that does not define its forces."""
 
     type: Literal["forceless"] = "forceless"
     elasticity, gather, apply = Loose.elasticity, Loose.gather, Loose.apply

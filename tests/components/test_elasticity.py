@@ -237,7 +237,8 @@ def springs_of(lattice):
 
 
 def cells_beside(X, i, j, is_square):
-    """How many cells share an edge: on each side the corners that complete one must be there."""
+    """Return the number of cells that share an edge: on each side the corners that complete one
+    must exist."""
     cells, (x, y) = 0, X[j] - X[i]
     for side in (1, -1):
         across = side * np.array([-y, x])

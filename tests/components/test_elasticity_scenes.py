@@ -1,4 +1,4 @@
-"""Where calibrated rules, their frames and lattices do not go together, and what is said then."""
+"""Calibrated rules are rejected with frames and lattices that do not suit them."""
 
 from typing import Literal
 
@@ -129,7 +129,8 @@ def test_copying_frames_are_warned_of_with_the_size_of_the_error(frame, warned):
 
 
 def test_cut_cells_have_the_area_of_the_outline(monkeypatch):
-    """That of a disc, at second order, but for the slivers that are left out."""
+    """The moment of a disc is reproduced at second order, except for the slivers that are left
+    out."""
     monkeypatch.setattr(cut_cells, "MIN_SHARE", 0.0)
     off = []
     for spacing in (0.2, 0.1, 0.05):

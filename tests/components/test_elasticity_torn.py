@@ -178,8 +178,9 @@ def test_a_notched_plate_turns_as_a_whole(rule):
 
 
 MOMENTS = {0.0: 19.3682, 0.2: 19.3992, 1 / 3: 19.4726, 0.45: 19.5685}
-"""Of a plate 41 × 20 with a crack to half its height, 9.5 + .5 of a cell, bent between ends that
-turn by a radian and do not contract: quadratic elements with a true crack, graded at its tip."""
+"""A plate 41 × 20 with a crack to half its height, 9.5 + .5 of a cell, is bent between ends that
+turn by a radian and do not contract. The reference are quadratic elements with a true crack, graded
+at its tip."""
 
 
 @pytest.mark.parametrize("nu", MOMENTS)
@@ -253,7 +254,7 @@ def test_energy_of_softened_springs_is_the_work_that_stretched_them():
 @pytest.mark.parametrize("lattice", LATTICES, ids=lambda lattice: lattice["type"])
 @pytest.mark.parametrize("rule", [elastic(0.0), elastic(0.3), {"type": "springs"}], ids=str)
 def test_stress_of_softened_cells_is_what_they_carry(lattice, rule):
-    """All bonds have lost half of their pull: so has the stress."""
+    """If all bonds have lost half of their force, the stress is halved."""
     if rule["type"] == "springs" and lattice["type"] == "rectangular":
         rule = ORTHOTROPIC
     experiment = pbdkit.Experiment(

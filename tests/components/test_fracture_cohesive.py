@@ -40,7 +40,7 @@ def body(a, rule=SPRINGS, lattice="square", **parts):
 
 
 class Strained:
-    """A body whose displacements are those of a gradient, from moment to moment."""
+    """A body with the displacements of a gradient, from moment to moment."""
 
     def __init__(self, **parts):
         self.scene = build_scene(pbdkit.Experiment(**body(1.0, **parts)))
@@ -73,7 +73,7 @@ class Strained:
 
     @property
     def broken(self):
-        """How many bonds are."""
+        """Return the number of broken bonds."""
         return int((self.state.broken_step >= 0).sum())
 
 

@@ -121,7 +121,7 @@ def test_its_name_stays_reserved():
 
 @pytest.fixture
 def old_result(tmp_path):
-    """A result whose experiment names the frame, as earlier versions wrote it."""
+    """Return a result with an experiment that names the frame, as earlier versions wrote it."""
     ds = pbdkit.run(SHEET, progress=False)
     parts = json.loads(ds.experiment) | {"frame": {"type": "traction-free"}}
     ds.attrs["experiment"] = json.dumps(parts)

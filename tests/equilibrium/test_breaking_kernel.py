@@ -1,4 +1,4 @@
-"""Scenes that a kernel of its own settles while their bonds break: as numpy does."""
+"""Scenes with breaking bonds that a kernel brings to equilibrium, as numpy does."""
 
 import os
 import subprocess
@@ -56,7 +56,7 @@ def _mostly_interpreted(request):
 
 
 def by_kernel(monkeypatch):
-    """Counts the increments that a kernel settles, each time."""
+    """Count the increments that the kernel solves, each time."""
     monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
     settled, settle = [], Settler.settle
     monkeypatch.setattr(

@@ -43,8 +43,8 @@ def steps_of(ds):
 
 
 def stepped_on(given, ds, most=20_000):
-    """Where the steps lead without an early end, (particle, axis), found by making them: None where
-    they do not come to rest; and the breaking steps at the end."""
+    """Return the steady state of the steps, (particle, axis), found by making them, or None if they
+    do not come to rest; and the breaking steps at the end."""
     solver = {k: v for k, v in given["solver"].items() if k != "settle"}
     scene = build_scene(pbdkit.Experiment(**given | {"solver": solver, "steps": most}))
     stepper, state = Stepper(scene), initial_state(scene)
@@ -65,7 +65,7 @@ def error_of(ds, rest):
 @samples(4)
 @given(experiments(), st.sampled_from([1e-2, 1e-4, 1e-7]))
 def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tolerance):
-    """All lattices, rules, frames, motions and fracture, against the steps themselves."""
+    """All lattices, rules, frames, motions and fracture are compared with the steps themselves."""
     assume(not drawn["neighbours"].get("reevaluate"))
     solver = drawn["solver"] | {"settle": {"tolerance": tolerance}, "engine": "numpy"}
     if drawn["rule"]["type"] == "distance-weighted":
@@ -163,7 +163,7 @@ def test_what_begins_after_the_last_step_does_not_delay_the_end(beyond):
 
 
 def test_a_load_that_has_ended_does_not_delay_the_end_by_its_course():
-    """Its force would go on to change, and acts on nobody."""
+    """Its force would continue to change, and acts on no particle."""
     force = [0.0, {"steps": [0, 1500], "values": [0.0, 1.0]}]
     load = {"select": {"edge": "top"}, "force": force, "until": 60}
     ds = run(sheet(5, 4, rule={"type": "springs"}, frame={"type": "natural"}, loads=[load],
@@ -235,7 +235,7 @@ SWINGING = {"memory": 0.8, "relaxation": 0.5}
 
 
 def test_it_does_not_end_while_a_bond_may_break_farther_than_the_equilibrium():
-    """What memory carries the body on by counts, at both ends of the bond."""
+    """Displacements that momentum still causes count, at both ends of the bond."""
     pulled = {"select": NECK["leaders"][1]["select"],
               "motion": {"type": "displace", "displacement": [1.0, 0.0]}}  # fmt: skip
     parts = NECK | {"leaders": [NECK["leaders"][0], pulled], "solver": SWINGING}
@@ -261,8 +261,9 @@ def test_it_does_not_end_while_a_bond_may_break_farther_than_the_equilibrium():
 
 @pytest.mark.parametrize(("memory", "lag"), [(0.8, 0), (-0.4, 0), (0.0, 1)])
 def test_what_carries_the_body_on_is_part_of_the_distance(memory, lag):
-    """|b| / (1 - |b|) times the last step for memory b, once it for a frame that lags: beside the
-    true distance, which is that of the correction to rounding here."""
+    """The bound is |b| / (1 - |b|) times the last step for memory b, plus the last step for a frame
+    with delay, in addition to the true distance, which is that of the correction to rounding
+    here."""
     solver = {"memory": memory, "relaxation": 0.5, "engine": "numpy"}
     given_ = sheet(solver=solver, frame="lag" if lag else "mean", tolerance=0.05)
     ds = run(given_)
@@ -465,7 +466,7 @@ def test_parts_that_remember_have_no_known_distance():
 
 @pytest.mark.parametrize("memory", [0.9, 0.97])
 def test_what_memory_may_carry_a_body_on_by_counts_as_distance(memory):
-    """A body that memory alone moves goes on by memory/(1 - memory) times its last step."""
+    """A body that moves by momentum alone moves by memory/(1 - memory) times its last step."""
     solver = {"memory": memory, "relaxation": 0.5}
     ds = run(sheet(solver=solver, tolerance=1e-3, record={"every": 1}))
     last = np.abs((ds.position[-1] - ds.position[-2]).values).max()

@@ -1,4 +1,5 @@
-"""solver: equilibrium goes where the steps go, and its certificate is never below the error."""
+"""The solver `equilibrium` finds the state to which steps lead, and its error bound is never below
+the error."""
 
 import json
 
@@ -60,7 +61,8 @@ def test_every_method_finds_the_affine_sheet_within_its_certificate(method, size
 
 
 def came_to_rest(state):
-    """Whether the last of some steps, in which every drawn motion has ended, moved nothing."""
+    """Return whether the last of some steps, in which every drawn motion has ended, moved
+    nothing."""
     last, scale = np.abs(state.u - state.previous).max(), max(1.0, np.abs(state.u).max())
     return state.step >= 100 and last < 1e-15 * scale
 
@@ -69,8 +71,7 @@ def came_to_rest(state):
 @samples(4)
 @given(experiments())
 def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
-    """Where steps from
-    the start settle, they do so within the certificate of it."""
+    """If steps from the start converge, they do so within the error bound."""
     assume(experiment["fracture"]["type"] == "none")
     assume(experiment["rule"]["type"] != "distance-weighted")
     assume(not experiment["neighbours"].get("reevaluate"))
@@ -99,7 +100,8 @@ LAST = {"every": 10_000}
 
 @pytest.mark.parametrize("until", [7, 600])
 def test_a_released_body_keeps_what_it_had_at_rest(until):
-    """No leader in the last step: the mean at the release remains, that of the settled body."""
+    """If there is no leader in the last step, the mean at the release remains, that of the body at
+    rest."""
 
     def parts(until):
         leaders = [LEFT | {"until": until}, pulled(2.0, 1.0, until=until)]
@@ -113,7 +115,7 @@ def test_a_released_body_keeps_what_it_had_at_rest(until):
 
 @pytest.mark.parametrize("lag", [0, 1])
 def test_late_leaders_start_where_the_body_rests(lag):
-    """In whatever step, as after so many that steps rest there."""
+    """Stopping works in any step, also after so long that steps rest there."""
 
     def parts(begin):
         held = {"select": {"nearest": [[2.0, 2.0]]}, "motion": {"type": "hold"}, "from": begin}

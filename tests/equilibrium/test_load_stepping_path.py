@@ -1,4 +1,4 @@
-"""Where the way of the load decides: rules that are not linear, bonds that break, events."""
+"""Cases in which the load path matters: rules that are not linear, bonds that break, events."""
 
 import json
 from itertools import pairwise
@@ -77,7 +77,7 @@ def test_springs_end_where_slow_loading_leads_and_are_not_folded(displacement):
 
 
 def test_a_body_that_buckles_is_no_equilibrium():
-    """Pressed along its axis, a strip can give way to either side."""
+    """A strip that is pressed along its axis can buckle to either side."""
     with pytest.raises(pbdkit.DivergedError, match="several equilibria meet there"):
         run(springs([-2.0, 0.0]))
 
@@ -159,7 +159,7 @@ def test_no_bond_changes_by_more_than_the_tolerance_where_the_way_ends(tolerance
 
 
 def test_bounds_to_first_order_are_doubled():
-    """Of springs, by the search and of a state on its way."""
+    """Test springs, by the search and by a state on the path."""
     scene = build_scene(pbdkit.Experiment(**springs([0.5, 1.0])))
     state = initial_state(scene)
     certificate = settle(scene, state)

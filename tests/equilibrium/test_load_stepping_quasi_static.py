@@ -228,7 +228,7 @@ def test_a_refusal_on_the_way_is_no_run_to_resume(call, tmp_path, monkeypatch):
 
 
 def test_a_body_torn_into_two_held_halves_has_a_curve_to_the_end():
-    """Its equilibria go on: the halves are held, and bear nothing."""
+    """There are equilibria after the fracture: the halves are held, and bear no load."""
     ds = ran(FRACTURE, {"steps": STEPS})
     force = ds.reaction.values[:, 1, 0]
     assert ds.attrs["status"] == "complete"
@@ -241,7 +241,7 @@ def test_a_body_torn_into_two_held_halves_has_a_curve_to_the_end():
 
 @pytest.mark.parametrize("increments", [False, True])
 def test_a_quasi_static_test_in_parts_is_the_whole(increments, tmp_path):
-    """Stopped anywhere, it goes on to the same file; steps after the last event too."""
+    """A run that is stopped anywhere continues to the same file; steps after the last event too."""
     given = BAR | FRACTURE | {"steps": STEPS + 5, "record": {"increments": increments}}
     given |= {"solver": {"type": "equilibrium", "increments": 60}}
     whole = ran(given)

@@ -138,7 +138,8 @@ def test_grids_of_a_slender_soft_body_solve_or_are_stuck():
 
 @pytest.mark.parametrize("power", [-20, 20])
 def test_springs_find_their_equilibrium_in_all_units(power):
-    """Scaled by a power of 2 all numbers are the same but for their exponent."""
+    """If all lengths are scaled by a power of 2 all numbers are the same except for their
+    exponent."""
 
     def found(a):
         way = {"type": "displace", "displacement": [0.3 * a, 0.15 * a]}

@@ -104,7 +104,7 @@ SCENES = {
 
 
 def solved(given, method="multigrid", tolerance=1e-8):
-    """(u, certificate) of followers and leaders."""
+    """Return (u, error bound) of followers and leaders."""
     given = given | {"diagnostics": [{"type": "displacement"}]}
     given |= {"solver": {"type": "equilibrium", "method": method, "tolerance": tolerance}}
     found = pbdkit.run(given, components=[Skew], progress=False)
@@ -113,8 +113,8 @@ def solved(given, method="multigrid", tolerance=1e-8):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_few_iterations_lead_within_what_is_certified(name):
-    """The certificate is never below the true error, and near it; the same comes out again, to the
-    bit."""
+    """The error bound is never below the true error, and near it; it is the same in a second run,
+    to the bit."""
     exact, _ = solved(SCENES[name], "lu", 1e-11)
     for tolerance in (1e-3, 1e-8):
         u, certificate = solved(SCENES[name], tolerance=tolerance)
@@ -206,8 +206,8 @@ def interpreted_moves():
 
 @pytest.mark.parametrize("name", NOT_LINEAR)
 def test_rules_that_are_not_linear_are_followed_on_grids(name, monkeypatch):
-    """By differences of compiled moves, of one rule really compiled: where the direct solver
-    leads."""
+    """Differences of compiled moves, of one rule really compiled, lead to the result of the direct
+    solver."""
     exact, _ = solved(NOT_LINEAR[name], "lu", 1e-10)
     monkeypatch.setattr(moves, "LARGEST_BY_NUMPY", 0)
     with nullcontext() if name == "distance-weighted" else interpreted_moves():

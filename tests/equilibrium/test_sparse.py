@@ -1,4 +1,4 @@
-"""Which linear solver serves which matrix, what it finds, and how a search is stopped."""
+"""Choice of the linear solver for a matrix, its results, and stops of a search."""
 
 import json
 import signal

@@ -1,4 +1,4 @@
-"""What is done at once, once, or not at all, with the same result.
+"""Work that is done in one pass, once, or not at all, with the same result.
 
 Derivatives, cut cells, kernels.
 """

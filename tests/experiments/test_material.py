@@ -1,4 +1,4 @@
-"""The shipped experiments of a material, and what docs/materials.md says of materials."""
+"""The shipped experiments of a material, and the statements of docs/materials.md."""
 
 import functools
 import math

@@ -1,4 +1,4 @@
-"""The paper's cases, as shipped: what model.md, section 10, says of them, and their datasets."""
+"""The paper's cases as shipped, with the statements of model.md, section 10, and their datasets."""
 
 import numpy as np
 import pytest

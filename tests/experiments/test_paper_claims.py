@@ -1,4 +1,4 @@
-"""The claims of the paper that were judged too kindly, wrongly or not at all, measured anew."""
+"""Measure again the claims of the paper that were judged too kindly, wrongly or not at all."""
 
 import json
 import re
@@ -129,7 +129,8 @@ def test_what_the_paper_s_rules_are():
     ("lattice", "tension", "shear"), [("square", 2.0, 0.0), ("hexagonal", 2.25, 0.75)]
 )
 def test_pe1_is_an_elastic_energy_on_the_hexagonal_lattice_only(lattice, tension, shear):
-    """Of ν = 1/3: four times E / (2 (1 - ν²)) and E / (4 (1 + ν)), times the square of a strain."""
+    """The factors are those of ν = 1/3: four times E / (2 (1 - ν²)) and E / (4 (1 + ν)), times the
+    square of a strain."""
     for gradient, expected in (([[1, 0], [0, 0]], tension), ([[0, 0.5], [0.5, 0]], shear)):
         strain = 1e-3 * np.array(gradient)
         started = f"initial={{type: affine, gradient: {strain.tolist()}}}"

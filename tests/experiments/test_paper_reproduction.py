@@ -12,7 +12,7 @@ from pbdkit.model.shipped import shipped_names
 
 OTHER = (DOCS / "validation/anisotropy-and-plasticity.md").read_text("utf-8")
 CASES = {"a": 15, "b": 5, "c": 5, "d": 11, "e": 3, "f": 14, "g": 4}
-"""At least so many claims a case."""
+"""Smallest number of claims for each case."""
 VERDICT = re.compile(r"^(reproduced|reproduced only with \S.*|not reproduced)$")
 NAMED = sorted(set(re.findall(r"paper/[a-z0-9-]+", PAGE + OTHER)))
 

@@ -1,4 +1,4 @@
-"""What `pbdkit check` says of every shipped experiment, against its run.
+"""Compare the predictions of `pbdkit check` for every shipped experiment with its run.
 
 The run is followed from where its leaders have come to rest, shaken a little so that symmetric
 leaders leave no mode out, to its equilibrium, which is known without stepping.
@@ -24,7 +24,8 @@ from pbdkit.stepping.state import initial_state
 MASSES = {"modelling/mass-on-a-bar"}
 SHIPPED = {name: read_experiment(name).data for name in shipped_names()}
 BARE = [n for n, data in SHIPPED.items() if "obstacles" not in data and n not in MASSES]
-"""Of obstacles `check` says nothing, and masses have no place at which they rest beforehand."""
+"""`check` makes no prediction for obstacles, and the rest position of masses is not determined
+beforehand."""
 TORN = [n for n in BARE if SHIPPED[n].get("fracture", {}).get("type", "none") != "none"]
 JUMPS = [n for n in TORN if SHIPPED[n].get("solver", {}).get("type") == "equilibrium"]
 STEPS = [n for n in TORN if n not in JUMPS and n != "modelling/ageing"]
@@ -57,8 +58,8 @@ SMALLER = {
         for n, (x, y) in enumerate([(5, 5), (5, 6), (6, 5), (6, 6)])
     ],
 }
-"""Settings of shorter variants where the experiment itself would take minutes to settle, and of
-stable steps where they are not those of the file, which goes straight to equilibrium."""
+"""Settings of shorter variants if the experiment itself would take minutes to converge, and of
+stable steps if those of the file are not, because it solves for the equilibrium."""
 LONG = ["steps=100000", "record={at: [100000]}"]
 STRAIGHT = ["solver={type: equilibrium, tolerance: 1.0e-10}"]
 SHAKEN = 0.1
@@ -118,10 +119,11 @@ def test_runs_settle_in_the_steps_that_check_says(call, name):
 
 @pytest.mark.parametrize("name", in_turn(STEPS, 2))
 def test_torn_bodies_stay_stable_and_settle_more_slowly_than_whole_ones(call, name):
-    """check speaks of the whole body, and says so; the operator of the torn one has the rate.
+    """The prediction is for the unbroken body, and the output states that; the operator of the torn
+    one has the rate.
 
     Memory leaves no mode faster than √b. A particle that hangs by springs in one line is free to
-    swing across: its mode neither grows nor shrinks, and it does not move.
+    move across: its mode neither grows nor shrinks, and it does not move.
     """
     said = json.loads(call("check", name, "--json").out)
     assert "as long as no bond breaks" in call("check", name).out

@@ -1,1 +1,1 @@
-"""Components with one fault each; test_conformance.py says which property finds it."""
+"""Components with one fault each; test_conformance.py contains the property that finds it."""

@@ -44,7 +44,7 @@ class Vane(SharesParticles, TurnsParticles, pbdkit.FollowerRule):
 
 
 def off(d, r, there):
-    """How far the neighbour stands from where it would, turned as it is."""
+    """Return the distance of the neighbour from its position after the turn."""
     c, s = there.vane_cos, there.vane_sin
     return r + d - Vector(c * r.x - s * r.y, s * r.x + c * r.y)
 

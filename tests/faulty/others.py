@@ -47,7 +47,7 @@ class Flat(pbdkit.Lattice):
 
 
 class Rows(pbdkit.Lattice):
-    """A square lattice told by two rows a cell; no fault."""
+    """A square lattice defined by two rows a cell; it has no fault."""
 
     type: Literal["rows"] = "rows"
     across: ClassVar[float] = 0.0
@@ -64,7 +64,7 @@ class Rows(pbdkit.Lattice):
 
 
 class Astray(Rows):
-    """The second row lies a cell farther than its index says."""
+    """The second row lies a cell farther than its index."""
 
     type: Literal["astray"] = "astray"
     across: ClassVar[float] = 1.0
@@ -79,7 +79,7 @@ class Miscounts(Rows):
 
 
 class Skips(pbdkit.Lattice):
-    """Every other index along x is nobody's."""
+    """Every other index along x has no site."""
 
     type: Literal["skips"] = "skips"
 
@@ -133,7 +133,7 @@ class Favours(pbdkit.NeighbourMetric):
 
 
 class Contradicts(pbdkit.NeighbourMetric):
-    """Chooses within one radius and finds anew within another."""
+    """Chooses neighbours within one radius and re-evaluates them within another."""
 
     type: Literal["contradicts"] = "contradicts"
 
@@ -186,7 +186,7 @@ class SaysItIsLocal(Following):
 
 
 class Shrinks(Following):
-    """Follows by nine tenths, which ties the body to its place, and does not say so."""
+    """Follows by nine tenths, which ties the body to its place, and does not declare it."""
 
     type: Literal["shrinks"] = "shrinks"
 
@@ -196,7 +196,7 @@ class Shrinks(Following):
 
 
 class SaysItAnchors(Anchors, Following):
-    """Says that it ties the body to its place, and does not."""
+    """Declares that it ties the body to its place, and does not."""
 
     type: Literal["says-it-anchors"] = "says-it-anchors"
 
@@ -249,7 +249,7 @@ class Directed(Strain):
 
 
 class DeniesBreaking(Strain):
-    """Says that nothing breaks, and breaks."""
+    """Declares that nothing breaks, and breaks bonds."""
 
     type: Literal["denies-breaking"] = "denies-breaking"
     can_break: ClassVar[bool] = False
@@ -263,7 +263,7 @@ class BreaksAtRest(Strain):
 
 
 class Measures(Strain):
-    """Answers with a number where yes or no is asked."""
+    """Returns a number where a boolean is required."""
 
     type: Literal["measures"] = "measures"
 
@@ -273,7 +273,7 @@ class Measures(Strain):
 
 
 class Tupled(Strain):
-    """Puts a plain tuple where a vector is asked."""
+    """Returns a plain tuple where a vector is required."""
 
     type: Literal["tupled"] = "tupled"
 
@@ -283,7 +283,7 @@ class Tupled(Strain):
 
 
 class Extent(pbdkit.Diagnostic):
-    """How far each particle has moved: what the others would be without their fault."""
+    """The displacement of each particle: the result of the others without their fault."""
 
     type: Literal["extent"] = "extent"
 
@@ -295,7 +295,7 @@ class Extent(pbdkit.Diagnostic):
 
 
 class NoUnits(Extent):
-    """Does not say in which units it is."""
+    """Does not define the unit of its values."""
 
     type: Literal["no-units"] = "no-units"
 

@@ -103,7 +103,7 @@ class Shouts(Wearing):
 
 
 class OfNoUnit(Wearing):
-    """Does not say in which units its number is."""
+    """Does not define the unit of its number."""
 
     type: Literal["of-no-unit"] = "of-no-unit"
 
@@ -160,7 +160,7 @@ class Overflows(Wearing):
 
 
 class DrawsElsewhere(Wearing):
-    """Draws from a generator that nobody gave it."""
+    """Draws from a generator that it was not given."""
 
     type: Literal["draws-elsewhere"] = "draws-elsewhere"
 
@@ -275,7 +275,7 @@ class WearsOneWay(Wearing):
 
 
 class Misstates(Wearing):
-    """Says that bonds bear twice as much as they do."""
+    """Declares that bonds bear twice the force that they do."""
 
     type: Literal["misstates"] = "misstates"
 
@@ -313,7 +313,7 @@ class Tired(RenewsParticles, Sound):
 
 
 class ForgetsTheWay(Tired):
-    """Returns nothing of what it says that changes."""
+    """Returns none of the numbers that it declares to change."""
 
     type: Literal["forgets-the-way"] = "forgets-the-way"
 
@@ -365,8 +365,7 @@ class DrawsAgain(Draws, Tired):
 
 
 class LastOnes(Extent):
-    """How far those have moved that have moved farthest, at the end: what the others would be
-    without their fault."""
+    """The largest displacements at the end: the result of the others without their fault."""
 
     type: Literal["last-ones"] = "last-ones"
     at_end: ClassVar[bool] = True

@@ -76,7 +76,7 @@ class Doubles(Sound):
 
 
 class LooksAround(Sound):
-    """Moves everybody by the mean of all."""
+    """Moves every particle by the mean of all."""
 
     type: Literal["looks-around"] = "looks-around"
 
@@ -101,7 +101,7 @@ SEEN: list[float] = []
 
 
 class Remembers(Sound):
-    """Goes on from what it was asked before."""
+    """Depends on the arguments of earlier calls."""
 
     type: Literal["remembers"] = "remembers"
 
@@ -125,7 +125,7 @@ class Counts(Sound):
 
 
 class Throws(Sound):
-    """Throws dice."""
+    """Returns a random move."""
 
     type: Literal["throws"] = "throws"
 
@@ -213,7 +213,7 @@ class ClaimsLinear(Sound):
 
 
 class HoldsOn(Sound):
-    """Pulls particles back to their sites, and does not say so."""
+    """Pulls particles back to their sites, and does not declare it."""
 
     type: Literal["holds-on"] = "holds-on"
 
@@ -295,7 +295,7 @@ class Gives(Net):
 
 
 class HasAScale(Sound):
-    """Moves nobody by more than a lattice unit."""
+    """Moves no particle by more than a lattice unit."""
 
     type: Literal["has-a-scale"] = "has-a-scale"
 
@@ -342,7 +342,7 @@ class Restarts(Sound):
 
 
 class Raises(Sound):
-    """Asks for a parameter that it does not have."""
+    """Uses a parameter that it does not have."""
 
     type: Literal["raises"] = "raises"
 
@@ -352,7 +352,7 @@ class Raises(Sound):
 
 
 class Undescribed(Sound):
-    """Has a parameter that nobody explains."""
+    """Has a parameter without a description."""
 
     type: Literal["undescribed"] = "undescribed"
     strength: float = 1.0
@@ -390,7 +390,7 @@ class Unhashable(Sound):
 
 
 class Lenient(Sound):
-    """Takes any key."""
+    """Accepts any key in experiments."""
 
     model_config = ConfigDict(extra="allow")
     type: Literal["lenient"] = "lenient"
@@ -408,7 +408,7 @@ class Forgets(Sound):
 
 
 class Chooses(Sound):
-    """Refuses every lattice."""
+    """Rejects every lattice it is given."""
 
     type: Literal["chooses"] = "chooses"
 
@@ -417,7 +417,7 @@ class Chooses(Sound):
 
 
 def homeless() -> Any:
-    """A rule whose class stands where nothing can import it from."""
+    """A rule with a class that cannot be imported."""
 
     class Homeless(Sound):
         """Is defined within a function."""

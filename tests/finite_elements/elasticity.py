@@ -22,8 +22,8 @@ def values(basis: Basis, u, points, cells):
 
 
 def local(basis: Basis, points, cells):
-    """Coordinates (2, points, 1) within the elements, by Newton's method. scikit-fem's own asks for
-    more digits than points in the smallest elements have."""
+    """Return coordinates (2, points, 1) within the elements, by Newton's method. scikit-fem's own
+    iterates to more digits than points in the smallest elements have."""
     mapping, points = basis.mapping, points[:, :, None]
     found = np.full_like(points, 1 / 3)
     for _ in range(NEWTON):
@@ -41,8 +41,9 @@ def _shaped(basis: Basis, u, found, cells):
 
 
 def find(basis: Basis, points, candidates: int = 8):
-    """The element of each point (2, points), curved edges included: of those with the nearest
-    middles the one whose reference element the point lies in, or misses by least."""
+    """Return the element of each point (2, points), curved edges included: among those with the
+    nearest middles the one with a reference element that contains the point, or misses it by
+    least."""
     mesh = basis.mesh
     middles = mesh.p[:, mesh.t].mean(axis=1)
     count = min(candidates, middles.shape[1])
@@ -52,7 +53,7 @@ def find(basis: Basis, points, candidates: int = 8):
 
 
 def _missed(mesh, found):
-    """How far points lie outside the reference element; negative inside."""
+    """Return the distance of points outside the reference element; negative inside."""
     x, y = found
     beyond = x + y - 1 if len(mesh.t) == 3 else np.maximum(x, y) - 1
     return np.maximum(np.maximum(-x, -y), beyond)

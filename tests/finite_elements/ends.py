@@ -49,15 +49,15 @@ def ends(data: Data | None = None) -> dict[str, End]:
 
 
 class Fall(NamedTuple):
-    """By how much the strain falls from end to end."""
+    """Decrease of the strain from end to end."""
 
     between: Estimate
-    """As the affine fits of both ends have it, over the distance of their middles."""
+    """From the affine fits of both ends, over the distance of their middles."""
     whole: Estimate
-    """As one x² has it, fitted with elastic elements for all else."""
+    """From one x², fitted with elastic elements for the rest."""
     left: Estimate
     right: Estimate
-    """The same, as an x² of each half of its own has it: told by that half alone."""
+    """From an x² for each half, which that half alone determines."""
     without: Found
     found: Found
     apart: Found
@@ -103,8 +103,8 @@ def straightened(strength: float) -> dict[str, End]:
 
 
 class Clamped(NamedTuple):
-    """A fit of Young's modulus and Poisson's ratio to the field, with the left end held and the
-    force on the right one; the root mean square of what is left, in mm."""
+    """Young's modulus and Poisson's ratio fitted to the field, with the left end held and the force
+    on the right one; and the root mean square of the remainder, in mm."""
 
     young: Estimate
     poisson: Estimate
@@ -168,7 +168,7 @@ def moved() -> tuple[Estimate, Estimate]:
 
 
 def main() -> None:
-    """All of it in lines."""
+    """Print all results in lines."""
     for side, end in ends().items():
         print(f"{side}: strain {told(end.strain, 1e6)}e-6, {told(end.modulus, 1e-3)} GPa")
     found = fall()
@@ -191,7 +191,7 @@ def main() -> None:
 
 
 def told(of: Estimate, unit: float = 1.0) -> str:
-    """Value ± error."""
+    """Return the text "value ± error"."""
     return f"{of.value * unit:.4g} ± {of.error * unit:.2g}"
 
 

@@ -1,4 +1,4 @@
-"""What a lattice's displacements are compared with, and how. Needs numpy only."""
+"""References for the displacements of a lattice, and norms of the difference. Needs numpy only."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class Reference:
 
 
 def load(name: str, cells: int = FINEST) -> Reference:
-    """The reference of one of `PROBLEMS`.
+    """Return the reference of one of `PROBLEMS`.
 
-    Raises ValueError where none is kept for so many cells per unit length.
+    Raises ValueError if there is none for that number of cells per unit length.
     """
     problem = PROBLEMS[name]
     if cells not in problem.kept:

@@ -126,8 +126,8 @@ def _mesh(shape: Rectangle | Holed, knots) -> MeshQuad2:
 
 
 def _held(problem: Problem, basis: Basis):
-    """Held dofs of the quarter, and a field with their values: the clamped edge, and on the two mid
-    lines what the mirrors say."""
+    """Return the held dofs of the quarter, and a field with their values: those of the clamped edge
+    and, on the two mid lines, those of the mirror symmetry."""
     u = basis.zeros()
     along, across = (f"u^{axis + 1}" for axis in (problem.pulled, problem.across))
     clamped = basis.get_dofs(lambda x: np.isclose(x[0], 0)).all()

@@ -27,7 +27,7 @@ SIZES = (20, 40, 80)
 
 @dataclass(frozen=True)
 class Material:
-    """Under plane stress."""
+    """Elastic constants under plane stress."""
 
     modulus: float
     poisson_ratio: float
@@ -56,13 +56,13 @@ class Potentials:
     psi: dict[int, float]
 
     def displacement(self, z):
-        """u + iv."""
+        """Return u + iv at z."""
         of = self.material
         turned = z * np.conj(_derivative(self.phi, z)) + np.conj(_sum(self.psi, z))
         return (of.kappa * _sum(self.phi, z) - turned) / (2.0 * of.shear)
 
     def stress(self, z):
-        """(σ_x, σ_y, τ)."""
+        """Return (σ_x, σ_y, τ) at z."""
         trace = 4.0 * _derivative(self.phi, z).real
         second = _derivative({n - 1: n * c for n, c in self.phi.items()}, z)
         apart = 2.0 * (np.conj(z) * second + _derivative(self.psi, z))
@@ -172,7 +172,7 @@ class Plate:
 
 @cache
 def plate(cells: int) -> Plate:
-    """So many cells across."""
+    """Return the plate with a number of cells across."""
     line = np.arange(cells + 1) / cells
     around = [np.stack(p, -1) for s in (0 * line, 0 * line + 1) for p in ((line, s), (s, line))]
     points = np.unique(np.concatenate(around), axis=0)

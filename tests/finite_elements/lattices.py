@@ -84,7 +84,7 @@ def between_edges(problem: Problem, cells: int) -> dict[str, Any]:
 
 
 def solved(problem: Problem, cells: int, **parts: Any) -> Solved:
-    """The equilibrium, with the reaction where the natural frame knows it, else NaN."""
+    """Return the equilibrium, with the reaction if the natural frame defines it, else NaN."""
     asked = experiment(problem, cells, **parts)
     natural = asked["frame"] == NATURAL
     if natural:

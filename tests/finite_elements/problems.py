@@ -28,11 +28,12 @@ class Problem:
     pulled: int = 0
     radius: float = 0.0
     hexagonal: bool = False
-    """Whether the reference is kept at the sites of the hexagonal lattice, or of the square one."""
+    """True if the reference is stored at the sites of the hexagonal lattice, and not of the square
+    one."""
 
     @property
     def kept(self) -> tuple[int, ...]:
-        """Cells per unit length of the lattices at whose sites a reference is kept."""
+        """Cells per unit length of the lattices that have a reference at their sites."""
         return (20, 40, 80) if self.hexagonal else (10, 20, 40, 80)
 
     @property

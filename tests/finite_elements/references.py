@@ -1,6 +1,6 @@
-"""Makes the references anew: `python tests/finite_elements/references.py`, a quarter of a minute.
+"""Compute the references: `python tests/finite_elements/references.py`, a quarter of a minute.
 
-Prints how they converge. Each file holds the displacements `u` of the lower left quarter (2, i, j)
+Prints their convergence. Each file holds the displacements `u` of the lower left quarter (2, i, j)
 at the sites of the finest lattice, NaN elsewhere, with `reaction`, `energy` and `error`.
 """
 

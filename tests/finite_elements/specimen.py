@@ -31,7 +31,8 @@ class Data(NamedTuple):
     displacements: np.ndarray
 
     def inside(self, margin: float, inset: float = 0.0) -> Data:
-        """Of those farther than that within the outline, and than `inset` from both ends."""
+        """Return the points farther than that within the outline, and than `inset` from both
+        ends."""
         x = self.points[:, 0]
         chosen = (depth(self.points) >= margin) & (np.minimum(x, LENGTH - x) >= inset)
         return Data(self.points[chosen], self.displacements[chosen])
@@ -47,13 +48,13 @@ class Data(NamedTuple):
 
 
 def read() -> Data:
-    """All that was measured."""
+    """Return all measured data of the file."""
     rows = np.loadtxt(FILE, delimiter=",", skiprows=1)
     return Data(rows[:, :2], rows[:, 2:])
 
 
 def depth(points: np.ndarray) -> np.ndarray:
-    """How far points lie within the outline."""
+    """Return the depth of points within the outline."""
     x, y = points.T
     hole = np.hypot(*(points.T - CENTRE)) - RADIUS
     return np.min([x, LENGTH - x, y, HEIGHT - y, hole], axis=0)
@@ -61,13 +62,13 @@ def depth(points: np.ndarray) -> np.ndarray:
 
 @BilinearForm
 def volumetric(u, v, _):
-    """λ's part."""
+    """Return the part of λ."""
     return div(u) * div(v)
 
 
 @BilinearForm
 def distortional(u, v, _):
-    """2μ's part."""
+    """Return the part of 2μ."""
     return ddot(sym_grad(u), sym_grad(v))
 
 
@@ -77,7 +78,7 @@ def lame(nu: float) -> np.ndarray:
 
 
 def lame_slope(nu: float) -> np.ndarray:
-    """Their derivatives."""
+    """Return the derivatives of both constants."""
     return np.array([(1.0 + nu**2) / (1.0 - nu**2) ** 2, -1.0 / (1.0 + nu) ** 2])
 
 
@@ -146,7 +147,7 @@ class Plate:
 
     @cached_property
     def parts(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """Of λ and of 2μ: the stiffness is linear in them."""
+        """Stiffness matrices of λ and of 2μ: the stiffness is linear in them."""
         return tuple(part.assemble(self.basis).tocsr() for part in (volumetric, distortional))
 
     def stiffness(self, coefficients: np.ndarray) -> sparse.csr_matrix:
@@ -179,14 +180,14 @@ class Plate:
         return np.hstack(found)
 
     def measured(self, data: Data) -> np.ndarray:
-        """What was measured at both ends, on the unknowns there."""
+        """Displacements measured at both ends, on the unknowns there."""
         u = np.zeros(self.basis.N)
         both = data.at(self.basis.doflocs[:, self.led].T)
         u[self.led] = np.where(self.along_x[self.led], both[:, 0], both[:, 1])
         return u
 
     def factorised(self, stiffness: sparse.csr_matrix, free: np.ndarray | None = None):
-        """Of the free unknowns: without others, of those that are on no end."""
+        """Factorise the stiffness of the free unknowns, by default of those that are on no end."""
         free = self.free if free is None else free
         inner = stiffness[free][:, free].tocsc()
         return splu(inner, permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC)

@@ -1,4 +1,4 @@
-"""How many steps lead from rest to near an equilibrium, and how long they take."""
+"""Count the steps from rest to near an equilibrium, and measure their time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Steps:
 def stepped(
     problem: Problem, cells: int, share: float, repeats: int = 3, memory: float = 0.0
 ) -> Steps:
-    """By the compiled engine on one thread, from rest, with the kernel made beforehand."""
+    """Time the compiled engine on one thread, from rest, with the kernel made beforehand."""
     exact = equilibrium_state(build_scene(_experiment(problem, cells, None)))[0].u
     scene = build_scene(_experiment(problem, cells, memory))
     engine = make_engine(scene, choose(scene))[0]
@@ -46,7 +46,7 @@ def stepped(
 
 
 def setting_up(problem: Problem, cells: int, memory: float, repeats: int) -> Seconds:
-    """What scene and engine take, the kernel made beforehand."""
+    """Time scene and engine, with the kernel made beforehand."""
     asked = _experiment(problem, cells, memory)
 
     def set_up():

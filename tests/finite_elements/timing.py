@@ -20,7 +20,7 @@ ENOUGH_S = 1.0
 
 
 def best(repeats: int, work: Callable):
-    """The least seconds, and what came out the last time."""
+    """Return the least seconds, and the last result."""
     walls, processors, begun = [], [], time.perf_counter()
     for n in range(repeats):
         if n and time.perf_counter() - begun > ENOUGH_S:

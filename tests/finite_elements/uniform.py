@@ -31,7 +31,7 @@ ELEMENTS = {
 CURVED = {"P2": skfem.MeshTri2, "Q2": skfem.MeshQuad2}
 RESOLUTIONS = (5, 10, 20, 40, 80)
 TOLERANCE = 1e-8
-"""Of the iterative solver, relative to the load; below every error measured here."""
+"""Tolerance of the iterative solver, relative to the load; below every error measured here."""
 SMALL, LARGE = 2_000, 300_000
 """Unknowns below which only the direct solver is tried, and above which it is not."""
 
@@ -170,7 +170,8 @@ def _direct(K, load, basis, free):
 
 
 def _multigrid(K, load, basis, free):
-    """Conjugate gradients, preconditioned with smoothed aggregation that knows rigid motions."""
+    """Solve by conjugate gradients, preconditioned with smoothed aggregation with the rigid
+    motions."""
     import pyamg  # scikit-fem does without it, and so does all but this solver
 
     x, y = basis.doflocs[:, free]

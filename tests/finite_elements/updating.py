@@ -29,7 +29,7 @@ from skfem.models.elasticity import linear_elasticity
 
 BOUNDS, START, MODES, MARGIN = (0.0, 0.49), 0.245, 6, 0.5
 SCALE = 1.345
-"""Where residuals begin to count less, in units of their noise (Huber)."""
+"""Residual, in units of the noise, above which it counts less (Huber)."""
 
 
 class Estimate(NamedTuple):
@@ -58,7 +58,8 @@ class Model:
         self._last: tuple[bytes, Answers] | None = None
 
     def state(self, nu: float, ends: np.ndarray) -> np.ndarray:
-        """All displacements, of one displacement of the ends, assembled anew."""
+        """Return all displacements for one displacement of the ends, with a newly assembled
+        matrix."""
         self.states += 1
         found, _ = self._assembled(nu, ends)
         return found
@@ -69,13 +70,14 @@ class Model:
         return solve(*condense(stiffness, x=ends, D=self.plate.led)), stiffness
 
     def reaction(self, nu: float, ends: np.ndarray) -> float:
-        """What the right end carries along x, over Young's modulus and thickness."""
+        """Return the force of the right end along x, over Young's modulus and thickness."""
         found, stiffness = self._assembled(nu, ends)
         return float((stiffness @ found)[self.plate.pulled].sum())
 
     def answers(self, nu: float, ends: np.ndarray, weights: np.ndarray) -> Answers:
-        """Of all columns of `ends` at once, and of what their weighted sum changes by with ν. The
-        last are kept, as residuals and derivatives are asked for one after another."""
+        """Solve for all columns of `ends` at once, and for the derivative of their weighted sum
+        with respect to ν. The last solutions are kept, as residuals and derivatives are computed
+        one after another."""
         key = np.append(weights, nu).tobytes()
         if self._last is None or self._last[0] != key:
             self.states += 1
@@ -96,8 +98,8 @@ class Model:
 
 
 class Answers(NamedTuple):
-    """What is seen of each end's coefficient (number, coefficient), ∂/∂ν of the whole (number,),
-    and the same of the force that the right end carries."""
+    """Observed displacements for each coefficient of the ends (number, coefficient), ∂/∂ν of the
+    whole (number,), and the same for the force of the right end."""
 
     seen: np.ndarray
     seen_slope: np.ndarray
@@ -146,8 +148,8 @@ def usual(n: int, *, plain: bool, inset: float, margin: float = MARGIN) -> Found
 
 
 def alike(n: int, *, plain: bool, terms: Terms | None = None) -> Found:
-    """As pbdkit's fit of the same name: z is ν, the coefficients of the ends, and the strengths of
-    what is allowed for besides, by default x²."""
+    """A fit like pbdkit's of the same name: z is ν, the coefficients of the ends, and the
+    amplitudes of additional fields, by default x²."""
     every = read()
     data = every.inside(MARGIN)
     model = Model(n, data)

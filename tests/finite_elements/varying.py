@@ -1,4 +1,5 @@
-"""A bar whose stiffness varies from place to place, with its exact solution. Needs numpy only.
+"""A bar with a stiffness that varies from place to place, with its exact solution. Needs numpy
+only.
 
 Young's modulus is f(x) g(y) and ν = 0, so that stress is along x alone and constant there:
 u_x = ∫ dx / f from 0 to x over that to the right edge, whatever g is, and u_y = 0.
@@ -14,7 +15,7 @@ from finite_elements.problems import FINEST, Problem
 
 VARYING = Problem("varying", 2.0, 1.0)
 SOFTER = 24.0
-"""By so much f falls along the bar: from 1 to 1/25. No grid has exact values at its nodes then."""
+"""Decrease of f along the bar: from 1 to 1/25. No grid has exact values at its nodes then."""
 
 
 def modulus(x, y):

@@ -55,7 +55,8 @@ def _solved(mesh, element, intorder):
 
 @cache
 def reference(elements: int = ELEMENTS) -> Solution:
-    """With so many elements along the beam, and along half its height, towards both corners."""
+    """Return the mesh with a number of elements along the beam, and along half its height, graded
+    towards both corners."""
     half = graded(elements) * HEIGHT / 2
     knots = graded(elements) * LENGTH, np.concatenate([half, HEIGHT - half[-2::-1]])
     mesh = MeshQuad2.from_mesh(MeshQuad.init_tensor(*knots))

@@ -1,4 +1,5 @@
-"""Parameters come back from what they made; what data cannot tell is said."""
+"""Parameters are recovered from data that they generated; parameters that are not identifiable are
+reported."""
 
 from __future__ import annotations
 
@@ -143,8 +144,8 @@ def test_the_noise_of_a_force_is_part_of_the_error_of_youngs_modulus(tmp_path):
 
 
 def test_errors_are_those_of_repeats():
-    """Noise on the field and on what is prescribed, as both are measured; the long trial has more
-    repeats. Poisson's ratio is off by as much as its standard error says."""
+    """The field and the prescribed displacements have noise, as both are measured; the long trial
+    has more repeats. The error of Poisson's ratio agrees with its standard error."""
     generator = np.random.default_rng(3)
     from pbdkit.fitting.observations import FieldEvidence, FieldObservation
     from pbdkit.fitting.parameter import Parameter

@@ -1,5 +1,4 @@
-"""Which points of a measured field count: how deep they lie in a body, and between which
-particles."""
+"""Points of a measured field that count: their depth in a body, and the particles around them."""
 
 from __future__ import annotations
 
@@ -51,7 +50,7 @@ OUTLINES = {
 
 @pytest.mark.parametrize("name", OUTLINES)
 def test_the_depth_of_a_point_is_the_way_to_the_nearest_one_outside(name):
-    """Against the signs of places all over, whose distances are as fine as they are."""
+    """Compared with the signs of points all over, with distances as fine as they are."""
     body, fine = BODY.validate_python(OUTLINES[name]), 0.03
     x, y = (each.ravel() for each in np.meshgrid(*[np.arange(-1.0, 9.0, fine)] * 2))
     places = np.stack([x, y], axis=1)
@@ -79,8 +78,8 @@ def lattice(given):
 
 @pytest.mark.parametrize("name", LATTICES)
 def test_a_grid_is_as_deep_as_the_same_rectangle(name):
-    """By itself, with a hole, beside another body, and cut out of another: what remains then ends
-    at the particles next to it."""
+    """The body alone, with a hole, beside another body, and cut out of another: the remaining part
+    then ends at the particles next to it."""
     given, a, b = LATTICES[name]
     x, y = given.get("origin", [0.0, 0.0])
     grid, same = {"type": "grid", "columns": 7, "rows": 5}, box(6 * a, 4 * b, x, y)
@@ -157,8 +156,8 @@ def test_a_margin_leaves_out_as_many_points_of_a_grid_as_of_a_rectangle(tmp_path
 @pytest.mark.parametrize("radius", [0.3, 1.6, 2.6])
 @pytest.mark.parametrize("kind", ["hexagonal", "centred-rectangular"])
 def test_points_in_a_hole_lie_between_no_particles(kind, radius):
-    """Those of which a corner of the triangle around them is none of the body; elsewhere a straight
-    field is what it is."""
+    """Points in a hole have a corner of their triangle outside the body; elsewhere a linear field
+    is reproduced."""
     high = 3**0.5 if kind == "hexagonal" else 1.3
     given = {"type": kind, "a": 1.0} | ({} if kind == "hexagonal" else {"b": high})
     centre = np.array([5.0, 2 * high])

@@ -210,7 +210,7 @@ def test_left_out_residuals_are_told_over_the_same_noise_whatever_the_weight(mea
 
 
 def small(**more):
-    """A bar that has settled soon, and the solver that looks for it."""
+    """A bar that converges soon, and the solver that finds its equilibrium."""
     body = {"type": "rectangle", "width": 4.0, "height": 2.0}
     return bar(body=body, steps=400, **more)
 
@@ -263,7 +263,7 @@ def on_rollers(**more):
 
 @pytest.mark.parametrize("times", [[10.0], [0.0, 10.0], [5.0, 7.5, 10.0]])
 def test_each_step_that_tracks_need_is_an_equilibrium(times, tmp_path):
-    """By closed form, with ν = .25."""
+    """The reference is the closed form with ν = .25."""
     places = np.array([[3.0, 0.0], [3.0, HEIGHT], [6.5, 0.5]])
     u = np.c_[places[:, 0], -0.25 * (places[:, 1] - HEIGHT / 2)]
     pairs = list(zip(places, u, strict=True))
@@ -293,7 +293,7 @@ def test_a_state_that_does_not_come_is_no_displacement_of_0(tmp_path, monkeypatc
 
 
 def test_curves_have_the_equilibria_within_steps(tmp_path):
-    """Of bonds that may break, which are loaded in increments."""
+    """Bonds may break, so that the load is applied in increments."""
     write(tmp_path / "rows.csv", ["displacement", "force"], [[0.02, 0.0], [0.05, 0.0]])
     given = {"type": "curve", "file": str(tmp_path / "rows.csv"), "group": 1, "noise": 1.0}
     made = on_rollers(

@@ -1,4 +1,5 @@
-"""How equilibria change with parameters: against complex steps, differences and closed forms."""
+"""Derivatives of equilibria with respect to parameters, against complex steps, differences and
+closed forms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Strengths come back from repeats; what weakest links say in closed form is what is found."""
+"""Strengths are recovered from repeats; results agree with closed forms of weakest links."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ WHOLE = {"type": "strain", "failure": 1e60}
 
 
 def even(bonds):
-    """As many bonds in the same strain, along the load."""
+    """As many bonds have the same strain, along the load."""
     return BondStrains(np.array([0.01]), np.array([1e-4]), np.array([float(bonds)]))
 
 
@@ -100,7 +100,7 @@ def fit_of(peaks, *, bonds=16, unknown=WEIBULL, **more):
 
 
 def test_the_likelihood_of_an_even_bar_is_weibulls_own():
-    """ln of the density of the weakest of n bonds, whose scale is s n^(-1/m)."""
+    """The reference is ln of the density of the weakest of n bonds, with the scale s n^(-1/m)."""
     loads, m, s = np.array([0.8, 1.1, 1.7]), np.array([3.0, 9.0]), 0.02
     sums, slopes = weibull_sums(even(50), Breaks(loads, np.ones(3, bool)), m)
     for n, each in enumerate(m):
@@ -148,7 +148,7 @@ def test_strengths_come_back(law):
 
 
 def test_large_samples_know_what_fishers_information_says():
-    """Of n specimens ln m has the error √(6/n)/π; intervals are 3.92 of them wide."""
+    """ln m of n specimens has the error √(6/n)/π; intervals are 3.92 of them wide."""
     found = pbdkit.fit_strength(fit_of(16 * drawn(16, 2000, 5)))
     modulus = found.values["fracture.modulus"]
     expected = np.sqrt(6 / 2000) / np.pi
@@ -157,7 +157,7 @@ def test_large_samples_know_what_fishers_information_says():
 
 
 def test_the_modulus_does_not_depend_on_the_size_and_the_scale_does_as_the_theory_says():
-    """The same peaks of a chain of 10 and of 1000 bonds: s grows by 100^(1/m), draw by draw."""
+    """Chains of 10 and of 1000 bonds with the same peaks: s grows by 100^(1/m), draw by draw."""
     loads = drawn(10, 40, 3)
     small, large = (
         LAWS["weibull"].draws(even(n), Breaks(loads / 0.01, np.ones(40, bool)),
@@ -179,8 +179,8 @@ def test_mean_strength_of_specimens_falls_as_the_root_of_their_size():
 
 
 def test_what_outlasts_its_test_counts():
-    """Tests that end at 0.8 of the scale of chains: taken for breaks they would tell too much
-    modulus, left out they would tell too little strength."""
+    """Tests that end at 0.8 of the scale of chains: counted as breaks they would overestimate the
+    modulus, left out they would underestimate the strength."""
     strength = drawn(16, 300, 4)
     end = 0.8 * 0.02 * 16 ** (-1 / 8)
     seen = np.minimum(strength, end)
@@ -276,8 +276,8 @@ def test_where_the_first_break_is_not_the_failure_it_is_said():
 
 
 def test_simulation_finds_the_strengths_of_chains_torn_in_closed_form(monkeypatch):
-    """Within 4.5 of its errors, which are larger than those of the likelihood: mean and spread
-    of ln peak do not tell all."""
+    """The estimates are within 4.5 of their errors, which are larger than those of the likelihood:
+    mean and spread of ln peak do not contain all information."""
     peaks = 16 * drawn(16, 60, 8)
     by_likelihood = pbdkit.fit_strength(fit_of(peaks))
     model = [Weibull]

@@ -1,4 +1,4 @@
-"""What a fit tells on request: profiles, a sampler, other models; and where it begins."""
+"""Results of a fit on request: profiles, a sampler, other models; and its start."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_a_sampler_that_is_missing_is_named_before_the_fit(fit, monkeypatch):
 
 
 def test_the_right_model_foretells_best(tmp_path):
-    """An orthotropic plate: the isotropic rule foretells left-out points worse."""
+    """The isotropic rule predicts left-out points of an orthotropic plate worse."""
     rule = {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.5, "shear_ratio": 0.3}
     made = plate(rule, **COARSE)
     measured(made, tmp_path / "field.csv", noise=NOISE / 4)
@@ -193,24 +193,24 @@ def test_the_right_model_foretells_best(tmp_path):
 
 
 class Lazy(pbdkit.FollowerRule):
-    """Somebody else's rule: goes a share of the way to the mean of its neighbours."""
+    """A rule of a third party, which moves a share of the way to the mean of its neighbours."""
 
     type: Literal["lazy"] = "lazy"
     share: float = 0.5
 
     @staticmethod
     def gather(d, r, w, p):
-        """What a neighbour contributes."""
+        """Return the contribution of a neighbour."""
         return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        """How far the particle moves."""
+        """Return the move of the particle."""
         return p.share * total[0] / total[1]
 
 
 def test_a_third_party_s_rule_is_a_candidate(fit):
-    """Its equilibrium is that of barycentres, so that nothing tells its share."""
+    """Its equilibrium is that of barycentres, so that its share is not identifiable."""
     settings = {"rule": {"type": "lazy", "share": 0.5}, "frame.type": "mean"}
     rival = {"settings": settings, "unknown": {"rule.share": [0.2, 0.9]}}
     found = pbdkit.fit(fit | {"candidates": {"lazy": rival}, "folds": 2}, components=[Lazy])
@@ -224,7 +224,7 @@ def test_a_third_party_s_rule_is_a_candidate(fit):
 
 
 def test_wide_bounds_start_where_the_gap_is_least(tmp_path):
-    """The middle of 0.01 to 100 is far off; the gap tells the order of magnitude."""
+    """The middle of 0.01 to 100 is far off; the gap determines the order of magnitude."""
     rule = {"type": "elastic", "poisson_ratio": 0.2, "stiffness": {"otherwise": 1.0, "half": 1.7}}
     made = plate(rule)
     measured(made, tmp_path / "field.csv", noise=NOISE)

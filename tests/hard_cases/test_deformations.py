@@ -33,8 +33,8 @@ sheets = pytest.mark.parametrize(
 
 
 def stretched(lattice, neighbours, stretch):
-    """Parts of a 6 x 6 sheet whose end columns stand where a stretch along x has them, the rows of
-    its body, its displacements in equilibrium, and its leaders."""
+    """Return parts of a 6 x 6 sheet with end columns at their places after a stretch along x, the
+    rows of its body, its displacements in equilibrium, and its leaders."""
     parts = {"lattice": lattice, "neighbours": neighbours}
     raster = scene_of(6, 6, **parts).raster
     X, ends = raster.reference(), np.isin(raster.site_table()[:, 0], (0, 5))
@@ -121,8 +121,9 @@ def test_case_3_a_coupling_that_passes_a_million_times_the_body_is_stopped(steps
 
 @pytest.mark.parametrize(("columns", "speed"), [(20, 0.0035), (12, 0.35)])
 def test_case_22_the_body_lags_behind_a_leader_by_the_formula(columns, speed):
-    """The steady lag w of (1 - P) w = the way of the equilibrium in a step, less what the leaders,
-    who move first, hand on within the step: (2v/3N) i (N² - i² - 3/2), N = columns - 1."""
+    """The steady lag w solves (1 - P) w = the motion of the equilibrium in a step, less the part
+    that the leaders, which move first, pass on within the step: (2v/3N) i (N² - i² - 3/2), N =
+    columns - 1."""
     N, steps = columns - 1, 10 * columns**2
     leaders = [HOLD_LEFT, pull_right(speed, 0.0, steps)]
     given = experiment(columns, 3, leaders=leaders, steps=steps, record={"every": steps})
@@ -152,7 +153,8 @@ def test_case_22_a_fast_leader_stretches_its_first_bond_nine_times_as_far_as_equ
 
 
 def test_case_25_the_barycentre_does_not_follow_a_rotation_of_its_leaders():
-    """Documented and warned of, and within its certificate of the equilibrium of its rule."""
+    """The case is documented and warned of, and within its error bound of the equilibrium of its
+    rule."""
     turn = {"type": "rotation", "centre": [5.5, 5.5], "angle": 1.0, "steps": 90}
     leaders = [{"select": {"edge": e}, "motion": turn} for e in ("left", "right")]
     given = experiment(12, 12, leaders=leaders, steps=90, solver={"type": "equilibrium"})

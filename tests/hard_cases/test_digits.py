@@ -66,7 +66,7 @@ def test_case_10_lengths_from_positions_break_bonds_at_rest():
 
 
 def near_and_away(far, **parts):
-    """The same run near the origin and far from it."""
+    """The run near the origin is the same as far from it."""
     origins = [{"origin": [0.0, 0.0]}, {"origin": [far, -far]}]
     given = [experiment(**parts | {"lattice": parts["lattice"] | at}) for at in origins]
     return (pbdkit.run(one, progress=False) for one in given)
@@ -149,7 +149,8 @@ def test_case_23_a_step_is_jacobi_every_follower_sees_the_same_configuration():
 
 
 def test_case_23_the_numbers_of_the_particles_do_not_matter():
-    """The same sheet, numbered along its rows in place of its columns: x and y changed about."""
+    """The second sheet is the same, numbered along its rows in place of its columns, with x and y
+    exchanged."""
     u = np.random.default_rng(3).normal(size=(4, 5, 2))
     one = advanced(scene_of(4, 5), u.reshape(20, 2), 30)[-1].reshape(4, 5, 2)
     swapped = u.transpose(1, 0, 2)[..., ::-1]

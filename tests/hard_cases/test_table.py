@@ -20,7 +20,7 @@ def rows():
 
 
 def checks(function):
-    """Whether a test says what has to come out."""
+    """Return whether a test asserts its expected result."""
     for node in ast.walk(function):
         called = node.func if isinstance(node, ast.Call) else None
         if isinstance(node, ast.Assert) or getattr(called, "attr", "") in CHECKS:

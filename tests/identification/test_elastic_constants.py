@@ -1,4 +1,4 @@
-"""What `pbdkit identify` says of the built-in rules, against what is known of them exactly."""
+"""Results of `pbdkit identify` for the built-in rules, against exact values."""
 
 import math
 
@@ -158,7 +158,8 @@ def test_plane_strain_has_the_ratio_of_another_material_in_plane_stress(lattice,
     ("lattice", "neighbours", "alike"), [(SQUARE, EIGHT, NEAREST), (HEXAGONAL, NEAREST, NEAREST)]
 )
 def test_the_member_with_poisson_ratio_minus_one_is_the_barycentre(lattice, neighbours, alike):
-    """Of the four nearest on the square lattice: the weights of the diagonals are (1 + ν)."""
+    """With the four nearest neighbours on the square lattice the weights of the diagonals are (1 +
+    ν)."""
     found, mean = identity(lattice, neighbours, elastic(-1.0)), identity(lattice, alike, BARYCENTRE)
     assert (found.kind, found.diffusivity) == ("diffusion", pytest.approx(mean.diffusivity))
     assert found.poisson_ratio == pytest.approx(-1.0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""What `pbdkit identify` says of third parties' rules and lattices, and how it says it."""
+"""Results and texts of `pbdkit identify` for rules and lattices of third parties."""
 
 import json
 

@@ -89,7 +89,7 @@ def test_bonds_select_sort_and_group_by_number(sheet):
 
 
 def texts(figure):
-    """What stands at the axes of a figure and above them."""
+    """Return the texts at the axes of a figure and above them."""
     axes = figure.axes
     found = (t for ax in axes for t in (ax.get_xlabel(), ax.get_ylabel(), ax.get_title()))
     return [" ".join(text.split()) for text in found if text]

@@ -99,7 +99,7 @@ def whole(call: Any) -> Any:
 
 
 def is_whole(right: Any) -> bool:
-    """Whether the output is there as it should be, and nothing besides."""
+    """Return whether the output is complete, and nothing else is in the folder."""
     with pbdkit.open(OUT) as dataset:
         same = np.array_equal(dataset["position"].values, right)
     return same and names() <= {"e.json", "whole.nc", "out.nc"}
@@ -184,12 +184,12 @@ def test_a_folder_that_takes_no_file_is_refused_before_the_first_step(
 
 
 def names() -> set[str]:
-    """Of the files in the current folder."""
+    """Return the names of the files in the current folder."""
     return {path.name for path in Path.cwd().iterdir()}
 
 
 class FailingError(Exception):
-    """What a plugin may raise."""
+    """An error that a plugin may raise."""
 
 
 def stopped(call: Any, patch: pytest.MonkeyPatch) -> None:
@@ -254,7 +254,8 @@ KEPT = "out.nc.run", "out.nc.run-records", "out.nc.run-wal"
 
 
 def killed(call: Any, patch: pytest.MonkeyPatch, *more: str, number: int = 6) -> dict[str, bytes]:
-    """What a run of e.json leaves that is killed at this commit; nothing else is left."""
+    """Return the files that a run of e.json leaves if it is killed at this commit; nothing else is
+    left."""
     found: dict[str, bytes] = {}
     with patch.context() as inner:
         copying = lambda: found.update({name: Path(name).read_bytes() for name in KEPT})  # noqa: E731
@@ -273,7 +274,7 @@ def lay(files: dict[str, bytes]) -> None:
 
 
 def kept() -> dict[str, bytes]:
-    """The files of the run, but for what SQLite makes to read."""
+    """Return the files of the run, except those that SQLite creates for reading."""
     found = {path.name: path.read_bytes() for path in Path.cwd().glob("out.nc*")}
     return {name: data for name, data in found.items() if data and not name.endswith("-shm")}
 
@@ -368,7 +369,7 @@ def test_stores_that_are_put_together_from_two_are_named(
 
 
 def stopping(keep: Any, number: int) -> Any:
-    """Keeps so many times, and fails then."""
+    """Keep a number of times, and fail then."""
     left = [number]
 
     def keeping(*args: Any) -> None:
@@ -382,7 +383,7 @@ def stopping(keep: Any, number: int) -> Any:
 
 @pytest.mark.parametrize("cut", [0, 100, 4096])
 def test_a_store_that_was_never_whole_is_in_nobodys_way(call: Any, cut: int) -> None:
-    """As where the disk got full, or the power went, while it was made."""
+    """The disk was full, or the power failed, while it was written."""
     with RunStore(store_of(OUT), mode="rwc"):
         data = store_of(OUT).read_bytes()
     lay({"out.nc.run": data[:cut], "out.nc.run-records": b""})

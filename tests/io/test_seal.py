@@ -42,7 +42,7 @@ def test_other_programs_read_the_same(sound):
 @samples(20)
 @given(data=st.data())
 def test_a_flipped_bit_is_never_a_silent_difference(sound, tmp_path_factory, data):
-    """Wherever it lies: in values, in what HDF5 says of itself, in the seal."""
+    """The changed byte may lie anywhere: in values, in the metadata of HDF5, in the seal."""
     content = bytearray(sound.read_bytes())
     at = data.draw(st.integers(0, len(content) - 1))
     content[at] ^= 1 << data.draw(st.integers(0, 7))

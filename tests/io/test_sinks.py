@@ -18,7 +18,7 @@ LARGE = np.zeros(LARGE_BYTES // 8)
 
 
 class Noting(KeepingSink):
-    """Notes what it is told, by which thread; fails at one value."""
+    """Records the values it receives, with the thread; fails at one value."""
 
     def __init__(self, fails_at=None):
         self.calls, self.threads, self.fails_at = [], set(), fails_at
@@ -76,7 +76,7 @@ def test_large_values_are_written_in_order_by_one_other_thread():
 
 
 def test_what_is_known_at_the_end_may_be_large():
-    """As when every bond of a large body broke is."""
+    """The value has the size of a record in which every bond of a large body broke."""
     inner = Noting()
     sink = OverlappingSink(inner)
     sink.begin([], {}, {})

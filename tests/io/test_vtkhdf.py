@@ -1,4 +1,4 @@
-"""What ParaView reads of an exported result is the dataset, step by step."""
+"""The content of an exported result in ParaView is the dataset, step by step."""
 
 import h5py
 import numpy as np
@@ -21,7 +21,7 @@ TORN = {
 
 
 def grids(path):
-    """What vtk reads of a file: the grid of each step, with the time that it stands for."""
+    """Yield what vtk reads from a file: the grid of each step, with its time."""
     reader = vtk.vtkHDFReader()
     reader.SetFileName(str(path))
     reader.UpdateInformation()

@@ -65,7 +65,7 @@ def test_the_cells_of_a_lattice_tile_the_plane(cell, corners):
 
 
 def measured(scene, u, *, intact_only=False):
-    """The shares of all cells of a body whose displacements are u, (body particle, axis)."""
+    """Return the shares of all cells of a body with displacements u, (body particle, axis)."""
     moment = StateMoment(state_with(scene, u), Tables(scene))
     return moment.cells.over(area_share, intact_only=intact_only)
 

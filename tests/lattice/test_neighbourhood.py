@@ -34,7 +34,7 @@ any_metric = st.builds(
 
 
 def counts(lattice, metric):
-    """How many neighbours each shell has, asked of every sublattice."""
+    """Return the number of neighbours in each shell, for every sublattice."""
     found = {
         tuple(len(shell) for shell in metric.shells_around(lattice.cell(), s))
         for s in range(len(lattice.cell().sites))

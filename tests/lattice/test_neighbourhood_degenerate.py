@@ -1,4 +1,5 @@
-"""Lattices without area, neighbours along one line, frame points that copy nobody: all are said."""
+"""Lattices without area, neighbours along one line, and frame points without weights are
+reported."""
 
 import math
 from itertools import pairwise
@@ -122,7 +123,7 @@ def test_offsets_are_all_within_the_radius(a, b, angle, radius):
 
 
 class Mute(pbdkit.FramePolicy):
-    """Frame point 3 follows somebody with the weight 0."""
+    """Frame point 3 follows a particle with the weight 0."""
 
     type: Literal["mute"] = "mute"
 

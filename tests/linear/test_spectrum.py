@@ -1,4 +1,4 @@
-"""Relaxation and memory: where a step settles, where it swings, and with which period."""
+"""Relaxation and memory for which a step converges or oscillates, and the period."""
 
 import json
 import math
@@ -123,9 +123,9 @@ def test_memory_is_bounded_by_1(memory, stable):
 
 
 def growth_of(**parts):
-    """By what small noise grows in the second half of the steps in which the slowest mode changes
-    by 1e4: some hundred, or one over it. The first half is for the modes to part: a start at rest
-    has little of those that alternate."""
+    """Return the growth of small noise in the second half of the steps in which the slowest mode
+    changes by 1e4: some hundred, or one over it. The first half is for the modes to separate: a
+    start at rest has little of those that alternate."""
     scene = scene_of(**parts)
     radius = pbdkit.analyse(experiment(**parts)).spectral_radius
     half = math.ceil(math.log(1e2) / abs(math.log(radius)))
@@ -156,7 +156,7 @@ def test_memory_settles_the_distance_weighted_rule_as_printed():
 
 
 def zeros_of(x):
-    """Where a series changes its sign, on straight lines between its steps."""
+    """Return the zeros of a series, on straight lines between its steps."""
     n = np.flatnonzero(x[:-1] * x[1:] < 0)
     return n + x[n] / (x[n] - x[n + 1])
 
@@ -219,7 +219,7 @@ def test_check_says_nothing_where_nothing_swings(call, memory):
 
 @pytest.mark.parametrize("memory", [0.9, 0.999])
 def test_the_slowest_swing_of_large_sheets_against_the_closed_form(memory):
-    """Where the slowest modes creep back, the first that swings lies inside the spectrum."""
+    """If the slowest modes creep back, the first that oscillates lies inside the spectrum."""
     n = 40
     analysis = pbdkit.analyse(sheet(n, n, solver=stepping(1.0, memory)))
     a = np.cos(np.pi * np.arange(1, n - 1) / (n - 1))[:, None]

@@ -23,7 +23,7 @@ SQUARE_4 = {"type": "coordination", "shells": 1}
 
 
 def closed_form(columns, rows, neighbours):
-    """All eigenvalues of the step between two held end columns, with a copying frame."""
+    """Return all eigenvalues of the step between two held end columns, with a copying frame."""
     a = np.cos(np.arange(1, columns - 1) * np.pi / (columns - 1))[:, None]
     b = np.cos(np.arange(rows) * np.pi / rows)[None, :]
     values = (a + b) / 2 if neighbours is SQUARE_4 else (2 * a + 2 * b + 4 * a * b) / 8

@@ -235,7 +235,7 @@ def test_groups_that_agree_may_overlap():
 
 
 def test_whether_leaders_overlap_is_told_of_the_groups_that_a_scene_has():
-    """Also where somebody gives it others, as hands do."""
+    """Overlaps are also found if the groups are replaced, as in interactive sessions."""
     held = build_scene(pbdkit.load("paper/a"))
     assert not held.leaders_overlap
     assert replace(held, leading=(*held.leading, held.leading[0])).leaders_overlap

@@ -42,7 +42,7 @@ def cut(at):
 
 
 def crossed(ds):
-    """Whether each bond crosses the cut, by its ends."""
+    """Return whether each bond crosses the cut, by its ends."""
     a, b = (ds.reference.values[ds.bond_ends.values[:, end] - 1] for end in (0, 1))
     parted = (a[:, 1] > 3.5) != (b[:, 1] > 3.5)
     return parted & ((a + b)[:, 0] / 2 <= 3.2)

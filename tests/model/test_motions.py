@@ -98,7 +98,7 @@ def test_what_is_linear_is_interpolated_exactly(tmp_path, points, select):
 
 
 def test_a_measured_motion_starts_where_the_particle_then_is(tmp_path):
-    """As every other motion; the displacement is that of the place at rest all the same."""
+    """The motion is that of every other motion; the displacement is that of the place at rest."""
     path = written(tmp_path, "{type: measured, file: data.csv}", measured(SCATTER))
     given = pbdkit.load(path).model_dump(by_alias=True, mode="json")
     (late,) = given["leaders"]

@@ -22,7 +22,7 @@ FIT_FILE = "experiment: e.json\nunknown: {rule.K: [-1, 0]}\nmeasured: {file: d.c
 
 @pytest.fixture
 def told(call: Any) -> Any:
-    """What a command answers where files of all kinds lie, by names that say nothing."""
+    """Results of commands for files of all kinds with names that do not show their kind."""
     assert call("run", "e.json", "-o", "result.yaml", "--quiet").code == 0
     Path("sweep.nc").write_text(SWEEP_FILE)
     Path("fit.nc").write_text(FIT_FILE)

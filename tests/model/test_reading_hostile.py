@@ -24,7 +24,7 @@ from pbdkit.stability.forecast import forecast
 
 Call = Callable[..., Any]
 SOON_S = 5.0
-"""Of processor time, so that a busy machine does not decide."""
+"""Largest processor time in seconds, so that a busy machine does not decide."""
 
 
 def checked(**parts: Any) -> tuple[Any, float]:

@@ -34,13 +34,13 @@ from pbdkit.simulation import Execution, record
 from tests.test_restart import contents
 
 BESIDE = Path(sys.executable).parent
-"""Where the launcher of mpi4py's own MPI is, whether or not the environment is activated."""
+"""Place of the launcher of mpi4py's own MPI, whether or not the environment is activated."""
 MPIEXEC = shutil.which("mpiexec", path=BESIDE) or shutil.which("mpiexec")
 NUMPY = {"type": "stepping", "engine": "numpy"}
 
 
 def written(given_, path, processes=None, watch=None):
-    """How a run into a file ended."""
+    """Return the outcome of a run into a file."""
     together = processes or Execution()
     scene = together.scene(pbdkit.Experiment.model_validate(given_))
     run = together.run(scene, watch or Watch())
@@ -62,7 +62,7 @@ def assert_same(one, other):
 
 
 def compare(given_, folder, size):
-    """As one process or, where that refuses it, in the same words."""
+    """Run like one process or, if that refuses the run, return the same message."""
     one, several = folder / "one.nc", folder / "several.nc"
     alone, together = (
         written_or_refused(given_, one),
@@ -236,7 +236,7 @@ OTHERS = {
 
 
 class AheadBefore(pbdkit.Diagnostic):
-    """Where the particle three lines ahead was a step ago."""
+    """Position of the particle three lines ahead before the last step."""
 
     type: Literal["ahead-before"] = "ahead-before"
     line: int
@@ -300,7 +300,7 @@ def stopping_after(looks):
 
 @pytest.mark.parametrize("sizes", [(3, 2), (1, 3), (2, 1)])
 def test_resumed_on_another_number_of_processes(sizes, tmp_path, monkeypatch):
-    """What was kept and recorded is read piece by piece."""
+    """Stored and recorded data is read piece by piece."""
     for what in ("io.run_store.PART_BYTES", "restart.BLOCK_BYTES"):
         monkeypatch.setattr(f"pbdkit.{what}", 256)
     given_ = sheet(fracture={"type": "damage", "onset": 0.1, "failure": 0.4})
@@ -403,7 +403,7 @@ def test_what_is_wrong_is_said_once(tmp_path):
 
 @pytest.mark.parametrize("names", [("PMI_SIZE",), ("OMPI_COMM_WORLD_SIZE", "PMIX_RANK")])
 def test_processes_that_do_not_find_each_other_are_refused(names, monkeypatch, call):
-    """As where the launcher is of one MPI and mpi4py of another."""
+    """The launcher belongs to one MPI and mpi4py to another."""
     for name in names:
         monkeypatch.setenv(name, "2")
     monkeypatch.setattr("pbdkit.mpi.launch.refuse_without", lambda *missing: None)

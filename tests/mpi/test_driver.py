@@ -44,7 +44,7 @@ def share_small_grids(monkeypatch):
 
 
 def strip(**parts):
-    """Of 260 rows, of which two grids are parted."""
+    """Return a strip of 260 rows, of which two grids are divided."""
     return {
         "name": "strip",
         "lattice": {"type": "square", "a": 1.0},
@@ -164,7 +164,7 @@ def certified(path):
 
 
 def test_what_the_certificate_says_is_true(tmp_path):
-    """By factors of a matrix it is found more accurately."""
+    """The result by factors of a matrix is more accurate."""
     given_ = strip(body=RING, leaders=ENDS)
     exact = {"type": "equilibrium", "method": "lu", "tolerance": 1e-11}
     written(given_ | {"solver": exact}, tmp_path / "exact.nc")
@@ -288,7 +288,7 @@ def ended(given_, path, processes=None):
 
 
 def test_strips_cut_every_grid():
-    """Without gaps; what each process knows there contains its own rows, and some around them."""
+    """The parts have no gaps; each process has its own rows there, and some around them."""
     scene = build_scene(pbdkit.Experiment.model_validate(strip()))
     for parts in (2, 3, 5, 9):
         strips = [strip_of(scene, own, parts) for own in deep_subdomains(scene, parts)]

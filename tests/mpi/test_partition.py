@@ -29,11 +29,11 @@ LEFT_OUT = {
     "group",
     "tiling",
 }
-"""Of scenes: what both take from the same experiment."""
+"""Fields of scenes that both take from the same experiment."""
 
 
 def assert_alike(one, other, name="part"):
-    """The same numbers, down to the last array."""
+    """Assert that all numbers are equal, down to the last array."""
     if is_dataclass(one):
         assert type(one) is type(other), name
         for field in fields(one):

@@ -1,4 +1,5 @@
-"""Pictures of bodies: nothing is clipped or overprinted, whatever their shape; what colours say."""
+"""Pictures of bodies: nothing is clipped or overprinted, for any shape, and colours have their
+meaning."""
 
 import re
 from dataclasses import fields
@@ -78,7 +79,7 @@ def torn():
 
 
 def drawn_texts(figure, monkeypatch):
-    """All texts that a figure writes, with the boxes that they take, in pixels."""
+    """Return all texts of a figure, with their boxes in pixels."""
     found, draw = [], Text.draw
 
     def drawing(self, renderer):
@@ -490,7 +491,7 @@ def test_a_difference_is_of_particles_of_one_number(bodies):
 
 
 def test_a_field_has_the_value_of_its_place_and_holes_stay_holes():
-    """Of a linear quantity, on cells larger and smaller than pixels; a cell is left out."""
+    """Test a linear quantity, on cells larger and smaller than pixels; a cell is left out."""
     for count in (4, 9, 60, 300):
         site = np.stack(np.meshgrid(*2 * [np.arange(count + 1)], indexing="ij"), -1).reshape(-1, 2)
         x = site / count + 0.05 * np.sin(3 * site[:, ::-1] / count)
@@ -547,7 +548,7 @@ def test_cells_with_a_broken_side_are_left_out_and_the_outline_goes_around_the_r
 
 
 def test_a_file_is_read_as_far_as_it_is_drawn(tmp_path, call, monkeypatch):
-    """Of five steps and three fields, one step of one."""
+    """Draw one step of five and one field of three."""
     given = {"name": "some", "lattice": SQUARE, "body": {"type": "grid", "columns": 30, "rows": 30}}
     more = {"rule": {"type": "barycentre"}, "steps": 4, "leaders": [HOLD], "neighbours": WHOLE}
     given |= more | {"diagnostics": [{"type": "pe1"}, {"type": "pe2"}, {"type": "displacement"}]}

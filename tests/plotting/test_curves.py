@@ -46,7 +46,7 @@ def torn():
 
 @pytest.fixture(scope="module")
 def pulled():
-    """An elastic sheet whose right edge, leader group 1, is pulled to the left and up."""
+    """An elastic sheet with its right edge, leader group 1, pulled to the left and up."""
     return run(
         **CALIBRATED, leaders=[HELD, pull_right(-0.02, 0.005, 4)], diagnostics=FORCES, steps=8
     )
@@ -72,7 +72,7 @@ def told(ax):
 
 
 def texts(figure):
-    """All texts that are seen, with the boxes that they take."""
+    """Return all visible texts, with their boxes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.text import Text
 

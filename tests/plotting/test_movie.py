@@ -20,7 +20,7 @@ from pbdkit.plotting.movie import MovieSheet
 from pbdkit.plotting.style import Look
 
 SMALL = {"figsize": (3.01, 2.47), "dpi": 61}
-"""Of an odd number of pixels either way, as it is given."""
+"""A picture with an odd number of pixels either way is written in its own size."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def torn():
 
 
 def frames_of(path):
-    """All of a movie: (frame, row, column, red green blue)."""
+    """Return all frames of a movie: (frame, row, column, red green blue)."""
     if path.suffix == ".gif":
         with Image.open(path) as moving:
             found = []

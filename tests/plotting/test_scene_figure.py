@@ -1,4 +1,4 @@
-"""What a notebook shows of an experiment, of an analysis and of a run that goes on."""
+"""Representations in a notebook of an experiment, of an analysis and of an unfinished run."""
 
 import io
 import sys

@@ -1,4 +1,4 @@
-"""What a diagnostic is given and may give: read-only tables, the rows of the body, names."""
+"""Arguments and results of a diagnostic: read-only tables, the rows of the body, names."""
 
 from typing import ClassVar, Literal
 
@@ -187,7 +187,7 @@ def test_a_file_of_version_1_opens_and_reruns(tmp_path):
 
 
 def test_smallest_cell_area_is_the_area_of_a_concave_cell():
-    """A square whose corner stands at (.4, .4) has .4 of its area."""
+    """A square with a corner at (.4, .4) has .4 of its area."""
     corner = {"select": {"nearest": [[1.0, 1.0]]}}
     leaders = [corner | {"motion": {"type": "displace", "displacement": [-0.6, -0.6]}}]
     others = [{"select": {"nearest": [p]}, "motion": {"type": "hold"}}

@@ -1,5 +1,5 @@
-"""Which plugins are loaded and which of two is meant is the user's choice, never that of an order;
-what is not needed is not imported."""
+"""The user, and never an order, decides which plugins are loaded and which of two is used; unused
+plugins are not imported."""
 
 from __future__ import annotations
 

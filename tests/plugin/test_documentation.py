@@ -1,4 +1,4 @@
-"""docs/extending tells of every interface, hook and public name, and its examples conform."""
+"""docs/extending describes every interface, hook and public name, and its examples conform."""
 
 import ast
 import doctest
@@ -106,7 +106,7 @@ def test_a_page_gives_the_signatures(interface):
 
 
 def reports_on(interface, code, tmp_path, monkeypatch):
-    """The example's own run, and what the suite says of its component."""
+    """Return the example's own run, and the report of the suite about its component."""
     module = f"page_of_{interface.__name__.lower()}_{len(sys.modules)}"
     (tmp_path / f"{module}.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)

@@ -1,4 +1,4 @@
-"""Parameters that differ from place to place: what an experiment may write, and what it is told."""
+"""Parameters that vary from place to place: valid experiments, and the errors of others."""
 
 from __future__ import annotations
 

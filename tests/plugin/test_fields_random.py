@@ -62,7 +62,7 @@ def same(one, other):
 
 SEEDS = 300
 FAR = 4.0 * LENGTH
-"""So far apart two places know as good as nothing of one another: exp(-16)."""
+"""Values at two places so far apart are almost uncorrelated: exp(-16)."""
 DISTANCES = np.array([0.0, 0.5, 1.0, 2.0, 3.0])
 ENOUGH = 4.0
 """Standard errors that an estimate may be off."""
@@ -96,7 +96,8 @@ def test_mean_and_scatter_are_those_asked_for(samples):
 
 
 def test_values_are_lognormal(samples):
-    """By the largest distance between two distributions, Kolmogorov's, at the level 1e-4."""
+    """Compare by the largest distance between two distributions, Kolmogorov's, at the level
+    1e-4."""
     g = np.sort(standard(samples[:, :, 0]), axis=None)
     share = np.arange(len(g) + 1) / len(g)
     distance = max(abs(norm.cdf(g) - share[1:]).max(), abs(norm.cdf(g) - share[:-1]).max())

@@ -1,4 +1,5 @@
-"""The number of axes is said once, by the lattice: a simple cubic lattice steps like the others."""
+"""The number of axes is defined once, by the lattice: a simple cubic lattice steps like the
+others."""
 
 from itertools import product
 from typing import Literal
@@ -49,8 +50,8 @@ def faces():
 
 
 def scene(engine, threshold, *, moves=True):
-    """The block, its ends led apart. The experiment file knows bodies and motions of the plane
-    only: those of space are put in."""
+    """Return the block, with its ends moved apart. The experiment file has bodies and motions of
+    the plane only: those of space are put in."""
     left, right, window = faces()
     plane = pbdkit.Experiment(
         version=1,

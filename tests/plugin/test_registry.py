@@ -1,4 +1,4 @@
-"""Plugins: whatever one of them does, the others load, and what is wrong is said."""
+"""Plugins: the others load in spite of the errors of one, and errors are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers that change in the course of the steps: what they are when, and what goes with them."""
+"""Numbers that change with the steps: their values, and features that they can be combined with."""
 
 import json
 import math
@@ -106,7 +106,7 @@ def same(one, other):
 
 
 def now(part, step):
-    """Parts of an experiment with numbers in place of courses: by hand, as documented."""
+    """Parts of an experiment with numbers in place of schedules: by hand, as documented."""
     if isinstance(part, list):
         return [now(each, step) for each in part]
     if not isinstance(part, dict):
@@ -175,8 +175,8 @@ def test_kernels_follow_courses_to_the_bit(name, compiled_at_length):
 
 @pytest.mark.parametrize("name", ["both", "memory"])
 def test_kernels_follow_courses_in_single_precision(name, request):
-    """As nearly as it goes: kernels and numpy round differently there. One is compiled, the other
-    interpreted."""
+    """The agreement is approximate: kernels and numpy round differently there. One is compiled, the
+    other interpreted."""
     parts = CHANGING[name]
     if name == "both":
         request.getfixturevalue("interpreted")
@@ -254,8 +254,8 @@ def test_equilibria_are_those_of_the_last_numbers():
 
 
 def test_increments_of_an_equilibrium_follow_courses():
-    """What ages under a steady strain breaks within the increment in which its strength is reached,
-    in step 898; then nothing holds its parts, and the last equilibrium is that before."""
+    """Bonds that age under a steady strain break within the increment in which the strength is
+    reached, in step 898; then nothing holds the parts, and the last equilibrium is that before."""
     smaller = ["body.columns=11", "solver={type: equilibrium}"]
     given_ = pbdkit.load("modelling/ageing", settings=smaller)
     with pytest.raises(pbdkit.DivergedError, match="between step 892 and step 900") as error:
@@ -281,7 +281,8 @@ def test_loads_that_grow_lead_along_the_way_that_they_grow():
 
 
 def test_what_is_measured_of_a_step_is_measured_with_its_numbers():
-    """The same displacements press half as hard once the stiffness has come down to half."""
+    """The force of the same displacements is half as large once the stiffness has come down to
+    half."""
     stretched = SHEET | {
         "rule": {"type": "elastic", "poisson_ratio": 0.0,
                  "stiffness": course([0, 30], [1.0, 0.5])},
@@ -437,7 +438,7 @@ FOLLOWING = {
     "limits": CHANGING["limits"]
     | {"rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4])}},
 }
-"""What changes under a frame that reads the rule."""
+"""Time-dependent parameters under a frame that reads the rule."""
 
 
 def leaning(**parts):
@@ -471,7 +472,7 @@ def test_kernels_leave_frames_that_follow_a_course_to_numpy():
 
 
 class Behind(StrainGradient):
-    """Applies a rule to the moves of another, whose weights alone hang on the length."""
+    """Applies a rule to the moves of another, with weights that alone depend on the length."""
 
     type: Literal["behind"] = "behind"
 
@@ -538,7 +539,8 @@ def test_parameters_move_the_frame_too():
 
 @pytest.mark.parametrize("frame", ["natural", "mean"])
 def test_sensitivities_are_those_of_the_numbers_in_the_last_step(frame):
-    """How the body answers leaders that go on, where its numbers still change when the run ends."""
+    """The body responds to leaders that continue to move, with numbers that still change when the
+    run ends."""
     moved = {"type": "displace", "displacement": [0.1, 0.2]}
     sheet_ = SHEET | {
         "rule": {"type": "elastic", "poisson_ratio": course([1, 9], [0.1, 0.45])},
@@ -617,8 +619,8 @@ def test_every_number_that_ships_and_may_change_is_among_those_compared():
     ("kind", "number"), [(kind, number) for kind, own in SHIPPED.items() for number in own]
 )
 def test_states_and_measurements_of_each_step_are_those_of_its_numbers(kind, number):
-    """Of every number that ships, with masses, guides and an obstacle: against a scene built anew
-    for each step."""
+    """Compare every number that ships, with masses, guides and an obstacle, with a scene built
+    again for each step."""
     part = {"type": kind} | GIVEN.get(kind, {})
     begins = part.get(number, 1.0)
     part[number] = course([1, 4], [begins, 1.2 * begins])

@@ -342,7 +342,7 @@ def test_a_strength_is_divided_by_youngs_modulus() -> None:
 
 
 class Tough(pbdkit.FractureModel):
-    """Takes an energy."""
+    """Has an energy as its parameter."""
 
     type: Literal["tough"] = "tough"
     energy: Annotated[float, FRACTURE_ENERGY] = 0.1

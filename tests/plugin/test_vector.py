@@ -43,7 +43,7 @@ OPERATIONS = {
         lambda a, b, s: [((1.0 - s) * x + s * y) - (x + y) / s for x, y in zip(a, b, strict=True)],
     ),
 }
-"""By name: of vectors a and b and a positive number s; and the same of plain numbers."""
+"""Functions by name: of vectors a and b and a positive number s; and the same of plain numbers."""
 EVERY = pytest.mark.parametrize("name", OPERATIONS)
 
 

@@ -32,8 +32,8 @@ WEAK_ZONES = {
     ("square", 45.0): (-0.37, 1.08),
     ("hexagonal", 0.0): (-0.3, 0.8),
 }
-"""Where along the bar the centres of weak cells lie, by lattice and angle: a crack across the bar
-meets one column of squares along their axis, and two rows where cells touch by corners."""
+"""Positions along the bar of the centres of weak cells, by lattice and angle: a crack across the
+bar meets one column of squares along their axis, and two rows if cells touch by corners."""
 
 
 def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
@@ -91,11 +91,12 @@ def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
 
 
 CORNERS = (-1, -1), (1, -1), (1, 1), (-1, 1)
-"""Of the bar, in units of half its length and height."""
+"""Corners of the bar, in units of half its length and height."""
 
 
 def measured(lattice, rule, ell, angle=0.0, height=4.0, **more):
-    """(strength over onset · E, energy over that asked for, force at the end over the largest)."""
+    """Return (strength over onset · E, energy over the prescribed energy, force at the end over the
+    largest)."""
     given = bar(lattice, rule, ell, angle, height=height, **more)
     ds = pbdkit.run(given, progress=False)
     turn = np.radians(angle)

@@ -1,8 +1,8 @@
-"""Contact against the solutions of contact mechanics and of beams.
+"""Compare contact with the solutions of contact mechanics and of beams.
 
     python tests/reliability/contact.py [--cells N]...
 
-Hertz's half-width at so many cells across the contact (40 and 20), and three-point bending.
+Hertz's half-width with N cells across the contact (40 and 20), and three-point bending.
 """
 
 from __future__ import annotations

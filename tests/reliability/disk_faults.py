@@ -1,14 +1,15 @@
-"""Faults of a disk at each call by which a command writes: an error, a short write, a full disk.
+"""Inject faults of a disk at each call by which a command writes: an error, a short write, a full
+disk.
 
     python tests/reliability/disk_faults.py [--commands run,export] [--kinds EIO,short,full]
                                             [--every N] [--first N]
 
-A library of 200 lines of C is compiled and preloaded. The n-th call of a command on files below
-its folder (write, pwrite, fsync, fdatasync, link, rename, unlink, ftruncate, mkdir, mmap, open with
-O_CREAT) fails with EIO, takes half of what it is given, or, with all that need room after it,
-reports ENOSPC. Each trial is a fork of one process that has imported everything. Looked at are the
-exit status, the message, the earlier file, what is left in the folder, whether an output of exit 0
-is that of the undisturbed command, and whether the next call comes to it where the exit was 6.
+A library of 200 lines of C is compiled and preloaded. The n-th call of a command on files below its
+folder (write, pwrite, fsync, fdatasync, link, rename, unlink, ftruncate, mkdir, mmap, open with
+O_CREAT) fails with EIO, writes half of its bytes, or, with all that need room after it, reports
+ENOSPC. Each trial is a fork of one process that has imported everything. Checked are the exit
+status, the message, the earlier file, the files in the folder, that an output of exit 0 is that of
+the undisturbed command, and that the next call produces it if the exit was 6.
 """
 
 from __future__ import annotations
@@ -98,10 +99,10 @@ FIT = {
 STORES = re.compile(
     r"out\.nc\.run(-wal|-shm|-journal|-records)?|s(/lock|/sweep\.sqlite.*|/set-aside.*)?"
 )
-"""What an exit of 6 may leave: an unfinished run, members that are finished."""
+"""Files that an exit of 6 may leave: an unfinished run, members that are finished."""
 LOGS = re.compile(r".*\.sqlite-(wal|shm)|s/set-aside.*")
-"""What SQLite leaves where it cannot close a database, and takes up again; and what a sweep sets
-aside of a database that it cannot read."""
+"""Files that SQLite leaves if it cannot close a database, and recovers later; and files that a
+sweep sets aside if it cannot read a database."""
 
 
 @dataclass
@@ -112,7 +113,7 @@ class Command:
     output: str
     prepare: Callable[[], None] = lambda: None
     before: Callable[[], object] = lambda: None
-    """What the process of the command does first."""
+    """First action in the process of the command."""
     same: Callable[[Path, Path], list[str]] = field(
         default=lambda one, other: _same_bytes(one, other)
     )
@@ -156,7 +157,7 @@ def _same_sweep(one: Path, other: Path) -> list[str]:
 
 
 def _same_page(one: Path, other: Path) -> list[str]:
-    """But for the time of day."""
+    """Compare the pages except for the time of day."""
     texts = [re.sub(r'"created": ?"[^"]*"', "", p.read_text()) for p in (one, other)]
     return [] if texts[0] == texts[1] else [f"{one}: another text"]
 
@@ -184,7 +185,7 @@ def _result(*more: str) -> None:
 
 
 def _beside(name: str) -> Callable[[], None]:
-    """A result, and an earlier file in whose place another is to come."""
+    """Make a result, and an earlier file that another is to replace."""
 
     def prepare() -> None:
         _result()
@@ -371,7 +372,7 @@ class Bench:
             yield from self._gone_on(self.command.again(), output, whole)
 
     def _left(self) -> list[str]:
-        """What is in the folder that the undisturbed command does not leave."""
+        """Return the files in the folder that the undisturbed command does not leave."""
         names = [
             {str(p.relative_to(top)) for p in top.rglob("*")} for top in (self._folder, self._whole)
         ]
@@ -388,7 +389,7 @@ class Bench:
             yield f"then left behind: {left}"
 
     def tried(self, kind: str, first: int, every: int) -> tuple[int, list[str]]:
-        """How many trials there were, and their findings."""
+        """Return the number of trials, and their findings."""
         numbers = range(first, self.calls + 1, every)
         findings = []
         for number in numbers:

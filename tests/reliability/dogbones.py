@@ -53,8 +53,8 @@ def specimen(
     steps: int = 12,
     pulled: float = 1.6,
 ) -> dict[str, Any]:
-    """A dogbone of a length, width, gauge length, gauge width and radius, held on the left and
-    pulled on the right so many times as far as the gauge bears."""
+    """Return a dogbone of a length, width, gauge length, gauge width and radius, held on the left
+    and pulled on the right by a multiple of the strain that the gauge bears."""
     length, width, gauge_length, gauge_width, radius = size
     way = pulled * failure * length
     motion: dict[str, Any] = {"type": "displace", "displacement": [way, 0.0]}
@@ -91,7 +91,7 @@ def specimen(
 
 
 def drawn(rng: np.random.Generator, largest: float) -> dict[str, Any]:
-    """A random specimen."""
+    """Return a random specimen and its experiment."""
     lattice = str(rng.choice(["square", "hexagonal"]))
     rule = str(rng.choice([*RULES][: 3 if lattice == "square" else 2]))
     length = float(rng.integers(14, largest + 1))
@@ -128,7 +128,7 @@ def strains(ds: Any, time: int) -> Any:
 
 
 def faults_of(experiment: dict[str, Any], ds: Any) -> list[str]:
-    """What is wrong with the result of a specimen, in words."""
+    """Return the faults of the result of a specimen as texts."""
     found, failure = [], experiment["fracture"]["failure"]
     if ds.attrs["status"] not in ("complete", "separated"):
         found.append(f"ends as {ds.attrs['status']}: {ds.attrs['stop_reason']}")
@@ -157,7 +157,7 @@ def faults_of(experiment: dict[str, Any], ds: Any) -> list[str]:
 
 
 def main() -> int:
-    """Runs the trials."""
+    """Run the trials and print their findings."""
     asked = argparse.ArgumentParser(description=__doc__)
     asked.add_argument("--trials", type=int, default=200)
     asked.add_argument("--seed", type=int, default=0)

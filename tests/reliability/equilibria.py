@@ -1,11 +1,12 @@
-"""Equilibria of random scenes against what they must agree with.
+"""Compare equilibria of random scenes with references.
 
 python tests/reliability/equilibria.py springs|fracture|certificates [--trials N] [--seed S]
 
 springs: large loads (pressed, pulled, sheared, turned) against stepping with the load in --parts
-parts, each settled. fracture: a load in one step against the same load in as many steps as it has
-increments: which bonds break. certificates: grids against a direct solver: how far the certificate
-lies above the true error, and whether ever below. Exits with 1 where something differs.
+parts, each until convergence. fracture: a load in one step against the same load in as many steps
+as it has increments: which bonds break. certificates: grids against a direct solver: the ratio of
+the error bound to the true error, and cases in which it is below. Exits with 1 if something
+differs.
 """
 
 from __future__ import annotations
@@ -156,7 +157,7 @@ TRIALS: dict[str, Callable[[np.random.Generator, int, Counts], None]] = {
 
 
 def main() -> int:
-    """Counts what comes out."""
+    """Count the outcomes of the trials."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("trial", choices=TRIALS)
     parser.add_argument("--trials", type=int, default=500)

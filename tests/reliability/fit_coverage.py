@@ -1,14 +1,14 @@
-"""Whether the errors of `pbdkit.fit` are those of repeats: plates, fitted again and again.
+"""Compare the errors of `pbdkit.fit` with the scatter of repeats: plates, fitted again and again.
 
     python tests/reliability/fit_coverage.py [--trials N] [--kinds poisson ...] [--loss soft_l1]
 
 The true field is an equilibrium on the lattice of the fit, between ends that move by cubics. Each
 repeat draws new noise, as large as that of image correlation, for the points of the field and for
-those of both ends, and fits. Counted is how often the true value lies within 1.96 standard errors,
-how far the mean of value - true, in standard errors, is from 0, and its standard deviation. What is
-behind ± is twice the sampling error of so many repeats. Exits with 1 where a goal is missed by more
-than sampling explains (three times its standard deviation); values may spread by 5 % more or less
-than their errors, and as much besides.
+those of both ends, and fits. The output is how often the true value lies within 1.96 standard
+errors, and mean and standard deviation of value - true, in standard errors. The number behind ± is
+twice the sampling error for the number of repeats. Exits with 1 where a goal is missed by more than
+sampling explains (three times its standard deviation); values may spread by 5 % more or less than
+their errors, and as much besides.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ import pbdkit
 
 WIDTH, HEIGHT = 20.0, 10.0
 NOISE, POINTS, ENDS = 3e-4, 500, 11
-"""Of a displacement in mm, as of the shipped plate with a hole; points of the field, and of each
-end."""
+"""Noise of a displacement in mm, as of the shipped plate with a hole; points of the field, and of
+each end."""
 WITHIN, BIAS, COVERAGE = 1.96, 0.1, (93.5, 96.5)
 MODULUS = 210e3
 YOUNG = "youngs_modulus"
@@ -96,7 +96,7 @@ def motion(x: float, noise: np.ndarray | None = None) -> dict[str, Any]:
 
 
 def plate(kind: Kind, noises: np.ndarray | None = None) -> dict[str, Any]:
-    """A plate with a hole, softer or stiffer in one half where the rule says so."""
+    """A plate with a hole, softer or stiffer in one half if the rule is to be wrong."""
     hole = {"type": "disc", "radius": 2.0, "centre": [10.0, 5.0]}
     sides = (("left", 0.0), ("right", WIDTH))
     return {
@@ -132,8 +132,8 @@ class Truth:
 
 @cache
 def truth(name: str) -> Truth:
-    """Of an equilibrium, bilinear between particles as in a fit; points in cells that lack a
-    particle are none."""
+    """Return an equilibrium, bilinear between particles as in a fit; points in cells that lack a
+    particle are left out."""
     kind = KINDS[name]
     diagnostics: list[dict[str, Any]] = [{"type": "displacement"}]
     if kind.forced:
@@ -151,7 +151,8 @@ def truth(name: str) -> Truth:
 
 
 def repeat(name: str, seed: int, trial: int, loss: str) -> list[tuple[float, float]]:
-    """Value and standard error of all that is unknown; NaN where the fit says it is not told."""
+    """Return value and standard error of all unknowns; NaN if the fit reports one as not
+    identifiable."""
     kind, true = KINDS[name], truth(name)
     generator = np.random.default_rng([seed, list(KINDS).index(name), trial])
     noises = NOISE * generator.normal(size=(2, ENDS, 2))
@@ -199,7 +200,7 @@ def told(name: str, found: np.ndarray) -> bool:
 
 
 def main() -> int:
-    """All kinds, one after another."""
+    """Run all kinds, one after another."""
     asked = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     asked.add_argument("--trials", type=int, default=2000)
     asked.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))

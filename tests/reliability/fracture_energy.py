@@ -1,13 +1,13 @@
-"""Fracture with energy against linear fracture mechanics: a double-cantilever beam and a plate with
-a central notch, over spacings.
+"""Compare fracture with energy with linear fracture mechanics: a double-cantilever beam and a plate
+with a central notch, over spacings.
 
     python tests/reliability/fracture_energy.py beam 15 29 57 119
     python tests/reliability/fracture_energy.py plate 31 63 127 255
 
 The bodies are the net of springs of ν = 1/3, which 'elastic' is for small strains, mirrored at the
-crack's plane. What is not on that plane is linear and condensed once; the cells across it soften by
-`Cohesive` itself under the stress across the plane, settled and softened in turn as `solver:
-equilibrium` does. So finer lattices are affordable than whole bodies;
+crack's plane. The part outside that plane is linear and condensed once; the cells across it soften
+by `Cohesive` itself under the stress across the plane, with equilibrium and softening in turn as
+`solver: equilibrium` does. Lattices can therefore be finer than with whole bodies;
 `tests/components/test_fracture_cohesive.py` holds one of these, cracked, against a whole one by
 pbdkit.
 """
@@ -44,7 +44,7 @@ EDGE, DIAGONAL = 0.75, 0.375
 POISSON = 1 / 3
 ONSET, ENOUGH, MOST = 1e-4, 1e-5, 3000
 NUMBERS = "damage_left", "damage_right", "failure_left", "failure_right"
-"""What `Cohesive` remembers of a bond, in its order."""
+"""State variables of a bond of `Cohesive`, in their order."""
 
 
 def net(columns, rows):
@@ -72,7 +72,7 @@ def net(columns, rows):
 @dataclass
 class Half:
     """A body above its crack's plane, condensed on its lowest row (u of all, then v) and on one
-    upward displacement of who leads."""
+    upward displacement of the leaders."""
 
     h: float
     columns: int
@@ -122,8 +122,8 @@ class Half:
         return damage
 
     def load(self, fracture, cut, openings):
-        """The force and the damage of the cells at each opening, settled and softened in turn, as
-        far as they are asked for; some bonds are `cut`."""
+        """Yield the force and the damage of the cells at each opening, with equilibrium and
+        softening in turn, for the requested openings; some bonds are `cut`."""
         c, zero = constants(self.h, self.columns, fracture), np.zeros(self.columns - 1)
         numbers = dict.fromkeys(NUMBERS, zero)
         d = r = Vector(zero, zero + self.h)
@@ -149,7 +149,7 @@ class Half:
 
 
 def constants(h, columns, fracture):
-    """The constants of upright bonds that `Cohesive` knows in a scene of that spacing."""
+    """Return the constants of upright bonds that `Cohesive` has in a scene of that spacing."""
     scene = build_scene(Experiment(**PARTS, lattice={"type": "square", "a": h}, fracture=fracture))
     upright = next(s for s in scene.constants.limits if s.rest.x == 0.0)
     return scene.constants.limits[upright]._asdict()

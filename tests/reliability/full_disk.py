@@ -29,7 +29,7 @@ def mounted(folder: Path, kib: int, *, again: bool = False) -> None:
 
 
 def tried(folder: Path, kib: int, whole: Path) -> tuple[list[str], bool]:
-    """What is wrong with a run on a disk of that size, and whether it was too small."""
+    """Return the faults of a run on a disk of that size, and whether it was too small."""
     mounted(folder, kib)
     os.chdir(folder)
     try:

@@ -1,9 +1,9 @@
-"""Fuzzed experiments, as many as are asked for, through all that `pbdkit check` does.
+"""Run the checks of `pbdkit check` on a number of fuzzed experiments.
 
     python tests/reliability/fuzz_experiments.py [--count N] [--seed S] [--only NUMBER]
 
-Each ends in a documented error, soon and in a short text, or is valid and foretold soon. `--only`
-prints one case.
+Each ends in a documented error, soon and in a short text, or is valid and has a forecast soon.
+`--only` prints one case.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from pbdkit.stability.forecast import forecast
 
 PATIENCE_S = 60.0
 MEMORY = 2**29
-"""The machine that is asked for has so many bytes, whatever this one has."""
+"""Memory in bytes that the machine reports, whatever this one has."""
 ERROR_S, ERROR_MB, TEXT_S, MARK_S = 0.1, 100.0, 1.0, 1e-4
-"""What an error may cost, of processor time and memory, where it is found before the scene; and
-what each megabyte of text and each mark of it that can begin a value may take besides, up to the
-number of values that is taken."""
+"""Bounds on processor time and memory of an error that is found before the scene; and further
+bounds for each megabyte of text and each mark of it that can begin a value, up to the number of
+values that is accepted."""
 VALID_S, VALID_MB = 5.0, 500.0
-"""What a forecast, or an error that only the scene shows, may cost; and once more for each
-`MEMORY` / 4 that the scene takes."""
+"""Bounds on the cost of a forecast, or of an error that only the scene shows; and once more for
+each `MEMORY` / 4 that the scene takes."""
 
 
 def case(seed: int, number: int) -> tuple[bytes, list[str]]:
@@ -59,7 +59,7 @@ def case(seed: int, number: int) -> tuple[bytes, list[str]]:
 
 
 def tried(content: bytes, settings: list[str], *, quick: bool = False) -> Outcome:
-    """How it ends, and what that took."""
+    """Return the outcome of a case, with its cost."""
     sizes.machine_memory = lambda processes=1: MEMORY
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "e.yaml")
@@ -81,7 +81,7 @@ def tried(content: bytes, settings: list[str], *, quick: bool = False) -> Outcom
 
 
 def marks(content: bytes) -> int:
-    """How many values there can be in a text."""
+    """Return the number of values that can be in a text."""
     return min(MAX_NODES, sum(content.count(c) for c in b",:-[{"))
 
 
@@ -106,14 +106,14 @@ def _checked(path: Path, settings: list[str], quick: bool) -> Outcome:
 
 
 def undocumented(error: Exception) -> Outcome:
-    """With its place."""
+    """Return the outcome with the place of the error."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     said = f"{type(error).__name__}: {str(error)[:150]} ({place.filename[-40:]}:{place.lineno})"
     return {"how": "undocumented error", "said": said}
 
 
 def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
-    """What is wrong with how a case ended, with `slack` times the bounds."""
+    """Return the faults of the outcome of a case, with `slack` times the bounds."""
     how = outcome["how"]
     said = outcome.get("said", "")
     if how in ("hang", "crash", "undocumented error"):
@@ -135,7 +135,7 @@ def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
 
 
 def warm_up() -> None:
-    """All is imported, and every model is built, before anything is measured."""
+    """Import all modules and build every model before anything is measured."""
     for part in [{}, *({name: part} for name, part in PARTS)]:
         tried(json.dumps(BASES[0] | part).encode(), [])
     for text in TEXTS:
@@ -157,7 +157,7 @@ TEXTS = [shipped_text(name) for name in shipped_names()]
 def fuzz(
     count: int, seed: int, workers: int = 2, *, quick: bool = False
 ) -> list[tuple[int, Outcome]]:
-    """The outcomes of the first `count` cases of a seed; `quick`: of scenes nothing is foretold,
+    """Return the outcomes of the first `count` cases of a seed; `quick`: scenes have no forecast,
     and imports are in the figures."""
     command = [__file__, "--seed", str(seed), *(["--quick"] if quick else [])]
     return outcomes(command, range(count), PATIENCE_S, workers)

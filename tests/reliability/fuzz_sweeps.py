@@ -1,4 +1,4 @@
-"""Fuzzed sweeps, as many as are asked for, up to where the first member would be run.
+"""Check a number of fuzzed sweeps, up to the run of the first member.
 
     python tests/reliability/fuzz_sweeps.py [--count N] [--seed S] [--only NUMBER]
 
@@ -34,7 +34,7 @@ from pbdkit.sweeps.execute import validated
 from pbdkit.sweeps.specification import SweepPlan, read_sweep
 
 MEMBER_S = 0.2
-"""What each of the members, of which there are a few dozen, may take besides."""
+"""Further bound for each of the members, of which there are a few dozen."""
 HUGE = [10**5, 10**9, 2**63, 10**40]
 PATHS = ["solver.relaxation", "solver.memory", "steps", "seed", "rule.K", "rule", "lattice.a", "body",
          "body.columns", "leaders.0.until", "leaders.7", "name", "x", "", ".", "steps.x", "fracture",
@@ -75,7 +75,7 @@ def _values(draw: random.Random) -> Any:
 
 
 def tried(content: bytes) -> Outcome:
-    """How it ends, and what that took."""
+    """Return the outcome of a case, with its cost."""
     sizes.machine_memory = outlook.machine_memory = lambda processes=1: MEMORY
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "s.yaml")
@@ -107,7 +107,7 @@ def _checked(path: Path) -> Outcome:
 
 
 def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
-    """What is wrong with how a case ended."""
+    """Return the faults of the outcome of a case."""
     return fuzz_experiments.faults(outcome, slack + MEMBER_S * outcome.get("members", 24))
 
 

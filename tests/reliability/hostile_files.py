@@ -1,5 +1,5 @@
-"""Field files and results that are damaged or made to do harm, and experiments that name files
-elsewhere, as many as are asked for: each through a command of the program, in a fork.
+"""Run commands, each in a fork, on a number of field files and results that are damaged or
+malicious, and of experiments that name files elsewhere.
 
     python tests/reliability/hostile_files.py [--count N] [--seed S] [--only NUMBER]
 
@@ -241,8 +241,8 @@ Case = tuple[list[str], bool, str]
 
 
 def _damaged(sound: Path, path: Path, draw: random.Random) -> str:
-    """What was done to a sound file: bytes damaged, or a change that does harm and, of a result, a
-    seal that says that all is well."""
+    """Damage a sound file, and return a description: bytes damaged, or a malicious change and, in a
+    result, a valid seal."""
     if draw.random() < 0.5:
         what, content = mutated(sound.read_bytes(), draw)
         path.write_bytes(content)
@@ -346,7 +346,7 @@ CASES = (field_case, result_case, result_case, experiment_case)
 
 
 def tried(seed: int, number: int, subjects: Path) -> Outcome:
-    """How the case of that number ends, in a fork with a bound on its memory."""
+    """Return the outcome of the case of that number, in a fork with a bound on its memory."""
     draw = random.Random(f"{seed}/{number}")
     with tempfile.TemporaryDirectory(dir=subjects) as name:
         folder = Path(name)
@@ -407,7 +407,7 @@ def _ended(pid: int) -> tuple[int, int]:
 
 
 def _leaks(folder: Path, log: str) -> bool:
-    """Whether what lies elsewhere is in a message, or in a file that a command wrote."""
+    """Return whether data from elsewhere is in a message, or in a file that a command wrote."""
     needles = (SECRET_TEXT, struct.pack("<d", SECRET), str(SECRET)[:10].encode(), b"root:")
     told = [log.encode()]
     made = (p for p in folder.iterdir() if p.is_file() and p.name not in ("link.csv", "log"))
@@ -416,7 +416,7 @@ def _leaks(folder: Path, log: str) -> bool:
 
 
 def _as_stored(folder: Path) -> bool:
-    """Whether the field that was taken is what HDF5 itself finds in the file."""
+    """Return whether the field that was read is what HDF5 itself finds in the file."""
     taken = read_field({"file": "f.nc", "variable": "E"}, FileResolver(folder))
     with h5py.File(folder / "f.nc") as file:
         stored = {name: file[name][...] for name in ("E", "x", "y")}
@@ -427,7 +427,7 @@ def _as_stored(folder: Path) -> bool:
 
 
 def faults(outcome: Outcome) -> list[str]:
-    """What is wrong with how a case ended."""
+    """Return the faults of the outcome of a case."""
     how, what = outcome["how"], outcome.get("what", "")
     found = [] if how.startswith("status") else [f"{how}: {what}"]
     if outcome.get("peak_mib", 0.0) > MOST_BYTES / 2**20:

@@ -1,4 +1,4 @@
-"""Texts, bytes and settings that somebody, or some accident, made of an experiment file."""
+"""Malformed texts, bytes and settings in place of an experiment file, by accident or intention."""
 # ruff: noqa: E501  (rows of words)
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FILES = [
 
 
 def to_yaml(draw: Random, data: Any) -> str:
-    """The data as somebody may have written it: JSON is YAML, too."""
+    """Return the data as a text: JSON is YAML, too."""
     if draw.random() < 0.5:
         return json.dumps(data, indent=draw.choice([None, 1]))
     stream = io.StringIO()
@@ -55,7 +55,7 @@ def hostile_text(draw: Random, text: str) -> bytes:
 
 
 def hostile_setting(draw: Random) -> str:
-    """What `--set` may be given."""
+    """Return a value for the option `--set`."""
     paths = [
         "steps",
         "leaders.1.until",
@@ -106,7 +106,7 @@ def _line(draw: Random, text: str) -> str:
 
 
 def _piece(draw: Random, text: str) -> str:
-    """A piece moved."""
+    """Return the text with a piece moved."""
     a, b, c = sorted(draw.randrange(len(text) + 1) for _ in range(3))
     return text[:a] + text[b:c] + text[a:b] + text[c:]
 

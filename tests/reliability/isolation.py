@@ -1,5 +1,5 @@
-"""Numbered cases tried in processes of their own: one that hangs or crashes is a finding, and the
-others go on."""
+"""Run numbered cases in processes of their own: one that hangs or crashes is a finding, and the
+others continue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 SHARE = 500
-"""So many cases a process tries, unless it ends before."""
+"""Number of cases of a process, unless it ends before."""
 Outcome = dict[str, Any]
 
 

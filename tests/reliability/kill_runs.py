@@ -1,10 +1,10 @@
-"""Runs killed at random moments, and at chosen points of their end, and gone on with.
+"""Kill runs at random moments, and at chosen points of their end, and resume them.
 
     python tests/reliability/kill_runs.py [--trials N] [--seed S] [--only NUMBER]
 
 Every run of these commits whenever it can. After each kill `pbdkit status` and `pbdkit.open` are
-held against what the run was told is kept; in the end the result against that of the uninterrupted
-run, bit for bit.
+compared with the steps that the run has acknowledged as stored; in the end the result is compared
+with that of the uninterrupted run, bit for bit.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ NUMBER = struct.Struct("<q")
 
 
 def acknowledging(then: Callable[[], object] = often) -> Callable[[], None]:
-    """What makes a process note each step that a commit returned for, with one write."""
+    """Make a process record each step for which a commit returned, with one write."""
 
     def begin() -> None:
         then()
@@ -66,8 +66,8 @@ def acknowledging(then: Callable[[], object] = often) -> Callable[[], None]:
 
 
 def dying(at: int) -> Callable[[], None]:
-    """What makes a process end at the n-th call by which it changes the disk, before or after it;
-    SQLite's own calls, which Python does not see, count as one a commit."""
+    """Make a process end at the n-th call by which it changes the disk, before or after it;
+    SQLite's own calls, which are invisible to Python, count as one a commit."""
 
     def begin() -> None:
         left = at
@@ -105,7 +105,7 @@ def network() -> None:
 
 
 class Trial:
-    """One run in the current folder, killed and gone on with until it has ended."""
+    """One run in the current folder, killed and resumed until it has ended."""
 
     def __init__(self, seed: str, whole: Path, seconds: float, parts: dict[str, Any]) -> None:
         self.draw, self.seconds = random.Random(seed), seconds
@@ -114,7 +114,7 @@ class Trial:
         write_experiment(parts, Path.cwd())
 
     def run(self) -> list[str]:
-        """What was found."""
+        """Return the findings of the run."""
         command = ["run", "e.json", "-o", OUTPUT]
         while True:
             code, said = self.killed(*command)
@@ -150,7 +150,7 @@ class Trial:
         return done(*command, log=log, before=lambda: (begin(), deadly()))
 
     def looked_at(self, before: list[str]) -> list[str]:
-        """What is to be called next; holds what is there against what was acknowledged."""
+        """Return the next command; compares the files with the acknowledged steps."""
         output = Path(OUTPUT)
         noted = Path(ACKNOWLEDGED).read_bytes() if Path(ACKNOWLEDGED).exists() else b""
         steps = [step for (step,) in NUMBER.iter_unpack(noted)]

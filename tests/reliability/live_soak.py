@@ -1,11 +1,11 @@
-"""Looks at a live page for some minutes: random input, memory, pictures, delay.
+"""Test a live page for some minutes: random input, memory, pictures, delay.
 
     python tests/reliability/live_soak.py [--minutes 10] [--size 100] [--rule barycentre]
 
-Starts ``pbdkit live`` and headless Chromium, does whatever a user may do, and prints once a minute
-the memory of the server and of the page, pictures a second and those left out; at the end the
-delay from the mouse to the picture. Exits 1 where memory grows by more than a tenth after the first
-minute, or the page says something on its console.
+Starts ``pbdkit live`` and headless Chromium, performs actions of users, and prints once a minute
+the memory of the server and of the page, pictures a second and those left out; at the end the delay
+from the mouse to the picture. Exits 1 where memory grows by more than a tenth after the first
+minute, or the page writes to its console.
 """
 
 import argparse
@@ -118,7 +118,7 @@ def cut(page):
 
 
 def figures(page, server):
-    """What there is to say at a moment."""
+    """Return the figures of a moment."""
     told = page.evaluate(
         "({ second: pbdkitLive.perSecond, lost: pbdkitLive.lostPictures, drawn: pbdkitLive.drawn,"
         " step: pbdkitLive.step })"

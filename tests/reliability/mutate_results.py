@@ -1,8 +1,8 @@
-"""Mutated results, as many as are asked for: opened, loaded, looked at as plots do, and verified.
+"""Open, load, draw and verify a number of mutated results.
 
     python tests/reliability/mutate_results.py [--count N] [--seed S] [--only NUMBER]
 
-None crashes, hangs, or shows other values without a word. `--only` prints one case.
+None may crash, hang, or show other values without a message. `--only` prints one case.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pbdkit.io.open import reading
 from pbdkit.plotting.data import Trajectory
 
 PATIENCE_S, LONGEST_S = 120.0, 20.0
-"""After so many seconds a case is ended, and so many it may take."""
+"""Seconds after which a case is ended, and seconds that it may take."""
 TORN = ["--set=leaders.1.motion.velocity=[1.2, 0.0]", "--set=steps=12"]
 SUBJECTS = ("sealed", "sealed-zlib", "rewritten", "rewritten-zlib")
 
@@ -55,7 +55,8 @@ def make_subject(name: str, folder: Path) -> Path:
 
 
 def read_subject(path: Path) -> dict[str, Any]:
-    """All that a user sees of it, to be compared: values, attributes, and what a plot draws."""
+    """Return all that a user sees of it, to be compared: values, attributes, and the data of a
+    plot."""
     with reading(path) as dataset:
         dataset.load()
         seen = {name: variable.values.tobytes() for name, variable in dataset.variables.items()}
@@ -67,14 +68,14 @@ def read_subject(path: Path) -> dict[str, Any]:
 
 @cache
 def seen_of_sound(path: Path) -> dict[str, Any]:
-    """The same of a sound file, read once."""
+    """Return the same for a sound file, read once."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return read_subject(path)
 
 
 def verified(path: Path) -> bool:
-    """Whether `pbdkit verify` finds nothing."""
+    """Return whether `pbdkit verify` finds no fault."""
     return _call("verify", str(path)) == 0
 
 
@@ -88,11 +89,11 @@ def _call(*arguments: str) -> int:
 
 
 def mutated(content: bytes, draw: random.Random) -> tuple[str, bytes]:
-    """What was done to it, and what came out."""
+    """Return a description of the mutation, and its result."""
     data, size = bytearray(content), len(content)
 
     def place() -> int:
-        """Anywhere, or where HDF5 keeps what it says of itself, or in the seal."""
+        """Return a place anywhere, or in the metadata of HDF5, or in the seal."""
         return draw.choice(
             [draw.randrange(size), draw.randrange(8192), size - 1 - draw.randrange(400)]
         )
@@ -127,7 +128,7 @@ def mutated(content: bytes, draw: random.Random) -> tuple[str, bytes]:
 
 
 def tried(seed: int, number: int, folder: Path) -> Outcome:
-    """How the case of that number ends."""
+    """Return the outcome of the case of that number."""
     draw = random.Random(f"{seed}/{number}")
     name = SUBJECTS[number % len(SUBJECTS)]
     sound = make_subject(name, folder)
@@ -161,7 +162,7 @@ def tried(seed: int, number: int, folder: Path) -> Outcome:
 
 
 def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
-    """What is wrong with how a case ended, with `slack` times the time."""
+    """Return the faults of the outcome of a case, with `slack` times the time."""
     how, what = outcome["how"], outcome.get("what", "")
     found = []
     if how in ("hang", "crash", "read, differs, silently") or how.startswith("undocumented"):

@@ -1,12 +1,12 @@
-"""Stores of unfinished runs that were damaged: bits flipped, files cut, zeroed, swapped, missing,
-or put together from two runs or from two moments of one run.
+"""Read and resume damaged stores of unfinished runs: bits flipped, files cut, zeroed, swapped,
+missing, or put together from two runs or from two moments of one run.
 
     python tests/reliability/mutate_stores.py [--trials N] [--seed S] [--only NUMBER]
 
-Each is asked for its status, opened with all its values, some are drawn, and some run again without
---force; then it is gone on with. Each call ends in a documented error or gives what the undamaged
-one gives, to the bit, and soon. No file is changed or removed where the damage is refused: with the
-undamaged files in the place of the damaged ones the run is gone on with to the right result.
+The status of each is read, it is opened with all its values, some are drawn, and some run again
+without --force; then it is resumed. Each call ends in a documented error or has the result of the
+undamaged store, to the bit, and soon. No file is changed or removed where the damage is refused:
+with the undamaged files in the place of the damaged ones the run is resumed to the right result.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def unfinished(parts: dict[str, Any], folder: Path) -> None:
 
 
 def dying(commits: int) -> Callable[[], None]:
-    """What makes a process commit whenever it can, and end after so many commits."""
+    """Make a process commit whenever it can, and end after a number of commits."""
 
     def begin() -> None:
         often()
@@ -109,7 +109,7 @@ def of_other(draw: random.Random, others: list[Path]) -> str:
 
 
 def rows(draw: random.Random, others: list[Path]) -> str:
-    """Rows with their digests right, as somebody would write them who knows how."""
+    """Change rows and their digests, as a deliberate forgery would, and return a description."""
     with RunStore(store_of(Path(OUTPUT))) as store, RunStore(store_of(others[0] / OUTPUT)) as other:
         table = {key: store.piece(key) for key in store.keys("")}
         theirs = {key: other.piece(key) for key in other.keys("")}
@@ -141,7 +141,7 @@ def changed_fact(draw: random.Random, text: str) -> str:
 
 
 def hostile(draw: random.Random, others: list[Path]) -> str:
-    """What SQLite would carry out, or write elsewhere."""
+    """Add content that SQLite would execute, or write elsewhere."""
     what = draw.choice(["trigger", "view", "journal", "attach", "newer"])
     if what == "journal":  # one that names a file to be removed once it is rolled back
         name = str(Path("precious").absolute()).encode()
@@ -179,11 +179,11 @@ HOW: list[Callable[[random.Random, list[Path]], str]] = [
     hostile,
 ]
 BY_DESIGN = (rows, hostile)
-"""What somebody wrote who knows how: it may be another run, and is not put right again."""
+"""Forgeries of a store: it may be another run, and is not repaired."""
 
 
 def read_all() -> None:
-    """Every value."""
+    """Read every value of the store."""
     for name, values in zip(("times", "positions"), recorded(Path(OUTPUT)), strict=True):
         np.save(f"{name}.npy", values)
     with pbdkit.open(OUTPUT) as dataset:
@@ -204,7 +204,7 @@ class Trial:
         self.files = files()
 
     def run(self) -> list[str]:
-        """What is wrong."""
+        """Return the faults of the trial."""
         looks = [("status", ["status", OUTPUT]), ("open", None)]
         if self.draw.random() < 0.1:
             looks.append(("plot", ["plot", OUTPUT, "-o", "picture.png"]))
@@ -263,7 +263,7 @@ class Trial:
             self.put_right()
 
     def put_right(self) -> None:
-        """What was damaged is as it was again, and all else as the commands left it."""
+        """Restore the damaged files, and keep all else as the commands left it."""
         for path in Path.cwd().glob(OUTPUT + ".run*"):
             if path.name not in {p.name for p in self.base.iterdir()}:
                 path.unlink()
@@ -277,7 +277,7 @@ class Trial:
 
 
 def files() -> dict[str, bytes]:
-    """All that is there of the run, but for empty files and the memory that SQLite shares."""
+    """Return all files of the run, except empty files and the memory that SQLite shares."""
     paths = [*Path.cwd().glob(OUTPUT + "*"), *Path.cwd().glob(f".{OUTPUT}.*")]
     found = {path.name: path.read_bytes() for path in paths if not path.name.endswith("-shm")}
     return {name: data for name, data in found.items() if data}
@@ -289,7 +289,8 @@ def changed(before: dict[str, bytes], now: dict[str, bytes]) -> list[str]:
 
 
 def is_other(whole: Path) -> bool:
-    """Whether what `read_all` saw is not what the run records; an earlier commit is."""
+    """Return whether the values that `read_all` read are not those that the run records; an earlier
+    commit is."""
     times, positions = np.load("times.npy"), np.load("positions.npy")
     right_times, right = recorded(whole)
     both = np.isin(times, right_times)
@@ -303,7 +304,7 @@ def result_is_other(whole: Path) -> list[str]:
 
 
 def reading() -> None:
-    """`read_all`, with errors told as the program does."""
+    """Call `read_all`, with errors printed as the program does."""
     try:
         read_all()
     except PbdkitError as error:
@@ -328,14 +329,14 @@ def main() -> None:
 
 
 def twin(parts: dict[str, Any]) -> dict[str, Any]:
-    """The same experiment pulled a little faster: every piece has the same key and size."""
+    """Return the same experiment pulled a little faster: every piece has the same key and size."""
     found: dict[str, Any] = json.loads(json.dumps(parts))
     found["leaders"][1]["motion"]["velocity"][0] *= 1.01
     return found
 
 
 def all_tried(seed: int, numbers: Any, kinds: list[str]) -> Counter[str]:
-    """How they ended; `failed` are those with which something was wrong."""
+    """Return the outcomes of the trials; `failed` are those with faults."""
     outcomes, here = Counter[str](), Path.cwd()
     with tempfile.TemporaryDirectory() as name:
         base = Path(name)

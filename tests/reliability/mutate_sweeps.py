@@ -1,11 +1,11 @@
-"""Folders of sweeps that were damaged: bits flipped, files cut, zeroed, swapped, missing, or put
+"""Rerun sweeps in damaged folders: bits flipped, files cut, zeroed, swapped, missing, or put
 together from two sweeps or from two moments of one sweep.
 
     python tests/reliability/mutate_sweeps.py [--trials N] [--seed S] [--only NUMBER]
 
-The same command is given again. It ends in a documented error, or writes the dataset of an
-undamaged folder, to the bit. Whatever was held is held still, is named, or lies untouched in a
-folder aside; and the command after that finds all members held and nothing to say.
+The same command is run again. It ends in a documented error, or writes the dataset of an undamaged
+folder, to the bit. Every stored member is still stored, is reported, or lies untouched in a folder
+aside; and the command after that finds all members stored and prints no message.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def network() -> None:
 
 
 def dying(members: int, begin: Callable[[], None]) -> Callable[[], None]:
-    """What makes a process end once so many members are held."""
+    """Make a process end once a number of members is stored."""
 
     def begin_to_die() -> None:
         begin()
@@ -100,8 +100,8 @@ def write_sweep(folder: Path, velocity: float, relaxations: list[float]) -> None
 
 
 def prepared(kind: str, folder: Path, velocity: float) -> None:
-    """A folder with a sweep that is finished, or was killed after seven of ten members; and what it
-    was after three, under `earlier`. The command there asks for eight members."""
+    """Make a folder with a sweep that is finished, or was killed after seven of ten members; and
+    its state after three, under `earlier`. The command there runs eight members."""
     folder.mkdir()
     os.chdir(folder)
     begin = network if kind == "network" else small
@@ -116,14 +116,14 @@ def prepared(kind: str, folder: Path, velocity: float) -> None:
 
 
 def called(before: Callable[[], None], code: int) -> str:
-    """What the command says, which has to end so."""
+    """Return the output of the command, which must end with that code."""
     found, said = done(*COMMAND, log=Path("log"), before=before)
     assert found == code, said
     return said
 
 
 def content(path: Path) -> dict[str, Any]:
-    """All that a dataset holds, but for when it was made."""
+    """Return all content of a dataset, except the time of its creation."""
     with pbdkit.open(path) as dataset:
         found: dict[str, Any] = {"": {k: v for k, v in dataset.attrs.items() if k != "created"}}
         for name, variable in dataset.variables.items():
@@ -141,7 +141,7 @@ def held(path: Path) -> set[tuple[Any, ...]]:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """What there is of the database."""
+    """Return the files of the database."""
     paths = folder.glob(DATABASE + "*")
     return {p.name: p.read_bytes() for p in paths if not p.name.endswith("-shm")}
 
@@ -177,7 +177,7 @@ HOW = [*[damage_file] * 7, *[damage_two] * 2, remove_file, *[of_other] * 3]
 
 
 def tried(kind: str, right: dict[str, Any], base: Path, others: list[Path], seed: str) -> Any:
-    """How the command ended on a damaged copy in the current folder, and what is wrong."""
+    """Return the outcome of the command on a damaged copy in the current folder, and its faults."""
     draw = random.Random(seed)
     before = held(base / "s" / DATABASE)
     how = draw.choice(HOW)(draw, others)
@@ -226,7 +226,7 @@ def main() -> None:
 
 
 def all_tried(seed: int, numbers: Any) -> Counter[str]:
-    """How they ended; `failed` are those with which something was wrong."""
+    """Return the outcomes of the trials; `failed` are those with faults."""
     outcomes, here = Counter[str](), Path.cwd()
     with tempfile.TemporaryDirectory() as name:
         base, whole = Path(name), Path(name, "whole")

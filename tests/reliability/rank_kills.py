@@ -1,10 +1,10 @@
-"""Runs of several processes of which one is killed, or their launcher, and that are gone on with by
-another number of processes.
+"""Kill one of the processes of a run, or their launcher, and resume the run with another number of
+processes.
 
     python tests/reliability/rank_kills.py [--trials N] [--seed S]
 
-After each kill every process must have ended within ten seconds; in the end the result is held
-against that of one process that nobody killed, bit for bit.
+After each kill every process must have ended within ten seconds; in the end the result is compared
+with that of one undisturbed process, bit for bit.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def _lives(pid: int) -> bool:
 
 
 def tried(draw: random.Random, folder: Path) -> tuple[list[str], float, int]:
-    """What is wrong with one run, killed and gone on with; the longest end, and the kills."""
+    """Return the faults of one run, killed and resumed; the longest end, and the kills."""
     kind = draw.choice(sorted(EXPERIMENTS))
     expected, _ = reference(EXPERIMENTS[kind], folder)
     name, longest, kills = written(EXPERIMENTS[kind], folder), 0.0, 0
@@ -108,7 +108,7 @@ def tried(draw: random.Random, folder: Path) -> tuple[list[str], float, int]:
 
 
 def main() -> None:
-    """As many trials as asked for; or one of the processes of a run."""
+    """Run the requested number of trials; or be one of the processes of a run."""
     if "--program" in sys.argv:
         (Path(PIDS) / str(os.getpid())).touch()
         often()

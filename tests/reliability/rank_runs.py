@@ -1,8 +1,8 @@
-"""Random scenes run by one process and by several, which must give the same file.
+"""Run random scenes with one process and with several, which must give the same file.
 
     mpiexec -n 3 python tests/reliability/rank_runs.py [--trials N] [--seed S] [--only NUMBER]
 
-Variables, attributes and the final state are compared bit for bit, but for `created` and `ranks`.
+Variables, attributes and the final state are compared bit for bit, except `created` and `ranks`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ENGINES = st.sampled_from(["numpy", "numpy", "numpy", "compiled"])
 
 
 def drawn(count: int, number: int) -> list[Parts]:
-    """So many experiments from a seed, each with one of the engines."""
+    """Return a number of experiments from a seed, each with one of the engines."""
     found: list[Parts] = []
     kinds = st.one_of(
         experiments(),
@@ -57,7 +57,7 @@ def drawn(count: int, number: int) -> list[Parts]:
 
 
 def ran(parts: Parts, output: Path, processes: Execution) -> str:
-    """Runs it into a file; what was refused, and in whose words."""
+    """Run it into a file; return the refusal, with its message."""
     try:
         scene = processes.scene(Experiment.model_validate(parts))
         run = processes.run(scene, Watch())
@@ -68,7 +68,7 @@ def ran(parts: Parts, output: Path, processes: Execution) -> str:
 
 
 def tried(parts: Parts, folder: Path, ranks: DistributedExecution) -> tuple[str, list[str]]:
-    """What came of it, and in what the file of several processes differs."""
+    """Return the outcome, and the differences of the file of several processes."""
     alone = ranks.communicator.bcast(
         ran(parts, folder / "one.nc", Execution()) if ranks.communicator.is_root else ""
     )
@@ -83,7 +83,7 @@ def tried(parts: Parts, folder: Path, ranks: DistributedExecution) -> tuple[str,
 
 
 def main() -> None:
-    """As many trials as asked for, or one."""
+    """Run the requested number of trials, or one."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--trials", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)

@@ -1,5 +1,5 @@
-"""Every component, built in and of the plugins in this repository, in runs that are stopped and
-gone on with, by both engines and other threads; and what else a run can be asked for.
+"""Stop and resume runs with every component, built in and of the plugins in this repository, by
+both engines and other threads, and with the other options of a run.
 
     python tests/reliability/resume_components.py [--scenes N] [--seed S] [--only NAME]
 """

@@ -1,12 +1,12 @@
-"""Equilibria of slender and soft bodies against stiffnesses that are assembled here.
+"""Compare equilibria of slender and soft bodies with stiffnesses that are assembled here.
 
     python tests/reliability/slender_bodies.py [--trials N] [--seed S]
 
 Bodies of up to --longest columns and few rows, soft at the root, in a layer or nowhere, that
-leaders hold, or leave free to slide, or that nothing holds; by every method. Whatever is certified
-must lie within its certificate of the solution of the assembled system, which is corrected in
-extended precision until rounding of the stiffness no longer counts; what is pushed on for ever must
-be refused. Exits with 1 where it does not.
+leaders hold, or leave free to slide, or that nothing holds; by every method. Each result must lie
+within its error bound of the solution of the assembled system, which is corrected in extended
+precision until rounding of the stiffness no longer counts; bodies that loads move without end must
+be refused. Exits with 1 otherwise.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class Reference:
 
 
 def scene(rng: np.random.Generator, longest: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """An experiment, and what the reference has to know of it."""
+    """An experiment, and the data of it that the reference uses."""
     kind = str(rng.choice(["square", "rectangular", "hexagonal"]))
     columns = int(min(longest, np.exp(rng.uniform(np.log(8), np.log(longest + 1)))))
     rows = int(rng.integers(2, 7))
@@ -194,7 +194,7 @@ def scene(rng: np.random.Generator, longest: int) -> tuple[dict[str, Any], dict[
 
 
 def trial(experiment: dict[str, Any], known: dict[str, Any]) -> str:
-    """What comes of it, in words; beginning with "differs" where that is wrong."""
+    """Return the outcome as a text; it begins with "differs" if it is wrong."""
     method, supports = experiment["solver"]["method"], known["supports"]
     try:
         ds = pbdkit.run(experiment, progress=False)
@@ -263,7 +263,7 @@ def edges(X: np.ndarray, columns: int, rows: int) -> tuple[np.ndarray, np.ndarra
 
 
 def main() -> int:
-    """Counts what comes out."""
+    """Count the outcomes of the trials."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)

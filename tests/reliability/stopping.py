@@ -1,5 +1,4 @@
-"""Runs stopped at random looks and gone on with, in this process, by other engines and threads
-too."""
+"""Runs stopped at random checks and resumed, in this process, by other engines and threads too."""
 
 from __future__ import annotations
 
@@ -32,8 +31,8 @@ ENGINES = [NUMPY, {"engine": "compiled", "threads": 1}, {"engine": "compiled", "
 
 
 class Looks(Watch):
-    """Stops at one of the looks to come; not while the last good state of a run that diverged is
-    looked for: who stops that does without it."""
+    """Watch that stops at one of the next checks; not while the last good state of a run that
+    diverged is searched: a stop then leaves no such state."""
 
     def __init__(self, at: int) -> None:
         super().__init__()
@@ -46,7 +45,7 @@ class Looks(Watch):
 
 
 def with_engine(parts: dict[str, Any], engine: dict[str, Any]) -> dict[str, Any]:
-    """The same, carried out by another engine; an equilibrium has none to choose."""
+    """Return the same run, carried out by another engine; an equilibrium has none to choose."""
     solver = parts["solver"]
     return parts if solver["type"] == "equilibrium" else parts | {"solver": solver | engine}
 
@@ -90,8 +89,8 @@ def resumed_otherwise(
     own: Components = (),
     engines: list[dict[str, Any]] = ENGINES,
 ) -> tuple[list[str], int]:
-    """In what the run, stopped here and there and gone on with, differs from the same in one go;
-    and how often it was stopped."""
+    """Return the differences of the run, stopped and resumed several times, from the uninterrupted
+    one; and the number of stops."""
     own, often_enough = list(own), drivers.LONGEST_CALL_S
     whole, output = folder / "whole.nc", folder / "out.nc"
     for path in (whole, output):

@@ -1,4 +1,5 @@
-"""What it costs to keep unfinished runs, against the same without; in turns, medians of pairs.
+"""Measure the cost of storing unfinished runs, against the same without; in turns, medians of
+pairs.
 
 python tests/reliability/store_cost.py [--turns N] [--records N]
 """
@@ -31,14 +32,14 @@ Work = Callable[[], object]
 
 
 def seconds(work: Work) -> float:
-    """Of the wall."""
+    """Return the wall-clock time of the work."""
     begun = time.perf_counter()
     work()
     return time.perf_counter() - begun
 
 
 def in_pairs(one: Work, other: Work, turns: int) -> tuple[float, str]:
-    """The median of the ratios of turns, and what they were; who begins alternates."""
+    """Return the median of the ratios of turns, and the ratios; the order alternates."""
     wait_for_quiet()
     ratios = []
     for turn in range(turns):
@@ -102,7 +103,7 @@ def against_raw(folder: Path, turns: int, records: int) -> tuple[float, str]:
 
 
 def files_of_short_runs(folder: Path) -> int:
-    """What runs of less than a second leave behind, or have lying about at their end."""
+    """Return the number of further files that a run of less than a second leaves in its folder."""
     path = folder / "short.nc"
     recording(BASE | {"name": "short"}, path)()
     assert not store_of(path).exists()

@@ -73,7 +73,7 @@ def pulled(body: dict[str, Any], fracture: dict[str, Any], far: float) -> dict[s
 
 
 BONDS, STEPS = 16, 120
-"""Of a chain, and in which it is torn."""
+"""Bonds of a chain, and steps in which it is torn."""
 SHEET = {"type": "grid", "columns": 9, "rows": 6}
 SMALL = {"type": "grid", "columns": 5, "rows": 3}
 
@@ -101,7 +101,7 @@ def elastic_of(law: str, experiment: pbdkit.Experiment, of: str = "force") -> El
 
 
 def described(law: str, peaks: Any, **more: Any) -> StrengthFit:
-    """Of such peaks."""
+    """Return the fit of such peaks."""
     return StrengthFit(
         kind="strength",
         experiment="",
@@ -135,8 +135,8 @@ def _rows(found: Any) -> list[list[float]]:
 
 
 def by_others(strains: BondStrains, loads: Any) -> dict[str, list[list[float]]]:
-    """The same of the largest likelihood: Wald's intervals, by observed information in logarithms,
-    and of the profile."""
+    """Return the same for the largest likelihood: Wald's intervals, by observed information in
+    logarithms, and those of the profile."""
     n, merged = len(loads), strains.merged()
     wide = 6.0 / n**0.5
     log_m = np.linspace(np.log(8.0) - wide, np.log(8.0) + wide, 161)
@@ -164,7 +164,8 @@ def by_others(strains: BondStrains, loads: Any) -> dict[str, list[list[float]]]:
 
 
 def told(law: str, found: Any, how: str, judged: bool = True) -> bool:
-    """Rows of (trial, parameter, (value, low, high)); whether the goals are met, but for chance."""
+    """Print rows of (trial, parameter, (value, low, high)); return whether the goals are met,
+    except for chance."""
     found, fine = np.array(found), True
     chance = 3.0 / len(found) ** 0.5
     for n, path in enumerate(LAWS[law].paths):
@@ -232,7 +233,7 @@ def torn(law: str, trials: int, count: int, numbers: Any) -> bool:
 
 
 def simulated(law: str, trials: int, count: int, numbers: Any) -> bool:
-    """By simulation, of peaks."""
+    """Test by simulation of peaks."""
     experiment = built(law, pulled(SMALL, fractures(law), 0.3))
     elastic = elastic_of(law, experiment)
     source, found = Specimens.of(experiment, Peaks(peaks=(1, 1, 1), of="force"), elastic), []
@@ -252,7 +253,7 @@ class Chains:
     elastic: None = None
 
     def tear(self, experiment: pbdkit.Experiment) -> Specimen:
-        """By the strengths of their bonds."""
+        """Tear the specimen by the strengths of its bonds."""
         fracture, numbers = experiment.fracture, np.random.default_rng(experiment.seed)
         if fracture.type == "weibull":
             least = fracture.scale * numbers.weibull(fracture.modulus, BONDS).min()
@@ -262,7 +263,7 @@ class Chains:
 
 
 def closed(law: str, trials: int, count: int, numbers: Any) -> bool:
-    """By simulation, of chains that need no run."""
+    """Test by simulation of chains that need no run."""
     experiment, found = built(law, chains(law, 1)), []
     source = Chains(Peaks(peaks=(1, 1, 1), of="force"))
     for n in range(trials):

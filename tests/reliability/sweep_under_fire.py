@@ -1,7 +1,7 @@
-"""Kills the workers of a sweep at random: ``python tests/reliability/sweep_under_fire.py``.
+"""Kill the workers of a sweep at random: ``python tests/reliability/sweep_under_fire.py``.
 
 1000 small runs while 20 workers are killed. Goal: every member is there with the digest that it has
-in a process that nobody disturbs, and none is run again once it has been reported.
+in an undisturbed process, and none is run again once it has been reported.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def children(pid: int) -> list[int]:
 
 
 def digests(folder: Path) -> Counter[tuple[str, str, bytes]]:
-    """Of each member that a store holds, and how often it holds it."""
+    """Return the members that a store contains, and how often it contains each."""
     database = sqlite3.connect(f"file:{folder / 'sweep.sqlite'}?mode=ro", uri=True)
     with closing(database):
         rows = database.execute("SELECT key, status, digest FROM member").fetchall()
@@ -54,7 +54,7 @@ def digests(folder: Path) -> Counter[tuple[str, str, bytes]]:
 
 
 def held(folder: Path) -> int:
-    """How many members a store holds; 0 while there is none."""
+    """Return the number of members in a store; 0 if there is none."""
     try:
         return digests(folder).total()
     except sqlite3.OperationalError:

@@ -1,5 +1,5 @@
-"""What the trials of runs share: small experiments, calls of the program in processes of their own
-that can be killed, and the comparison of two results, bit for bit."""
+"""Small experiments, calls of the program in processes of their own that can be killed, and the
+comparison of two results, bit for bit; the trials of runs share them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from pbdkit.io.seal import SealedFile, open_sealed
 
 OUTPUT = "out.nc"
 OF_A_RUN = ("created", "ranks")
-"""The attributes that say when and by how many processes it was made."""
+"""Attributes with the time and the number of processes of a run."""
 BASE: dict[str, Any] = {
     "name": "trial",
     "lattice": {"type": "square", "a": 1.0},
@@ -91,7 +91,7 @@ def often(first_s: float = 0.0) -> None:
 
 
 def started(work: Callable[[], object], log: Path) -> int:
-    """A process that does the work and exits as it does; what it says goes to the log."""
+    """Start a process that does the work and exits as it does; its output is written to the log."""
     log.touch()  # it may be killed before it says anything
     if pid := os.fork():
         return pid
@@ -114,7 +114,7 @@ def started(work: Callable[[], object], log: Path) -> int:
 
 
 def ended(pid: int, patience_s: float = 60.0) -> int:
-    """How it ended: its exit status, or minus the signal; one that hangs is killed: -1000."""
+    """Return the exit status of a process, or minus the signal; one that hangs is killed: -1000."""
     end = time.monotonic() + patience_s
     while time.monotonic() < end:
         found, status = os.waitpid(pid, os.WNOHANG)
@@ -149,7 +149,7 @@ def called(*arguments: str, log: Path, before: Callable[[], object] = often) -> 
 
 
 def done(*arguments: str, log: Path, before: Callable[[], object] = often) -> tuple[int, str]:
-    """How such a call ended, and what it said."""
+    """Return the exit status of such a call, and its output."""
     code = ended(called(*arguments, log=log, before=before))
     return code, log.read_text(errors="replace")
 
@@ -175,7 +175,7 @@ def reference(parts: dict[str, Any], folder: Path) -> tuple[Path, float]:
 
 
 def differences(one: Path, other: Path) -> list[str]:
-    """In what two results differ, to the bit, but for when they were made."""
+    """Return the differences of two results, to the bit, except the time of their creation."""
     for path in (one, other):
         with SealedFile(path) as file:
             file.check()
@@ -221,7 +221,7 @@ def recorded(path: Path) -> Any:
 
 
 def debris(folder: Path, *known: str) -> list[str]:
-    """What lies in a folder that should not."""
+    """Return the files in a folder that should not be there."""
     return sorted({p.name for p in folder.iterdir()} - {*known, "e.json", "log"})
 
 

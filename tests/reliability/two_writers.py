@@ -1,10 +1,10 @@
-"""Two calls that write the same output, at about the same time.
+"""Run two calls that write the same output, at about the same time.
 
     python tests/reliability/two_writers.py [--trials N] [--seed S] [--only NUMBER]
 
 Run against run, run against resume, resume against resume, some with --force, one with a delay;
-`pbdkit status` looks on. In the end the result must be there, whole and right, and nothing else but
-another whole result beside it; who does not finish must be told why.
+`pbdkit status` runs too. In the end the result must be there, whole and right, and nothing else
+except another whole result beside it; a call that does not finish must report the reason.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ REFUSALS = ("being written", "exists", "unfinished", "another run", "appeared wh
 
 
 def hesitating(draw: random.Random, first_s: float) -> Callable[[], None]:
-    """What makes a process wait now and then where it begins to keep, and where it ends."""
+    """Make a process wait now and then when it begins to store, and when it ends."""
     seed = draw.random()
 
     def begin() -> None:
@@ -71,7 +71,7 @@ def hesitating(draw: random.Random, first_s: float) -> Callable[[], None]:
 
 
 def race(seed: str, whole: Path, seconds: float, parts: dict[str, Any]) -> list[str]:
-    """What is wrong after two calls in the current folder."""
+    """Return the faults after two calls in the current folder."""
     draw = random.Random(seed)
     pair = draw.choice(PAIRS)
     write_experiment(parts, Path.cwd())

@@ -1,4 +1,5 @@
-"""What can be run and may not be what was meant is warned of: points beside the body, radians."""
+"""Valid experiments that may not be what the user meant have a warning: points beside the body,
+radians."""
 
 from __future__ import annotations
 
@@ -140,7 +141,8 @@ def pulled_cloth(columns: int, rows: int, soft: float) -> dict[str, Any]:
 
 
 def test_cells_of_cloth_along_the_diagonals_lock_and_the_cure_is_named() -> None:
-    """What is foretold is the order of what comes out, against a lattice four times as fine."""
+    """The predicted order of accuracy is that of the result, against a lattice four times as
+    fine."""
 
     def force(rows: int) -> float:
         ds = pbdkit.run(pulled_cloth(3 * rows, rows, 0.005), progress=False)

@@ -1,4 +1,4 @@
-"""What parts that remember may not do, and what is said of it."""
+"""Components with state variables: invalid combinations, and their messages."""
 
 from typing import Literal
 
@@ -98,7 +98,7 @@ class Loose(pbdkit.plugin.Remembers, Plain):
 
 
 class Tangled(Plain):
-    """Breaks at once, so that fictitious points are asked for."""
+    """Breaks at once, so that fictitious points are used."""
 
     type: str = "tangled"
 

@@ -1,4 +1,4 @@
-"""Loads: who bears which share, what acts when, and what bodies do under them."""
+"""Loads: their distribution on particles, their times, and their effect on bodies."""
 
 import math
 
@@ -106,7 +106,7 @@ def test_a_cantilever_sags_as_finite_elements_say():
 
 @pytest.mark.parametrize("rule", [ELASTIC, SPRINGS, GRADIENT, GRADIENT | {"length": 0.0}])
 def test_reactions_balance_loads(rule):
-    """Those on leaders too: the left edge bears its weight."""
+    """Leaders have loads too: the left edge bears its weight."""
     ds = ran(loaded(TIP, WEIGHT, rule=rule))
     assert ds.attrs["status"] == "complete"
     total = ds.load_resultant.values[-1].sum(axis=0)
@@ -145,7 +145,7 @@ def test_a_body_force_counts_the_area_of_cells():
 
 
 def test_loads_act_from_and_until():
-    """Before, nobody has moved, exactly; after, the body comes back to rest."""
+    """Before the load no particle has moved, exactly; after it, the body comes back to rest."""
     given = loaded(TIP | {"from": 4, "until": 9}, steps=900, solver=QUICK)
     ds = ran(given | {"record": {"at": [3, 4, 9, 10]}})
     u = abs(ds.position - ds.reference).max(["particle", "axis"])
@@ -166,7 +166,7 @@ def test_steps_settle_at_the_equilibrium(rule):
 
 
 def test_shares_are_of_the_way_that_loads_make():
-    """A thousandth of the load settles as the load does."""
+    """A thousandth of the load converges as the load does."""
     solver = QUICK | {"settle": {"tolerance": 1e-3}}
     found = []
     for size in (1.0, 1e-6):
@@ -178,7 +178,7 @@ def test_shares_are_of_the_way_that_loads_make():
 
 
 def test_a_released_body_is_where_its_steps_are():
-    """Where nothing holds it, how far it went under the load counts."""
+    """If nothing holds the body, its displacement under the load counts."""
     push = TIP | {"until": 20}
     free = loaded(push, steps=600, **FREE)
     stepped = ran(free | {"solver": {"type": "stepping"}})

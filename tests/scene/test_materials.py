@@ -65,7 +65,7 @@ def test_two_phases_in_series(contrast, border):
 
 
 def errors_of(modulus: Any, exact: Any) -> list[float]:
-    """Of graded bars of length 1 with 5, 10 and 20 cells, over the pull."""
+    """Compare graded bars of length 1 with 5, 10 and 20 cells, over the pull."""
     errors = []
     for n in (5, 10, 20):
         given = bar(1.0, 2.0 / n, 1.0 / n, stiffness=lambda x, y: modulus(x) + 0.0 * y)
@@ -199,7 +199,7 @@ def test_engines_agree_and_the_dataset_says_all(parts):
 
 
 def _uniform(given: dict[str, Any]) -> dict[str, Any]:
-    """The same with one number for all."""
+    """Return the same with one number for all."""
 
     def one(value: Any) -> Any:
         if not isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""What `check` says of a scene's size comes out."""
+"""The predictions of `check` for the size of a scene are those of the run."""
 
 import json
 import subprocess
@@ -78,7 +78,8 @@ scene, peak = run(int(sys.argv[2]))
 sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
 print(json.dumps([peak - little, sizes.memory]))
 """
-"""What a run takes more than one of a few particles in the same process, and what was foretold."""
+"""Memory of a run beyond that of one with a few particles in the same process, and the
+prediction."""
 CALIBRATED = [
     "rule={type: elastic, poisson_ratio: 0.3}",
     "neighbours={type: chebyshev}",

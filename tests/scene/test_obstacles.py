@@ -1,4 +1,4 @@
-"""Obstacles: followers do not enter them, and rest against them as contact mechanics says."""
+"""Obstacles: followers do not enter them, and rest against them as in contact mechanics."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_followers_do_not_enter_and_leaders_are_not_touched() -> None:
 
 
 def plane(point: Any, normal: Any, **parts: Any) -> dict[str, Any]:
-    """An obstacle."""
+    """Return an obstacle with a straight edge."""
     return {"shape": {"half_plane": {"point": point, "normal": normal}}} | parts
 
 
@@ -305,8 +305,9 @@ def test_a_block_between_two_plates_is_compressed_uniformly() -> None:
 
 
 def half_widths(cells: int) -> tuple[float, float]:
-    """(fitted to the pressure, of Hertz for the same force) with about so many across the contact:
-    p² = p_0² (1 - x² / a²), a² = 4 F' R / (π E*)."""
+    """Return half-width and peak of the pressure, fitted and by Hertz for the same force, with
+    about that number of particles across the contact: p² = p_0² (1 - x² / a²), a² = 4 F' R / (π
+    E*)."""
     a = cells / 2
     wide, high, radius = int(4 * a) * 2, int(5 * a), 20 * a
     given = block(

@@ -1,4 +1,4 @@
-"""Whoever asks where something stands is told the same: the place in the experiment's coordinates,
+"""Every component that reads positions gets the same: the place in the experiment's coordinates,
 the lattice's origin included."""
 
 from typing import ClassVar, Literal
@@ -10,7 +10,7 @@ import pbdkit
 
 
 class Placed(pbdkit.plugin.Draws, pbdkit.plugin.RenewsParticles, pbdkit.FollowerRule):
-    """Stays, and remembers the places that it is told."""
+    """Does not move, and stores the places that it gets."""
 
     type: Literal["placed"] = "placed"
     uses_reference: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""What is said before a run, against closed forms and against what runs do."""
+"""Predictions before a run, against closed forms and against runs."""
 
 import json
 import math
@@ -273,7 +273,7 @@ class Hypotenuse(pbdkit.FollowerRule):
 
 
 class Absolute(Hypotenuse):
-    """The same by one that drops the imaginary part without a word."""
+    """The same rule, which drops the imaginary part silently."""
 
     type: str = "absolute"
 

@@ -1,4 +1,4 @@
-"""What is estimated of large bodies, against what is exact of small ones, and what is left out."""
+"""Estimates for large bodies, against exact results for small ones, and omitted predictions."""
 
 import json
 import math

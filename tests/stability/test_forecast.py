@@ -1,9 +1,9 @@
-"""What is predicted before the first step against what runs do, on scenes drawn at random.
+"""Compare predictions before the first step with runs, on scenes drawn at random.
 
-A run is compared with the same run of another start: their distance obeys the step without what
-pushes it. It is left alone until the slowest mode remains, then followed for the steps in which
-that changes by a million by prediction. The excess over the prediction, a factor, stays within
-10^(± 6 · 5 %), that is within a factor of 2.
+A run is compared with the same run of another start: their distance obeys the step without loads.
+It is left alone until the slowest mode remains, then followed for the steps in which that changes
+by a million by prediction. The excess over the prediction, a factor, stays within 10^(± 6 · 5 %),
+that is within a factor of 2.
 """
 
 import math
@@ -124,8 +124,8 @@ class Pair:
 
 
 def excess(scene, analysis, seed):
-    """By what the slowest mode of a run changes beyond its prediction while that says a million,
-    or LONGEST steps are over."""
+    """Return the change of the slowest mode of a run beyond its prediction, while that predicts a
+    million, or LONGEST steps are over."""
     rate = math.log(analysis.spectral_radius)
     steps = min(LONGEST, math.ceil(MILLION / abs(rate)) if rate else LONGEST)
     pushed = bool(np.abs(analysis.operator.source).max() > 1e-13)
@@ -144,7 +144,7 @@ def excess(scene, analysis, seed):
 
 
 def half_period(analysis):
-    """Of the slowest mode's size, in steps: what swings is looked at over that long."""
+    """Return the steps over which the size of the slowest mode is measured, as it may oscillate."""
     every = analysis.spectrum.eigenvalues
     slowest = every[np.abs(every) > (1 - 1e-6) * analysis.spectral_radius]
     angles = np.abs(np.angle(slowest))
@@ -176,7 +176,7 @@ def test_runs_settle_and_diverge_at_the_predicted_rate(parts, seed):
 @settings(thoroughly, max_examples=15)
 @given(scenes())
 def test_bodies_are_stable_where_run_says_that_waves_are(parts):
-    """What `run` says in milliseconds against what `check` knows."""
+    """Compare the estimate of `run`, in milliseconds, with that of `check`."""
     scene = built(parts)
     assume(prediction(scene, wave_bound(scene)).get("stable"))
     assert Analysis(scene).stable

@@ -1,4 +1,4 @@
-"""How far a body trails its equilibrium: against the closed form, and against runs."""
+"""Distance of a body from its equilibrium: against the closed form, and against runs."""
 
 import json
 import math
@@ -24,13 +24,13 @@ from pbdkit.stepping.state import initial_state
 
 
 def pulled(columns, rows, x, y=0.0, steps=10, **parts):
-    """A sheet whose right end moves by (x, y) in each of its steps."""
+    """A sheet with a right end that moves by (x, y) in each of its steps."""
     leaders = [HOLD_LEFT, pull_right(x, y, steps)]
     return {"columns": columns, "rows": rows, "leaders": leaders, "steps": steps} | parts
 
 
 def trailing(**parts):
-    """By how much a run is behind the equilibrium of its last step."""
+    """Return the distance of a run from the equilibrium of its last step."""
     scene = scene_of(**parts)
     stepped = Stepper(scene).advance(initial_state(scene), scene.experiment.steps)
     straight = scene_of(**parts | {"solver": {"type": "equilibrium", "tolerance": 1e-9}})

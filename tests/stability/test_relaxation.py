@@ -63,7 +63,7 @@ def test_the_choice_settles_calibrated_rules(lattice, rule, neighbours, frame):
 
 
 def test_the_choice_is_that_of_the_heavy_ball():
-    """λ of a sheet whose ends are held is known: m and M are 1 - λ at the ends."""
+    """λ of a sheet with held ends is known: m and M are 1 - λ at the ends."""
     scene = tuned(scene_of(12, 12))
     slowest = (1 + math.cos(math.pi / 11)) / 2
     m, M = 1 - slowest, 1 - Analysis(scene).smallest_eigenvalue
@@ -94,7 +94,7 @@ def test_a_number_that_is_given_stays():
 
 @pytest.mark.parametrize("parts", [{}, {"rule": SPRINGS, "neighbours": EIGHT}])
 def test_of_large_bodies_the_ends_are_found_by_iteration(parts):
-    """All modes of 24 × 24 with four neighbours are known in closed form; those of the springs by
+    """The modes of 24 × 24 with four neighbours have a closed form; those of the springs come from
     the analysis of the choice."""
     scene = tuned(scene_of(24, 24, **parts))
     w, b = chosen(scene)

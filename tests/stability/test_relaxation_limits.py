@@ -1,4 +1,4 @@
-"""Where a step settles and where it diverges: the tables of largest stable relaxations."""
+"""Relaxations for which a step converges and diverges: the tables of largest stable relaxations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Contact without friction: bodies rest on obstacles as mechanics says, whatever leads there."""
+"""Contact without friction: bodies rest on obstacles as in mechanics, by any path."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FORCES = [{"type": name, "youngs_modulus": 1.0} for name in ("contact", "reactio
 
 
 def stepping(relaxation: float, memory: float = 0.0, steps: int = 1500) -> dict[str, Any]:
-    """So many steps, of which the last is recorded."""
+    """Return a solver for a number of steps, of which the last is recorded."""
     solver = {"type": "stepping", "engine": "numpy", "relaxation": relaxation, "memory": memory}
     return {"solver": solver, "steps": steps, "record": {"at": [0]}}
 
@@ -67,7 +67,8 @@ def displaced(x: float, y: float) -> dict[str, Any]:
     ids=["square, stepping", "hexagonal, equilibrium"],
 )
 def test_springs_between_plates_are_compressed_uniformly(kind: Any, solver: Any) -> None:
-    """As elasticity with ν = 1/3 at small strain, corners and cut cells included."""
+    """The result is that of elasticity with ν = 1/3 at small strain, corners and cut cells
+    included."""
     found = []
     for rule in (SPRINGS, THIRD):
         height = 4.0 if kind is SQUARE else 4.0 * math.sqrt(0.75)
@@ -91,7 +92,7 @@ def test_springs_between_plates_are_compressed_uniformly(kind: Any, solver: Any)
 
 @pytest.mark.parametrize("kind", [SQUARE, TRIANGLES], ids=["square", "hexagonal"])
 def test_an_oblique_plate_pushes_along_its_normal(kind: Any) -> None:
-    """On a corner, which springs and elastic bodies give way to alike."""
+    """The obstacle is on a corner, where springs and elastic bodies deform equally."""
     corner, found = [9.0, 4.0] if kind is SQUARE else [9.5, 5.0 * math.sqrt(0.75)], []
     for rule in (SPRINGS, THIRD):
         ds = at_rest(
@@ -274,7 +275,7 @@ PRESSING = {"disc": displaced(0.2, -1.4), "ring": displaced(-0.1, -0.15)}
 
 @pytest.mark.parametrize("shape", CURVED)
 def test_before_round_outlines_the_way_does_not_matter(shape: str) -> None:
-    """Cells are cut, so that particles give way unlike along different directions."""
+    """Cells are cut, so that the compliance of particles depends on the direction."""
     given = {
         **TRIANGLES, "rule": ELASTIC,
         "body": {"type": "rectangle", "width": 8.0, "height": 4.0},
@@ -291,7 +292,8 @@ def test_before_round_outlines_the_way_does_not_matter(shape: str) -> None:
 
 @pytest.mark.parametrize("shape", ["disc", "ring", "polygon"])
 def test_the_way_out_is_linearised_exactly(shape: str) -> None:
-    """T against differences of where particles end, whose way is not along the normal."""
+    """Compare T with differences of the final positions of particles, which do not move along the
+    normal."""
     parts = HEXAGONAL | {"obstacles": [{"shape": SHAPES[shape]}], "leaders": []}
     scene = build_scene(pbdkit.Experiment(**block(**parts, neighbours=TRIANGLES["neighbours"])))
     contact, place = Contact(scene), scene.raster.place_of(scene.raster.body_rows)
@@ -413,7 +415,7 @@ def test_forces_balance_in_every_equilibrium(case: str, loaded: bool) -> None:
 
 
 def masses(**parts: Any) -> dict[str, Any]:
-    """A block whose right edge flies to the right."""
+    """Return a block with a right edge that flies to the right."""
     fly = {"type": "newton", "mass": 50.0, "velocity": [0.05, 0.01]}
     given = {
         "body": {"type": "grid", "columns": 6, "rows": 4}, "rule": ELASTIC,
@@ -460,7 +462,7 @@ def test_masses_before_obstacles_step_alike_in_kernels() -> None:
 
 
 def test_two_plates_that_meet_leave_particles_least_deep() -> None:
-    """Where no place is free there is no other answer, and none flies off."""
+    """If no place is free there is no other result, and no particle flies off."""
     plates = [plane([0.0, 8.0 - d], [0.0, -n]) for n, d in ((1.0, 0.1), (-1.0, 0.0))]
     plates = [plates[0] | {"from": 2}, plane([0.0, 8.0], [0.0, 1.0], **{"from": 2})]
     scene = build_scene(pbdkit.Experiment(**block(obstacles=plates)))

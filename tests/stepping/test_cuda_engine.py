@@ -37,7 +37,7 @@ def test_every_kind_of_scene_is_stepped_as_by_numpy():
 
 @pytest.fixture
 def device(monkeypatch):
-    """A capability to compile for, where no device is asked."""
+    """Set a compute capability to compile for, so that no device is needed."""
     pytest.importorskip("numba_cuda", reason="numba-cuda is not installed: nox -s gpu")
     from numba.cuda import dispatcher
     from numba.cuda.cudadrv import nvvm

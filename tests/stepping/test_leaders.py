@@ -43,7 +43,7 @@ def way_of_mass(data):
 
 
 def test_a_mass_on_a_bar_is_the_chain_of_columns():
-    """Each column goes to where the mean of both beside it says; the mass by m v' = F - c v."""
+    """Each column goes to the mean of both beside it; the mass moves by m v' = F - c v."""
     mass, damping, force = 8.0, 0.7, 0.02
     data = bar(mass, damping=damping, force=[force, 5.0], velocity=[0.01, 3.0])
     u, v, found = np.zeros(LENGTH + 1), 0.01, [0.0]
@@ -115,7 +115,8 @@ def test_both_engines_agree_to_the_bit_and_resume_from_the_state():
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
 def test_check_knows_the_lightest_mass(damping):
-    """Of a particle between its held neighbours: k = 4 m - 2 c, from which steps grow or fade."""
+    """The stiffness of a particle between its held neighbours: k = 4 m - 2 c, from which steps grow
+    or fade."""
 
     def data(mass):
         parts = bar(mass, 2, 2, 100, axes=("x", "y"), damping=damping, velocity=[1e-3, 0.0])

@@ -55,7 +55,7 @@ ROUNDING = 1e-12
 
 @paired(list(RULES), list(FRAMES))
 def test_a_body_at_rest_stays_at_rest_exactly(lattice, neighbours, rule, frame):
-    """As nothing changes in the first steps, not even behind a lag, nothing does in any other."""
+    """If nothing changes in the first steps, not even with a delay, nothing does in any other."""
     parts = {"lattice": lattice, "neighbours": neighbours, "rule": rule, "frame": frame}
     for leaders in ([], BOTH_ENDS_HELD):
         u = displacements(5, 4, leaders=leaders, steps=4, **parts)
@@ -123,7 +123,7 @@ SYMMETRIES = [
     *product(("centred-rectangular", "hexagonal"), SHORTEST, (Y_FLIP,), (5,)),
     *product(LATTICES, ANY, (TURN,), (6,)),
 ]
-"""Which indices and components change their sense in a symmetry of a body of 6 x `rows` sites."""
+"""Indices and components that change their sign in a symmetry of a body of 6 x `rows` sites."""
 
 
 MIRRORED = ["barycentre", "distance-weighted", "mixed-coordinate"]

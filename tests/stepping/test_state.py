@@ -49,8 +49,9 @@ BONDS, ONSET, FAILURE = 5, 0.1, 0.9
 
 
 def force_of_a_chain(extension):
-    """Of equal bonds with stiffness 1, one of which softens from `ONSET` on: in series the forces
-    are the same, n F + strain = extension, with F = o (f - strain) / (f - o) at the weak one."""
+    """Return the force of equal bonds with stiffness 1, one of which softens from `ONSET` on: in
+    series the forces are the same, n F + strain = extension, with F = o (f - strain) / (f - o) at
+    the weak one."""
     peak = BONDS * ONSET
     if extension <= peak:
         return extension / BONDS

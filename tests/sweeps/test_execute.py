@@ -1,4 +1,5 @@
-"""Sweeps: the same numbers whoever runs the members, each once, and nobody stopped by another."""
+"""Sweeps: the numbers do not depend on the worker, each member is run once, and no member stops
+another."""
 
 import json
 import os
@@ -57,7 +58,7 @@ def swept(experiment, **more):
 
 
 def same(one, other):
-    """Bit for bit, NaN too, but for the time of day."""
+    """Assert equality bit for bit, NaN too, except the time of day."""
     xarray.testing.assert_identical(*(ds.drop_attrs(deep=False) for ds in (one, other)))
     for name in one.variables:
         if one[name].dtype.kind == "f":
@@ -211,7 +212,7 @@ def test_a_flipped_bit_is_named_and_that_member_runs_again(small, tmp_path, run_
 
 
 def flip(path, column):
-    """One bit of the second row, behind SQLite's back as far as it knows."""
+    """Change one bit of the second row, without a call of SQLite."""
     with sqlite3.connect(path) as database:
         query = f"SELECT rowid, CAST({column} AS BLOB) FROM member ORDER BY rowid"
         row, value = database.execute(query).fetchall()[1]
@@ -304,7 +305,7 @@ def test_members_whose_log_was_lost_are_said_to_be(small, tmp_path, run_only):
 
 
 def test_a_database_that_was_never_whole_is_in_nobodys_way(small, tmp_path):
-    """As where the disk got full, or the power went, while it was made."""
+    """The disk was full, or the power failed, while it was written."""
     path = tmp_path / stores.DATABASE
     with sqlite3.connect(path) as database:
         database.execute("PRAGMA journal_mode = WAL")
@@ -475,7 +476,7 @@ def test_a_stopped_sweep_goes_on_where_it_was(small, tmp_path):
 
 
 def test_a_worker_that_hangs_before_it_begins_is_ended(small, tmp_path, monkeypatch):
-    """As one that is stopped, or whose disk does not answer."""
+    """The process is stopped, or its disk does not respond."""
     (tmp_path / "sitecustomize.py").write_text("import time\ntime.sleep(60)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     begun, stopped = time.monotonic(), []
@@ -518,7 +519,7 @@ def test_a_sweep_is_stopped_while_its_members_are_validated(small, tmp_path, mon
 
 
 class Lost:
-    """A client of a dask cluster whose scheduler is lost as soon as it is asked for something."""
+    """A client of a dask cluster that loses its scheduler at the first request."""
 
     status = "running"
 
@@ -548,7 +549,7 @@ def test_the_wait_for_a_worker_of_a_cluster_can_be_stopped(small):
 
 
 def rows(folder):
-    """How many members a store holds."""
+    """Return the number of members in a store."""
     try:
         with sqlite3.connect(f"file:{folder / stores.DATABASE}?mode=ro", uri=True) as database:
             (count,) = database.execute("SELECT COUNT(*) FROM member").fetchone()

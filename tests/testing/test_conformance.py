@@ -197,7 +197,8 @@ def test_every_property_says_what_it_asks_and_of_whom():
 
 
 def test_nobody_is_excused():
-    """Every property of an interface is asked of everybody; the built-in ones are tried above."""
+    """Every property of an interface is tested on every component; the built-in ones are tested
+    above."""
     for component in pbdkit_components():
         asked = [p.name for p in PROPERTIES if issubclass(component, p.interfaces)]
         for example in examples_of(component):
@@ -245,7 +246,7 @@ def test_a_class_without_usable_examples_is_told(field, words):
 
 
 class Unfinished(pbdkit.FollowerRule):
-    """Lacks `apply`."""
+    """A rule without the method `apply`."""
 
     type: Literal["unfinished"] = "unfinished"
 

@@ -1,4 +1,4 @@
-"""A body that answers to the mouse: what is saved repeats it, and nobody else leads it."""
+"""Interactive bodies: a saved session repeats it, and no other client moves it."""
 
 import asyncio
 import json
@@ -607,7 +607,7 @@ def test_nobody_looks_on_and_the_body_rests(tmp_path):
 
 
 class Gone:
-    """A socket whose other end has been left."""
+    """A socket with its other end closed."""
 
     async def send(self, message):
         raise ConnectionClosed(None, None)

@@ -1,7 +1,8 @@
-"""scikit-fem's contestants: a line of JSON in, a problem to solve, and one out, its seconds.
+"""Serve scikit-fem's contestants: read a problem as a line of JSON, and write its seconds as
+another.
 
 Runs in an environment with scikit-fem, cvxopt and pyamg; the first argument is the folder of
-`finite_elements`. The displacements are written where the job says, at the reference's sites.
+`finite_elements`. The displacements at the reference's sites are written to the path in the job.
 """
 
 from __future__ import annotations

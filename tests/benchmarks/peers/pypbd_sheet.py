@@ -44,7 +44,8 @@ def seconds(model, step, iterations):
 
 
 def measure(n):
-    """What an iteration more costs; what a step does besides (velocities, contacts) is left out."""
+    """Measure the cost of a further iteration; the other work of a step (velocities, contacts) is
+    left out."""
     model, step = sheet(n)
     few, many = 2, 42 if n <= 200 else 12
     step.step(model)

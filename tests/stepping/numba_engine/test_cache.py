@@ -67,7 +67,7 @@ def halved(total):
 
 
 def kernel_is_right():
-    """Whether a kernel that this process has not loaded yet gives what Python gives."""
+    """Return whether a kernel that this process has not loaded yet has the result of Python."""
     kernel_cache._loaded.clear()
     out = np.empty(1)
     kernel_cache.load_kernel(SOURCE, {"apply": halved}, (out,))(out)

@@ -53,7 +53,8 @@ def sheet(**parts):
 
 
 def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
-    """However many steps are made in one call, and whoever made the steps before."""
+    """Assert that results depend neither on the number of steps in one call nor on the engine of
+    earlier steps."""
     reference, oracle = initial_state(scene), Stepper(scene)
     states = [initial_state(scene) for _ in engines]
     for steps in calls:
