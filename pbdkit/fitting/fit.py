@@ -33,10 +33,10 @@ ComponentClasses = Iterable[type[Component]]
 BASE_MODEL = "as given"
 """Name of the fit's own experiment among the candidates."""
 INSET = 1e-6
-"""Distance from a bound, as a fraction of the interval, at which a number must be valid."""
+"""Distance from a bound, as a fraction of the interval, at which a parameter must be valid."""
 TINY = 1e-6
-"""First noise as a fraction of the measured values, before it is estimated from the residuals.
-Residuals smaller than this fraction of it are rounding errors."""
+"""Initial noise as a fraction of the measured values, before it is estimated from the residuals.
+Residuals smaller than this fraction of the values are rounding errors."""
 
 
 def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasses = ()) -> Fitted:
@@ -219,7 +219,8 @@ def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
         problem, observations=(observation.with_noise(TINY * _size(observation.measured)),)
     )
     solution = solved(problem, problem.start())
-    for _ in range(1 if fit.loss == "linear" else 2):  # a loss identifies outliers by the noise
+    # A robust loss identifies outliers by the noise, so that both are computed twice.
+    for _ in range(1 if fit.loss == "linear" else 2):
         (observation,) = problem.observations
         ratio = max(solution.ratio / np.sqrt(observation.weight), TINY)
         problem = replace(

@@ -1,5 +1,5 @@
-"""Fit files: an experiment, its unknown parameters, and the measurements (fields of displacements,
-tracks in time, curves), or the peaks of repeated tests for a fit of strength."""
+"""Fit files: an experiment, its unknown parameters, and measurements (fields of displacements,
+tracks in time, curves) or, for a fit of strength, the peaks of repeated tests."""
 
 from __future__ import annotations
 
@@ -134,11 +134,11 @@ class MeasuredColumns(Component):
 
 
 DATASET = "(dataset)"
-"""The `file` of a measurement that is handed over in Python."""
+"""Value of `file` for a measurement that is passed as a dataset in Python."""
 
 
 def _rows_of(table: xarray.Dataset, columns: Sequence[str]) -> Floats:
-    """The rows of a dataset with these variables. Raises ValueError."""
+    """Return the rows of a dataset with these variables. Raises ValueError."""
     for name in columns:
         if name not in table:
             hint = did_you_mean(name, map(str, table))
@@ -582,7 +582,7 @@ def read_fit(
 
 
 def _with_dataset(source: Source) -> Source:
-    """The description with a dataset in place of the file of its measurement."""
+    """Return the description with a dataset in place of the file of its measurement."""
     data = dict(source.data) if isinstance(source.data, Mapping) else {}
     file = data.get("measured") or {}
     if not isinstance(file, Mapping):

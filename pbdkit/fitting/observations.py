@@ -1,14 +1,14 @@
 """Observations of a fit: predictions of an equilibrium or a run for measured displacements, tracks
 and forces.
 
-A measured boundary is noisy, and prescribing it prescribes the noise. The displacement of each
-group that moves by `measured` is therefore a polynomial along it. Its coefficients are estimated
-with all other unknowns, starting from the measured values.
+A measured boundary contains noise, which would be prescribed with it. The displacement of each
+group that moves by `measured` is therefore a polynomial along the boundary. Its coefficients are
+estimated with all other unknowns, starting from the measured values.
 
 Displacements between particles are interpolated bilinearly in the cells of the lattice. Derivatives
 of predictions of a run are central differences of order 8 of whole runs, in which the same bonds
 must break. If a run ends in equilibrium, the runs of the differences make the same number of steps,
-since that number is no smooth function of the parameters.
+since the number of steps is not a smooth function of the parameters.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ class Interpolation:
 
     @cached_property
     def _places(self) -> dict[str, tuple[Raster, Indices]]:
-        """Cache for the places of the rows on the last raster."""
+        """Cache of the places of the rows on the last raster."""
         return {}
 
     def of(self, planes: Floats, scene: Scene) -> Floats:
@@ -250,7 +250,7 @@ def _in_cells(scene: Scene, points: Floats) -> Interpolation:
     for step in ((0, 0), (1, 0), (0, 1), (1, 1)):
         corners.append(raster.rows_of_sites((low + step) * cell.period))
     rows, weights = np.stack(corners, axis=1), np.stack(shares, axis=1)
-    is_unused = weights <= ON_EDGE  # on a side of the cell, or in its corner
+    is_unused = weights <= ON_EDGE  # The point lies on a side of the cell, or at its corner.
     body = np.append(raster.table_kind == FOLLOWER, False)
     inside = np.asarray((body[rows] | is_unused).all(axis=1))
     rows = np.where(is_unused | ~inside[:, None], 0, rows)
@@ -275,7 +275,7 @@ def _in_triangles(scene: Scene, points: Floats) -> Interpolation:
 def _are_in_cells(scene: Scene, triangles: Indices) -> NDArray[np.bool_]:
     """Return whether the corners of each triangle are corners of one whole cell of the lattice.
 
-    Other triangles bridge holes and notches.
+    Triangles that are not in cells bridge holes or notches.
     """
     count = scene.raster.count
     threes = [
@@ -284,7 +284,7 @@ def _are_in_cells(scene: Scene, triangles: Indices) -> NDArray[np.bool_]:
         for corners in combinations(range(rows.shape[1]), 3)
     ]
     triples = np.concatenate([*threes, np.zeros((0, 3), np.intp)])
-    # Pairs are numbered, so that keys stay below the square of the number of particles.
+    # Pairs are numbered, so that keys are below the square of the number of particles.
     pairs, number = np.unique(triples[:, :2] @ (count, 1), return_inverse=True)
     keys = number * count + triples[:, 2]
     ordered = np.sort(triangles, axis=1)
@@ -848,9 +848,9 @@ def _monotonic_part(places: Floats, forces: Floats) -> tuple[Floats, Floats]:
 DERIVATIVES = 1e-5
 """Accuracy of derivatives relative to the largest, far below any noise."""
 CLOSE = 0.02
-"""Distance of parameters, relative to the interval between their bounds, up to which derivatives
-with respect to boundaries are reused. Residuals remain exact, and estimates change by this fraction
-of their errors."""
+"""Largest distance of parameters, relative to the interval between their bounds, for which
+derivatives with respect to boundaries are reused. Residuals are exact in any case, and estimates
+change by at most this fraction of their errors."""
 
 NEAR = ", or nearer to its outline than the margin"
 """Reason why points are left out if there is a margin."""
@@ -1084,7 +1084,7 @@ class TracksObservation(RunObservation):
             weight = np.maximum(0.0, 1.0 - np.abs(self.along - moment))
             self._add(displacements, weight, state, run)
             remainder -= weight
-        # The state of a converged run is constant.
+        # The state of a run is constant after it has converged.
         is_after = self.along > run.driver.state.step
         self._add(displacements, np.where(is_after, remainder, 0.0), run.driver.state, run)
         if (missing := ~is_after & (remainder > ON_STEP)).any():

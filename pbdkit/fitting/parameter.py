@@ -1,4 +1,5 @@
-"""A number of an experiment that can be changed, by its path as in `--set`."""
+"""Parameters of an experiment, addressed by a path as in `--set`, and derivatives with respect to
+them."""
 
 from __future__ import annotations
 
@@ -27,12 +28,13 @@ LARGE_STEP = 1e-2
 larger."""
 
 MIN_STEP = 1e-7
-"""The smallest such fraction, which is used near a bound."""
+"""Smallest step as a fraction of the value, used near a bound."""
 SMOOTH = 1e-5
-"""Relative difference of orders 2 and 4 up to which order 4 is exact to about its square."""
+"""Relative difference of the results of orders 2 and 4 up to which the error of order 4 is about
+the square of this number."""
 
 ROUGH = 1e-8
-"""Relative accuracy from which on order 2 suffices, with a step of a quarter of its root."""
+"""Relative accuracy for which order 2 suffices, with a step of a quarter of its square root."""
 PARTS = ("rule", "fracture")
 """Parts of an experiment that are replaced without any other change."""
 SEPARATE_PARTS = ("leaders", "loads")
@@ -61,7 +63,7 @@ class Parameter:
             If there is no number at the path.
         """
         words = self.path.split(".")
-        # Leaders may have thousands of numbers, which are left out if possible.
+        # Groups of leaders may have thousands of numbers, which are not converted unless necessary.
         value: Any = experiment.model_dump(
             mode="json", by_alias=True, exclude={"leaders"} - {*words}
         )
@@ -78,13 +80,7 @@ class Parameter:
         return float(value)
 
     def put(self, experiment: Experiment, value: float) -> Experiment:
-        """Return the experiment with another number.
-
-        Raises
-        ------
-        ExperimentError
-            If the number is invalid.
-        """
+        """Return the experiment with another value of the parameter."""
         part, _, rest = self.path.partition(".")
         name, _, region = rest.partition(".")
         component = getattr(experiment, part) if part in PARTS else None
@@ -135,8 +131,8 @@ class Parameter:
 
         Notes
         -----
-        Order 4 is used if it is exact to some 1e-10, else order 8; order 2 if an accuracy of some
-        1e-7 suffices.
+        Order 2 is used if an accuracy of about 1e-7 suffices. Otherwise order 4 is used if its
+        error is about 1e-10, and order 8 if not.
 
         Raises
         ------
@@ -165,7 +161,7 @@ class Parameter:
     def _ends(
         self, experiment: Experiment, value: float, fraction: float, pairs: int
     ) -> tuple[float, list[tuple[Experiment, Experiment]]]:
-        """Return the step, and the experiments with 1, 2, … steps more and less."""
+        """Return the step, and the experiments displaced by 1, 2, … steps in both directions."""
         step = fraction * max(abs(value), 0.1)
         while True:
             try:

@@ -1,10 +1,11 @@
 """Least-squares problem of a fit: residuals divided by their noise, their derivatives, an initial
-guess, and a Gauss-Newton iteration restricted to what the data determine.
+guess, and a Gauss-Newton iteration restricted to identifiable directions.
 
-The initial guess minimises the equilibrium gap: measured displacements at the particles would be in
-equilibrium for the right parameters, m(u, θ) = 0 where all neighbours are known. Since m is nearly
-linear in θ, a few linear problems give θ without an equilibrium (Claire, Hild, Roux 2004). The
-guess is biased by noise, but independent of the bounds, whose middle may be far from the solution.
+The initial guess minimises the equilibrium gap. With the true parameters θ, measured displacements
+u at the particles are in equilibrium: the moves m(u, θ) are zero wherever all neighbours are
+measured. Since m is nearly linear in θ, a few linear problems give θ without computing an
+equilibrium (Claire, Hild and Roux 2004). The guess is biased by noise, but independent of the
+bounds, whose middle may be far from the solution.
 """
 
 from __future__ import annotations
@@ -310,8 +311,8 @@ class Problem:
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 TELLS = 0.25
-"""A direction is identifiable if its standard error is a smaller fraction of the interval between
-bounds."""
+"""Ratio of the standard error along a direction to the interval between bounds below which the
+direction is identifiable."""
 PART = 0.3
 """Component of a direction above which a parameter belongs to it."""
 AT_BOUND = 1e-6
@@ -333,7 +334,8 @@ STEADY = 1e-6
 """Change of residuals at which the weights have converged."""
 
 RANK = 1e-5
-"""Relative tolerance of singular values, for columns of unit length. It is that of derivatives."""
+"""Relative tolerance of singular values, for columns of unit length; it is the accuracy of
+derivatives."""
 INVOLVED = 1e-2
 """Component of a null direction, relative to the largest, below which an unknown is not part of
 it."""
@@ -379,12 +381,13 @@ class Directions:
 
     @property
     def is_null(self) -> NDArray[np.bool_]:
-        """Return which directions do not change the residuals, (direction,)."""
+        """Return a mask of the directions that do not change the residuals, (direction,)."""
         return self.variance >= NULL_VARIANCE
 
     @property
     def unsure(self) -> NDArray[np.bool_]:
-        """Return which unknowns a direction determines insufficiently, (direction, unknown)."""
+        """Return a mask of the unknowns that a direction determines insufficiently, (direction,
+        unknown)."""
         components = np.abs(self.vectors)
         is_large = components * np.sqrt(self.variance)[:, None] > TELLS
         is_uncertain = (self.variance > TELLS**2)[:, None]

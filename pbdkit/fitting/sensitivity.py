@@ -1,9 +1,9 @@
 """Sensitivity of an equilibrium to a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
 
-In equilibrium no follower moves, m(u, θ) = 0. The matrix A = -∂m/∂u is that of the equilibrium
-solver, so each parameter costs one further solution, and the moves of a few scenes with slightly
-changed parameters. The derivative of a single number J of the displacements costs one solution for
-all parameters, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ.
+In equilibrium no follower moves, m(u, θ) = 0. A = -∂m/∂u is the matrix of the equilibrium solver,
+so that each parameter requires one more solution, and the moves of a few scenes with slightly
+different parameters. The derivatives of a scalar J = w · u with respect to all parameters require a
+single solution, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ (adjoint method).
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Resting:
 
     @property
     def guesses(self) -> tuple[dict[bytes, Floats], ...]:
-        """Return the solutions that are initial guesses of the next equilibrium."""
+        """Return the solutions that serve as initial guesses for the next equilibrium."""
         return (self._solutions, *self.former)[:FORMER]
 
     @cached_property
@@ -226,7 +226,7 @@ class Resting:
     def along(self, function: Callable[[Floats], Floats], direction: Floats) -> Floats:
         """Return the derivative of a function of displacements along a direction.
 
-        It is a difference for linear scenes, else a central difference.
+        It is computed by a difference for linear scenes, otherwise by a central difference.
         """
         linear, u = self.finder.linear, self.state.u
         if linear and function == self._moves:
@@ -242,7 +242,7 @@ class Resting:
         return self._moves(self.state.u.copy())
 
     def _derivatives(self, parameter: Parameter) -> tuple[Floats, Floats]:
-        """Differentiate the prescribed displacements, and the moves of followers, by a
+        """Differentiate the prescribed displacements, and the moves of followers, with respect to a
         parameter."""
         direct, moves = parameter.derivative(
             self.scene.experiment, self._leaders_and_moves, self.accuracy

@@ -1,23 +1,24 @@
 """Strength of bonds and its scatter from repeated tests: likelihood, simulated specimens, result.
 
-The load at which the first bond breaks in a body with displacements proportional to the load: with
-d the difference along a bond under the experiment's full load, the strain at the load factor λ is
-ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1, p = r·d/|r|², q = |d|²/|r|². It is convex and
-0 at λ = 0, so that the strain of a stretched bond grows with λ.
+The load of the first break is computed for bodies whose displacements are proportional to the load.
+With the difference d along a bond under the full load of the experiment, the strain of the bond at
+the load factor λ is ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1, p = r·d/|r|², q =
+|d|²/|r|². The strain is a convex function of λ and 0 at λ = 0, so that the strain of a stretched
+bond increases with λ.
 
-A specimen bears the load λ if all its bonds do, with probability Π_b (1 - F(ε_b(λ))). The
-likelihood of repeats is therefore known without any run (weakest link: W. Weibull, J. Appl. Mech.
-18 (1951) 293). Location μ and scale σ of ln strength (Weibull: μ = ln s, σ = 1/m) or of strength
-(uniform) have the prior density dμ dσ/σ, and the likelihood is integrated. If all bonds have equal
-strains, specimens also belong to a location-scale family, and intervals from the integrated
-likelihood are exact for any number of specimens (J. Berger, Statistical Decision Theory, 1985,
-section 6.6).
+A specimen survives the load λ if all its bonds do, with probability Π_b (1 - F(ε_b(λ))), where F is
+the distribution of strengths. The likelihood of repeated tests therefore follows without a run
+(weakest link: W. Weibull, J. Appl. Mech. 18 (1951) 293). Location μ and scale σ of ln strength
+(Weibull: μ = ln s, σ = 1/m) or of strength (uniform) have the prior density dμ dσ/σ, and the
+likelihood is integrated. If all bonds have equal strains, specimens also belong to a location-scale
+family, and intervals from the integrated likelihood are exact for any number of specimens (J.
+Berger, Statistical Decision Theory, 1985, section 6.6).
 
-If the likelihood is unknown it is synthetic: single specimens are torn at strengths over all
-bounds, and then where the measurement is likely. Mean and spread of ln peak follow by regression
-over the logarithms of the parameters. They are compared with the mean of the measured ln peaks and
-the logarithm of their standard deviation, which are approximately normal (S. Wood, Nature 466
-(2010) 1102).
+If specimens do not fail with their first bond, a synthetic likelihood is used: single specimens are
+simulated with strengths between all bounds, and then with strengths for which the measurement is
+likely. Mean and spread of ln peak follow by regression over the logarithms of the parameters. They
+are compared with the mean of the measured ln peaks and the logarithm of their standard deviation,
+which are approximately normal (S. Wood, Nature 466 (2010) 1102).
 """
 
 from __future__ import annotations
@@ -163,7 +164,8 @@ def has_forces(scene: Scene) -> bool:
 
 
 class MachineReading(NamedTuple):
-    """MachineReading of a testing machine; the force is NaN if the rule defines none."""
+    """Reading of a testing machine: force and displacement; the force is NaN if the rule defines
+    none."""
 
     force: float
     displacement: float
@@ -176,7 +178,7 @@ class Pull:
     Parameters
     ----------
     group
-        Its number.
+        Index of the group.
     direction
         Unit vector of its displacement.
     factor
@@ -362,8 +364,8 @@ class Specimens:
     def tear(self, experiment: Experiment) -> Specimen:
         """Simulate a specimen until it has lost half of its peak force.
 
-        The experiment differs from that of the scene by parameters and seed. Between increments the
-        load is scaled until the next bond breaks.
+        The experiment may differ from that of the scene in parameters and seed. Between increments
+        the load is scaled until the next bond breaks.
         """
         scene = scene_like(self.scene, experiment)
         state, tables = initial_state(scene), Tables(scene)
@@ -399,7 +401,7 @@ class Specimens:
     def _advance_to_first_break(self, state: State, first: MachineReading) -> float:
         """Set a state to the last increment before the first break, and return its moment.
 
-        The load alone changes until then.
+        Until then only the load changes.
         """
         assert self.elastic is not None
         full = self.elastic.full.displacement
@@ -472,7 +474,7 @@ class Breaks:
 
 @dataclass(frozen=True)
 class WeightedSamples:
-    """WeightedSamples of parameters, (draw, parameter), with their weights."""
+    """Samples of the parameters, (draw, parameter), with their weights."""
 
     values: Floats
     weights: Floats
@@ -486,7 +488,7 @@ class StrengthLaw(ABC):
     @staticmethod
     @abstractmethod
     def whole(path: str) -> float:
-        """Return the value of the parameter at a path for which no bond breaks."""
+        """Return a value of the parameter at a path for which no bond breaks."""
 
     @abstractmethod
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
@@ -505,7 +507,7 @@ class WeibullLaw(StrengthLaw):
 
     @staticmethod
     def whole(path: str) -> float:
-        """Return a scale out of reach, or a modulus without scatter."""
+        """Return a scale that no strain reaches, or a modulus without scatter."""
         return 1e60 if path == "fracture.scale" else 1000.0
 
     @staticmethod
@@ -544,7 +546,7 @@ class WeibullLaw(StrengthLaw):
         m, log_total = np.exp(log_m), np.interp(log_m, nodes, total)
         low, high = (gammainc(count, np.exp(np.minimum(log_total - m * np.log(end), 700.0)))
                      for end in reversed(bounds[0]))  # fmt: skip
-        # A low-discrepancy sequence beside `order` makes the draws reproducible.
+        # A low-discrepancy sequence, sorted by `order`, makes the draws reproducible.
         other = (np.arange(DRAWS) * 0.6180339887498949 + 0.5) % 1.0
         log_s = (log_total - np.log(gammaincinv(count, low + other * (high - low)))) / m
         return WeightedSamples(np.stack([np.exp(log_s), m], axis=1), np.full(DRAWS, 1.0 / DRAWS))
@@ -573,7 +575,7 @@ class UniformLaw(StrengthLaw):
 
     @staticmethod
     def whole(path: str) -> float:
-        """Return a strain out of reach, or zero scatter."""
+        """Return a strain that is never reached, or zero scatter."""
         return 1e60 if path == "fracture.failure" else 0.0
 
     @staticmethod
@@ -614,7 +616,8 @@ class UniformLaw(StrengthLaw):
 
 
 def _uniform(strain: Floats, rate: Floats, count: Floats, broke: Mask, a: float, w: float) -> float:
-    """Return the logarithm of the likelihood, -inf if a specimen survived what no bond does."""
+    """Return the logarithm of the likelihood; -inf if a specimen survived a load at which a bond is
+    certain to break."""
     z = (strain - a) / w
     if z.max() >= 1.0 or z[broke].max(axis=1).min() <= 0.0:
         return -np.inf
@@ -863,7 +866,8 @@ def _plain(estimate: StrengthEstimate) -> dict[str, Any]:
 
 
 SHARES = 0.2, 0.2, 0.6
-"""Fractions of the specimens: over all bounds, then twice where the measurement is likely."""
+"""Fractions of the specimens: the first between all bounds, the next two where the measurement is
+likely."""
 POINTS = 2**14
 """Number of points at which the likelihood is evaluated."""
 LIKELY = 8.0
@@ -906,7 +910,8 @@ class PeakDistribution:
 
     @classmethod
     def of(cls, logs: Floats, y: Floats) -> PeakDistribution:
-        """Fit the distribution by the likelihood of normal residuals, mean and variance in turn."""
+        """Fit the distribution by maximum likelihood with normal residuals, alternating between
+        mean and variance."""
         empty = np.zeros(0)
         ends = logs.min(axis=0), logs.max(axis=0)
         distribution = cls(*ends, empty, empty, empty, 0.0, 3.0)
@@ -1001,7 +1006,8 @@ def fit_by_simulation(
 
 
 def _spread(box: Floats, count: int, seed: int) -> Floats:
-    """Return points all over a box, (point, parameter), by a scrambled Sobol sequence."""
+    """Return points that fill a box uniformly, (point, parameter), by a scrambled Sobol
+    sequence."""
     from scipy.stats import qmc
 
     unit_points = qmc.Sobol(box.shape[1], seed=seed).random_base2(int(np.ceil(np.log2(count))))
@@ -1025,7 +1031,7 @@ def _simulate_peaks(
 def _refuse_short_load(specimens: Specimens, largest: float) -> None:
     """Raise ExperimentError if the load of the experiment is not far above the measured ones.
 
-    Specimens that survive it would count with the load at its end.
+    A specimen that survives that load would be counted with it as its peak.
     """
     if (elastic := specimens.elastic) is None:
         return

@@ -6,18 +6,18 @@ contains the values at which -2 log L exceeds its minimum by less than 3.84 (Wil
 strongly nonlinear predictions. With a loss the increase is that of M-estimators: it is divided by
 mean ψ² / mean ψ'.
 
-Posterior: unknowns that enter linearly - boundaries of a linear rule, distortions, Young's modulus
-- are integrated out exactly, boundaries of other rules by linearisation at the fit: with their
-derivatives J, the remaining residuals r and a flat prior, log p = -½ |r|² - ½ log det JᵀJ. Walkers
-make the affine-invariant stretch moves of Goodman and Weare (emcee).
+Posterior: unknowns that enter linearly (boundaries of a linear rule, distortions, Young's modulus)
+are integrated out exactly, and boundaries of other rules by linearisation at the fit. With their
+derivatives J, the remaining residuals r and a flat prior, log p = -½ |r|² - ½ log det JᵀJ. The
+sampler uses the affine-invariant stretch moves of Goodman and Weare (emcee).
 
-Combinations: a direction v of parameters along which nothing changes is also one of their
-logarithms, d ln θ = v / θ. Products of powers Π θ^e with e · d ln θ = 0 are identifiable, and so
-are sums Σ e θ with e · v = 0. Both agree near the fit. The one that holds farther along the
-direction is chosen by evaluating residuals there.
+Combinations: if predictions do not change along a direction v of the parameters θ, they do not
+change along the direction v / θ of ln θ either, to first order. Products of powers Π θ^e with e ·
+(v / θ) = 0 are then identifiable, and so are sums Σ e θ with e · v = 0. Both agree near the fit;
+the one that is valid over the longer distance is chosen by evaluating residuals.
 
-Cross-validation leaves out blocks of neighbouring points together (Roberts et al. 2017, Ecography
-40, 913), since the neighbours of a left-out point would reveal it.
+Cross-validation leaves out blocks of adjacent points (Roberts et al. 2017, Ecography 40, 913),
+since a single point could be predicted from its neighbours.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> E
         gradient[n] = direction @ reaction.change(du, unknown.parameter)
     reaction = GroupReaction(
         prediction.answering, force.group
-    )  # responses to boundary modes are those at this state
+    )  # The responses to boundary modes are those at this state.
     for n, du in enumerate(prediction.answers, start=count):
         gradient[n] = direction @ reaction.change(du)
     unidentified = [
@@ -143,8 +143,8 @@ def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> E
 
 
 BLOCKS_PER_SIDE = 32
-"""Number of blocks along the longest side. Larger blocks at an end would determine its displacement
-alone."""
+"""Number of blocks along the longest side. With larger blocks, the displacement of an end would
+depend on a single block."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Candidate:
         Mean square of left-out residuals over their noise (1 is the noise alone), and its standard
         error over blocks.
     behind, behind_error
-        Difference of `left_out` to that of the best model, block by block, and its standard error.
+        Mean difference of `left_out` to that of the best model over blocks, and its standard error.
     differs
         Root mean square difference to the predictions of the best model, over the noise.
     values
@@ -302,10 +302,10 @@ MAX_STEPS = 12
 MAX_FIRST_STEP = 0.1
 """Largest first step, as a fraction of the interval between the bounds."""
 STRAIGHT = 1.5
-"""Increment of the root of the rise over which it is interpolated linearly."""
+"""Increment of the square root of the rise over which it is interpolated linearly."""
 
 REFINEMENTS = 30
-"""Largest number of further values until it is."""
+"""Maximum number of additional values for that interpolation."""
 MAX_RISE = 8.0
 """Rise at which a profile ends."""
 RISE_95 = 3.841
@@ -365,7 +365,8 @@ def profile_likelihood(problem: Problem, solution: Solution, n: int, loss: Loss)
 def _walk(
     problem: Problem, solution: Solution, n: int, direction: float, loss: Loss
 ) -> Iterator[tuple[float, float]]:
-    """Yield values in one direction, with the rise at each, as long as all others can be fitted."""
+    """Yield values in one direction, with the rise at each, while all other parameters can be
+    fitted."""
     low, high = _ends(problem.unknowns[n])
     value, z = float(solution.z[n]), solution.z
     step = min(STEP * float(solution.errors[n]), MAX_FIRST_STEP * (high - low))
@@ -385,7 +386,7 @@ def _walk(
 def _refine(side: Floats, problem: Problem, solution: Solution, n: int, loss: Loss) -> Floats:
     """Insert values, (value, 2), where the rise reaches RISE_95.
 
-    Its root is not linear there if it was flat before.
+    The square root of the rise is not linear there if the profile was flat before.
     """
     unit, minimum = _unit(problem, solution, loss)
     for _ in range(REFINEMENTS):
@@ -434,7 +435,7 @@ def _fit_at(
 
 
 def _crossing(values: Floats, rises: Floats) -> float | None:
-    """Interpolate where the rise first reaches RISE_95; its root is nearly linear."""
+    """Interpolate where the rise first reaches RISE_95; its square root is nearly linear."""
     roots = np.sqrt(np.maximum(rises, 0.0))
     indices = np.flatnonzero(roots >= np.sqrt(RISE_95))
     if not indices.size or indices[0] == 0:
@@ -505,7 +506,8 @@ def sample_posterior(
     start = solution.z[:count] + spread * generator.normal(size=(walkers, count))
     start = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
     chain = emcee.EnsembleSampler(walkers, count, log_posterior)
-    chain.random_state = np.random.RandomState(seed).get_state()  # emcee keeps a state of its own
+    # emcee stores a state of its own for random numbers.
+    chain.random_state = np.random.RandomState(seed).get_state()
     chain.run_mcmc(start, steps)
     memory = chain.get_autocorr_time(quiet=True, tol=0)
     draws = chain.get_chain(discard=int(BURN_IN * steps), flat=True)
@@ -530,26 +532,27 @@ def _marginal(problem: Problem, z: Floats, values: Floats, size: float) -> float
         size_of = np.linalg.norm(linearisation.jacobian, axis=0)
         size_of[size_of == 0.0] = 1.0
         basis, sizes, _ = np.linalg.svd(linearisation.jacobian / size_of, full_matrices=False)
-        is_regular = sizes > RANK * sizes.max(initial=0.0)  # the others have no influence
+        # The other directions have no influence.
+        is_regular = sizes > RANK * sizes.max(initial=0.0)
         residuals = residuals - basis[:, is_regular] @ (basis[:, is_regular].T @ residuals)
         log_volume = float(np.log(size_of).sum() + np.log(sizes[is_regular]).sum())
     return float(-0.5 * (residuals @ residuals) / size**2 - log_volume)
 
 
 SAME = 1e-3
-"""Exponents below this fraction of the largest are 0."""
+"""Fraction of the largest exponent below which an exponent counts as 0."""
 
 SIMPLE = 5e-3
-"""Largest deviation of exponents that are rounded to whole or half numbers."""
+"""Largest deviation of an exponent from a whole or half number to which it is rounded."""
 NEAR_ZERO = 1e-2
 """Fraction of the interval between its bounds below which a parameter may be 0."""
 UNSEEN = 1e-2
-"""Change of the squared residuals, over that of the noise, that is negligible."""
+"""Change of the squared residuals, relative to that of the noise, that is negligible."""
 MAX_RELATIVE_CHANGE = 0.2
 """Largest relative change of parameters along a direction that is not identifiable."""
 
 MAX_BOUND_FRACTION = 0.8
-"""Largest fraction of the distance to their bounds."""
+"""Largest change along such a direction as a fraction of the distance to the bounds."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,9 @@
-"""Recording of runs as datasets, result files and their seals, checkpoints of unfinished runs, and
-exports.
+"""Datasets of runs in memory and in files.
+
+`recorder` takes the variables of a dataset from the states of a run (`layout`, `snapshot`) and
+passes them to a sink (`sinks`, `netcdf`). `seal` protects result files against changes,
+`checkpoint` and `run_store` keep unfinished runs for `resume`, `open` and `save` read and write
+results, and `vtkhdf` exports to ParaView.
 """
 
 from __future__ import annotations

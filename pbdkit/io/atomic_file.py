@@ -1,8 +1,8 @@
 """Atomic writing of files: complete or not at all, locked against other writers, replacing an
 earlier file only on request.
 
-`NewFile` is a file under construction for libraries that do not handle a write that fails or is cut
-short.
+`NewFile` is a file under construction, for libraries that do not handle writes that fail or are
+incomplete.
 """
 
 from __future__ import annotations
@@ -27,8 +27,13 @@ LOCAL = {"apfs", "bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "hfs", "jf
 LOCAL |= {"ramfs", "reiserfs", "tmpfs", "xfs", "zfs"}
 """File systems of one machine, where SQLite's write-ahead log can share memory."""
 FULL = "the disk is full; free some space, or record fewer steps"
+"""Message for a full disk."""
 FULL_BYTES = 2**20
-TRIES, PAUSE_S = 10, 0.02
+"""Number of free bytes below which a disk counts as full."""
+TRIES = 10
+"""Number of attempts to lock a file."""
+PAUSE_S = 0.02
+"""Pause between two attempts, in seconds."""
 
 
 def is_local(path: Path, mounts: str = "/proc/self/mountinfo") -> bool:
@@ -70,7 +75,7 @@ def open_locked(path: Path) -> io.FileIO | None:
     """
     for _ in range(TRIES):
         file = io.FileIO(path, "r+b")
-        with suppress(FileNotFoundError):  # it may be another one by now, or none
+        with suppress(FileNotFoundError):  # The file may have been replaced or removed meanwhile.
             if lock(file) and os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
         file.close()
@@ -87,8 +92,8 @@ def is_full(folder: Path) -> bool:
 
 
 def write_all(file: io.FileIO, data: bytes | bytearray | memoryview) -> None:
-    """Write all of the data: a single write may be short, above all on a disk that is nearly full.
-    Raises OSError."""
+    """Write all of the data: a single write may be incomplete, in particular on a disk that is
+    nearly full. Raises OSError."""
     view = memoryview(data)
     while view:
         view = view[file.write(view) :]
@@ -105,13 +110,12 @@ def sync_folder(folder: Path) -> None:
 
 
 class NewFile(io.RawIOBase):
-    """A file on the disk that is written completely; its first fault is recorded instead of
-    raised.
+    """File on the disk that records the first failed write instead of raising it.
 
-    HDF5 would try a failed write again when the process ends, and crash it; other libraries drop
-    what a short write left. Here every write is complete and none raises: after the first fault
-    nothing more is written, and `check` raises it. There is no `fileno`, through which libraries
-    would write past this.
+    HDF5 would repeat a failed write when the process ends and crash; other libraries lose the rest
+    of an incomplete write. Here every write is complete and none raises: after the first fault
+    nothing more is written, and `check` raises the fault. There is no `fileno`, by which libraries
+    could bypass the class.
     """
 
     def __init__(self, disk: io.FileIO) -> None:
@@ -197,7 +201,7 @@ class NewFile(io.RawIOBase):
 WHOLE = ("complete", "settled")
 """Status of results that may replace other results."""
 PARTIAL = "-partial"
-"""Suffix of the name of a result that may not, where its name exists already."""
+"""Suffix of the name of other results, if their name exists already."""
 TEMPORARY = ".partial"
 """Suffix of files under construction."""
 RANDOM_BYTES = 8
@@ -213,7 +217,7 @@ File = TypeVar("File", bound=NewFile)
 @contextmanager
 def open_atomic(path: Path, kind: type[File], *, replace: bool) -> Iterator[File]:
     """Write a file that appears under its name at the end of the block, complete and synced, or not
-    at all; until then, and after a fault, an earlier file stays.
+    at all. Until then, and after a fault, an earlier file remains.
 
     Parameters
     ----------
@@ -226,7 +230,7 @@ def open_atomic(path: Path, kind: type[File], *, replace: bool) -> Iterator[File
     Raises
     ------
     WriteError
-        Where the system refuses anything, or the name belongs to a link, a pipe or a device.
+        If the system refuses an operation, or the name belongs to a link, a pipe or a device.
     """
     with _refusing(path):
         if kind_in_place := kind_of(path):
@@ -239,7 +243,8 @@ def open_atomic(path: Path, kind: type[File], *, replace: bool) -> Iterator[File
             file = kind(disk)
             try:
                 yield file
-            finally:  # what the block raised may be what a library made of a failing write
+            # An exception in the block may have been caused by a failed write in a library.
+            finally:
                 with _refusing(path):
                     file.check()
             with _refusing(path):
@@ -325,14 +330,17 @@ def _short(name: str) -> str:
 
 
 class Destination:
-    """The name of a result. With `replace`, a complete result replaces an existing file; a run that
-    diverged or did not converge is written beside it."""
+    """Name of a result.
+
+    With `replace`, a complete result replaces an existing file; the result of a run that diverged
+    or did not converge gets another name in the same folder.
+    """
 
     def __init__(self, path: Path, *, replace: bool) -> None:
         self.path, self.replace = path, replace
-        self._folder = path.parent.absolute()  # whoever changes the folder meanwhile
+        self._folder = path.parent.absolute()  # The folder of the process may change meanwhile.
         self.written = path
-        """Path of the result once it has its name: beside `path` where that was in use."""
+        """Path of the finished result, which differs from `path` if that was in use."""
 
     def temporary(self) -> io.FileIO:
         """Create and lock a file beside the result, under a unique name; remove the files that
@@ -347,18 +355,18 @@ class Destination:
             file = io.FileIO(self._folder / _hidden(self.path.name), "x+b")
             if lock(file) and os.fstat(file.fileno()).st_nlink:
                 return file
-            file.close()  # another run took it for one that was left behind
+            file.close()  # Another run has removed the file, which looked like one of a killed run.
 
     def take(self, temporary: Path, status: str) -> None:
-        """Give a file its name. Raises OSError, and WriteError where the name came into use
-        meanwhile: the result is then beside it."""
+        """Give a temporary file the name of the result. Raises OSError, and WriteError where the
+        name came into use meanwhile: the result is then beside it."""
         whole = status in WHOLE
         if whole and self.replace:
             name = self._folder / self.path.name
-            with suppress(OSError):  # whoever may read it stays the same
+            with suppress(OSError):  # Permissions to read the file are unchanged.
                 shutil.copymode(name, temporary)
             temporary.replace(name)
-            with suppress(OSError):  # two names of one file are left as they are
+            with suppress(OSError):  # Two names of one file are left unchanged.
                 temporary.unlink(missing_ok=True)
         else:
             names = (p for p in self._free(whole) if _rename(temporary, self._folder / p.name))
@@ -381,17 +389,17 @@ class Destination:
 
 
 def _rename(file: Path, name: Path) -> bool:
-    """Rename a file unless the name is in use, and return whether it has that name now; a file that
-    was linked before the process was killed counts as renamed."""
+    """Rename a file unless the name is in use, and return whether it now has that name. A file that
+    had been linked before the process was killed counts as renamed."""
     try:
         os.link(file, name)
     except FileExistsError:
         if not name.samefile(file):
             return False
-    except OSError:  # no hard links on this file system
+    except OSError:  # The file system has no hard links.
         if os.path.lexists(name):
             return False
         file.rename(name)
-    with suppress(OSError):  # it has its name
+    with suppress(OSError):  # The file has its name.
         file.unlink(missing_ok=True)
     return True

@@ -48,6 +48,7 @@ class RecordedSteps:
 CLASSES: dict[str, type] = {"Seen": RecordedSteps}
 """Dataclasses of this module that a checkpoint contains, by their names in files."""
 NAMES = {type_: name for name, type_ in CLASSES.items()}
+"""Names of these dataclasses in files."""
 
 
 @dataclass(frozen=True)
@@ -89,11 +90,12 @@ class Checkpoint:
         return cls(about, facts, arrays)
 
     def with_origin(self, origin: Mapping[str, Any]) -> Checkpoint:
-        """Return the same of a run that a command began: `origin` is what that was called with."""
+        """Return the checkpoint of a run that a command began, with the arguments of the
+        command."""
         return Checkpoint(self.about | {"origin": dict(origin)}, self.facts, self.arrays)
 
     def copied(self) -> Checkpoint:
-        """Return the same with arrays of its own."""
+        """Return a checkpoint with copies of the arrays."""
         arrays = {name: array.copy() for name, array in self.arrays.items()}
         return Checkpoint(self.about, self.facts, arrays)
 
@@ -143,7 +145,8 @@ def _is_consistent(
         earlier = [recorded.step, recorded.recorded, parts.get("kept", -1), guard["good_step"]]
         later = [guard["next_look"], pace.next_look if pace else step, steps]
         integral = all(isinstance(n, int) for n in (step, *earlier[2:], *later))
-        # An equilibrium may be recorded within a step, and that of steps that are yet to be made.
+        # An equilibrium may be recorded within a step, and the step may be one that is still to be
+        # made.
         latest = max(step, parts.get("moment", 0.0))
         in_order = min(earlier) >= -1 and max(earlier) <= latest and step <= min(later)
         in_order = in_order and 0.0 <= parts.get("moment", 0.0) <= steps
@@ -169,7 +172,8 @@ def _is_like(facts: Any, template: Any) -> bool:
     if isinstance(template, str) or isinstance(facts, str):
         return isinstance(template, str) and isinstance(facts, str)
     if isinstance(facts, float):
-        return not isinstance(template, int)  # infinite is what a run may find, and no step
+        # A state of a run may contain infinity, but a number of steps may not.
+        return not isinstance(template, int)
     return facts is None or (isinstance(facts, int) and abs(facts) < 2**63)
 
 

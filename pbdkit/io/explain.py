@@ -35,8 +35,8 @@ class BondStatus:
 
     `state` is "intact", "broken", "cut", "broken from the start" or "cannot break". `step`, `order`
     (among the broken ones, from 1) and `strain_at_break` are None unless known; `breaks_above` is
-    the strain that it bears, None where the model does not say. `strain` is that of the recorded
-    step `at_step`.
+    the strain above which it breaks, None if the model does not define it. `strain` is the strain
+    at the recorded step `at_step`.
     """
 
     bond: tuple[int, int]

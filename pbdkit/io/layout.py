@@ -33,19 +33,28 @@ if TYPE_CHECKING:
 
 
 CONVENTIONS = "CF-1.11"
+"""Version of the CF conventions."""
 SCHEMA_VERSION = "2"
+"""Version of the layout."""
 STATUSES = ("complete", "settled", "diverged", "unconverged", "separated", "interrupted")
+"""Values of the attribute `status`."""
 ATTRIBUTES = (
     "Conventions", "schema_version", "title", "pbdkit_version", "experiment", "plugins",
     "prediction", "status", "stop_reason", "created",
 )  # fmt: skip
+"""Names of the attributes of every dataset."""
 INDICES = "ijk"
 """Names of a site's indices, one for each axis of the lattice."""
-OF_BODY, OF_FRAME = np.int8(0), np.int8(1)
-"""Roles of particles: leaders and followers are body, at every step."""
+OF_BODY = np.int8(0)
+"""Role of leaders and followers, at every step."""
+OF_FRAME = np.int8(1)
+"""Role of frame points."""
 TIMES = ("time", "step")
-"""Coordinates that count steps; fractional where increments of load are recorded."""
-STEP, ENDS = "step", "their numbers, the lower one first"
+"""Coordinates that count steps. They are fractional if increments of load are recorded."""
+STEP = "step"
+"""Name of the coordinate of every step."""
+ENDS = "their numbers, the lower one first"
+"""Description of the ends of bonds."""
 Values = dict[str, Any]
 """Values of a dataset, by the name of the variable."""
 
@@ -63,7 +72,7 @@ class When(Enum):
 class Column:
     """One variable of the dataset with all its dimensions; `coordinate` marks coordinates.
 
-    `long_name` is short, as it stands at the axes of plots; `comment` is the rest. `extra` are
+    `long_name` is short, for the axes of plots; `comment` has further explanations. `extra` are
     other attributes.
     """
 
@@ -234,14 +243,14 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
 
 
 def makers_of(names: set[str]) -> list[str]:
-    """Return, as an experiment names them, the built-in diagnostics that make a variable of one of
-    these names, or of a name that begins with one and `_`."""
+    """Return the built-in diagnostics, as written in experiments, that provide a variable of one of
+    these names, or of a name that begins with one of them and `_`."""
     prefixes = tuple(f"{name}_" for name in names if name)
     spellings = []
     for each, types in Registry().spellings(Diagnostic, installed=False).items():
         variables = [column.name for column in _columns_of(each)]
         if any(name in names or name.startswith(prefixes) for name in variables):
-            fields = each.model_fields.items()  # the modulus may come from `units`
+            fields = each.model_fields.items()  # The modulus may be given by `units`.
             required = [n for n, part in fields if part.is_required() or n == "youngs_modulus"]
             spellings.append(
                 f"{{{', '.join([f'type: {types[0]}', *(f'{n}: ...' for n in required)])}}}"
@@ -253,7 +262,7 @@ def _columns_of(diagnostic: type[Component]) -> list[Column]:
     """Return the columns of a diagnostic with unset parameters; none where its variables depend on
     parameters or cannot be evaluated, which leaves the schema open."""
     assert issubclass(diagnostic, Diagnostic)
-    with suppress(Exception):  # it is somebody's code, which nobody asked to run
+    with suppress(Exception):  # Code of a plugin that the user has not selected must not fail here.
         variables = diagnostic.model_construct(type="").variables()
         columns = [diagnostic_column(v, diagnostic) for v in variables]
         json.dumps([_schema_of(column) for column in columns])
@@ -290,11 +299,12 @@ def refuse_no_dataset(candidate: Any) -> None:
 
 
 def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset in the current layout: indices and roles of particles, and bonds by
-    number, which were indices from 0; all of the body counts as inside its outline.
+    """Return the dataset in the current layout. Older ones lack indices and roles of particles, and
+    have bonds by index from 0 instead of by particle number; the whole body counts as inside its
+    outline.
 
-    What was measured stays as it was: frame points hold 0 in what is NaN there now. Raises
-    ExperimentError for what is no dataset.
+    Diagnostics are unchanged: at frame points they are 0, where they are NaN in the current layout.
+    Raises ExperimentError if the argument is not a dataset.
     """
     refuse_no_dataset(dataset)
     variables, dims = dataset.variables, {name: v.dims for name, v in dataset.variables.items()}
@@ -348,7 +358,7 @@ def json_attribute(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
 def scene_of(dataset: xarray.Dataset, what: str) -> Scene:
     """Build the scene of the run that made a dataset, which `what` needs.
 
-    Raises ExperimentError where it cannot be built, as where a component of it is retired.
+    Raises ExperimentError if it cannot be built, for example because a component is retired.
     """
     refuse_retired(json_attribute(dataset, "experiment"), what)
     return build_scene(experiment_of(dataset))
@@ -398,7 +408,7 @@ def rows_of(numbers: Array, wanted: Array) -> Array:
     """Return the rows of particles by number; -1 for numbers that are missing."""
     integers = np.nan_to_num(wanted, nan=-1.0).astype(np.int64)
     last = len(numbers)
-    if last and numbers[0] == 1 and numbers[-1] == last:  # all of them, as in most datasets
+    if last and numbers[0] == 1 and numbers[-1] == last:  # Most datasets contain all particles.
         return np.where(integers <= last, integers - 1, -1)
     if not last:
         return np.full(integers.shape, -1)

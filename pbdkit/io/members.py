@@ -17,12 +17,14 @@ from pbdkit.model.reading import Source, with_value
 if TYPE_CHECKING:
     import xarray
 
-SWEEP, STATUS = "sweep", "status"
-"""The attribute that identifies datasets of sweeps, and the variable along all their dimensions."""
+SWEEP = "sweep"
+"""Attribute that identifies datasets of sweeps."""
+STATUS = "status"
+"""Variable with the status of each member."""
 TEXT = "_text"
-"""Suffix of the coordinate with the text of values that are numbered along a dimension."""
+"""Suffix of the coordinate with the texts of values that are numbered along a dimension."""
 PARAMETER = "parameter"
-"""The attribute of a coordinate with the path of its parameter in the experiment."""
+"""Attribute of a coordinate with the path of its parameter in the experiment."""
 SHOWN = 6
 """Maximum number of values in messages."""
 
@@ -39,8 +41,8 @@ def type_alone(text: str) -> str:
 def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset:
     """Return the part of a sweep in which parameters have these values.
 
-    Where every parameter is chosen, the dataset carries the experiment of that member, and its
-    title names the choice.
+    If every parameter is given, the result has the experiment of that member as an attribute, and
+    the choice in its title.
 
     Parameters
     ----------
@@ -118,7 +120,7 @@ def _is_alike(label: Any, value: Any) -> bool:
 
 def _with_experiment(selection: xarray.Dataset) -> xarray.Dataset:
     """Return a member with its experiment, without the times that only other members reached."""
-    from pbdkit.model.experiment import Experiment  # imports pydantic
+    from pbdkit.model.experiment import Experiment  # This import loads pydantic.
 
     source = Source(data=json_attribute(selection, SWEEP).get("experiment"))
     for name, coordinate in selection.coords.items():

@@ -29,7 +29,8 @@ from pbdkit.io.sinks import KeepingSink
 from pbdkit.scene.memory_estimate import CHUNK_BYTES, OPEN_CHUNK
 
 LEVEL = 1
-"""Compression level of zlib: higher levels cost much and gain little on positions."""
+"""Compression level of zlib. For positions, higher levels take much more time and reduce the size
+little."""
 LABELS = "coordinates"
 """CF's attribute for coordinates that are not those of a dimension; xarray reads it from the file
 too."""
@@ -41,8 +42,8 @@ Waiting = dict[str, list[Array]]
 
 
 class NetcdfFile:
-    """The columns of a dataset, written to a file as they come. Its state is `waiting` and
-    `written`, the number of entries of each column in the file."""
+    """File with the columns of a dataset, which are written while a run continues. Its state is
+    `waiting` and `written`, the number of entries of each column in the file."""
 
     def __init__(self, file: PagedFile, columns: list[Column], *, compress: bool = False) -> None:
         self.file, self._compress = file, compress
@@ -110,7 +111,7 @@ class NetcdfFile:
         for key, array in arrays.items():
             dims = {f"{key}_{n}": length for n, length in enumerate(array.shape)}
             group.dimensions.update(dims)
-            # The library would give empty arrays chunks larger than they are.
+            # The library would choose chunks that are larger than empty arrays.
             heuristic = {"chunking_heuristic": "h5py"}
             variable = group.create_variable(key, tuple(dims), array.dtype, **heuristic)
             _fill(variable, array)
@@ -141,7 +142,8 @@ class NetcdfFile:
             self._lengthen(dim, min(FIRST_LENGTH, planned[dim]))
         dtype = import_module("h5py").string_dtype() if column.dtype == "str" else column.dtype
         attributes = column.attributes
-        if column.dtype == "bool":  # as xarray writes it: netCDF has no such type
+        # xarray writes truth values in the same way, since netCDF has no such type.
+        if column.dtype == "bool":
             dtype, attributes = "i1", attributes | {"dtype": "bool"}
         variable = self._content.create_variable(column.name, column.dims, dtype, **options)
         variable.attrs.update(attributes)
@@ -172,7 +174,8 @@ class NetcdfFile:
 
     def _write_chunk(self, dataset: Any, place: tuple[int, ...], chunk: Array) -> None:
         data: Any = np.ascontiguousarray(chunk)
-        if dataset.compression:  # as HDF5's filters do it: bytes of like weight together
+        # Bytes of equal significance are stored together, as by HDF5's shuffle filter.
+        if dataset.compression:
             planes = data.reshape(-1).view(np.uint8).reshape(-1, data.itemsize).T
             data = np.frombuffer(zlib.compress(planes.tobytes(), LEVEL), np.uint8)
         self.file.values_bytes = data.nbytes
@@ -208,7 +211,7 @@ def _parts(entries: list[Any], chunks: tuple[int, ...]) -> Iterator[tuple[int, A
         for n, rows in enumerate(entries[0].rows(chunks[1])):
             yield n * chunks[1], rows[None]
         return
-    # A large one is stored as it is, not copied.
+    # A large array is stored without being copied.
     values = np.stack(entries) if len(entries) > 1 else np.asarray(entries[0])[None]
     if values.ndim == 1:
         yield 0, values
@@ -222,7 +225,7 @@ def _chunks(
 ) -> tuple[int, ...]:
     inner = [max(1, sizes[dim]) for dim in column.dims[1:]]
     entry = int(np.prod(inner)) * np.dtype(column.dtype).itemsize
-    if inner:  # parts of equal size, so that the last one wastes nothing
+    if inner:  # Parts are of equal size, so that the last one is not padded much.
         inner[0] = -(-inner[0] // -(-entry // CHUNK_BYTES))
     return max(1, min(CHUNK_BYTES // entry, planned[column.dims[0]])), *inner
 
@@ -236,19 +239,23 @@ def _padded(part: Array, shape: tuple[int, ...]) -> Array:
     return whole
 
 
-FIRST_S, EVERY_S, SHARE = 1.0, 1.0, 50
-"""Time in seconds before the first commit, minimum interval of commits, and minimum interval as a
-multiple of the duration of the last commit. A run that ends before the first has no store."""
+FIRST_S = 1.0
+"""Time in seconds before the first commit. A run that ends earlier has no store."""
+EVERY_S = 1.0
+"""Minimum interval between commits in seconds."""
+SHARE = 50
+"""Minimum interval between commits as a multiple of the duration of the last commit."""
 FINAL_STATE = "final_state"
 """The group of the file with the state from which a run can be continued to more steps."""
 WAITING = "waiting."
+"""Prefix of the names of arrays of buffered entries in a checkpoint."""
 
 
 class NetcdfSink(KeepingSink):
     """Sink that writes a temporary file beside `path`, commits it after a second as the records of
     an unfinished run, and renames it at `finish`. `origin` are the arguments of the command.
 
-    Raises StorageError where anything cannot be written; what was kept until then stays kept.
+    Raises StorageError if a write fails; earlier commits remain.
     """
 
     def __init__(
@@ -357,7 +364,7 @@ class NetcdfSink(KeepingSink):
             self._complete(file.file, attributes["status"])
 
     def _complete(self, file: PagedFile, status: str, *, settled: bool = False) -> None:
-        """Verify, settle and rename a file that is complete with its pages. Raises OSError."""
+        """Verify a complete file, write its pages, and rename it. Raises OSError."""
         if not settled:
             file.verify()
             file.settle()
@@ -396,8 +403,8 @@ class NetcdfSink(KeepingSink):
             raise WriteError(f"{path}: cannot be written: {reason}") from None
 
     def _reason(self, error: Exception) -> str:
-        """Return the reason of the disk where there is one, since the library's errors say
-        little."""
+        """Return the error of the disk if there is one, since the errors of the library are not
+        informative."""
         try:
             if self._file:
                 self._file.file.check()
@@ -426,6 +433,6 @@ def reopen_dataset(
         dataset.reopen({n: [np.asarray(v) for v in batch] for n, batch in waiting.items()}, written)
     except StorageError:
         raise
-    except Exception as error:  # whatever the libraries below make of it
+    except Exception as error:  # The libraries raise various errors for damaged files.
         raise StorageError(f"the store holds a damaged file: {error}") from None
     return dataset

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 
 UNSEALED = "has no seal: changes since it was written cannot be detected"
+"""Warning for a file without a seal."""
 
 
 def open(path: str | Path) -> xarray.Dataset:
@@ -56,7 +57,7 @@ def open(path: str | Path) -> xarray.Dataset:
         dataset = in_this_layout(_unfinished(unfinished) if unfinished else _opened(file))
     except PbdkitError:
         raise
-    except Exception as error:  # whatever the libraries below make of a damaged file
+    except Exception as error:  # The libraries raise various errors for damaged files.
         if not unfinished:
             with SealedFile(file) as content:
                 content.check()
@@ -98,7 +99,7 @@ def _dataset(content: Any) -> xarray.Dataset:
     import xarray
     from xarray.backends import StoreBackendEntrypoint
 
-    # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
+    # Times are numbers of steps and must not be decoded as dates.
     store = xarray.backends.H5NetCDFStore(content)
     return xarray.open_dataset(store, engine=StoreBackendEntrypoint, decode_times=False)
 

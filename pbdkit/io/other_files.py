@@ -12,6 +12,7 @@ from pbdkit.model.shipped import shipped_names
 from pbdkit.untrusted_files import BEGINNINGS
 
 TEXTS = (".yaml", ".yml", ".json")
+"""Suffixes of files that may be experiments."""
 FAULTY = "faulty"
 """Kind of a file that is not text, or not valid YAML."""
 
@@ -62,7 +63,7 @@ def _kind_of_text(path: Path) -> str | None:
         return kind_of(read_file(path).data)
     except OSError:
         return None
-    except ExperimentError:  # no text, or text that is at fault
+    except ExperimentError:  # The file is not text, or its text is invalid.
         return FAULTY
 
 

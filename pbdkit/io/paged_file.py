@@ -1,6 +1,5 @@
-"""The file object that the HDF5 library writes into: committed bytes are never overwritten, and
-large arrays are appended piece by piece.
-"""
+"""File object for the HDF5 library. Committed bytes are never overwritten, and large arrays are
+appended piece by piece."""
 
 from __future__ import annotations
 
@@ -22,13 +21,18 @@ from pbdkit.io.atomic_file import NewFile, write_all
 from pbdkit.io.seal import BLOCK, BrokenSealError, ByteRange, digest, is_whole, put_seal
 
 MAGIC = b"pbdkit-r"
+"""First bytes of the records of an unfinished run."""
 HDF5 = b"\x89HDF\r\n\x1a\n"
+"""First bytes of an HDF5 file."""
 LAYOUT = struct.Struct("<8s16sQ")
+"""Layout of the header: first bytes, identity, number of commits."""
 HEADER_BYTES = LAYOUT.size + 8
-"""Length of the header with its digest. The superblock of HDF5, which is longer, takes its place in
-the finished file; until then it is in a page of the store."""
-TRIES, PAUSE_S = 3, 0.02
-"""Attempts and pause in seconds for a header that is being written at the moment of reading."""
+"""Length of the header with its digest. In the finished file the superblock of HDF5, which is
+longer, replaces the header; until then the superblock is in a page of the store."""
+TRIES = 3
+"""Number of attempts to read a header that is being written."""
+PAUSE_S = 0.02
+"""Pause between two attempts, in seconds."""
 
 
 class Header(NamedTuple):
@@ -69,18 +73,19 @@ def read_header(file: io.FileIO) -> Header | None:
 
 
 PAGE = 4096
+"""Size of a page in bytes."""
 LARGE_BYTES = 2**16
-"""Single writes larger than this go to the disk immediately."""
+"""Number of bytes above which a single write goes to the disk immediately."""
 
 
 class PagedFile(NewFile):
     """A file on the disk overlaid by pages in memory.
 
-    Large writes are appended to the disk, behind everything that existed at the last `commit`, each
-    extent once. Everything else, such as the metadata that HDF5 rewrites, stays in memory until
-    `settle`. The bytes on the disk, with the pages, extents and size of a commit, therefore form
-    the file as of that commit, whatever is written afterwards. With `read_only` everything stays in
-    memory.
+    Large writes are appended to the disk behind everything that existed at the last `commit`, and
+    each extent is written once. Everything else, such as the metadata that HDF5 rewrites, stays in
+    memory until `settle`. The bytes on the disk together with the pages, extents and size of a
+    commit therefore form the file as of that commit, independent of later writes. With `read_only`
+    all writes stay in memory.
 
     Extents passed to the constructor are verified before any of their bytes are returned; damage
     raises BrokenSealError.
@@ -104,7 +109,7 @@ class PagedFile(NewFile):
         self.changed: set[int] = set()
         """Numbers of the pages written since the last commit."""
         self.values_bytes = -1
-        """A single write of this size counts as values, however small."""
+        """Size of single writes that count as values even if they are small."""
         self.noted = len(self.extents)
         """Number of extents at the last commit."""
         self._unchecked = {extent.start for extent in extents}

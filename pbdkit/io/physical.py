@@ -19,11 +19,15 @@ if TYPE_CHECKING:
 
 
 IN_MM = f"_{LENGTH.unit}"
+"""Suffix of the names of variables in mm."""
 OF_GIVEN = {"youngs_modulus": "stress unit", "thickness": "thickness unit"}
-"""Names of the units in which these quantities are given as plain numbers."""
-UNITS, FACTOR, TWIN_OF = "physical_units", "physical_factor", "physical_of"
-"""Attributes of a variable in lattice units: its physical unit and the factor to it; and the
-attribute of a converted copy with the name of the original."""
+"""Names of the units of these quantities if they are given as plain numbers."""
+UNITS = "physical_units"
+"""Attribute of a variable in lattice units with its physical unit."""
+FACTOR = "physical_factor"
+"""Attribute of a variable in lattice units with the factor to its physical unit."""
+TWIN_OF = "physical_of"
+"""Attribute of a converted copy with the name of the original."""
 
 
 class Physical:

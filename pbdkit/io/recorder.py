@@ -1,6 +1,5 @@
-"""The recorder: takes the variables of the dataset from the states of a run, measured diagnostics
-and remembered numbers included, and passes them to a sink.
-"""
+"""Recorder: takes the variables of the dataset, diagnostics and state variables included, from the
+states of a run and passes them to a sink."""
 
 from __future__ import annotations
 
@@ -161,8 +160,9 @@ class RecordedVariables:
     ) -> Values:
         """Measure the diagnostics of that time, by variable; all, or those selected by `which`.
 
-        Raises PluginError for another shape than declared, and FloatingPointError for what is not
-        finite; at the end such values stay: the run may have ended because of them.
+        Raises PluginError for a shape other than the declared one, and FloatingPointError for
+        values that are not finite. At the end of a run such values are kept, since the run may have
+        ended because of them.
         """
         values: Values = {}
         occasion = "at the end" if when is When.END else f"at step {moment.step}"
@@ -174,7 +174,8 @@ class RecordedVariables:
                 results = as_values(diagnostic.measure(moment), "measure")
                 for (variable, factor), value in zip(variables, results, strict=True):
                     if dimension in variable.dims and np.ndim(value) == len(variable.dims):
-                        # The first variable that has it gives its length, the others keep to it.
+                        # The first variable determines the length of the dimension, which the
+                        # others must have, too.
                         sizes.setdefault(dimension, np.shape(value)[variable.dims.index(dimension)])
                     shape = tuple(sizes.get(dim, -1) for dim in variable.dims)
                     if np.shape(value) != shape:
@@ -232,8 +233,8 @@ class Recorder:
         self.warnings: tuple[str, ...] = ()
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
-        """Pass the columns and initial values to the sink, or instead of these the `history` of a
-        run that is continued."""
+        """Pass the columns and initial values to the sink or, for a run that is continued, its
+        `history`."""
         count = self._scene.experiment.record_count
         planned = {"time": count, "step": max(count, self._scene.experiment.steps + 1)}
         self.sink.begin(self._columns, self._measured.sizes, planned)
@@ -273,13 +274,7 @@ class Recorder:
 
     @np.errstate(all="ignore")
     def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
-        """Record what is due at this step.
-
-        The `last` state of a run that stops early is recorded in any case, even if it was observed
-        before; otherwise an observed step is skipped. `time` is that of an equilibrium within a
-        step. Raises FloatingPointError where a recorded value is not finite; then nothing of the
-        step is recorded.
-        """
+        """Record the variables that are due at this step."""
         if (state.step if time is None else time) > self.last_steps.step or last:
             self._put(state, self._record_of(state, last, time))
 
@@ -298,7 +293,7 @@ class Recorder:
         experiment, within_step = self._scene.experiment, time is not None
         time = state.step if time is None else time
         late = last and time > self.last_steps.recorded
-        # The first state is always recorded, also of a run that does not begin with step 0.
+        # The first state is always recorded, even if the run does not begin with step 0.
         planned = within_step or experiment.records(state.step) or self.last_steps.recorded < 0
         recorded = late or (not last and planned)
         if recorded:
@@ -321,7 +316,7 @@ class Recorder:
     def finish(self, state: State, outcome: RunOutcome, prediction: dict[str, Any]) -> None:
         """Record the final values, and the attributes with the prediction made before the first
         step; `warnings` then holds warnings about the last state."""
-        # Where a run diverged, what broke since the last record is no result.
+        # In a run that diverged, bonds that broke after the last record are not a result.
         diverged, recorded = outcome.status == "diverged", self.last_steps.recorded
         if state.step < recorded < state.step + 1:
             moment = StateMoment(state, self._tables, time=recorded)
@@ -363,7 +358,7 @@ def provenance_of(experiment: Experiment) -> dict[str, str]:
 
 
 class Snapshots:
-    """Builds labelled datasets of single states of a scene, as its run has them at one time."""
+    """Builder of labelled datasets of single states of a scene."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._tables = scene, Tables(scene)

@@ -1,6 +1,5 @@
-"""The store of an unfinished run beside its output: a SQLite database with the last checkpoint, and
-the records, which become the result.
-"""
+"""Store of an unfinished run beside its output: a SQLite database with the last checkpoint, and the
+records, a file that becomes the result."""
 
 from __future__ import annotations
 
@@ -48,15 +47,18 @@ from pbdkit.io.sqlite_file import (
 )
 
 FORMAT = "3"
-"""Version of the store; newer ones are refused."""
+"""Version of the store; later versions are refused."""
 TABLE = "CREATE TABLE pieces (key TEXT PRIMARY KEY, digest BLOB NOT NULL, data BLOB NOT NULL)"
+"""SQL statement that creates the table of pieces."""
 SCHEMA = [(TABLE,), (None,)]
 """Schema of the database: the table and the index of its keys, by which digests are read without
 the data."""
-IDENTITY, COMMIT = "identity", "commit"
-"""Keys of the random number on which every digest depends, and of the number of the commit with the
-digest of all other digests."""
+IDENTITY = "identity"
+"""Key of the random number on which every digest depends."""
+COMMIT = "commit"
+"""Key of the number of the commit, with the digest of all other digests."""
 IDENTITY_BYTES = 16
+"""Number of bytes of the random number."""
 PART_BYTES = 2**20
 """Maximum number of bytes of a piece of an array."""
 LONGEST = 2**26
@@ -70,19 +72,19 @@ Piece = tuple[str, bytes | memoryview]
 
 
 class RunStore:
-    """Pieces by key in one SQLite file. A commit is complete or absent, whatever stops the process
-    or the machine; when `commit` returns, it is on the disk.
+    """Pieces of data by key in one SQLite file. A commit is complete or absent, even if the process
+    or the machine stops; when `commit` returns, it is on the disk.
 
-    What is read is of one commit of one store: pieces of another commit or of another store, in
-    whichever way they came into the file, are damage. Raises StorageError, with the file's name,
-    for whatever SQLite or a digest has against it.
+    All data that are read belong to one commit of one store; pieces of another commit or store
+    count as damage. Raises StorageError, with the name of the file, for errors of SQLite and wrong
+    digests.
     """
 
     def __init__(self, path: Path, *, mode: str = "ro") -> None:
         """Open a store; `mode` is ro, rw, or rwc to create it.
 
-        With ro nothing on the disk changes, whatever is wrong; with rw a damaged log is dropped, so
-        that `check` and the header of the records are verified first.
+        With ro nothing on the disk changes, even if it is damaged. With rw SQLite drops a damaged
+        log; therefore `check` and the header of the records are verified first.
         """
         self.path, self._writes = path, mode != "ro"
         self.identity, self.commits = b"", 0
@@ -126,7 +128,8 @@ class RunStore:
                 raise
             self._listed, self.commits = listed, number
             self._verified |= digests
-            if not self._settled:  # table and first commit last, should the log be lost
+            # The table and the first commit are written last, in case the log is lost.
+            if not self._settled:
                 _, frames, moved = self._file.execute("PRAGMA wal_checkpoint").fetchone()
                 self._settled = frames == moved
 
@@ -238,7 +241,7 @@ class RunStore:
     def _sqlite(self) -> Iterator[None]:
         try:
             yield
-        except sqlite3.OperationalError as error:  # which says of a full disk this and that
+        except sqlite3.OperationalError as error:  # SQLite's message for a full disk varies.
             reason = FULL if is_full(self.path.absolute().parent) else error
             raise StorageError(f"{self.path}: {reason}") from None
         except sqlite3.Error as error:
@@ -263,8 +266,9 @@ def keys_of(name: str, array: np.ndarray[Any, Any] | PiecedArray) -> list[str]:
 
 
 class StoredArray:
-    """An array in such pieces, read on access: all of it, or some rows, ``array[:, :, 3:7]``, one
-    axis sliced and those before it whole. Raises StorageError where pieces are missing."""
+    """Array stored in pieces, which is read on access: all of it, or some rows, ``array[:, :,
+    3:7]``, with one axis sliced and all axes before it whole. Raises StorageError where pieces are
+    missing."""
 
     def __init__(
         self, store: RunStore, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
@@ -319,8 +323,10 @@ def _digest_of_all(listed: dict[str, bytes]) -> str:
     return xxhash.xxh3_128_hexdigest(b"".join(sorted(listed.values())))
 
 
-STORE, RECORDS = ".run", ".run-records"
-"""Suffixes of the output's name for the store, and for the file of large values."""
+STORE = ".run"
+"""Suffix of the name of the store, after that of the output."""
+RECORDS = ".run-records"
+"""Suffix of the name of the file of large values, after that of the output."""
 
 
 def store_of(output: Path) -> Path:
@@ -344,11 +350,13 @@ class StoreState(Enum):
     """State of the store of a run beside its output."""
 
     NOTHING = auto()
+    """There is no store."""
     BEGUN = auto()
-    """It holds no commit."""
+    """The store has no commit."""
     COMMITTED = auto()
+    """The store has a commit, from which the run can be resumed."""
     FINISHED = auto()
-    """Its records have the name of the result, but its store still exists."""
+    """The records have the name of the result, but the store still exists."""
 
 
 def is_unfinished(output: Path) -> bool:
@@ -366,8 +374,8 @@ def is_unfinished(output: Path) -> bool:
 def make_room(output: Path, *, discard: bool = False) -> bool:
     """Return whether an output is free for a run, removing stores without commits.
 
-    An unfinished run keeps it occupied unless it is to be discarded, which may be damaged. Raises
-    as `is_unfinished` does.
+    The output of an unfinished run is not free unless the run is to be discarded; such a run may be
+    damaged. Raises the errors of `is_unfinished`.
     """
     with _exclusive(output):
         if not discard and has_committed(output):
@@ -477,9 +485,15 @@ def remove_store(output: Path) -> None:
 
 
 EXTENT = np.dtype([("start", "<u8"), ("stop", "<u8"), ("digest", "<u8")])
+"""Data type of the extents of the records."""
 LARGEST_ARRAY = 2**40
-PAGES, EXTENTS, ARRAYS = "page/", "extents/", "array/"
-"""Prefixes of the keys of pieces."""
+"""Maximum number of entries of an array that is read."""
+PAGES = "page/"
+"""Prefix of the keys of pages."""
+EXTENTS = "extents/"
+"""Prefix of the keys of extents."""
+ARRAYS = "array/"
+"""Prefix of the keys of pieces of arrays."""
 
 
 class UnfinishedRun:
@@ -507,13 +521,13 @@ class UnfinishedRun:
             os.link(temporary, records)
         except FileExistsError:
             raise conflict from None
-        except OSError:  # no hard links on this file system
+        except OSError:  # The file system has no hard links.
             if records.exists():
                 raise conflict from None
             temporary.rename(records)
         else:
             temporary.unlink()
-        if store.exists():  # one that is just being finished
+        if store.exists():  # The store of a run that is being finished.
             records.unlink()
             raise conflict
         try:
@@ -602,8 +616,8 @@ class UnfinishedRun:
         return self._dict("facts")
 
     def checkpoint(self, *, on_disk: bool = False) -> Checkpoint:
-        """Return the checkpoint of the last commit; its arrays are those of the run, which stay
-        `on_disk` on request, and those that wait for a chunk to be full, ``waiting.NAME``."""
+        """Return the checkpoint of the last commit. Its arrays are those of the run, read on access
+        if `on_disk`, and the entries that wait for a chunk to be full, ``waiting.NAME``."""
         facts, arrays = self.facts, Arrays()
         try:
             for name, (dtype, shape) in facts["arrays"].items():
@@ -648,7 +662,8 @@ class UnfinishedRun:
         self._store.close()
 
     def remove(self) -> None:
-        """Remove the store and release the lock, once the records have the name of the result."""
+        """Remove the store and release the lock. The records have the name of the result by
+        then."""
         self._store.close()
         remove_store(self.output)
         self.disk.close()
@@ -660,7 +675,8 @@ class UnfinishedRun:
         return facts
 
     def _note_commits(self) -> None:
-        """Write the number of commits, which the store must have from now on, to the records."""
+        """Write the number of commits to the records. The store must have at least that number from
+        now on."""
         write_header(self.disk, Header(self._store.identity, self._store.commits))
 
     def _refuse_other(self, header: Header | None, anyway: bool) -> None:
@@ -697,7 +713,7 @@ def status_of(output: Path) -> dict[str, Any] | None:
     except StorageError:
         if has_store_files(output):
             raise
-        return None  # it was finished meanwhile
+        return None  # The run was finished meanwhile.
 
 
 def _status(output: Path) -> dict[str, Any]:
@@ -708,7 +724,7 @@ def _status(output: Path) -> dict[str, Any]:
         steps = int(about["steps"])
         step = steps if "finished" in facts else int(facts["step"])
         rate = float(facts.get("rate", 0.0))
-        age = max(0.0, time.time() - float(facts.get("at", math.inf)))  # clocks are set back
+        age = max(0.0, time.time() - float(facts.get("at", math.inf)))  # Clocks can be set back.
         remaining = max(0.0, (steps - step) / rate - age) if rate > 0.0 else None
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StorageError(f"{store_of(output)}: is damaged: {error}") from None

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 def save(dataset: xarray.Dataset, path: str | Path, *, force: bool = False) -> Path:
     """Write a dataset as a sealed result, as `pbdkit run` does, and return the path.
 
-    The file appears whole or not at all, and `pbdkit.open`, `pbdkit verify` and all commands take
-    it.
+    The file appears complete or not at all, and can be read by `pbdkit.open`, `pbdkit verify` and
+    all commands.
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ def write_dataset(dataset: xarray.Dataset, path: Path, *, replace: bool) -> None
 
 
 def refuse_existing(path: Path, *, force: bool) -> None:
-    """Raise ExperimentError where a path cannot be written: beside an unfinished run and over a
-    file without `force`, and over anything that is not a plain file."""
+    """Raise ExperimentError if a path cannot be written: without `force` if an unfinished run or a
+    file has that name, and always if it is not a plain file."""
     try:
         kind = kind_of(path)
     except OSError as error:

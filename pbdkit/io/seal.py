@@ -1,9 +1,9 @@
 """The seal of a result: digests of its bytes, extent by extent, appended behind the last extent
 that HDF5 uses.
 
-Bytes read through the seal were checked immediately before, so that a flipped bit reaches neither
-the HDF5 library nor a figure, and of a file larger than memory only the extents that are read are
-checked. Other programs read the file as if the seal were absent.
+Each extent is verified immediately before it is read, so that a flipped bit reaches neither the
+HDF5 library nor a figure. Extents that are not read are not verified, which matters for files
+larger than memory. Other programs read the file as if there were no seal.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from pbdkit.untrusted_files import check_declared
 BLOCK = 2**20
 """Maximum number of bytes of a digest, and so of the bytes read in addition to those requested."""
 MARK = b"pbdkit seal 2\n\0\0"
+"""Last bytes of a sealed file."""
 FOOT = struct.Struct("<QQ16s16s")
-"""End of the file: bytes of content, number of digests, digest of both and of the table, and the
-mark."""
+"""Layout of the end of the file: number of bytes of content, number of digests, digest of these and
+of the table, and the mark."""
 ROW = np.dtype([("stop", "<u8"), ("digest", "<u8"), ("values", "<u8")])
-"""Row of the table: end of an extent, which begins at the end of the previous one, its digest, and
-whether it holds only values, without structure of HDF5."""
+"""Row of the table: end of an extent, which begins at the end of the previous one; its digest; and
+whether it contains values alone, without structure of HDF5."""
 
 
 class BrokenSealError(StorageError):
@@ -74,7 +75,8 @@ class SealedFile(io.RawIOBase):
     def __init__(self, path: Path, file: io.FileIO | None = None) -> None:
         self.path, self._file = path, file or path.open("rb", buffering=0)
         self.seal = seal_of(self._file)
-        """None for a file without a seal: all of it is content, and nothing is verified."""
+        """Seal of the file; None if there is none. The whole file is then content, and nothing is
+        verified."""
         self._size = self.seal.size if self.seal else os.fstat(self._file.fileno()).st_size
         self._place = 0
         self._unchecked = np.ones(len(self.seal.table) if self.seal else 0, bool)
@@ -213,6 +215,6 @@ def open_content(file: io.RawIOBase) -> Any:
         content.close()
         raise
     dataset = h5netcdf.File(content, "r", decode_vlen_strings=True)
-    # HDF5 reads from Python here, and no more once Python has ended: by then it must be closed.
+    # HDF5 calls Python here, and must be closed before Python ends.
     weakref.finalize(dataset, content.close)
     return dataset

@@ -102,16 +102,19 @@ class MemorySink(Sink):
 
 
 LARGE_BYTES = 2**20
-"""Smaller values are written directly, which costs no more than a second thread."""
-MOST_WAITING, MOST_CALLS = 2, 100
-"""Maximum number of large values, and of calls, that may be pending; then the run waits."""
+"""Number of bytes below which values are written directly, because a second thread would not save
+time."""
+MOST_WAITING = 2
+"""Maximum number of pending large values; beyond it the run waits."""
+MOST_CALLS = 100
+"""Maximum number of pending calls; beyond it the run waits."""
 
 
 class OverlappingSink(KeepingSink):
-    """Passes everything on to another sink, in order; large values, and what follows while they are
-    written, in a second thread.
+    """Sink that passes everything on to another sink, in order. Large values, and calls that follow
+    while they are written, are passed on in a second thread.
 
-    What goes wrong there is raised at the next call.
+    Errors in that thread are raised at the next call.
     """
 
     def __init__(self, inner: KeepingSink) -> None:

@@ -1,12 +1,12 @@
-"""One time step as the dataset and the diagnostics see it: a row a particle, with strain, stress
-and materials computed on request.
+"""One time step as a table for the dataset and the diagnostics: a row for each particle, with
+strain, stress and materials computed on request.
 
 The displacement gradient at a particle is the mean over the cells that meet there, weighted by
-area. A polygon's mean gradient is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area (Green),
-on a rectangle that of the bilinear displacement, on a triangle that of the linear one. The mean
-belongs to the mean of the cells' centres, which on an edge is not the particle, and is extrapolated
-from there with the gradient's own slope, found in the same way. Quadratic displacements of
-rectangular cells are exact, edges included.
+area. The mean gradient of a polygon is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area
+(Green's theorem); it is that of the bilinear displacement of a rectangle, or of the linear
+displacement of a triangle. The mean over cells is a value at the mean of their centres. At an edge
+that is not the particle, to which the gradient is extrapolated with its slope, computed in the same
+way. The result is exact for quadratic displacements of rectangular cells, edges included.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ from pbdkit.stepping.state import State, describe_bonds
 def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
     """Return the first Piola-Kirchhoff stress lost to damage, over Young's modulus, as planes
     (component × axis, sublattice, cell, cell); at each particle the mean over the given cells
-    around it, weighted by their shares.
+    around it, weighted by their area fractions.
 
     In a cell it is -Σ ΔF ⊗ X over its corners, divided by its area, with the forces ΔF that damage
     changes: the mean stress of a body under forces on its surface.
@@ -91,7 +91,8 @@ def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, 
 
 
 def _places(scene: Scene, patch: Patch, corner: int, cells: NDArray[np.intp]) -> Places:
-    """Return the places of a corner of some cells of a patch, which are counted within it."""
+    """Return the places of a corner of some cells of a patch, given by their indices in the
+    patch."""
     block, shape = patch.corners[corner], scene.raster.shape
     at = np.unravel_index(cells, patch.whole.shape)
     index = [n + start for n, start in zip(at, block.start, strict=True)]
@@ -274,8 +275,8 @@ class Tables:
 
 
 FLAT = 0.1
-"""Smallest area spanned by the centres around a cell's corners, relative to its own area, for which
-they define a slope; below it they are collinear, as in a body of one row of cells."""
+"""Ratio to its own area of the area spanned by the centres of the cells around a corner, below
+which they do not define a slope: they are collinear, as in a body of one row of cells."""
 
 
 def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]) -> Floats:
@@ -352,7 +353,7 @@ def _extend_gradient(
 
 
 TURNED = -1e-6
-"""Threshold of the ratio of a cell's area to that at rest below which the cell is inverted; values
+"""Threshold of the ratio of a cell's area to that at rest below which the cell is inverted. Values
 closer to zero are rounding errors, also in single precision."""
 
 
@@ -400,7 +401,7 @@ class StateCells(CellValues):
 
     @cached_property
     def _weighed(self) -> list[tuple[Patch, Floats]]:
-        """The cells that count with their shares."""
+        """Area fractions of the cells that are included."""
         weighed = self._scene.cells
         return [
             (patch, (weighed.of(patch) if weighed else 1.0) * self._intact(patch))
@@ -436,7 +437,7 @@ class StateCells(CellValues):
         return None
 
     def _turned(self, share: Callable[..., Any], what: str) -> str | None:
-        """Return the number of inverted cells and the place of the worst, by their share of the
+        """Return the number of inverted cells and the place of the most inverted, relative to its
         area at rest; None where there is none."""
         turned = total = number = 0
         worst = 0.0
@@ -496,12 +497,12 @@ class StateMoment(Moment):
 
     @property
     def body(self) -> NDArray[np.bool_]:
-        """(particle,): whether the particle is a leader or follower, at every moment the same."""
+        """(particle,): whether the particle is a leader or follower; independent of the moment."""
         return self._tables.body
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """(particle,): whether the particle lies inside the outline, at every moment the same."""
+        """(particle,): whether the particle lies inside the outline; independent of the moment."""
         return self._tables.inside
 
     @cached_property

@@ -11,12 +11,16 @@ from tempfile import TemporaryDirectory
 from pbdkit.io.atomic_file import is_local
 
 BEGINNING = b"SQLite format 3\0"
+"""First bytes of a SQLite database."""
 SMALLEST_PAGE = 512
+"""Smallest size of a page in bytes."""
 PATIENCE_S = 60.0
-"""Seconds to wait for another program that has locked the file."""
+"""Time in seconds to wait for another program that has locked the file."""
 LOGS = ("-journal", "-wal")
-"""Suffixes of the files with commits that are not yet, or no longer, in the database."""
+"""Suffixes of the files with commits that are not yet in the database, or that are being rolled
+back."""
 SHARED_MEMORY = "-shm"
+"""Suffix of the file of shared memory."""
 ONE_PAGE = 4096
 """Maximum size in bytes of a database in which nothing was committed."""
 

@@ -69,7 +69,7 @@ def unfinished_dataset(output: Path) -> Any:
     recorder = Recorder(scene, Overlay(target))
     recorder.last_steps = recorded
     reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
-    with suppress(FloatingPointError):  # a state that is not finite is not shown
+    with suppress(FloatingPointError):  # A state that is not finite is not part of the dataset.
         recorder.observe(state, last=True)
     recorder.finish(state, RunOutcome("interrupted", reason, state.step), {})
     return open_content(file)

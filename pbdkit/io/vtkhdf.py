@@ -1,4 +1,4 @@
-"""Export to ParaView: VTKHDF, the format of VTK in HDF5, written without VTK; the body as vertices,
+"""Export to ParaView in the format VTKHDF, written without VTK. The body consists of vertices,
 lines and polygons.
 
 The format is described at docs.vtk.org, "VTKHDF file format", version 2: an UnstructuredGrid with
@@ -28,10 +28,22 @@ if TYPE_CHECKING:
     from pbdkit.scene.scene import Scene
 
 
-PARTICLE, BOND, CELL = 0, 1, 2
-"""Values of `part`: what a cell of the grid represents."""
-VERTEX, LINE, TRIANGLE, POLYGON, QUAD = 1, 3, 5, 7, 9
-"""VTK's numbers of cell types."""
+PARTICLE = 0
+"""Value of `part` for vertices."""
+BOND = 1
+"""Value of `part` for lines."""
+CELL = 2
+"""Value of `part` for polygons."""
+VERTEX = 1
+"""VTK's number of this type of cells."""
+LINE = 3
+"""VTK's number of this type of cells."""
+TRIANGLE = 5
+"""VTK's number of this type of cells."""
+POLYGON = 7
+"""VTK's number of this type of cells."""
+QUAD = 9
+"""VTK's number of this type of cells."""
 
 
 @dataclass(frozen=True)
@@ -113,11 +125,14 @@ def _first_breaking(rows: Array, bonds: Array, steps: Array, count: int) -> Arra
     return np.where(first == never, -1, first)
 
 
-VERSION, TYPE = (2, 2), b"UnstructuredGrid"
+VERSION = (2, 2)
+"""Version of the format."""
+TYPE = b"UnstructuredGrid"
+"""Type of the grid."""
 BLOCK_BYTES = 2**25
 """Approximate number of bytes of a variable that are in memory at a time."""
 CHUNK = 2**16
-"""Values in a chunk of a growing array."""
+"""Number of values in a chunk of a growing array."""
 ELSEWHERE = ("position", "time", "particle", "site", "axis", "bond_ends", "broken_step")
 """Variables that the grid itself contains."""
 NOT_HERE = {"i": -1, "u": 0, "f": np.nan}
@@ -128,9 +143,9 @@ def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace:
     """Write every recorded step: particles, bonds and, with a `scene`, the cells between them, with
     all variables of the dataset.
 
-    Only some steps are in memory at a time. Raises ExperimentError where there are no positions, as
-    in a sweep that kept none, and WriteError where the file cannot be written; then an earlier file
-    stays.
+    Only some steps are in memory at a time. Raises ExperimentError if there are no positions, as in
+    a sweep that did not keep them, and WriteError if the file cannot be written; an earlier file
+    then remains.
     """
     import h5py
 
@@ -257,7 +272,7 @@ def _put_broken(parts: Parts, dataset: xarray.Dataset, grid: UnstructuredGrid) -
 
 
 def _blocks(values: xarray.DataArray) -> Iterator[tuple[int, Array]]:
-    """Generate (first step, values) of some steps at a time."""
+    """Generate (first step, values) for a few steps at a time."""
     steps = values.sizes["time"]
     block = max(1, BLOCK_BYTES * steps // max(1, values.nbytes))
     for begin in range(0, steps, block):

@@ -1,7 +1,7 @@
 """Shapes of bodies, by the signed distance from an outline.
 
 A site belongs to a body if its signed distance is at most 1e-9 of a lattice constant, so that sites
-on the outline are included independent of rounding (model.md, section 3).
+on the outline are included in spite of rounding (docs/model.md, section 3).
 """
 
 from __future__ import annotations

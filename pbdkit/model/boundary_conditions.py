@@ -154,7 +154,8 @@ Axes = Annotated[tuple[Literal["x", "y"], ...], Field(strict=False, min_length=1
 
 
 class Driven(Strict):
-    """Base class of what moves by a motion from step `from` to step `until`, both included."""
+    """Base class of leader groups and obstacles, which move by a motion from step `from` to step
+    `until`, both included."""
 
     motion: AnyMotion
     from_: Annotated[int, Field(ge=1, alias="from")] = 1
@@ -269,7 +270,7 @@ class Load(Strict):
     def amplitude(self, moment: float) -> float:
         """Return the fraction of the force at the end of a step, or at a moment within it.
 
-        Within the steps in which the load begins and ends it is linear.
+        It is linear in time within the steps in which the load begins and ends.
         """
         start = min(max(moment - self.from_ + 1, 0.0), 1.0)
         end = 0.0 if self.until is None else min(max(moment - self.until, 0.0), 1.0)
@@ -323,7 +324,7 @@ def _shape(value: Any, info: ValidationInfo) -> Any:
         return Facing.model_validate(value, context=info.context)
     if isinstance(value, dict) and (kind := str(value.get("type"))) in NO_OBSTACLES:
         raise fault(NO_OBSTACLES[kind], key="type")
-    build: Any = _bodies.func  # pydantic's type includes functions without `info`
+    build: Any = _bodies.func  # pydantic's type includes functions without `info`.
     return build(value, info)
 
 

@@ -1,7 +1,5 @@
-"""Experiment: a validated description of a scene and of the run.
-
-Includes the checks that involve several parts.
-"""
+"""Experiment: a validated description of a scene and of its run, and the checks that involve
+several parts."""
 
 from __future__ import annotations
 
@@ -100,7 +98,7 @@ def _checks(experiment: Any) -> Iterator[tuple[Key, bool, str]]:
 
 
 def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
-    """Check what requires permanent bonds."""
+    """Check parts that require permanent bonds."""
     reevaluates = experiment.neighbours.nearness() is not None
     jumps = not experiment.solver.makes_steps
     settles = experiment.stepping.settle is not None
@@ -188,6 +186,7 @@ def _supported_version(version: int) -> int:
 
 
 _WORD = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
+"""Pattern of a part of the name of an experiment."""
 Name = Annotated[
     str, AfterValidator(_valid_name), Field(json_schema_extra={"pattern": f"^{_WORD}(/{_WORD})*$"})
 ]
@@ -352,14 +351,15 @@ def _each(field: str, parts: Any) -> list[Any]:
 
 
 def _default(part: str) -> Any:
-    # As in a file, so that it is resolved like one, and `--set` can start from it.
+    # The value is written as in a file, so that it is resolved in the same way and `--set` can
+    # start from it.
     return Field(default={"type": part})
 
 
 class Experiment(Strict):
     """Experiment: a scene and its run, validated as a whole.
 
-    The same from a file, a dict or objects.
+    It is the same whether created from a file, a dict or objects.
 
     Raises
     ------
@@ -453,7 +453,7 @@ class Experiment(Strict):
         """Serialize with the distribution of types that several distributions provide."""
         result: dict[str, Any] = serialize(self)
         if not result.keys() >= INTERFACES.keys():
-            return result  # only some fields are serialized
+            return result  # Only some fields are serialised.
         parts = [part for field in INTERFACES for part in _each(field, result[field])]
         for part, dumped in zip(self.components(), parts, strict=True):
             dumped["type"] = self._registry.name_of(part)
@@ -461,7 +461,7 @@ class Experiment(Strict):
                 dumped |= part.in_place_of_numbers()
             for name in given_by_units(part):
                 if self.units and self.units.value(name):
-                    del dumped[name]  # it is given by `units`
+                    del dumped[name]  # The value is given by `units`.
         for name in ("units", "regions", "operations"):
             if not result[name]:
                 del result[name]
@@ -513,8 +513,7 @@ class Experiment(Strict):
     @property
     def is_as_validated(self) -> bool:
         """True if all parts are those that were validated; `model_copy` replaces parts without
-        validation.
-        """
+        validation."""
         return all(self._validated.get(name) is part for name, part in self.__dict__.items())
 
     def refuse_unvalidated(self) -> None:

@@ -31,7 +31,7 @@ from pbdkit.plugin.registry import Registry
 
 ComponentClasses = Iterable[type[Component]]
 ExperimentLike = Experiment | Mapping[str, Any] | str | Path
-"""An experiment, or the dict, the file or the name of a shipped one of which it is made."""
+"""Type of an experiment, or of the dict, the file or the shipped name from which it is made."""
 
 
 def load_experiment(
@@ -93,7 +93,8 @@ def as_experiment(
         If the experiment is invalid, or a component is missing or fails.
     """
     if isinstance(experiment, Experiment):
-        Registry(components)  # what is handed over is checked, needed or not
+        # Component classes are checked even if the experiment does not use them.
+        Registry(components)
         experiment.refuse_unvalidated()
         return experiment.with_settings(settings) if settings else experiment
     if isinstance(experiment, str | Path):
@@ -105,7 +106,7 @@ def as_experiment(
 
 
 def but_got(value: Any) -> str:
-    """Return the end of a message: the value in place of an experiment, and the remedy."""
+    """Return the end of a message: the value given as an experiment, and the remedy."""
     if _is_dataset(value):
         return (
             "got a dataset, which is a result: `pbdkit.rerun(ds)` runs its experiment again, and "

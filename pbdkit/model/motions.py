@@ -1,7 +1,5 @@
-"""Prescribed motions of leader groups (model.md, section 1).
-
-By formula, from columns of a CSV file, from scattered measurements, or by Newton's law.
-"""
+"""Prescribed motions of leader groups: by formula, from columns of a CSV file, from scattered
+measurements, or by Newton's law (docs/model.md, section 1)."""
 
 from __future__ import annotations
 
@@ -149,7 +147,7 @@ def _number(cell: list[str], name: str, place: str) -> float:
     """Return the number in a cell, which is empty if the row is too short."""
     text = "".join(cell)
     try:
-        number = math.nan if "_" in text else float(text)  # Python would read 1_0 as 10
+        number = math.nan if "_" in text else float(text)  # Python would read 1_0 as 10.
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
@@ -189,9 +187,9 @@ class Motion(Component):
         """
 
     def knots(self) -> tuple[int, ...]:
-        """Return the steps n between and after which the displacement is one formula in n.
+        """Return the steps n between and after which the displacement is a single formula in n.
 
-        Empty by default: the displacement is one formula throughout.
+        It is empty by default: the displacement is a single formula for all n.
         """
         return ()
 
@@ -326,7 +324,7 @@ class Measured(Motion):
 class Newton(Motion):
     """Each particle is a mass that moves by Newton's law, with the step as the unit of time:
 
-    mass · a = share of `force` + force of the neighbours - damping · v.
+    mass · a = fraction of `force` + force of the neighbours - damping · v.
 
     Forces are over Young's modulus and thickness, in lattice units; `mass` and `damping` are those
     of each particle. Integrated by the symplectic Euler method, v += a, u += v, with the forces at
@@ -356,7 +354,7 @@ class Newton(Motion):
         pull
             Forces of the neighbours, (particle, axis).
         share
-            Share of each particle in the force, (particle,).
+            Fraction of the force on each particle, (particle,).
         """
         force = share[:, None] * np.array([at(component, step) for component in self.force])
         force += pull - self.damping * velocity
@@ -472,7 +470,7 @@ class Table(Tabulated):
         if content is None:
             return parameters
         rest, rows = content
-        if rows[0] == [0.0, 0.0, 0.0]:  # the start of every motion
+        if rows[0] == [0.0, 0.0, 0.0]:  # The start of every motion.
             del rows[0]
         if wrong := [row[0] for row in rows if row[0] < 1 or row[0] % 1]:
             text = f"{parameters['file']}: steps are whole numbers from 1, got {wrong[0]:g}"
@@ -492,7 +490,7 @@ class Rotation(Motion):
     def offset(self, n: float, start: Floats) -> Floats:
         """Return (Q - 1)(start - centre) with the rotation Q by angle · min(n, steps)."""
         angle = self.turned(n)
-        # 1 - cos without cancellation, which is exact for small angles.
+        # 1 - cos is computed without cancellation, so that small angles are accurate.
         versine, sine = 2 * math.sin(angle / 2) ** 2, math.sin(angle)
         x, y = (np.asarray(start) - self.centre).T
         return np.stack([-versine * x - sine * y, sine * x - versine * y], axis=-1)

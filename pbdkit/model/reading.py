@@ -1,8 +1,8 @@
-"""Read and write experiment files: YAML 1.2 with the position of every value.
+"""Read and write experiment files: YAML 1.2 with the position of every value, and changes by path,
+as in `--set` and sweeps.
 
-Includes changes by path, as in `--set` and sweeps. Limits on size, depth, aliases, merge keys and
-tags apply to the events of the parser, before any object is created. These features make YAML
-dangerous, and experiments do not require them.
+Size, depth, aliases, merge keys and tags, which could make YAML dangerous and which experiments do
+not require, are limited at the level of parser events, before any object is created.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class FileResolver:
         assert self.folder is not None
         try:
             return path.resolve().is_relative_to(self.folder.resolve())
-        except RuntimeError as error:  # links in a circle
+        except RuntimeError as error:  # Symbolic links form a circle.
             raise OSError(0, str(error)) from None
 
 
@@ -275,9 +275,8 @@ def _remedy(error: YAMLError) -> str:
 
 
 class _Scanner(Scanner):
-    """Store no keys beyond the maximum depth, because every character is compared with all stored
-    keys.
-    """
+    """Scanner that stores no keys beyond the maximum depth. The standard scanner compares every
+    character with all stored keys."""
 
     def save_possible_simple_key(self) -> None:
         """Store a possible key up to the maximum depth."""
@@ -286,7 +285,7 @@ class _Scanner(Scanner):
 
 
 class _Reading:
-    """Create data from the events of the parser, and store their places."""
+    """Construction of data from the events of the parser, with their places."""
 
     def __init__(self, yaml: YAML, text: str, source: Source) -> None:
         self._yaml, self._source, self._nodes = yaml, source, 0
@@ -356,9 +355,8 @@ class _Reading:
         return result
 
     def _inner(self) -> Iterator[Any]:
-        """Generate the events in a collection up to its end; the consumer also consumes nested
-        events.
-        """
+        """Generate the events in a collection up to its end. The caller consumes the events of
+        nested collections."""
         while not isinstance(event := next(self._events), CollectionEndEvent):
             yield event
 
@@ -488,7 +486,8 @@ def _leaves(data: Any, changes: Mapping[Any, Any], where: Where) -> Iterator[tup
 
 def plain(value: Any) -> Any:
     """Convert arrays and components to the values that a file would contain."""
-    # By their methods: neither pydantic nor numpy is imported to refuse a mistyped name.
+    # The methods are called without importing pydantic or numpy, so that a mistyped name is refused
+    # quickly.
     if hasattr(value, "model_dump") and not isinstance(value, type):
         return value.model_dump(mode="json", by_alias=True)
     if hasattr(value, "tolist") and not isinstance(value, type):

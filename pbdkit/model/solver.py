@@ -77,7 +77,7 @@ class Record(Strict):
 
 
 def _form_of(value: object) -> str:
-    """Return the form of a value that can also be a word."""
+    """Return the form of a value that is a number, a schedule or a word."""
     return WORD if isinstance(value, str) else form_of(value)
 
 
@@ -114,10 +114,8 @@ Memory = Annotated[
 
 
 class Settle(Strict):
-    """Stop a run early, once the distance of every follower from equilibrium is below a tolerance.
-
-    `tolerance` is relative to the largest prescribed displacement.
-    """
+    """Settings that end a run early, once the distance of every follower from equilibrium is below
+    a tolerance."""
 
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
 
@@ -175,7 +173,7 @@ class Stepping(Solver):
 
     @property
     def stepping(self) -> Stepping:
-        """These settings, of which this solver has its own."""
+        """The settings themselves."""
         return self
 
     @property
@@ -254,7 +252,7 @@ class Equilibrium(Solver):
 
     @property
     def equilibrium(self) -> Equilibrium:
-        """These settings, of which this solver has its own."""
+        """The settings themselves."""
         return self
 
 

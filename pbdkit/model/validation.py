@@ -1,7 +1,7 @@
-"""Validate the parts of an experiment with pydantic.
+"""Validate the parts of an experiment with pydantic, and read spatially varying parameters from
+files.
 
-Each error is reported with place, field, cause and the nearest valid value. Includes reading of
-spatially varying parameters from files.
+Each error is reported with place, field, cause and the nearest valid value.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def read_field(value: dict[str, Any], files: FileResolver) -> Gridded:
 
 @lru_cache(maxsize=4)
 def _read(path: Path, variable: str, size: int, changed_ns: int) -> Gridded:
-    """Read a file of that size and time of change; cached for members of a sweep."""
+    """Read a file of this size and modification time; cached for members of a sweep."""
     try:
         content = read_apart(path, variable, str(MAX_VALUES))
     except StorageError as error:
@@ -78,7 +78,7 @@ def _read(path: Path, variable: str, size: int, changed_ns: int) -> Gridded:
         return Gridded(x, y, values)
     except MemoryError:
         raise
-    except Exception as error:  # invalid attributes, reported by other libraries
+    except Exception as error:  # Invalid attributes, for which libraries raise various errors.
         raise FieldFileError(f"{path}: '{variable}': {one_line(str(error))}") from None
 
 
@@ -176,7 +176,7 @@ def _bound(context: Any) -> float:
 
 
 def _follows(fault: Any, faults: list[Any]) -> bool:
-    """Return whether a list is too short only because its items are invalid."""
+    """Return whether a list is too short only because some of its items are invalid."""
     where = fault["loc"]
     return any(f["loc"][: len(where)] == where and f["loc"] != where for f in faults)
 
@@ -208,7 +208,7 @@ def open_part(interface: type[Component]) -> BeforeValidator:
 
 
 def closed_part(base: type[Component], *members: type[Component]) -> BeforeValidator:
-    """Validate one of a fixed list of classes, distinguished by `type`."""
+    """Validate an object of one of a fixed list of classes, distinguished by `type`."""
     by_name = {member.type_name(): member for member in members}
 
     def find(name: str) -> type[Component]:

@@ -1,1 +1,6 @@
-"""Many runs of one experiment with some of its parameters varied, and one dataset of them all."""
+"""Sweeps: many runs of one experiment with varied parameters, combined into one dataset.
+
+`specification` reads the sweep file, `execute` runs the members in parallel, `store` keeps their
+results so that a sweep can be continued, and `combine` joins them with the parameters as
+dimensions.
+"""

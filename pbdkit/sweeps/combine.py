@@ -119,9 +119,9 @@ def combine_members(
 ) -> xarray.Dataset:
     """Combine the results of members into a dataset without attributes.
 
-    Values are aligned by their time, their number and the other labels of their dimensions. Missing
-    values are NaN, or the fill value. Variables that are known before the first step, and equal in
-    all members, are included once.
+    Values are aligned by time, particle number and the other labels of their dimensions. Missing
+    values are NaN, or the fill value. Variables that are known before the first step and equal in
+    all members are included once.
 
     Raises
     ------
@@ -182,7 +182,7 @@ class _Layout:
                 for attribute in first.attributes
                 if not _same_attribute(attribute, first, variable)
             ]:
-                del first.attributes[key]  # it does not hold for all members
+                del first.attributes[key]  # The attribute is not the same in all members.
             if variable.dims != first.dims:
                 raise ExperimentError(
                     f"'{name}' has the dimensions {variable.dims} in some members and {first.dims} "
@@ -248,7 +248,8 @@ class _Layout:
         }
         for name, (dims, values, *_) in variables.items():
             if name not in self._labels:
-                target: Any = (*where, ...) if self._varies(name) else ...  # a view, in any case
+                # The index has an ellipsis, so that the result is always a view.
+                target: Any = (*where, ...) if self._varies(name) else ...
                 rows = [
                     rows_of.get(dim, np.arange(n))
                     for dim, n in zip(dims, values.shape, strict=True)

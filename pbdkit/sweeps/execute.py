@@ -1,6 +1,5 @@
-"""Execute the members of a sweep that the store does not hold: in this process, in worker processes
-of this machine, each replaced where it is killed, or on a dask cluster.
-"""
+"""Execute the members of a sweep that have no stored result: in this process, in worker processes,
+which are replaced if they are killed, or on a dask cluster."""
 
 from __future__ import annotations
 
@@ -71,15 +70,19 @@ if TYPE_CHECKING:
 
 
 HANDED_OUT_S = 0.25
-"""Members are handed out in chunks that take about so long."""
+"""Duration of a chunk of members in seconds."""
 MOST_AT_ONCE = 16
-"""Largest number of members in a chunk, so that no chunk fills the pipe to a killed worker."""
+"""Maximum number of members in a chunk. A chunk must fit into the pipe to a worker that has been
+killed."""
 HEARTBEAT_S = 0.2
+"""Maximum time in seconds between two looks at the progress of workers."""
 MOST_LOSSES = 3
-"""Number of times that a member may be lost, alone, with its process before it has failed."""
+"""Maximum number of times that a member may be lost with its process, while it was run alone,
+before it counts as failed."""
 AHEAD = 2
-"""Chunks that a worker has at a time, so that it need not wait for the next."""
+"""Number of chunks that a worker has at a time, so that it does not wait for the next."""
 WAIT_FOR_WORKERS_S = 30.0
+"""Maximum time in seconds to wait for the first worker of a cluster."""
 
 
 class Executor(ABC):
@@ -96,7 +99,7 @@ class Executor(ABC):
 
 @dataclass
 class Queue:
-    """Queue of members, with their duration and how often each was lost."""
+    """Queue of members, with their duration and the number of times that each was lost."""
 
     jobs: deque[Job]
     workers: int
@@ -126,8 +129,8 @@ class Queue:
             yield report
 
     def lost(self, chunk: list[Job], reason: str) -> Iterator[MemberReport]:
-        """Put back the members of a worker that ended; a member that was lost alone too often has
-        failed."""
+        """Return the members of a worker that ended to the queue. A member that was lost alone too
+        often has failed."""
         retries = []
         for job in chunk:
             losses = self._losses.get(job.key, 0) + (len(chunk) == 1)
@@ -155,13 +158,14 @@ class SerialExecutor(Executor):
 
 
 class ClusterExecutor(Executor):
-    """Run members on the workers of a dask cluster, on which clients can execute any code."""
+    """Run members on the workers of a dask cluster. Clients of a cluster can execute any code on
+    it."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
 
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
-        """Run chunks as tasks, a few more than there are threads; pending ones are cancelled where
+        """Run chunks as tasks, a few more than there are threads; pending tasks are cancelled if
         the work ends early. Raises ExperimentError where the cluster has no worker, and
         StorageError where the scheduler is lost."""
         out: dict[Any, list[Job]] = {}
@@ -219,14 +223,14 @@ def _reports(future: Any, chunk: list[Job], queue: Queue) -> Iterator[MemberRepo
     """Return the reports of a task that has ended."""
     try:
         reports = future.result()
-    except Exception as error:  # a worker was lost, or cannot import pbdkit
+    except Exception as error:  # A worker was lost, or cannot import pbdkit.
         yield from queue.lost(chunk, f"{type(error).__name__}: {error}:")
     else:
         yield from queue.reported(reports)
 
 
 SHAPING = ("lattice", "body", "neighbours", "frame", "fracture", "diagnostics", "units")
-"""The parts of an experiment on which the shape of its dataset depends, besides its times."""
+"""Parts of an experiment that determine the shape of its dataset, apart from the recorded steps."""
 SHARE = 0.5
 """Fraction of the memory of this machine that the dataset of a sweep may take."""
 TEXT = 8
@@ -234,8 +238,8 @@ TEXT = 8
 
 
 class SizeEstimate:
-    """Estimates the size of the dataset from the experiments of all members, building the scene of
-    each distinct body."""
+    """Estimate of the size of the dataset from the experiments of all members. The scene of each
+    distinct body is built."""
 
     def __init__(self, keep: Keep, count: int) -> None:
         self._keep, self._count = keep, count
@@ -306,6 +310,7 @@ def _bytes(column: Column) -> int:
 
 
 RESULT = "sweep.nc"
+"""File name of the dataset of a sweep."""
 Show = Callable[[str, float], None]
 
 
@@ -437,19 +442,19 @@ def _attributes(plan: SweepPlan, versions: dict[str, str]) -> dict[str, str]:
 
 
 GRACE_S = 1.0
-"""Seconds that members have to end once the sweep is stopped."""
+"""Time in seconds for members to end after the sweep is stopped."""
 MOST_STARTS = 10
-"""Number of workers in succession that may end before they start."""
+"""Maximum number of workers in succession that end while they start."""
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
-"""Environment variables that limit the threads of linear algebra, if they are set before it is
-loaded. Kernels use the one thread of each member's settings."""
+"""Environment variables that limit linear algebra to one thread if they are set before it is
+loaded. The threads of kernels are limited by the settings of each member."""
 
 
 class ProcessExecutor(Executor):
-    """Run members in worker processes, each a pool of one, so that a killed process affects no
-    other."""
+    """Run members in worker processes, each in a pool of its own, so that a killed process affects
+    no other."""
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
@@ -492,15 +497,15 @@ class _Worker:
         self._processes: set[BaseProcess] = set()
 
     def take(self, queue: Queue) -> bool:
-        """Return whether the worker can take the next chunk; a killed worker cannot before its end
-        is reported."""
+        """Return whether the worker can take the next chunk; a killed worker cannot until its end
+        has been reported."""
         chunk = queue.chunk()
         for _ in range(1 + (not self.chunks)):
             try:
                 with _spawning():
                     self.chunks[self._current().submit(run_members, chunk)] = chunk
                 return True
-            except BrokenProcessPool:  # with nothing to do, another takes its place at once
+            except BrokenProcessPool:  # A worker without chunks is replaced at once.
                 if not self.chunks:
                     self._renew()
         queue.jobs.extendleft(reversed(chunk))
@@ -522,7 +527,7 @@ class _Worker:
             yield from queue.reported(reports)
 
     def end(self) -> None:
-        """End the process, whatever it is doing."""
+        """End the process in any state."""
         if self._pool is not None:
             for process in self._processes:
                 process.kill()
@@ -564,8 +569,8 @@ class _Worker:
 def _spawning() -> Iterator[None]:
     """Set up the environment of processes that are started in the block.
 
-    They use one thread of linear algebra, Ctrl-C is blocked until it is ignored, and the script of
-    the caller is not run again.
+    They use one thread of linear algebra, Ctrl-C is blocked until they ignore it, and they do not
+    run the script of the caller again.
     """
     blocks: Any = getattr(signal, "pthread_sigmask", None)
     mask = blocks(signal.SIG_BLOCK, {signal.SIGINT}) if blocks else None
@@ -616,7 +621,7 @@ def called(
             member, status, message = failures[0]
             text = f"{len(failures)} of {len(summary.members)} members have no values, as {status}"
             warn_caller(f"{text}: {member.words}: {message}", SweepWarning)
-        assert summary.path is not None  # nobody stops it but by an exception
+        assert summary.path is not None  # Only an exception can stop the sweep.
         dataset = open_result(summary.path)
         if folder is None:
             with dataset:

@@ -1,5 +1,5 @@
-"""The sweep file: an experiment, the parameters that vary, what is kept of each run, and the
-members with the digest of each."""
+"""Sweep files: an experiment, the parameters that vary, the variables and steps to keep of each
+run, and the members, identified by a digest."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MAX_MEMBERS = 100_000
 """Largest number of members. Each takes about a millisecond for validation, and some kilobytes
 during the sweep."""
 DIGITS = 15
-"""Significant digits of evenly spaced values, so that 0.6 is not 0.6000000000000001."""
+"""Number of significant digits of evenly spaced values: 0.6 instead of 0.6000000000000001."""
 
 
 class Range(Strict):
@@ -93,8 +93,8 @@ Times = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, m
 
 
 class Keep(Strict):
-    """Selection of what is kept of each run: `variables` by name, default all; of the recorded
-    steps all, the last, or those listed, which are then recorded."""
+    """Selection of the variables and steps to keep of each run: `variables` by name, by default
+    all; of the recorded steps all, the last, or those listed, which are then recorded."""
 
     variables: Annotated[tuple[str, ...] | None, Field(strict=False, min_length=1)] = None
     times: Literal["all", "last"] | Times = "all"
@@ -199,7 +199,7 @@ def sweep_schema() -> dict[str, Any]:
 
 
 CASE = "case"
-"""Dimension of the lists of `together`."""
+"""Name of the dimension of the lists of `together`."""
 
 REPLICATE = "replicate"
 """Name of the dimension of replicates."""
@@ -207,7 +207,8 @@ REPLICATE = "replicate"
 MESSAGE = "message"
 """Variable with the message of each member."""
 UNNAMED_ENDS = (".otherwise", ".type")
-"""Ends of paths that give no name: a number outside all regions, and the type of a part."""
+"""Ends of paths that are not part of a name: the value outside all regions, and the type of a
+part."""
 
 
 class MemberSetting(NamedTuple):
@@ -255,7 +256,7 @@ def dimensions(sweep: Sweep, experiment: Experiment, reserved: Set[str]) -> list
     Raises
     ------
     ExperimentError
-        If a name in the sweep file is among `taken`.
+        If a name in the sweep file is among `reserved`.
     """
     names = _names(sweep, {*reserved, CASE, REPLICATE, STATUS, MESSAGE})
     result = []
@@ -307,8 +308,7 @@ def describe(settings: tuple[MemberSetting, ...]) -> str:
 
 
 def names_of(paths: list[str], reserved: Set[str]) -> dict[str, str]:
-    """Return a name for each path: its last word, preceded by as many further words as make it
-    unique.
+    """Return a name for each path: its last word, preceded by further words until it is unique.
 
     Words are joined by `_`. `otherwise` and `type` at the end are ignored, and a name does not
     start with a position in a list.
@@ -351,7 +351,8 @@ def _tails(path: str) -> list[str]:
 def _coordinates(
     name: str, path: str, values: tuple[Any, ...], experiment: Experiment
 ) -> dict[str, Coordinate]:
-    """Return numbers unchanged; other values are numbered from 0, with their text beside."""
+    """Return numbers unchanged. Other values are numbered from 0, with an additional coordinate for
+    their text."""
     texts = coordinate(path, values, experiment)
     if texts.values.dtype.kind != "U":
         return {name: texts}

@@ -120,12 +120,13 @@ class Store:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        """Commit all results, whatever ended the sweep."""
+        """Commit all results, also after an exception."""
         with self._closing:
             if not isinstance(raised[1], StorageError):
                 self.commit()
                 return
-            with suppress(sqlite3.Error, StorageError):  # the error already waited for the lock
+            # The error has already waited for the lock.
+            with suppress(sqlite3.Error, StorageError):
                 self._database.execute("PRAGMA busy_timeout = 0")
                 self.commit()
 
@@ -151,7 +152,7 @@ class Store:
         return results
 
     def put(self, report: MemberReport) -> None:
-        """Store a report. It is on the disk after the next commit."""
+        """Store a report, which is on the disk after the next commit."""
         is_large = len(report.content) > LARGE_BYTES
         with self._report_errors():
             if is_large:
@@ -275,7 +276,7 @@ class Store:
         It gets its final name when it is complete.
         """
         new, count = self._folder / NEW, self._member_count()
-        if new.exists() and not self._path.exists():  # killed between both renames
+        if new.exists() and not self._path.exists():  # A sweep was killed between both renames.
             new.replace(self._path)
         fault = self._fault(count)
         if fault is None:
@@ -302,8 +303,8 @@ class Store:
         sync_folder(self._folder)
 
     def _fault(self, count: int) -> str | None:
-        """Return why the database cannot be used: empty if it was never completed, None if it can
-        be used.
+        """Return the reason why the database cannot be used: empty if it was never completed, None
+        if it can be used.
 
         Raises
         ------

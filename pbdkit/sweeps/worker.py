@@ -1,6 +1,5 @@
-"""Run one member of a sweep and return a report, never an exception; the kept results as bytes:
-names and shapes as JSON, then the values.
-"""
+"""Run one member of a sweep and return a report, in which exceptions are part. Kept results are
+bytes: names and shapes as JSON, then the values."""
 
 from __future__ import annotations
 
@@ -34,11 +33,11 @@ from pbdkit.simulation import Simulation, record
 from pbdkit.sweeps.specification import Job
 
 LENGTH = 8
-"""Bytes of the number with the length of the JSON header."""
+"""Number of bytes of the length of the JSON header."""
 
 
 class MemberVariable(NamedTuple):
-    """One variable of a run; `fixed` where it was known before the first step."""
+    """One variable of a run; `fixed` is true if it was known before the first step."""
 
     dims: tuple[str, ...]
     values: NDArray[Any]
@@ -75,14 +74,17 @@ def unpacked(content: bytes) -> dict[str, MemberVariable]:
 
 
 KEPT = (*WHOLE, "separated")
-"""Status of members with values in the dataset; a body that came apart under an equilibrium has
-those recorded before."""
-FAILED, INTERRUPTED, LOST = "failed", "interrupted", "lost"
-"""Status of members that cannot be run, that were interrupted, and that were lost with their
-process."""
+"""Status of members with values in the dataset. Bodies that came apart under an equilibrium have
+the values recorded before."""
+FAILED = "failed"
+"""Status of members that cannot be run."""
+INTERRUPTED = "interrupted"
+"""Status of members that were interrupted."""
+LOST = "lost"
+"""Status of members that were lost with their process."""
 _one_at_a_time = threading.Lock()
-"""Lock of the threads of a process, as of a dask worker: warnings and the threads of linear algebra
-are global."""
+"""Lock among the threads of a process, as of a dask worker: warnings and the number of threads of
+linear algebra are global."""
 
 
 class MemberReport(NamedTuple):
@@ -115,7 +117,8 @@ def digest_of(key: str, status: str, message: str, content: bytes) -> bytes:
 
 
 class KeptSink(MemorySink):
-    """A sink that keeps some variables of a run, at all recorded steps, the last or some."""
+    """Sink that keeps some variables of a run, at all recorded steps, the last one or selected
+    ones."""
 
     def __init__(self, variables: Iterable[str] | None, times: str | tuple[int, ...]) -> None:
         self._variables = None if variables is None else set(variables)
@@ -143,8 +146,8 @@ class KeptSink(MemorySink):
 
 
 def kept_columns(columns: list[Column], variables: set[str] | None) -> list[Column]:
-    """Return the columns of these variables and the coordinates of their dimensions; where
-    particles are among them, the positions at rest too."""
+    """Return the columns of these variables and the coordinates of their dimensions; for variables
+    of particles the reference positions, too."""
     chosen = [c for c in columns if variables is None or c.name in variables]
     dims = {dim for column in chosen for dim in column.dims}
     if "particle" in dims:
@@ -153,8 +156,8 @@ def kept_columns(columns: list[Column], variables: set[str] | None) -> list[Colu
 
 
 def begin_worker() -> None:
-    """Prepare a worker process: Ctrl-C is left to the sweep, and the worker ends with the process
-    of the sweep."""
+    """Prepare a worker process: it ignores Ctrl-C, which the sweep handles, and ends with the
+    process of the sweep."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     assert parent is not None
@@ -180,7 +183,7 @@ def run_member(
     start, sink = time.perf_counter(), KeptSink(job.variables, job.times)
     content, lasting = b"", False
     with _one_at_a_time, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what a run warns of is in its message
+        warnings.simplefilter("ignore")  # Warnings of a run are in its message.
         try:
             experiment = Experiment.build(Source(data=json.loads(job.experiment)), components)
             _refuse_other_versions(job, experiment)
