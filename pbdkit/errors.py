@@ -238,7 +238,7 @@ def one_line(text: str) -> str:
 
 
 def refuse_without(library: str, extra: str, reason: str) -> None:
-    """Raise ExperimentError where a library is not installed.
+    """Raise ExperimentError if a library is not installed.
 
     Parameters
     ----------
@@ -254,5 +254,5 @@ def refuse_without(library: str, extra: str, reason: str) -> None:
 
 
 def refuse_no_matplotlib() -> None:
-    """Raise ExperimentError where matplotlib is not installed."""
+    """Raise ExperimentError if matplotlib is not installed."""
     refuse_without("matplotlib", "plot", "pictures need matplotlib")

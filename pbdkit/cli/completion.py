@@ -34,7 +34,7 @@ Candidates = Callable[[click.Context, str], Iterable[str | CompletionItem]]
 def completer(candidates: Candidates) -> Completer:
     """Return a completer: those candidates that begin with the word on the line.
 
-    There are none where they cannot be computed, since a shell shows no messages.
+    There are none if they cannot be computed, since a shell shows no messages.
     """
 
     def complete(context: click.Context, _: click.Parameter, prefix: str) -> list[CompletionItem]:

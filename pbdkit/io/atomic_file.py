@@ -37,7 +37,7 @@ PAUSE_S = 0.02
 
 
 def is_local(path: Path, mounts: str = "/proc/self/mountinfo") -> bool:
-    """Return whether a file lies on a local file system; False where that cannot be determined."""
+    """Return whether a file lies on a local file system; False if that cannot be determined."""
     types: dict[str, str] = {}
     with suppress(OSError):
         for line in Path(mounts).read_text(errors="surrogateescape").splitlines():
@@ -51,7 +51,7 @@ def is_local(path: Path, mounts: str = "/proc/self/mountinfo") -> bool:
 def lock(file: io.FileIO) -> bool:
     """Lock an open file until it is closed and return whether that succeeded.
 
-    The result is False where another process holds the lock, and True on systems and file systems
+    The result is False if another process holds the lock, and True on systems and file systems
     without locks.
     """
     try:
@@ -68,7 +68,7 @@ def lock(file: io.FileIO) -> bool:
 
 
 def open_locked(path: Path) -> io.FileIO | None:
-    """Open an existing file and lock it; return None where another process writes it.
+    """Open an existing file and lock it; return None if another process writes it.
 
     A process that only tests the lock holds it for a moment, so that several attempts are made.
     Raises OSError.
@@ -187,7 +187,7 @@ class NewFile(io.RawIOBase):
         os.fsync(self.disk.fileno())
 
     def settle(self) -> None:
-        """Finish the file. Raises OSError where any write failed."""
+        """Finish the file. Raises OSError if any write failed."""
         self.sync()
 
     def _write_all(self, view: memoryview) -> None:
@@ -275,7 +275,7 @@ def write_folder(folder: Path, texts: Mapping[str, str]) -> None:
     """Write a new folder of files, given by their relative paths, which appears complete or not at
     all.
 
-    Raises WriteError where the system refuses anything, and where something has its name.
+    Raises WriteError if the system refuses anything, or if something has its name.
     """
     with _refusing(folder):
         temporary = folder.absolute().with_name(_hidden(folder.name))
@@ -358,8 +358,8 @@ class Destination:
             file.close()  # Another run has removed the file, which looked like one of a killed run.
 
     def take(self, temporary: Path, status: str) -> None:
-        """Give a temporary file the name of the result. Raises OSError, and WriteError where the
-        name came into use meanwhile: the result is then beside it."""
+        """Give a temporary file the name of the result. Raises OSError, and WriteError if the name
+        came into use meanwhile: the result is then beside it."""
         whole = status in WHOLE
         if whole and self.replace:
             name = self._folder / self.path.name

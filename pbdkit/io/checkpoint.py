@@ -101,7 +101,7 @@ class Checkpoint:
 
     def state(self, state_class: type) -> tuple[Any, Any]:
         """Return the state and the recorded steps alone. Raises KeyError, TypeError, ValueError or
-        StorageError where they are damaged."""
+        StorageError if they are damaged."""
         classes = CLASSES | {state_class.__name__: state_class}
         state = unpack(self.facts["run"]["state"], self.arrays, classes)
         return state, unpack(self.facts["seen"], self.arrays, classes)
@@ -112,8 +112,8 @@ class Checkpoint:
         """Return the parts of the driver's state, and the recorded steps under ``seen``.
 
         `like` is the state of the driver before its first step, `steps` the number of steps of the
-        run, and `classes` are further classes that may occur. Raises StorageError where the
-        checkpoint is damaged or of another scene.
+        run, and `classes` are further classes that may occur. Raises StorageError if the checkpoint
+        is damaged or of another scene.
         """
         try:
             facts = {**self.facts["run"], "seen": self.facts["seen"]}

@@ -57,7 +57,7 @@ class BondStatus:
 
 
 class BondRecords:
-    """The bonds of a dataset and their histories. Raises ExperimentError where the dataset has no
+    """The bonds of a dataset and their histories. Raises ExperimentError if the dataset has no
     table of bonds."""
 
     def __init__(self, dataset: xarray.Dataset, scene: Scene) -> None:
@@ -176,8 +176,8 @@ class BondRecords:
         return "cut" if self.cut[row] else "broken"
 
     def nearest(self) -> BondStatus | None:
-        """Return the bond closest to breaking at the last recorded step, or None where no limits
-        are known."""
+        """Return the bond closest to breaking at the last recorded step, or None if no limits are
+        known."""
         rows = np.flatnonzero((self.steps < 0) & ~self.spared & np.isfinite(self.limits))
         if not len(rows):
             return None
@@ -185,8 +185,8 @@ class BondRecords:
         return self.statuses(rows[[np.argmax(share)]])[0]
 
     def row(self, a: int, b: int) -> int:
-        """Return the row of the bond between two particle numbers. Raises ExperimentError where
-        there is none."""
+        """Return the row of the bond between two particle numbers. Raises ExperimentError if there
+        is none."""
         count = int(self._dataset.sizes["particle"])
         for number in (a, b):
             if not 1 <= number <= count:

@@ -259,7 +259,7 @@ def makers_of(names: set[str]) -> list[str]:
 
 
 def _columns_of(diagnostic: type[Component]) -> list[Column]:
-    """Return the columns of a diagnostic with unset parameters; none where its variables depend on
+    """Return the columns of a diagnostic with unset parameters; none if its variables depend on
     parameters or cannot be evaluated, which leaves the schema open."""
     assert issubclass(diagnostic, Diagnostic)
     with suppress(Exception):  # Code of a plugin that the user has not selected must not fail here.
@@ -289,7 +289,7 @@ def _object(properties: dict[str, Any], required: list[str]) -> dict[str, Any]:
 
 
 def refuse_no_dataset(candidate: Any) -> None:
-    """Raise ExperimentError where a file, or anything else, is given in place of a dataset."""
+    """Raise ExperimentError if a file, or anything else, is given in place of a dataset."""
     if not hasattr(candidate, "data_vars"):
         opening = f"pbdkit.open({str(candidate)!r})" if isinstance(candidate, str | Path) else ""
         raise ExperimentError(
@@ -343,7 +343,7 @@ def _described(dataset: xarray.Dataset, new: dict[str, Any]) -> xarray.Dataset:
 
 def json_attribute(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
     """Return the map in an attribute, or in the scalar coordinate that replaces it in one member of
-    a sweep; empty where there is neither. Raises StorageError where it is damaged."""
+    a sweep; empty if there is neither. Raises StorageError if it is damaged."""
     coordinate = dataset.coords.get(attribute)
     text = "{}" if coordinate is None or coordinate.ndim else coordinate.item()
     try:
@@ -367,8 +367,8 @@ def scene_of(dataset: xarray.Dataset, what: str) -> Scene:
 def experiment_of(
     dataset: xarray.Dataset, components: Iterable[type[Component]] = ()
 ) -> Experiment:
-    """Build the experiment of a dataset. Raises ExperimentError where there is none, or where it
-    needs components that are not available."""
+    """Build the experiment of a dataset. Raises ExperimentError if there is none, or if it needs
+    components that are not available."""
     refuse_no_dataset(dataset)
     parts = json_attribute(dataset, "experiment")
     if not parts:
@@ -390,7 +390,7 @@ def indices_of(dataset: xarray.Dataset) -> list[str]:
 
 
 def rows_at(dataset: xarray.Dataset, index: Mapping[str, int]) -> Array:
-    """Return the rows of the particles at the given lattice indices. Raises ExperimentError where
+    """Return the rows of the particles at the given lattice indices. Raises ExperimentError if
     there is none, and for unknown names."""
     names = indices_of(dataset)
     matches = np.ones(dataset.sizes.get("particle", 0), np.bool_)

@@ -63,8 +63,8 @@ class NetcdfFile:
             self._define(column, sizes, planned)
 
     def reopen(self, waiting: Waiting, written: Mapping[str, Any]) -> None:
-        """Continue with a file as it was committed. Raises StorageError where it holds fewer
-        entries than `written`."""
+        """Continue with a file as it was committed. Raises StorageError if it holds fewer entries
+        than `written`."""
         self.waiting |= waiting
         self.written |= written
         self._open("r+")

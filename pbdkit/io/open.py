@@ -70,7 +70,7 @@ def open(path: str | Path) -> xarray.Dataset:
 
 
 def refuse_no_file(file: Path) -> None:
-    """Raise StorageError where the path is not a plain file."""
+    """Raise StorageError if the path is not a plain file."""
     if file.is_dir():
         raise StorageError(f"{file}: is a folder, no result of pbdkit")
     if not file.is_file():

@@ -18,7 +18,7 @@ FAULTY = "faulty"
 
 
 def refuse_other_file(path: Path) -> None:
-    """Raise ExperimentError where a path is known to lead to something other than a result."""
+    """Raise ExperimentError if a path is known to lead to something other than a result."""
     if description := other_file(path):
         raise ExperimentError(f"{path}: {description}")
 

@@ -54,9 +54,9 @@ def write_header(file: io.FileIO, header: Header) -> None:
 
 
 def read_header(file: io.FileIO) -> Header | None:
-    """Read the header of open records; None where none was written yet.
+    """Read the header of open records; None if none was written yet.
 
-    Raises StorageError where other bytes stand there, and OSError.
+    Raises StorageError if other bytes stand there, and OSError.
     """
     for _ in range(TRIES):
         file.seek(0)
@@ -189,7 +189,7 @@ class PagedFile(NewFile):
 
     def settle(self) -> None:
         """Write the pages to their positions, seal and sync the file, and read all of it back.
-        Raises OSError where it cannot be written, or differs from what was written."""
+        Raises OSError if it cannot be written, or differs from what was written."""
         self.check()
         for number, page in sorted(self.pages.items()):
             self.disk.seek(number * PAGE)

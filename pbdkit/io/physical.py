@@ -69,7 +69,7 @@ class Physical:
 
     def columns(self, columns: Iterable[Column]) -> list[Column]:
         """Return the columns with their scales, comments on units, and the copies in mm. Raises
-        PluginError where a name is in use."""
+        PluginError if a name is in use."""
         entries = list(map(_with_comment, columns))
         if self._units is None:
             return entries

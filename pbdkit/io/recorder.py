@@ -195,7 +195,7 @@ class RecordedVariables:
 
 
 def _reserve_name(name: str, names: set[str], what: str) -> None:
-    """Add a name to those in use. Raises PluginError where it is among them already."""
+    """Add a name to those in use. Raises PluginError if it is among them already."""
     if name in names:
         raise PluginError(f"{what}, and that name is taken in the dataset; give it another")
     names.add(name)

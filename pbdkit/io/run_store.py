@@ -151,8 +151,7 @@ class RunStore:
         return data
 
     def check(self) -> None:
-        """Read and verify all pieces. Raises StorageError where one differs from what was
-        written."""
+        """Read and verify all pieces. Raises StorageError if one differs from what was written."""
         with self._sqlite():
             if fault := fault_of(self._file):
                 raise StorageError(f"{self.path}: is damaged: {fault}")
@@ -216,7 +215,7 @@ class RunStore:
         return digest
 
     def _list(self) -> None:
-        """Read identity and digests of the last commit. Raises StorageError where they were not
+        """Read identity and digests of the last commit. Raises StorageError if they were not
         committed together."""
         rows = self._file.execute("SELECT key, CAST(digest AS BLOB) FROM pieces").fetchall()
         query = "SELECT CAST(data AS BLOB) FROM pieces WHERE key = ?"
@@ -267,7 +266,7 @@ def keys_of(name: str, array: np.ndarray[Any, Any] | PiecedArray) -> list[str]:
 
 class StoredArray:
     """Array stored in pieces, which is read on access: all of it, or some rows, ``array[:, :,
-    3:7]``, with one axis sliced and all axes before it whole. Raises StorageError where pieces are
+    3:7]``, with one axis sliced and all axes before it whole. Raises StorageError if pieces are
     missing."""
 
     def __init__(
@@ -311,8 +310,8 @@ class StoredArray:
 
 
 def _refuse_others(path: Path) -> None:
-    """Raise StorageError where the journal names another file, which SQLite would remove after
-    rolling back: no store has such a journal."""
+    """Raise StorageError if the journal names another file, which SQLite would remove after rolling
+    back: no store has such a journal."""
     with suppress(FileNotFoundError), Path(f"{path}-journal").open("rb") as journal:
         journal.seek(max(0, journal.seek(0, os.SEEK_END) - len(JOURNAL_MARK)))
         if journal.read() == JOURNAL_MARK:
@@ -362,7 +361,7 @@ class StoreState(Enum):
 def is_unfinished(output: Path) -> bool:
     """Return whether there is a run to resume; the store of a finished one is removed.
 
-    Raises ExperimentError where a run is in progress, and StorageError where the store is damaged.
+    Raises ExperimentError if a run is in progress, and StorageError if the store is damaged.
     """
     with _exclusive(output):
         status = store_state(output)
@@ -419,8 +418,8 @@ def has_committed(output: Path) -> bool:
 
 
 def store_state(output: Path) -> StoreState:
-    """Return the state of the store of a run; nothing on the disk changes. Raises StorageError
-    where it is damaged."""
+    """Return the state of the store of a run; nothing on the disk changes. Raises StorageError if
+    it is damaged."""
     store, records = store_of(output), records_of(output)
     if not has_store_files(output):
         return StoreState.NOTHING
@@ -444,8 +443,8 @@ def store_state(output: Path) -> StoreState:
 
 
 def header_of(records: Path) -> Header | None:
-    """Read the header of the records of a run; None where it is missing or was overwritten at the
-    end of the run. Raises StorageError."""
+    """Read the header of the records of a run; None if it is missing or was overwritten at the end
+    of the run. Raises StorageError."""
     try:
         with io.FileIO(records, "rb") as file:
             return read_header(file)
@@ -539,7 +538,7 @@ class UnfinishedRun:
     @classmethod
     def open(cls, output: Path, *, writing: bool, anyway: bool = False) -> UnfinishedRun:
         """Open an existing store; with `anyway` even if commits are lost. Nothing on the disk
-        changes where it is damaged. Raises ExperimentError where another process writes it."""
+        changes where it is damaged. Raises ExperimentError if another process writes it."""
         store, records = store_of(output), records_of(output)
         try:
             disk = open_locked(records) if writing else io.FileIO(records, "rb")
@@ -680,8 +679,8 @@ class UnfinishedRun:
         write_header(self.disk, Header(self._store.identity, self._store.commits))
 
     def _refuse_other(self, header: Header | None, anyway: bool) -> None:
-        """Raise StorageError where the records belong to another run and, unless opened `anyway`,
-        where the store lacks commits that their header counts."""
+        """Raise StorageError if the records belong to another run and, unless opened `anyway`, if
+        the store lacks commits that their header counts."""
         commits, store = self._store.commits, self._store.path
         if header is None or (header is SETTLED and "finished" not in self.facts):
             raise damage_error(self.records, "its first bytes are not what was written")
@@ -707,7 +706,7 @@ class UnfinishedRun:
 def status_of(output: Path) -> dict[str, Any] | None:
     """Return the status of the unfinished run of an output: `step`, `steps`, `rate` in steps a
     second, `left_s`, the predicted seconds to its end, `age_s`, the seconds since the last
-    checkpoint, and `state`, running or stopped; None where there is no such run."""
+    checkpoint, and `state`, running or stopped; None if there is no such run."""
     try:
         return _status(output) if has_committed(output) else None
     except StorageError:

@@ -158,7 +158,7 @@ def _gapless(file: io.FileIO, size: int, extents: tuple[ByteRange, ...]) -> Iter
 
 
 def seal_of(file: io.FileIO) -> Seal | None:
-    """Read the seal of an open file; None where it has none. Raises BrokenSealError."""
+    """Read the seal of an open file; None if it has none. Raises BrokenSealError."""
     length = file.seek(0, os.SEEK_END)
     if length < FOOT.size:
         return None

@@ -438,7 +438,7 @@ class StateCells(CellValues):
 
     def _turned(self, share: Callable[..., Any], what: str) -> str | None:
         """Return the number of inverted cells and the place of the most inverted, relative to its
-        area at rest; None where there is none."""
+        area at rest; None if there is none."""
         turned = total = number = 0
         worst = 0.0
         for patch in self._scene.patches:

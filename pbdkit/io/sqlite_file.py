@@ -94,7 +94,7 @@ def look(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connection:
 
 
 def fault_of(connection: sqlite3.Connection) -> str:
-    """Return the first fault that SQLite finds in a database; empty where there is none."""
+    """Return the first fault that SQLite finds in a database; empty if there is none."""
     try:
         (report,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     except sqlite3.DatabaseError as error:

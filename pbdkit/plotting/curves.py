@@ -51,7 +51,7 @@ def load_curve(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> Loa
     """Return force and displacement of the chosen group, load or obstacle, or of the one with the
     largest displacement, along its main axis.
 
-    Raises ExperimentError where the dataset has no such forces, or not of the chosen one.
+    Raises ExperimentError if the dataset has no such forces, or not of the chosen one.
     """
     dim, moved = _moving(dataset, chosen)
     force, place = in_units(dataset[FORCE_OF[dim]]), chosen.get(CHOSEN_BY[dim])

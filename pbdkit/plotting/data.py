@@ -45,7 +45,7 @@ def cells_of(site: Array, reference: Array) -> Array:
 
     `site` (particle, 2) are whole numbers. Where the places of sites (i, j) repeat along i, as on
     Bravais lattices, cells are Delaunay's of the lattice: squares and rectangles, else triangles.
-    Elsewhere they are Delaunay's triangles without those that bridge gaps. None where all particles
+    Elsewhere they are Delaunay's triangles without those that bridge gaps. None if all particles
     are in line.
     """
     cells = _of_sites(site, reference) if len(site) else None
@@ -56,7 +56,7 @@ def cells_of(site: Array, reference: Array) -> Array:
 
 
 def triangles_of(reference: Array) -> Array:
-    """Return Delaunay's triangles, (triangle, 3), without those that bridge gaps; none where all
+    """Return Delaunay's triangles, (triangle, 3), without those that bridge gaps; none if all
     places are collinear."""
     from scipy.spatial import Delaunay, QhullError
 
@@ -72,7 +72,7 @@ def triangles_of(reference: Array) -> Array:
 
 def _of_sites(site: Array, reference: Array) -> Array | None:
     """Return the cells between sites (i, j), (i+1, j), (i+1, j+1), (i, j+1), whole or divided along
-    the shorter diagonal; None where the places of sites do not repeat."""
+    the shorter diagonal; None if the places of sites do not repeat."""
     low = site.min(axis=0)
     shape = site.max(axis=0) - low + 1
     if shape.min() < 2 or shape.prod() > 20 * len(site):
@@ -154,7 +154,7 @@ ON_IT = 1e-6
 
 
 def shape_of(dataset: xarray.Dataset) -> Shape | None:
-    """Return the outline of the body in a dataset; None where it has none, and for a body of given
+    """Return the outline of the body in a dataset; None if it has none, and for a body of given
     sites."""
     try:
         shape: Shape = TypeAdapter(AnyBody).validate_python(
@@ -383,7 +383,7 @@ def refuse_color(
 
 def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
     """Return the diagnostics that make the variable, or its vector, as an experiment names them;
-    none where it was recorded, or no diagnostic makes it."""
+    none if it was recorded, or no diagnostic makes it."""
     vector, _, axis = name.rpartition("_")
     names = {name, vector} if axis in axes_of(dataset) else {name}
     recorded = [*map(str, dataset.variables)]
@@ -420,7 +420,7 @@ class ReferenceBody:
     """The constant data of a body: `reference` (particle, axis), `site` (particle, index), `number`
     (particle,), whether a particle is of the body and not of the frame, `inside` (particle,), the
     rows of both ends of each bond (bond, 2), and the step in which it broke (bond,), -1 if intact.
-    `outside` marks corners of cut cells outside the outline, `shape`, which is None where there are
+    `outside` marks corners of cut cells outside the outline, `shape`, which is None if there are
     none or it is unknown. A lattice unit is `unit` in the units of lengths; the shape is in lattice
     units."""
 
@@ -458,7 +458,7 @@ class ReferenceBody:
 
     @cached_property
     def cut(self) -> CutCells | None:
-        """The `cells` cut by the outline; None where there is no outline."""
+        """The `cells` cut by the outline; None if there is no outline."""
         if self.shape is None:
             return None
         return CutCells.of(self.shape, self.cells, self.reference / self.unit, self.outside)
@@ -545,7 +545,7 @@ class Trajectory:
         )
 
     def row(self, time: float | None) -> int:
-        """Return the index of a step; None is the last. Raises ExperimentError where it was not
+        """Return the index of a step; None is the last. Raises ExperimentError if it was not
         recorded."""
         if time is None:
             return len(self.steps) - 1
@@ -598,7 +598,7 @@ class Trajectory:
 
 
 def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset with a time dimension. Raises ExperimentError where its positions are not
+    """Return the dataset with a time dimension. Raises ExperimentError if its positions are not
     those of one run in the plane."""
     dataset = _with_positions(dataset)
     position = dataset["position"]
@@ -627,7 +627,7 @@ def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset, at rest where positions were not recorded. Raises ExperimentError where
+    """Return the dataset, at rest where positions were not recorded. Raises ExperimentError if
     positions at rest are missing too."""
     if "position" in dataset.variables:
         return dataset
@@ -664,8 +664,8 @@ class Extent:
 
 
 def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: Look) -> Extent:
-    """Compute the extent of steps of a recording, one after another. Raises ExperimentError where
-    no particle has a position."""
+    """Compute the extent of steps of a recording, one after another. Raises ExperimentError if no
+    particle has a position."""
     body, quantity = recording.body, recording.quantity
     reference = body.reference if look.outline else np.empty((0, 2))
     low, high = [reference.min(axis=0, initial=np.inf)], [reference.max(axis=0, initial=-np.inf)]
@@ -740,7 +740,7 @@ OF_A_RUN = {"time", "step", "crack", "particle", "bond", "axis", "tracked", "end
 def variable(dataset: xarray.Dataset, name: str) -> xarray.DataArray:
     """Return a variable, or for `u_x` the component of `u`, without reading its values.
 
-    Raises ExperimentError where there is none of that name.
+    Raises ExperimentError if there is none of that name.
     """
     if not isinstance(name, str):
         raise ExperimentError(f"expected the name of a variable, such as 'pe1', got {name!r}")

@@ -176,7 +176,7 @@ class Page:
         """Put everything in its place, with the colour bar of a scale and a legend.
 
         A figure without a given size is at most `larger` times as large as the page of a journal.
-        Raises ExperimentError where a given size leaves no room for the panels.
+        Raises ExperimentError if a given size leaves no room for the panels.
         """
         bar = self._bar(scale, text) if scale else None
         legend = self._legend(handles) if handles else None

@@ -30,7 +30,7 @@ def draw_fit(fitted: Fitted) -> Figure:
     A field has panels of ux and uy, measured and fitted, of the residual over the noise, and of the
     sensitivity to each parameter; beside each other for wide bodies, else below. Tracks and curves
     have the measured and fitted values, residual and sensitivity along time or displacement. Raises
-    ExperimentError where matplotlib is missing.
+    ExperimentError if matplotlib is missing.
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.figure_layout import new_figure

@@ -90,8 +90,8 @@ def animate(
     replace : bool
         Put it in the place of an earlier file, which stands until the movie is whole.
 
-    The other parameters are those of `plot`. Raises ExperimentError as `plot` does, and where what
-    writes movies is missing; StorageError where the file cannot be written.
+    The other parameters are those of `plot`. Raises ExperimentError as `plot` does, or if what
+    writes movies is missing; StorageError if the file cannot be written.
     """
     path = _movie_file(color, file)
     refuse_no_movie(path)
@@ -122,7 +122,7 @@ def _refuse_speed(path: Path, fps: float, every: int) -> None:
 
 
 def _movie_file(color: str | None, file: str | Path | None) -> Path:
-    """Return the path of the movie. Raises ExperimentError where it stands for the variable."""
+    """Return the path of the movie. Raises ExperimentError if it stands for the variable."""
     if file is not None and Path(str(color)).suffix not in FORMATS:
         return Path(file)
     if isinstance(color, str | Path) and Path(color).suffix in FORMATS:
@@ -175,8 +175,8 @@ def animation(
 
 
 def refuse_no_movie(path: Path) -> None:
-    """Raise ExperimentError where the suffix is not that of a movie, or its writer is not
-    installed, and StorageError where the folder does not exist."""
+    """Raise ExperimentError if the suffix is not that of a movie, or its writer is not installed,
+    and StorageError if the folder does not exist."""
     if path.suffix not in FORMATS:
         raise ExperimentError(f"{path}: a movie ends in {' or '.join(FORMATS)}")
     writer = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"

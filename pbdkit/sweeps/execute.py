@@ -166,8 +166,8 @@ class ClusterExecutor(Executor):
 
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
         """Run chunks as tasks, a few more than there are threads; pending tasks are cancelled if
-        the work ends early. Raises ExperimentError where the cluster has no worker, and
-        StorageError where the scheduler is lost."""
+        the work ends early. Raises ExperimentError if the cluster has no worker, and StorageError
+        if the scheduler is lost."""
         out: dict[Any, list[Job]] = {}
         try:
             yield from self._with_workers(stopping)
@@ -250,7 +250,7 @@ class SizeEstimate:
 
     def look(self, experiment: Experiment, words: str) -> None:
         """Include a member, which messages name by `words`. Raises ExperimentError and PluginError
-        where its scene cannot be built, and where its dataset lacks a variable to keep."""
+        if its scene cannot be built, or if its dataset lacks a variable to keep."""
         steps, record = experiment.steps, experiment.record
         between = experiment.record_count - record.count(steps)
         self._times.add((steps, record.at, record.every, between))
@@ -274,8 +274,8 @@ class SizeEstimate:
         self._sizes["step"] = max(steps + 1, self._sizes.get("step", 0))
 
     def refuse_too_large(self) -> None:
-        """Raise ExperimentError where the dataset does not fit into memory, or where no member
-        reaches a step to keep."""
+        """Raise ExperimentError if the dataset does not fit into memory, or if no member reaches a
+        step to keep."""
         keep, last = self._keep, max(steps for steps, *_ in self._times)
         if isinstance(keep.times, tuple) and min(keep.times) > last:
             text = f"keep.times: {min(keep.times)} is beyond the last step of all, {last}"
@@ -460,7 +460,7 @@ class ProcessExecutor(Executor):
         self._workers = workers
 
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
-        """Raises PbdkitError where workers cannot be started."""
+        """Raises PbdkitError if workers cannot be started."""
         workers = [_Worker() for _ in range(min(self._workers, len(jobs)))]
         queue = Queue(deque(jobs), max(1, len(workers)))
         try:

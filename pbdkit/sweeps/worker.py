@@ -89,7 +89,7 @@ linear algebra are global."""
 
 class MemberReport(NamedTuple):
     """Result of a member: `message` is the reason of a failure, or the warnings of its run.
-    `digest` covers all other fields; `lasting` is False where another attempt could have another
+    `digest` covers all other fields; `lasting` is False if another attempt could have another
     result."""
 
     key: str
@@ -213,7 +213,7 @@ def _ran(experiment: Experiment, sink: KeptSink, stopping: Callable[[], bool]) -
 
 
 def _refuse_other_versions(job: Job, experiment: Experiment) -> None:
-    """Raise PluginError where a machine of a cluster has other versions than the sweep."""
+    """Raise PluginError if a machine of a cluster has other versions than the sweep."""
     installed = {"pbdkit": version("pbdkit")} | experiment.distributions()
     if installed != job.versions:
         differences = [

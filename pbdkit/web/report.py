@@ -323,9 +323,9 @@ class BondArrays:
 
 def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
     """Return the bonds of a dataset or, where it has no table, of its scene, unless neighbours are
-    re-evaluated; None where neither has any. Lengths are in the units of the page.
+    re-evaluated; None if neither has any. Lengths are in the units of the page.
 
-    Raises ExperimentError where dataset and scene do not go together.
+    Raises ExperimentError if dataset and scene do not go together.
     """
     bonds = _in_lattice_units(dataset, scene)
     return bonds and replace(bonds, rest=lattice_unit(dataset) * bonds.rest)
@@ -713,8 +713,8 @@ class SettlingMoves:
 
 
 def moves_of(dataset: xarray.Dataset) -> SettlingMoves | None:
-    """Return the moves between equidistant recorded steps, at most MOST; None where there are too
-    few, or no kinds."""
+    """Return the moves between equidistant recorded steps, at most MOST; None if there are too few,
+    or no kinds."""
     recorded = dataset.sizes["time"]
     steps = np.arange(0, recorded, -(-recorded // MOST))
     times = dataset["time"].values[steps]
@@ -845,7 +845,7 @@ def _curve(analysis: Analysis, moves: SettlingMoves) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Origin:
-    """The scene of a dataset's experiment, None where it cannot be built, and the reason."""
+    """The scene of a dataset's experiment, None if it cannot be built, and the reason."""
 
     scene: Scene | None
     fault: str = ""
@@ -1157,7 +1157,7 @@ def _label(value: Any) -> str:
 
 
 def _scene(specification: dict[str, Any]) -> Scene | None:
-    """Return the scene of the varied experiment, None where the body varies."""
+    """Return the scene of the varied experiment, None if the body varies."""
     experiment = specification.get("experiment", {})
     varied = {
         path.split(".")[0] for key in ("vary", "together") for path in specification.get(key, {})
@@ -1172,7 +1172,7 @@ def _scene(specification: dict[str, Any]) -> Scene | None:
 
 
 def speed(path: Path) -> dict[str, Any]:
-    """Return headings with their meanings, and a row for each method. Raises StorageError where the
+    """Return headings with their meanings, and a row for each method. Raises StorageError if the
     file cannot be read, and ExperimentError for other content."""
     try:
         content = json.loads(path.read_text("utf-8"))

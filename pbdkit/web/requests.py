@@ -135,7 +135,7 @@ def command_of(message: str | bytes | dict[str, Any]) -> Command:
 
 
 def execute(session: Session, command: Command) -> None:
-    """Execute a command between two steps. Raises PbdkitError, without any effect, where that is
+    """Execute a command between two steps. Raises PbdkitError, without any effect, if that is
     impossible."""
     match command:
         case Play():

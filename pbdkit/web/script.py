@@ -339,8 +339,8 @@ class Script:
         number.turn(step, value)
 
     def cut(self, segments: Sequence[Segment], step: int) -> None:
-        """Cut at the beginning of the next step. Raises ExperimentError where the experiment does
-        not support cuts."""
+        """Cut at the beginning of the next step. Raises ExperimentError if the experiment does not
+        support cuts."""
         cuts: list[Parts] = [{"from": list(a), "to": list(b), "at": step + 1} for a, b in segments]
         playing = self.playing(step)
         self.experiment.of_parts(playing | {"cuts": [*playing.get("cuts", ()), *cuts]})
@@ -454,8 +454,8 @@ def save_script(script: Script, step: int, output: FilePath | None) -> Saved:
     """Write the session until a step, under the next free name where the file exists or none is
     given.
 
-    Raises ExperimentError where there is no step yet, or more than a file may hold; StorageError
-    where it cannot be written.
+    Raises ExperimentError if there is no step yet, or more than a file may hold; StorageError if it
+    cannot be written.
     """
     if step < 1:
         raise ExperimentError("nothing has been stepped yet: an experiment has a step at least")

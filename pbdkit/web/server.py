@@ -299,8 +299,8 @@ class SessionServer:
         self.access = Access(port)
 
     async def run(self, on_ready: Callable[[str], None], end: asyncio.Event) -> None:
-        """Serve until the end; `on_ready` is called with the address. Raises ExperimentError where
-        the port is in use."""
+        """Serve until the end; `on_ready` is called with the address. Raises ExperimentError if the
+        port is in use."""
         try:
             server = await self._started()
         except OSError as error:
@@ -338,7 +338,7 @@ class SessionServer:
         return Connection
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the page, a refusal, or None where the socket may open."""
+        """Return the page, a refusal, or None if the socket may open."""
         path, is_socket = urlsplit(request.path).path, "Upgrade" in request.headers
         refusal = self.access.refusal(
             request.path, request.headers.get_all, is_socket=is_socket or path == "/socket"

@@ -141,7 +141,7 @@ class LiveStepper:
 
     def set(self, state: State) -> State:
         """Build the scene of the step after a state, and return the state as one of it. Raises
-        ExperimentError where that is impossible."""
+        ExperimentError if that is impossible."""
         if not self._since <= state.step < self._until:
             experiment = self.script.experiment.of_parts(self.script.playing(state.step))
             if experiment.parts_bonds != self.scene.has_fracture:
@@ -547,7 +547,7 @@ class Session:
             self._changed()
 
     def _changed(self) -> None:
-        """Apply a change of the script. Raises PbdkitError where that is impossible."""
+        """Apply a change of the script. Raises PbdkitError if that is impossible."""
         self.stage.changed()
         self.state = self.stage.set(self.state)
 

@@ -86,7 +86,7 @@ class Camera:
 
     @cached_property
     def bonds(self) -> NDArray[np.uint32]:
-        """Rows of the ends of bonds, (bond, end); none where particles or bonds are omitted."""
+        """Rows of the ends of bonds, (bond, end); none if particles or bonds are omitted."""
         table = self._scene.bonds.ends if self._shows_bonds else np.zeros((0, 2))
         return table.astype(np.uint32) if len(table) <= MOST_BONDS else np.zeros((0, 2), np.uint32)
 
