@@ -1,7 +1,7 @@
 """pbdkit: position-based dynamics of deformable bodies on lattices, rules instead of forces.
 
 The public names are those of `__init__.pyi`; each is imported when it is first used, so that
-importing pbdkit costs next to nothing. What authors of components need is in `pbdkit.plugin`.
+`import pbdkit` is fast. The interfaces for authors of components are in `pbdkit.plugin`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pbdkit.lazy_accessor import register_accessor
 
 def _public_names() -> dict[str, str]:
     """Return the module of each public name: ``from MODULE import NAME as NAME`` in the stub."""
-    # As `pkgutil.get_data`, which takes 13 ms to be imported; archives can be read too.
+    # The same as `pkgutil.get_data`, which takes 13 ms to import; archives are supported, too.
     stub = __spec__.loader.get_data(f"{__file__}i").decode()  # type: ignore[union-attr]  # optional
     lines = (line for line in stub.splitlines() if not line.startswith("#"))
     words = " ".join(lines).replace("(", " ").replace(")", " ").replace(",", " ").split()
@@ -28,8 +28,9 @@ def _public_names() -> dict[str, str]:
 
 
 _MODULE_OF = _public_names()
+"""Module of each public name."""
 _RENAMED = {"Components": "Vector"}
-"""Present names in `pbdkit.plugin` by the former names in this module."""
+"""Names in `pbdkit.plugin` that replace former names in this module."""
 
 
 def __getattr__(name: str) -> object:
@@ -48,7 +49,7 @@ def __getattr__(name: str) -> object:
 
 
 def _hint(name: str) -> str:
-    """Return where a name is that authors of components need; empty for any other name."""
+    """Return a hint to the module of a name for authors of components; empty for any other name."""
     if name.startswith("_"):
         return ""
     present_name = _RENAMED.get(name, name)

@@ -1,4 +1,4 @@
-"""The program `pbdkit`, which ``python -m pbdkit`` is too."""
+"""The program `pbdkit`, also started by ``python -m pbdkit``."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import signal
 from contextlib import suppress
 
 COLLECT_AFTER = 300_000
-"""Number of new objects after which the garbage collector looks for cycles. Python's own 700 make
-it look hundreds of times while a command is loaded, when nothing can be freed."""
+"""Number of new objects after which the garbage collector searches for cycles. With Python's
+default of 700 it runs hundreds of times while a command is imported, when nothing can be freed."""
 
 
 def main() -> None:
-    """Run `pbdkit.cli.main`, without a traceback where it is interrupted while it is loaded."""
-    # An exception can be lost in what libraries do as they are imported; nothing is to be undone.
+    """Run `pbdkit.cli.main`, without a traceback if it is interrupted during imports."""
+    # An exception can be lost in libraries during their import; there is nothing to undo.
     previous = signal.signal(signal.SIGINT, _end)
     gc.set_threshold(COLLECT_AFTER)
     try:

@@ -1,8 +1,8 @@
 """Collective operations among the processes that share a run.
 
-Every operation is called by all processes in the same order, and returns the same in all of them.
-`SERIAL` is the communicator of a process that runs alone; `pbdkit.mpi.communicator` has that of
-MPI.
+Every operation is called by all processes in the same order, and returns the same value in all of
+them. `SERIAL` is the communicator of a process that runs alone; that of MPI is in
+`pbdkit.mpi.communicator`.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Communicator(ABC):
 
     @abstractmethod
     def raise_together(self) -> AbstractContextManager[None]:
-        """Raise what the block raises in any process in all of them, at its end: the error of the
-        lowest rank."""
+        """Run the block; an exception in any process is raised in all of them at its end, that of
+        the lowest rank."""
 
     def bcast(self, value: Any) -> Any:
         """Return the value of the root."""

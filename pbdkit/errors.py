@@ -232,7 +232,7 @@ LONGEST_LINE = 400
 
 
 def one_line(text: str) -> str:
-    """Return the printable words of a text in one line, cut where it is long."""
+    """Return the printable words of a text in one line, shortened if it is long."""
     words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return words if len(words) <= LONGEST_LINE else words[: LONGEST_LINE - 3] + "..."
 

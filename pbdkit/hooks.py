@@ -1,7 +1,7 @@
-"""Hooks and plugins: what a distribution may implement, which are installed, and the guard in which
-each is loaded, so that an error in its code becomes a message that names it.
+"""Hooks that a distribution may implement, installed plugins, and the isolation in which each is
+loaded, so that an error in its code becomes a message with its name.
 
-Nothing here imports the interfaces, so that a command starts without them.
+This module does not import the interfaces of components, so that commands start without them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ GROUP = "pbdkit"
 """The entry-point group of plugins, and the project name of their hook markers."""
 COMMAND_GROUP = "pbdkit.commands"
 """The entry-point group of modules that implement `pbdkit_commands`. They are imported to list
-commands, those of the group "pbdkit" are not."""
+commands, unlike those of the group "pbdkit"."""
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
@@ -72,7 +72,7 @@ class Hooks:
     @hookspec
     def pbdkit_components(self) -> list[type[Any]]:
         """The component classes that the distribution offers."""
-        raise NotImplementedError  # a specification only: pluggy never calls it
+        raise NotImplementedError  # This is a specification, which pluggy never calls.
 
     @hookspec
     def pbdkit_commands(self) -> list[Command]:
@@ -108,7 +108,7 @@ def worded(error: BaseException, package: str = "", component: type[Any] | None 
     """
     try:
         message = str(error)
-    except Exception:  # `__str__` of an error class of a plugin can fail
+    except Exception:  # `__str__` of an error class of a plugin can fail.
         message = "(its message is not available)"
     if isinstance(error, AnswerError):
         return one_line(message)
@@ -153,9 +153,10 @@ A plugin can declare the version that it implements as `pbdkit_api`, in the modu
 of its entry point.
 """
 
-DISABLE, ALL = "PBDKIT_DISABLE_PLUGINS", "*"
-"""The variable that lists what is not to be loaded, distributions or entry points, and its value
-for: nothing at all."""
+DISABLE = "PBDKIT_DISABLE_PLUGINS"
+"""Environment variable that lists plugins to be disabled, by distribution or entry point."""
+ALL = "*"
+"""Value of that variable that disables all plugins."""
 
 SEVERITY = ("ok", "conflict", "broken")
 """States of an offer in increasing severity; the state of a plugin is the most severe."""
@@ -346,7 +347,7 @@ def guarded(plugin: Plugin, load: Callable[[EntryPoint, str], Plugin]) -> Plugin
         return replace(plugin, unusable="incompatible", why=str(error))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"while {plugin.distribution} was loaded") from None
-    except BaseException as error:  # includes SystemExit at import
+    except BaseException as error:  # This includes SystemExit at import.
         return replace(plugin, unusable="broken", why=worded(error, package))
 
 
@@ -356,7 +357,7 @@ def hook_answer(entry: EntryPoint, hook: str, elements: str) -> list[Any]:
     manager.add_hookspecs(Hooks)
     module = entry.load()
     declared = getattr(module, "pbdkit_api", None)
-    if declared is None:  # the entry point can refer to an object in the module
+    if declared is None:  # The entry point can refer to an object in the module.
         declared = getattr(sys.modules.get(entry.module), "pbdkit_api", API)
     if type(declared) is not int:
         raise TypeError(f"its `pbdkit_api` should be a whole number, got {declared!r}")

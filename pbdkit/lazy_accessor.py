@@ -1,4 +1,5 @@
-"""Give every xarray.Dataset its `pbd` as soon as xarray is imported, without importing it."""
+"""Registration of the accessor `pbd` of xarray.Dataset at the time when xarray is imported, without
+importing it."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from pbdkit.accessor import PbdAccessor
 
 LIBRARY = "xarray"
+"""Module that the accessor extends."""
 
 
 def register_accessor() -> None:
@@ -26,7 +28,8 @@ def register_accessor() -> None:
 
 
 class AccessorFinder:
-    """Find xarray as the other finders do, and register the accessor after it was executed."""
+    """Finder of modules that finds xarray by the other finders, and registers the accessor after
+    xarray is executed."""
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None

@@ -1,4 +1,4 @@
-"""Memory available to this process: of the machine, of a container, under a limit."""
+"""Available memory: of the machine, of a container, and under a limit of address space."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 LIBRARIES = 2**30
-"""Address space in bytes for the libraries that are loaded (560 MiB were measured while a
-kernel was compiled). Some of them crash or hang with less."""
+"""Number of bytes of address space for the libraries that are loaded (560 MiB were measured while a
+kernel was compiled). Some libraries crash or hang with less."""
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
 """File with the memory limit of a container."""
 
@@ -52,7 +52,7 @@ def address_limit() -> int | None:
     """Return the limit on address space in bytes; None if there is none."""
     try:
         from resource import RLIM_INFINITY, RLIMIT_AS, getrlimit
-    except ImportError:  # Windows has no resource module
+    except ImportError:  # Windows has no module resource.
         return None
     limit, _ = getrlimit(RLIMIT_AS)
     return None if limit == RLIM_INFINITY else limit
@@ -61,5 +61,5 @@ def address_limit() -> int | None:
 def _system_limits() -> Iterator[int]:
     with suppress(AttributeError, OSError, ValueError):
         yield os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with suppress(OSError, ValueError):  # "max" means no limit
+    with suppress(OSError, ValueError):  # "max" means that there is no limit.
         yield int(CONTAINER.read_text())

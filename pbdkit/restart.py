@@ -40,9 +40,9 @@ def restore(
     communicator: Communicator,
     recorded: int | None = None,
 ) -> None:
-    """Let a run that has not begun continue from the checkpoint that the root has; `recorded` is
-    the last step recorded, where that is another one than was kept. Raises StorageError for a
-    checkpoint that is damaged or of another scene."""
+    """Let a run that has not begun continue from the checkpoint of the root. `recorded` is the last
+    recorded step, if it differs from that of the checkpoint. Raises StorageError for a checkpoint
+    that is damaged or of another scene."""
     initial, parts = driver.state_dict(), dict[str, Any]()
     with communicator.raise_together():
         if checkpoint:
@@ -95,7 +95,7 @@ def unfinished_source(
 
 
 def chosen_parameters(facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the parameters of the solver that the run has chosen itself."""
+    """Return the parameters of the solver that the run has selected for `auto`."""
     names = facts.get("chosen", [])
     if not isinstance(names, list) or not {*names} <= {"relaxation", "memory"}:
         raise StorageError("the checkpoint is damaged: 'chosen' is no list of solver parameters")
@@ -162,7 +162,7 @@ def history(
 def _rows(dataset: Any, names: list[str], dim: str, pieced: bool) -> Iterator[Values]:
     """Yield row by row along a dimension.
 
-    They are read in blocks, which is much faster than reading rows of small bodies separately.
+    Rows are read in blocks, which is much faster for small bodies than reading them separately.
     """
     count = dataset.sizes.get(dim, 0)
     size = sum(dataset[name].nbytes for name in names)
@@ -241,13 +241,13 @@ def _refuse_changed_file(output: Path, about: Mapping[str, Any], origin: Any) ->
     if not isinstance(file, str) or not Path(file).is_file():
         return
     try:
-        source = read_experiment(file, allow_outside=True)  # it is compared, not run
+        source = read_experiment(file, allow_outside=True)  # The file is compared, not run.
         source = with_settings(source, settings, Experiment.defaults())
         current = json.loads(Experiment.build(source).model_dump_json(by_alias=True))
     except PbdkitError:
         current = None
     original = _map(about, "experiment")
-    if current is not None:  # numbers that the run chose for `auto` are no change
+    if current is not None:  # Values that the run selected for `auto` are not changes.
         chosen = original.get("solver", {})
         current["solver"] = {
             key: chosen.get(key) if value == "auto" else value
@@ -261,7 +261,7 @@ def _refuse_changed_file(output: Path, about: Mapping[str, Any], origin: Any) ->
 
 
 WEIGHT_TOLERANCE = 1e-6
-"""Tolerance for relaxation and memory that were chosen on different machines."""
+"""Tolerance for relaxation and momentum that were computed on different machines."""
 
 
 @dataclass(frozen=True)
@@ -445,10 +445,10 @@ def _continued(
 def _refuse_other_weights(
     place: str, scene: Scene, chosen: tuple[str, ...], execution: Execution
 ) -> None:
-    """Raise ExperimentError if a run with another number of steps would choose other numbers for
+    """Raise ExperimentError if a run with another number of steps would select other values for
     `auto`.
 
-    They depend on the roles of the last step.
+    These depend on the roles of the last step.
     """
     stepping = scene.experiment.stepping
     auto = stepping.model_copy(update={f"{name}_setting": "auto" for name in chosen})

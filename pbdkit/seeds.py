@@ -1,6 +1,7 @@
 """Random numbers of an experiment: the generators and seeds that follow from its `seed`.
 
-The streams are independent of each other: a component that draws more numbers changes nothing else.
+The streams are independent of each other, so that the numbers of one component do not depend on how
+many another draws.
 """
 
 from __future__ import annotations

@@ -153,8 +153,8 @@ class SteppingDriver(Driver):
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """Restore the result of `state_dict`.
 
-        What follows from the scene is not restored: the size of the body, and the first step at
-        which convergence is tested if a run of this length has not tested by then.
+        Data that follow from the scene are not restored: the size of the body, and the first step
+        at which convergence is tested, unless it was tested before.
         """
         self.state, self.recorded_step = parts["state"], parts["kept"]
         is_good = parts["guard"]["good_step"] == self.state.step
@@ -165,7 +165,7 @@ class SteppingDriver(Driver):
 
     def _restore_monitor(self, monitor: SteadyStateMonitor, pace: Pace, obstacle: str) -> None:
         step, new_pace = self.state.step, monitor.pace
-        if new_pace.next_look > step:  # the earlier run may not have planned those tests
+        if new_pace.next_look > step:  # The earlier run may not have planned those tests.
             return
         if pace.begin != new_pace.begin:
             experiment = self.scene.experiment
@@ -178,7 +178,7 @@ class SteppingDriver(Driver):
         monitor.pace, monitor.obstacle = pace, obstacle
 
     def restart(self, state: State) -> None:
-        """Continue from another state, which the guard takes as good."""
+        """Continue from another state, which the guard accepts as good."""
         super().restart(state)
         self.guard = replace(self.guard, good_step=state.step, good_copy=state.copy())
 
@@ -202,7 +202,7 @@ class SteppingDriver(Driver):
                 self.watch.look(step / steps, f"step {step} of {steps}")
                 self._advance()
                 yield from self._current_state()
-        except StoppedError:  # also raised while the last state is recorded
+        except StoppedError:  # It is also raised while the last state is recorded.
             step = self.state.step
             outcome = RunOutcome("interrupted", f"stopped after step {step}", step)
             self.interruption = outcome
@@ -221,7 +221,7 @@ class SteppingDriver(Driver):
         stops += [self.monitor.pace.next_look] if self.monitor else []
         stops += [self.requested_step] if self.requested_step > state.step else []
         target = min(*stops, state.step + self._steps_per_call)
-        is_recorded = experiment.record.keeps(target, target + 1)  # in longer runs too
+        is_recorded = experiment.record.keeps(target, target + 1)  # Recorded in longer runs, too.
         notes = target == self.guard.next_look or is_recorded
         start_time, steps = perf_counter(), target - state.step
         self.state = self._engine.advance(state, steps)
@@ -263,7 +263,7 @@ class SteppingDriver(Driver):
             if good is not None and good.step > self.recorded_step:
                 self.ends_early = True
                 yield good
-                if not self.rejection:  # otherwise a diagnostic is not finite
+                if not self.rejection:  # Otherwise a diagnostic is not finite.
                     reason += (
                         f"; the last recorded state is step {good.step}, the last in which no "
                         "displacement exceeds the size of the body and the paths of its leaders"
@@ -654,7 +654,7 @@ class Simulation:
     def state(self) -> xarray.Dataset:
         """Current state as a dataset.
 
-        It contains `position`, `u` and `kind` of every particle, the remembered numbers of rule and
+        It contains `position`, `u` and `kind` of every particle, the state variables of rule and
         fracture model, and `broken_step` of every bond if bonds can break. Names, coordinates and
         units are those of the dataset of a run at one time. The values are read-only, and later
         steps do not change them.
@@ -867,7 +867,7 @@ class Recording:
         except FloatingPointError as error:
             driver.rejection = error
             return
-        # A run is not resumed from its last state, so no checkpoint is needed there.
+        # A run is not resumed from its last state, which needs no checkpoint.
         steps = simulation.experiment.steps
         ends = driver.ends_early or driver.is_complete or state.step >= steps
         if self._checkpoints and not ends and self._checkpoints.due():
@@ -925,7 +925,7 @@ def rehearse(scene: Scene) -> None:
     if not scene.experiment.diagnostics or scene.raster.count > LARGEST:
         return
     recorder = Recorder(scene, MemorySink())
-    with _located(scene), suppress(FloatingPointError):  # such a run diverges in its first step
+    with _located(scene), suppress(FloatingPointError):  # Such a run diverges in its first step.
         recorder.begin()
         recorder.observe(initial_state(scene))
 

@@ -1,9 +1,10 @@
-"""Reading of files without a seal in a separate process, with bounds on memory, time, and on what
-an HDF5 file declares and refers to.
+"""Reading of files without a seal in a separate process, with bounds on memory and time, and checks
+of the declarations and references of an HDF5 file.
 
 A file of some kilobytes can declare arrays of terabytes, refer to the bytes of other files, and
-name filters that HDF5 loads as programs. On damaged bytes the libraries can crash the process or
-never return, which does no harm in a separate one. A seal is no protection: anyone can create one.
+name filters that HDF5 loads as programs. Damaged bytes can crash the libraries or make them hang,
+which does no harm in a separate process. A seal is no protection against such files, since anyone
+can create one.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ DENSEST = 1100
 SPARSEST = 16
 """Largest ratio of the bytes that a variable declares, written or not, to those of the file."""
 EMPTY = 2**20
-"""Bytes that a variable may declare whatever is stored."""
+"""Number of bytes that a variable may declare for any size of the file."""
 LARGEST_CHUNK = 2**26
-"""Bytes of a chunk that are taken whatever is stored."""
+"""Number of bytes that a chunk may declare for any size of the file."""
 MOST_OBJECTS = 10_000
 """Maximum number of objects and of links in a file, and of attributes of each."""
 LARGEST_TEXTS = 2**28
-"""Bytes that a block of texts can take when it is looked at."""
+"""Maximum number of bytes of a block of texts that is checked."""
 FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32"}
-"""The filters of HDF5 that are applied; others would be loaded as programs."""
+"""Filters of HDF5 that are applied; all others would be loaded as programs."""
 NO_VARIABLE = b"This is a netCDF dimension but not a netCDF variable"
-"""Beginning of the attribute NAME of datasets that are dimensions only and have no values."""
+"""Beginning of the attribute NAME of datasets that are only dimensions and have no values."""
 
 
 def check_declared(content: h5py.File, size: int) -> None:
@@ -64,7 +65,7 @@ def check_declared(content: h5py.File, size: int) -> None:
     links: list[tuple[bytes, bool]] = []
     objects = [b"."]
 
-    # h5py ends a visit where something is returned; it does not bear exceptions there.
+    # h5py ends a visit if the function returns a value; it does not support exceptions in it.
     def note_link(name: bytes, info: Any) -> bool | None:
         links.append((name, info.type == h5l.TYPE_HARD))
         return len(links) > MOST_OBJECTS or None
@@ -93,6 +94,7 @@ def check_declared(content: h5py.File, size: int) -> None:
 
 
 _REMEDY = "copy the data into one netCDF-4 file, for instance by xarray: open_dataset, to_netcdf"
+"""Remedy for files that are not accepted."""
 
 
 def _text(name: bytes) -> str:
@@ -217,7 +219,7 @@ def read_apart(path: Path, *arguments: str) -> bytes:
     StorageError
         If reading fails, crashes or does not end. The message names the file.
     """
-    # What is imported here is imported there, from wherever either runs.
+    # The child process imports this module from the same place as this process.
     paths = os.pathsep.join([*filter(None, sys.path), str(Path(__file__).parents[1])])
     process = subprocess.run(
         [sys.executable, "-P", "-m", __name__, str(path.absolute()), *arguments],
@@ -268,7 +270,7 @@ def opened_unsealed(path: Path) -> xarray.Dataset:
     """Return the dataset in a file without a seal. Errors of the libraries are not converted."""
     import xarray
 
-    # Times are steps: nothing is to be decoded as a date.
+    # Times are numbers of steps and must not be decoded as dates.
     return xarray.open_dataset(path, engine=getattr(xarray.backends, ENGINE), decode_times=False)
 
 

@@ -1,4 +1,5 @@
-"""Work–precision measurements: the cost of each solver against its error (`pbdkit bench`)."""
+"""Work–precision measurements: the cost of each solver against its error (`pbdkit bench`). The
+measurements are in `work_precision`, each in a separate process."""
 
 from __future__ import annotations
 

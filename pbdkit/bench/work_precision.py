@@ -1,4 +1,4 @@
-"""Work–precision measurements: solvers at several sizes, each in a process of its own.
+"""Work–precision measurements: solvers at several sizes, each in a separate process.
 
 The rows are shown as a table, a JSON object and a picture. A measurement is a process
 ``python -m pbdkit.bench.work_precision ANSWER``, with the job as JSON on its input.
@@ -55,9 +55,9 @@ if TYPE_CHECKING:
 def resized(experiment: Experiment, size: int) -> tuple[str, ...]:
     """Return the settings with which about `size` sites lie along the longer side of the body.
 
-    A grid gets `size` columns and rows in proportion; positions keep their place relative to the
-    body. For any other body the lattice becomes finer, and with it lengths in lattice constants:
-    thresholds and the radius of neighbours.
+    A grid gets `size` columns and rows in proportion; positions are scaled with the body. For any
+    other body the lattice constant is reduced, and with it lengths in lattice constants: thresholds
+    and the radius of neighbours.
 
     Raises
     ------
@@ -128,9 +128,12 @@ def _finer_lattice(experiment: Experiment, size: int) -> Iterator[tuple[str, Any
 
 
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
+"""Tolerances for which each method is measured."""
 METHODS = ("lu", "multigrid", "conjugate-gradients")
+"""Methods of the solver `equilibrium`."""
 MAX_PARTICLES_LU = 2_000_000
-"""Particles above which LU is left out: its factors take 1.4 GiB at a million, and grow faster."""
+"""Number of particles above which LU is left out: its factors take 1.4 GiB for a million particles,
+and their size grows faster than the number."""
 MAX_STEPPING_S = 60.0
 """Duration in seconds above which steps are extrapolated from the rate instead of measured."""
 COMPARISONS = 4
@@ -326,7 +329,7 @@ def _rows_to_equilibrium(run_job: Job, base: Row, steps: int) -> Iterator[Row]:
 def _rows_of_method(
     run_job: Job, base: Row, tolerances: list[float], exact: dict[str, Any]
 ) -> Iterator[Row]:
-    if base.method == "lu":  # it does not get faster with a looser tolerance
+    if base.method == "lu":  # LU does not become faster with a larger tolerance.
         if (base.particles or 0) > MAX_PARTICLES_LU:
             reason = f"left out above {MAX_PARTICLES_LU} particles: its factors take gibibytes"
             yield replace(base, reason=reason)
@@ -398,6 +401,7 @@ COLUMNS = {n: (n, "", "") for n in ("size", "particles", "method", "precision", 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of lines, after Okabe and Ito."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
+"""Markers of methods."""
 FLOOR = 1e-18
 """Position on the axis of errors at which errors of exactly zero are drawn."""
 
@@ -544,14 +548,20 @@ def show_work_precision(
 
 
 Task = dict[str, Any]
-REPEATS, MAX_REPEATING_S = 7, 2.0
-"""Number of repetitions of a measurement, of which the fastest counts, and their duration."""
+REPEATS = 7
+"""Maximum number of repetitions of a measurement, of which the fastest counts."""
+MAX_REPEATING_S = 2.0
+"""Maximum duration of all repetitions in seconds."""
 MAX_SOLVING_S = 60.0
-"""Duration above which tighter tolerances are left out."""
+"""Duration in seconds above which smaller tolerances are left out."""
 COMPILED = "pbdkit.stepping.numba_engine.engine"
+"""Module of the compiled engine."""
 SOLVERS = ("scipy.sparse.linalg", "scipy.sparse.csgraph", "numba")
-INVERSE_ITERATIONS, INVERSE_ACCURACY = 12, 1e-3
-"""Number of inverse iterations for the slowest mode, and accuracy of each."""
+"""Modules that are imported before the measurement of an equilibrium."""
+INVERSE_ITERATIONS = 12
+"""Number of inverse iterations for the slowest mode."""
+INVERSE_ACCURACY = 1e-3
+"""Relative accuracy of each inverse iteration."""
 
 
 def main(answer: Path) -> None:

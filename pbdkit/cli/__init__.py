@@ -1,4 +1,4 @@
-"""The command line. Commands load what they need when they run: `--help` costs next to nothing."""
+"""Command line. Each command imports its modules when it is called, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ WELCOME = """\
 pbdkit deforms bodies on lattices. Particles follow their neighbours by rules
 instead of forces. A file says what is to be done; the result is a dataset.
 """
+"""Text that is printed without a command."""
 SYSTEM = dict.fromkeys(
     (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENAMETOOLONG), ""
 )
@@ -73,21 +74,21 @@ def _welcome() -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The program: exits 0 done, 1 a bug of ours, 2 a wrong experiment or call, 3 a missing or
-    broken plugin, 4 diverged, 5 part of a sweep failed, 6 storage failed, 130 interrupted, 128
-    and the number of another signal."""
+    """Run the program and return its exit status: 0 done, 1 a defect of pbdkit, 2 an invalid
+    experiment or call, 3 a missing or broken plugin, 4 diverged, 5 part of a sweep failed, 6
+    storage failed, 130 interrupted, 128 plus the number of another signal."""
     with standard_streams():
         code = _exit_status(arguments)
-        exec("")  # after an interrupt in another `exec` Python would end by the signal
+        exec("")  # After an interrupt in another `exec`, Python would end by the signal.
         sys.exit(code)
 
 
 def _exit_status(arguments: list[str] | None) -> int:
-    """Run a command, and report how it failed where it did."""
+    """Run a command, report a failure, and return the exit status."""
     words = sys.argv[1:] if arguments is None else arguments
     if debug := "--debug" in words:
         words = [argument for argument in words if argument != "--debug"]
-    # pydantic would look for plugins of its own, and stop at any torn distribution.
+    # pydantic would search for its own plugins, and stop at a distribution with damaged metadata.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         with warnings.catch_warnings():
@@ -105,9 +106,9 @@ def _exit_status(arguments: list[str] | None) -> int:
         code = _failed(" ".join(["interrupted", *map(str, where)]), 130)
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
-    except (Exception, SystemExit) as error:  # pbdkit itself exits below
+    except (Exception, SystemExit) as error:  # pbdkit exits below.
         if isinstance(error, SystemExit) and COMPLETING in os.environ:
-            raise  # click has told a shell how the line goes on
+            raise  # click has printed the completion for a shell.
         if debug:
             traceback.print_exc()
         code = _report(error)

@@ -89,7 +89,7 @@ def _boundary_rows(scene: Scene, predicted: Forecast, limit: int | None) -> Iter
 
 
 def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator[Row]:
-    """Yield rows about the course of the run and its cost."""
+    """Yield rows about the time dependence of the run and its cost."""
     if loaded.stepping.is_open:
         reason = "the rule is not linear or bonds can break"
         remark = "" if predicted.exact else f", of the step linearised at rest: {reason}"

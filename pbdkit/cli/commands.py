@@ -1,7 +1,7 @@
 """The table of commands: those of pbdkit and those that plugins add by the hook `pbdkit_commands`.
 
 A command is listed by name, target and one sentence; its module is imported when it is called.
-Plugins are looked for where a name is none of pbdkit's own, and for `pbdkit --help`.
+Plugins are searched if a name is not a command of pbdkit itself, and for `pbdkit --help`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from pbdkit.hooks import (
 
 T = TypeVar("T")
 BUILTIN_MODULES = ("pbdkit.cli.commands", "pbdkit.web", "pbdkit.bench")
-"""Modules of pbdkit that implement `pbdkit_commands`. The latter two are leaves: they import from
-here, and only this table names them."""
+"""Modules of pbdkit that implement `pbdkit_commands`. The last two import from this package; only
+this table refers to them."""
 GROUPS = ("Start", "Run", "Look", "Understand", "Vary and fit", "Extend")
 """Headings of `pbdkit --help`, in the order of a first session."""
 
@@ -106,7 +106,8 @@ def builtin_commands() -> dict[str, Command]:
     """Return the commands of pbdkit itself by name, in the order of the groups."""
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
-    for module in reversed(BUILTIN_MODULES):  # pluggy calls the last that was registered first
+    # pluggy calls the module that was registered last first.
+    for module in reversed(BUILTIN_MODULES):
         manager.register(import_module(module))
     listed = [command for answer in manager.hook.pbdkit_commands() for command in answer]
     listed.sort(key=lambda command: GROUPS.index(command.group))
@@ -133,7 +134,7 @@ class CommandTable(click.Group):
             return with_no_plugins(command)
         plugins = plugins_with_commands()
         offers = _offers(plugins).get(name, [])
-        if not offers and not ctx.resilient_parsing:  # else a shell completes the line
+        if not offers and not ctx.resilient_parsing:  # Otherwise a shell completes the line.
             ctx.fail(_no_command(name, plugins))
         if not offers:
             return None
@@ -170,6 +171,7 @@ class CommandTable(click.Group):
 
 
 DISABLE_ONE = f"name one of them in {DISABLE} to use the other"
+"""Remedy for commands of the same name."""
 
 
 def _sections() -> dict[str, list[tuple[str, str]]]:

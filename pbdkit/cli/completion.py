@@ -25,6 +25,7 @@ from click.shell_completion import (
 SUFFIXES = (".yaml", ".yml", ".json")
 """Endings of the names of experiment files."""
 RESULT = ".nc"
+"""Ending of the names of results."""
 MAX_TIMES = 200
 """Maximum number of steps that are offered at once: the first and the last, and some between."""
 Completer = Callable[[click.Context, click.Parameter, str], list[CompletionItem]]
@@ -32,7 +33,7 @@ Candidates = Callable[[click.Context, str], Iterable[str | CompletionItem]]
 
 
 def completer(candidates: Candidates) -> Completer:
-    """Return a completer: those candidates that begin with the word on the line.
+    """Return a completer that offers the candidates that begin with the word on the line.
 
     There are none if they cannot be computed, since a shell shows no messages.
     """
@@ -138,9 +139,9 @@ def _content(context: click.Context) -> Iterator[Any]:
 
 
 class _Bash(BashComplete):
-    """Completion in bash, which splits words at `=` and puts a space behind what it completes.
+    """Completion in bash, which splits words at `=` and appends a space to completions.
 
-    Here `--set rule.K=1` has one value, and no space comes behind `=`.
+    In this class `--set rule.K=1` has a single value, and no space follows `=`.
     """
 
     source_template = BashComplete.source_template.replace(
@@ -166,7 +167,7 @@ class _Bash(BashComplete):
         return words[1:-1], words[-1]
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return an item without what stands before the part that bash completes."""
+        """Return an item without the part of the word that bash does not replace."""
         return f"{item.type},{item.value[self._prefix_length :]}"
 
 

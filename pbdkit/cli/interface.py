@@ -1,8 +1,8 @@
 """The commands of `pbdkit`: their arguments, options and help.
 
-The function that carries a command out is imported when it is called, so that `--help` and an error
-in the command line cost next to nothing. It has the name of the command, in the file that `call`
-names.
+The function that executes a command is imported when the command is called, so that `--help` and
+errors in the command line are fast. It has the name of the command, and is in the file that is
+given to `call`.
 """
 
 from __future__ import annotations

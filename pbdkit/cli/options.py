@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 PATH = click.Path(path_type=Path)
+"""Type of paths."""
 C = TypeVar("C", bound=click.Command)
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -33,7 +34,8 @@ def call(target: str, *args: Any, **options: Any) -> int | None:
 def load_experiment(name: str, settings: tuple[str, ...]) -> Experiment:
     """Return an experiment by its file or shipped name, with settings.
 
-    It is read before anything is imported that validates it, so that a mistyped name ends early.
+    The file is read before the modules that validate it are imported, so that a mistyped name is
+    reported quickly.
     """
     from pbdkit.model.shipped import read_experiment
 
@@ -155,6 +157,7 @@ NO_PLUGINS = click.Option(
     callback=_setting("pbdkit.hooks:DISABLE"),
     help="Load no plugins, as if pbdkit alone were installed.",
 )
+"""Option to load no plugins."""
 
 
 def with_no_plugins(command: C) -> C:

@@ -49,7 +49,7 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
     StorageError
         If the file system returns an error.
     """
-    try:  # in the bytes of the file system, whatever the locale
+    try:  # The name is in the bytes of the file system, independent of the locale.
         os.fsencode(path.absolute()).decode()
     except UnicodeDecodeError:
         text = os.fsencode(path.absolute()).decode(errors="backslashreplace")

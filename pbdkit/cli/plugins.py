@@ -88,7 +88,7 @@ def check_plugins(distributions: tuple[str, ...], verbose: bool, as_json: bool) 
 
 
 def _rows(plugin: Plugin) -> list[dict[str, str]]:
-    """One of the plugin and one of each of its components."""
+    """Return a row for the plugin, and one for each of its components."""
     rows = [("plugin", plugin.name, plugin.state, plugin.reason)]
     for offer in plugin.offers:
         interface = offer.interface.__name__ if offer.interface else ""
@@ -249,7 +249,7 @@ def project_of(name: str, interface: str) -> Project:
         raise ExperimentError(f"'{name}' gives no valid name for a class{remedy}")
     reserved = {*keyword.kwlist, *sys.stdlib_module_names}
     spec = None if module in reserved else find_spec(module)
-    if module in reserved or (spec and spec.origin):  # a folder without __init__ has no origin
+    if module in reserved or (spec and spec.origin):  # A folder without __init__.py has no origin.
         raise ExperimentError(f"there is already a module {module}{remedy}")
     field, base = next(
         (field, interface_class)

@@ -112,7 +112,8 @@ def _bond_in_words(facts: dict[str, Any]) -> Iterator[str]:
 
 
 def _around_in_words(around: list[BondStatus], step: int | None) -> Iterator[str]:
-    """Describe the other bonds at its ends: those that broke before it, with it and after it."""
+    """Describe the other bonds at the ends of a bond: those that broke before it, with it and after
+    it."""
     broken = [standing for standing in around if standing.step is not None]
     groups = {"broken around it": broken}
     if step is not None:

@@ -65,7 +65,7 @@ def run(
         warn(disk_warnings(path, scene), quiet)
         with progress_of_run(path, quiet or as_json, file) as (stop, watch):
             simulation = execution.run(scene, watch)
-            del scene  # each of several processes keeps its part alone
+            del scene  # Each of several processes keeps its part of the scene alone.
             warn([*simulation.warnings, *([] if quiet else simulation.outlook())], quiet)
             report = record(simulation, simulation.sink(file))
         if execution.communicator.is_root:
@@ -90,7 +90,7 @@ def refuse_unfinished(path: Path, *, force: bool) -> None:
 def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
     """Warn if the output may not fit on its disk."""
     output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total).output
-    with suppress(OSError):  # a missing folder is reported when the file is opened
+    with suppress(OSError):  # A missing folder is reported when the file is opened.
         if output > (free := shutil.disk_usage(path.parent).free):
             yield (
                 f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
@@ -106,7 +106,7 @@ def run_together(execution: Execution, quiet: bool, work: Callable[[Execution, b
     except NotSharedError as error:
         text = str(error).replace("; run it in one process", "; the first of them runs it alone")
         warn([text], quiet)
-    # A signal that is sent to all processes must not end those that wait.
+    # A signal that is sent to all processes must not end those that are waiting.
     with nullcontext() if execution.communicator.is_root else stop_on_signals():
         return execution.by_root(lambda: work(Execution(), True))
 

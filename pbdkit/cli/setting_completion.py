@@ -131,7 +131,7 @@ def settings(context: click.Context, prefix: str) -> Iterator[str]:
 
 
 def _data(context: click.Context) -> dict[str, Any]:
-    # The option that waits for its value keeps click from giving arguments their names.
+    # The option that waits for its value prevents click from assigning the arguments.
     name = context.params.get("experiment") or next(iter(context.args), None)
     defaults = Experiment.defaults()
     source = read_experiment(name) if name else Source(data={})

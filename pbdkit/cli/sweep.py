@@ -68,7 +68,7 @@ def _client(address: str | None) -> Iterator[Any]:
     except ImportError:
         what = "--dask needs dask.distributed: pip install 'pbdkit[sweep]'"
         raise ExperimentError(what) from None
-    # Its log messages about lost connections, with tracebacks, would hide those of the program.
+    # Log messages about lost connections, with tracebacks, would hide the messages of the program.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         client: Any = distributed.Client(address, timeout=CONNECT_S)  # type: ignore[no-untyped-call]  # distributed is untyped

@@ -17,9 +17,9 @@ from pbdkit.communicator import Communicator
 from pbdkit.errors import PbdkitError
 
 NUMBERS_AT_ONCE = 2**20
-"""Number of values of all processes together that are compared at a time."""
+"""Number of values of all processes together that are compared at once."""
 PAUSE_S = 0.05
-"""Interval at which processes test for a message of the root."""
+"""Interval in seconds at which processes test for a message of the root."""
 FAILED = 1
 """Exit status of a run that ends because one process failed."""
 
@@ -60,7 +60,7 @@ class MPICommunicator(Communicator):
         return bool(values.any())
 
     def send(self, block: Bytes, rank: int) -> None:
-        """Send bytes to one process, which receives as many."""
+        """Send bytes to one process, which expects the same number."""
         self._comm.Send(block, rank)
 
     def receive(self, into: Bytes, rank: int) -> None:
@@ -68,8 +68,8 @@ class MPICommunicator(Communicator):
         self._comm.Recv(into, rank)
 
     def scatter(self, each: Iterable[Any] | None) -> Any:
-        """Return what the root has for this process, made one after the other. What is raised in
-        making it is raised in all."""
+        """Return the object that the root generates for this process; objects are generated one
+        after the other. An exception in their generation is raised in all processes."""
         result: Any = None
         with self.raise_together():
             if each is None:
@@ -97,8 +97,8 @@ class MPICommunicator(Communicator):
 
     @contextmanager
     def raise_together(self) -> Iterator[None]:
-        """Raise what the block raises in any process in all of them, at its end: the error of the
-        lowest rank."""
+        """Run the block; an exception in any process is raised in all of them at its end, that of
+        the lowest rank."""
         error: Exception | None = None
         try:
             yield
@@ -107,7 +107,7 @@ class MPICommunicator(Communicator):
         self.raise_first(error)
 
     def raise_first(self, error: Exception | None) -> None:
-        """Raises the error of the lowest rank that has one, in all processes."""
+        """Raise the error of the lowest rank that has one, in all processes."""
         if not self.any(error is not None):
             return
         errors = self.allgather(error and _carried(error))
@@ -116,7 +116,8 @@ class MPICommunicator(Communicator):
         raise raised
 
     def by_root(self, work: Callable[[], int]) -> int:
-        """Return what the root alone comes to; the other processes sleep meanwhile."""
+        """Return the result of work that the root does alone; the other processes sleep
+        meanwhile."""
         if not self.is_root:
             while not self._comm.iprobe(source=0):
                 time.sleep(PAUSE_S)
@@ -134,8 +135,8 @@ class MPICommunicator(Communicator):
 
     @contextmanager
     def root_speaks(self) -> Iterator[None]:
-        """Report in the root alone what ends the block. After an error that is no PbdkitError this
-        process ends all others when it ends: they would wait for it."""
+        """Report an exception that ends the block in the root alone. After an exception other than
+        a PbdkitError the end of this process ends all others, which would wait for it."""
         try:
             yield
         except PbdkitError as error:
@@ -147,7 +148,7 @@ class MPICommunicator(Communicator):
 
 
 def _carried(error: Exception) -> Exception:
-    """Return an error that can be sent: itself, or one with the same message."""
+    """Return an error that can be sent: the same one, or one with the same message."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:

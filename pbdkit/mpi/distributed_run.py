@@ -39,9 +39,12 @@ from pbdkit.stepping.state import State
 
 
 class PartitionScheme(NamedTuple):
-    """Partition of a scene for a solver: a function that cuts it into subdomains, and one that
-    returns an upper bound of the halo, from the rows that a step and neighbours reach, the least
-    rows of a part and the number of parts."""
+    """Partition of a scene for a solver.
+
+    `subdomains` divides the scene, and `widest` returns an upper bound of the halo from the number
+    of rows that a step reads, that neighbours reach, the minimum number of rows of a part, and the
+    number of parts.
+    """
 
     subdomains: Callable[[Scene, int], list[partition.Subdomain]]
     widest: Callable[[int, int, int, int], int]
@@ -51,6 +54,7 @@ CUTS: dict[type[Solver], PartitionScheme] = {
     Stepping: PartitionScheme(partition.subdomains, partition.widest_halo),
     Equilibrium: PartitionScheme(driver.deep_subdomains, driver.deep_halo),
 }
+"""Partition schemes by solver."""
 
 
 class ElsewhereError(PbdkitError):
@@ -79,7 +83,7 @@ class BuildCommunicator(Communicator):
 
     @contextmanager
     def raise_together(self) -> Iterator[None]:
-        """End the block in all processes if one raises: by ElsewhereError in the others."""
+        """Run the block; if a process raises in it, all others raise ElsewhereError at its end."""
         try:
             yield
         except ElsewhereError:
@@ -91,10 +95,10 @@ class BuildCommunicator(Communicator):
 
 
 def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
-    """Return the scene of a process's own rows and their surroundings; of the whole if frame points
-    follow particles far away, or to raise an error as a single process does.
+    """Return the scene of the rows of a process and their halo. The whole scene is returned if
+    frame points follow distant particles, or to raise the same error as a single process.
 
-    Raises what `build_scene` does, in all processes.
+    Raises the errors of `build_scene`, in all processes.
     """
     if experiment.frame.local:
         error: Exception | None = None
@@ -114,7 +118,7 @@ def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
 
 
 def _is_too_large(experiment: Experiment) -> bool:
-    """Return whether the whole is too large for one process."""
+    """Return whether the whole scene is too large for one process."""
     try:
         Ground(experiment)
     except TooLargeError:
@@ -148,7 +152,8 @@ def _built(experiment: Experiment, ranks: Communicator) -> Scene:
 
 
 def _levels(rule: FollowerRule) -> int:
-    """Return an upper bound of the number of sweeps of a step: masses read one more."""
+    """Return an upper bound of the number of times that a step evaluates neighbours; forces on
+    masses are one of them."""
     levels = 2
     while isinstance(rule, AppliesTwice):
         with blaming(rule, "to return its inner rule", "rule"):
@@ -157,8 +162,8 @@ def _levels(rule: FollowerRule) -> int:
 
 
 def _search(ground: Ground) -> int:
-    """Return the largest number of rows from a frame point to its nearest particles, and to those
-    twice as far as the frame is deep, in site indices."""
+    """Return the largest number of rows between a frame point and its nearest particles, or
+    particles at twice the depth of the frame, in site indices."""
     cell: Cell = ground.cell
     steps = [math.hypot(*v) / p for v, p in zip(cell.vectors, cell.period, strict=True)]
     farthest = ground.layers * sum(steps) + sum(math.hypot(*v) for v in cell.vectors)
@@ -169,8 +174,8 @@ def _search(ground: Ground) -> int:
 
 
 class DistributedRecorder(Recorder):
-    """Recorder of a part. Diagnostics that are not `local` measure the whole state, which the first
-    process gathers."""
+    """Recorder of a part. For diagnostics that are not `local` the first process gathers the whole
+    state."""
 
     def __init__(self, division: driver.Division, sink: PartSink) -> None:
         super().__init__(division.scene, sink)
@@ -184,14 +189,14 @@ class DistributedRecorder(Recorder):
         self._local = {when_measured(d) for d in diagnostics if d.local}
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
-        """Begin; a history is that of the whole, in the first process."""
+        """Begin; a history contains the whole lattice, in the first process."""
         super().begin(None if history is None else ())
         if history is not None:
             self._joining.take(history)
 
     def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
-        """Record as a single process does, without equilibria within steps. An error of one rank is
-        raised on all."""
+        """Record in the same way as a single process, without equilibria within steps. An error of
+        one rank is raised on all."""
         if state.step <= self.last_steps.step and not last:
             return
         recorded = last or self._scene.experiment.records(state.step)
@@ -205,7 +210,7 @@ class DistributedRecorder(Recorder):
         self._put(state, values)
 
     def finish(self, state: State, outcome: Any, prediction: dict[str, Any]) -> None:
-        """Finish as a single process does."""
+        """Finish in the same way as a single process."""
         self._whole = self._division.gathered(state) if When.END in self._gathered else None
         if When.END in self._local:
             self._division.halo.look_back(state)
@@ -220,8 +225,8 @@ class DistributedRecorder(Recorder):
         return values
 
     def _inside_out(self, state: State) -> str | None:
-        """Return the description of cells that are inside out; the whole is gathered only if a part
-        has some."""
+        """Return the description of inverted cells. The state is gathered only if a part has
+        some."""
         if not self._ranks.any(super()._inside_out(state) is not None):
             return None
         whole = self._division.gathered(state)
@@ -236,7 +241,8 @@ def _is_local(diagnostic: Diagnostic) -> bool:
 
 
 class PartSink(KeepingSink):
-    """Sink that joins the parts of all processes for that of the first one."""
+    """Sink that joins the parts of all processes and passes them to the sink of the first
+    process."""
 
     def __init__(self, division: driver.Division, inner: KeepingSink) -> None:
         self._ranks = division.ranks
@@ -267,8 +273,8 @@ class PartSink(KeepingSink):
         self._first(put)
 
     def _parted(self, column: Column) -> tuple[str, int] | None:
-        """Return the dimension of which processes have parts, and its axis in an entry; None if
-        each has all."""
+        """Return the dimension that is divided among processes, and its axis in an entry; None if
+        each process has all values."""
         dims = column.dims[1:] if column.grows else column.dims
         along = [n for n, dim in enumerate(dims) if dim in self._own]
         if not along or column.name in self._not_local:
@@ -276,12 +282,13 @@ class PartSink(KeepingSink):
         return dims[along[0]], along[0]
 
     def put(self, values: Values) -> None:
-        """Write an entry of joined parts; other values are those of the first process."""
+        """Write an entry, joined from the parts if it is divided, otherwise from the first
+        process."""
         whole = dict(values)
         for name in [name for name in values if name in self._parts]:
             dim, axis = self._parts[name]
             part = np.asarray(values[name])[(*(slice(None),) * axis, self._own[dim])]
-            if name == "bond":  # a part counts its own
+            if name == "bond":  # Each part counts its own bonds.
                 part += sum(self._lengths[name][: self._ranks.rank]) + 1 - part[:1]
             whole[name] = partition.joined(self._ranks, part, axis, self._lengths[dim])
         self._first(lambda inner: inner.put(whole), whole)
@@ -314,8 +321,8 @@ class PartSink(KeepingSink):
     def _first(
         self, call: Callable[[KeepingSink], None], joining: Mapping[str, Any] | None = None
     ) -> None:
-        """Call the sink in the first process, and raise its errors in all. Others send their shares
-        of joined arrays meanwhile."""
+        """Call the sink in the first process, and raise its errors in all. Meanwhile the others
+        send their parts of arrays."""
         with self._ranks.raise_together():
             if self._inner:
                 try:
@@ -338,8 +345,8 @@ DRIVERS: dict[type[Solver], Callable[[driver.Division, Scene, Watch], Driver]] =
 
 
 class DistributedSimulation(Simulation):
-    """Run that several processes share, each with its part of the scene. Its states are those of
-    the part. Raises what any run does, in all processes."""
+    """Run that several processes share, each with a part of the scene. Its states are those of the
+    part. All errors are raised in all processes."""
 
     def __init__(self, ranks: MPICommunicator, scene: Scene, watch: Watch) -> None:
         automatic = scene.experiment.stepping.open_parameters
@@ -354,8 +361,8 @@ class DistributedSimulation(Simulation):
         self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
 
     def _warnings(self, scene: Scene, bound: Bound | None) -> tuple[str, ...]:
-        """Return warnings of the part; those about masses come from the whole, in the first
-        process."""
+        """Return the warnings of the part; those about masses refer to the whole and are issued by
+        the first process."""
         if not any(leading.share is not None for leading in scene.leading):
             return quick_warnings(scene, bound)
         with self.division.ranks.raise_together():
@@ -363,7 +370,7 @@ class DistributedSimulation(Simulation):
             return quick_warnings(whole, bound) if whole else ()
 
     def outlook(self) -> list[str]:
-        """Return nothing: `check` evaluates the whole."""
+        """Return no warnings: `check` evaluates the whole."""
         return []
 
     @property
@@ -377,12 +384,12 @@ class DistributedSimulation(Simulation):
         return DistributedRecorder(self.division, sink)
 
     def sink(self, inner: KeepingSink) -> KeepingSink:
-        """Return a sink that joins the parts for that of the first process."""
+        """Return a sink that joins the parts for the sink of the first process."""
         return PartSink(self.division, inner)
 
 
 def _tuned(ranks: MPICommunicator, scene: Scene) -> Scene:
-    """Return the scene with numbers in place of `auto`, which the first process computes for the
+    """Return the scene with values in place of `auto`, which the first process computes for the
     whole."""
     if not scene.experiment.stepping.is_open:
         return scene
@@ -406,11 +413,12 @@ class DistributedExecution(Execution):
         return built(self.communicator, experiment)
 
     def tuned(self, scene: Scene) -> Scene:
-        """Return the part with the numbers that are found for the whole."""
+        """Return the part with the values that are computed for the whole."""
         return _tuned(self.communicator, scene)
 
     def by_root(self, work: Callable[[], int]) -> int:
-        """Return what the root alone comes to; the other processes sleep meanwhile."""
+        """Return the result of work that the root does alone; the other processes sleep
+        meanwhile."""
         return self.communicator.by_root(work)
 
     def run(self, scene: Scene, watch: Watch) -> Simulation:

@@ -35,8 +35,8 @@ from pbdkit.stepping.step import Mode
 
 
 class DividedStepper(Engine):
-    """Engine that makes as many steps in a call as the halo allows, up to the beginning of a
-    motion, which starts from an updated state."""
+    """Engine that makes as many steps in a call as the halo permits. A call ends before a motion
+    begins, since the motion starts from an updated state."""
 
     def __init__(
         self, ranks: MPICommunicator, scene: Scene, engine: Engine, halo: partition.Halo, steps: int
@@ -71,7 +71,8 @@ def whole_of(ranks: MPICommunicator, scene: Scene) -> Scene | None:
 
 
 class Division:
-    """Scene divided among processes: the part of this one, and how states are gathered.
+    """Scene divided among processes: the part of this process, and methods that gather and
+    distribute states.
 
     The first process stores the `whole` scene if diagnostics or the steady state need it.
     """
@@ -95,7 +96,7 @@ class Division:
 
     def begun(self, scene: Scene) -> tuple[State, bool]:
         """Return the part of the state at time 0, and whether it can be computed again from the
-        part alone: random numbers are drawn for the whole, by the first process."""
+        part alone. Random numbers are drawn by the first process for the whole."""
         experiment, whole = scene.experiment, None
         draws = any(isinstance(part, Draws) for part in (experiment.rule, experiment.fracture))
         if not (experiment.initial.is_drawn or draws):
@@ -128,7 +129,8 @@ class Division:
         return self.halo.gathered(state)
 
     def state_dict(self, own: dict[str, Any]) -> dict[str, Any]:
-        """Return the state of a driver of the part with the state of the whole, as it is joined."""
+        """Return the state of a driver of the part, in which the state is that of the whole, joined
+        on access."""
         return own | {"state": self.halo.joined(own["state"])}
 
     def scattered(self, parts: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,7 +150,7 @@ class Division:
 
 
 class DistributedWatch(Watch):
-    """Watch by which all stop if one is to stop; the first shows the progress."""
+    """Watch by which all processes stop if one is to stop; the first shows the progress."""
 
     def __init__(self, ranks: MPICommunicator, watch: Watch) -> None:
         super().__init__(lambda: ranks.any(watch.stopping()), watch.show)
@@ -165,9 +167,11 @@ class DividedGuard(Guard):
         return self.ranks.largest(super().most(state))
 
     def worst(self, scene: Scene, state: State) -> int:
-        """Return the number of the particle with the largest displacement, the first on ties."""
+        """Return the number of the particle with the largest displacement; among equal ones that of
+        the lowest rank."""
         values = self.ranks.allgather((super().most(state), super().worst(scene, state)))
-        return int(values[int(np.argmax([largest for largest, _ in values]))][1])  # NaN is largest
+        # NaN counts as largest.
+        return int(values[int(np.argmax([largest for largest, _ in values]))][1])
 
 
 class DividedSettling(SteadyStateMonitor):
@@ -188,7 +192,8 @@ class DividedSettling(SteadyStateMonitor):
         return certificate
 
     def look(self, state: State) -> Certificate | None:
-        """Return the certificate as a single process does. Raises StoppedError in all."""
+        """Return the error bound of a steady state, as a single process does. Raises StoppedError
+        in all processes."""
         whole, certificate, ranks = self._division.gathered(state), None, self._division.ranks
         error: Exception | None = None
         if self._settling and whole is not None:
@@ -202,7 +207,7 @@ class DividedSettling(SteadyStateMonitor):
 
 
 class DistributedSteppingDriver(SteppingDriver):
-    """Stepping driver of a part, which agrees with the others."""
+    """Stepping driver of a part, with decisions that all processes make together."""
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
@@ -218,11 +223,12 @@ class DistributedSteppingDriver(SteppingDriver):
             self.monitor = DividedSettling(division, settle)
 
     def _steps_in(self, seconds_a_step: float) -> int:
-        """Return the number of steps as the first process estimates it."""
+        """Return the number of steps, as estimated by the first process."""
         return int(self._division.ranks.bcast(super()._steps_in(seconds_a_step)))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the driver with the state of the whole, as it is joined."""
+        """Return the state of the driver, in which the state is that of the whole, joined on
+        access."""
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
@@ -237,7 +243,7 @@ def refuse_operations(ranks: MPICommunicator, scene: Scene, mode: Mode) -> None:
 
 
 def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> None:
-    """Raises NotSharedError for the first clash of what does not fit, of a field."""
+    """Raise NotSharedError for the first feature that ranks do not support, with its field."""
     for clash, field, text in unfit:
         if clash:
             refusal = f"{text}, which several processes cannot share yet; run it in one process"
@@ -245,10 +251,10 @@ def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> 
 
 
 SHARE = 4
-"""Ratio of the part of one process to the first grid that all processes have."""
+"""Ratio of the number of rows of a part to that of the finest whole grid."""
 A_CYCLE = 6
-"""Number of rows of that grid beyond its own that a process takes into a cycle: valid rows shrink
-by 4 on the way down, and by 2 on the way up."""
+"""Number of rows of that grid, in addition to its own, with which a process computes a cycle: the
+number of valid rows decreases by 4 on the way down, and by 2 on the way up."""
 
 
 class DistributedRows(Rows):
@@ -267,8 +273,8 @@ class DistributedRows(Rows):
         return np.concatenate(self.communicator.allgather(numbers[..., self.own]), axis=-1)
 
     def random(self, shape: tuple[int, ...]) -> Floats:
-        """Return the numbers that a single process draws for these rows: each is one advance of its
-        generator."""
+        """Return the random numbers that a single process would draw for these rows; each number
+        advances the generator by one."""
         assert self.strip
         planes, (rows, places) = shape[:-2], shape[-2:]
         numbers: Floats = np.empty((math.prod(planes), rows, places))
@@ -279,8 +285,8 @@ class DistributedRows(Rows):
 
 
 def deep_subdomains(scene: Scene, parts: int) -> list[partition.Subdomain]:
-    """Return parts with halos for a cycle of multigrid, and arrays that begin where all divided
-    grids have a row.
+    """Return parts with halos for a multigrid cycle. Their arrays begin at rows that exist on all
+    divided grids.
 
     Raises ExperimentError if rows are too few.
     """
@@ -321,11 +327,12 @@ def _margin(scene: Scene) -> int:
 
 
 STUCK = "the iteration that several processes share gets nowhere; run it in one process"
+"""Message for an iteration that makes no progress."""
 
 
 class DistributedEquilibriumDriver(EquilibriumDriver):
-    """Driver of an equilibrium that several processes share: of linear rules, without bonds that
-    break and without obstacles, on the stencils of a lattice with one site in a cell."""
+    """Driver of an equilibrium that several processes share. It supports linear rules without
+    breaking bonds and obstacles, on the stencils of a lattice with one site in a cell."""
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
@@ -360,7 +367,7 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         return certificate
 
     def _renewed(self, way: Way) -> Way:
-        """Renew the frame points at each equilibrium of a load path."""
+        """Update the frame points at each equilibrium on the path of the load."""
         while True:
             try:
                 reached = next(way)

@@ -1,4 +1,4 @@
-"""Detection of a launch by mpiexec, with few imports otherwise."""
+"""Detection of a start by mpiexec. Little is imported for programs that are started otherwise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RANK = "PMIX_RANK"
 def launched() -> Iterator[Communicator]:
     """Yield the communicator of the processes that were started together, as by `mpiexec -n 4`.
 
-    The root alone prints in the block. A process that was started alone has the serial one.
+    Only the root prints in the block. A process that was started alone has the serial communicator.
 
     Raises ExperimentError if mpi4py is missing, finds no MPI library, or belongs to another
     launcher.
@@ -56,7 +56,7 @@ def launched() -> Iterator[Communicator]:
 
 
 def execution_of(communicator: Communicator) -> Execution:
-    """Return what carries out the runs of the processes of a communicator."""
+    """Return the execution of runs for the processes of a communicator."""
     if communicator is SERIAL:
         from pbdkit.simulation import Execution
 

@@ -1,10 +1,10 @@
 """Partition of a lattice among ranks: rows of repeat cells with a halo, exchange of halos, and
 joining of parts.
 
-A part has its own rows and, beyond them, a halo of rows of its neighbours. Its outermost rows, as
-many as neighbours reach, are empty; as many again hold frame points that follow no particle, except
-for leaders. In each step the valid rows shrink by the reach of a step, so that several steps can be
-made before the halo is exchanged.
+A part has its own rows and a halo of rows of the adjacent parts. The outermost rows, as many as
+neighbours reach, are empty; in the same number of rows next to them particles, except for leaders,
+are frame points that follow no particle. In each step the number of valid rows decreases by the
+reach of a step, so that several steps can be made before the halo is exchanged.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ BLOCK = 2**23
 
 
 class Share:
-    """Share of an array in another process than the first, along an axis: its type, and a method to
+    """Share of an array in a process other than the first, along an axis: its type, and a method to
     send it."""
 
     def __init__(self, part: Array, axis: int) -> None:
@@ -62,8 +62,8 @@ class Share:
 
 
 def joined(ranks: MPICommunicator, part: Array, axis: int, lengths: Sequence[int]) -> Any:
-    """Return an array of which each process has a part, with these lengths along an axis, in the
-    order of ranks: in the first process a PiecedArray, in the others their share."""
+    """Return an array that is divided among processes with these lengths along an axis, in the
+    order of ranks: a PiecedArray in the first process, and their share in the others."""
     if not ranks.is_root:
         return Share(part, axis)
     shape = (*part.shape[:axis], sum(lengths), *part.shape[axis + 1 :])
@@ -96,19 +96,21 @@ def _blocks(part: Array, axis: int) -> Iterator[Bytes]:
 
 
 MOST_STEPS = 16
-"""Maximum number of steps between two exchanges: by then halos are a hundredth of a part of 1500
-rows."""
+"""Maximum number of steps between two exchanges, after which the halo of a part of 1500 rows is a
+hundredth of the part."""
 MADE_TWICE = 0.05
-"""Maximum number of rows that two parts both compute, relative to the own rows of a part."""
+"""Maximum number of rows that two adjacent parts both compute, relative to the number of rows of a
+part."""
 LOOKED_AT = 3
-"""Minimum number of moving rows beside its own if diagnostics measure a part."""
+"""Minimum number of moving rows beyond the own rows of a part if diagnostics are evaluated on
+it."""
 
 
 @dataclass(frozen=True)
 class Subdomain:
-    """Rows `begin` to `end` of repeat cells with those from `low` to `high` around them, of which
-    the outermost `edge` are empty, and as many do not move; `steps` can be made between two
-    exchanges."""
+    """Rows `begin` to `end` of repeat cells, with a halo from `low` to `high`. The outermost `edge`
+    rows are empty, and the same number of rows next to them do not move; `steps` can be made
+    between two exchanges."""
 
     begin: int
     end: int
@@ -157,7 +159,7 @@ def farthest_apart(scene: Scene) -> int:
 
 
 def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
-    """Return parts of whole rows with about equally many particles.
+    """Return parts of whole rows with about equal numbers of particles.
 
     Raises ExperimentError if rows are too few.
     """
@@ -165,12 +167,15 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     counts = scene.raster.row_counts
     bounds = bounds_of(counts, parts)
     steps = _steps(each, int(np.diff(bounds).min()))
-    # After the last of these steps all of its own rows are right, and what frame points follow.
+    # After the last of these steps all own rows are valid, and all particles that their frame
+    # points follow.
     looked_at = edge + LOOKED_AT * any(d.local for d in experiment.diagnostics)
-    # Bonds from own frame points lead to particles that do not stand still.
+    # Bonds from own frame points lead to moving particles.
     halo = max(steps * each, looked_at, 2 * edge * experiment.shows_bonds) + edge
     if scene.has_fracture and not experiment.fracture.breaks_frame_bonds():
-        halo += edge  # bonds to what stands are spared: it must be beyond those of own rows
+        # Bonds to particles that do not move are spared, so that these must be beyond the bonds of
+        # own rows.
+        halo += edge
     return [
         Subdomain(b, e, max(0, b - halo), min(len(counts), e + halo), edge, steps)
         for b, e in pairwise(bounds)
@@ -178,8 +183,8 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
 
 
 def widest_halo(each: int, edge: int, least: int, parts: int) -> int:
-    """Return an upper bound of the halos of `subdomains`, if a step reaches at most `each` rows,
-    and neighbours `edge`, of parts of at least `least` rows."""
+    """Return an upper bound of the halos of `subdomains`, if a step reaches at most `each` rows and
+    neighbours `edge` rows, for parts of at least `least` rows."""
     return _steps(each, least) * each + 3 * edge + LOOKED_AT + int(MADE_TWICE * least)
 
 
@@ -202,8 +207,8 @@ def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
 
 
 def _steps(each: int, least: int) -> int:
-    """Return the number of steps between two exchanges, from the rows that a step reaches and the
-    least rows of a part."""
+    """Return the number of steps between two exchanges, for the rows that a step reaches and the
+    minimum number of rows of a part."""
     return min(MOST_STEPS, 1 + int(MADE_TWICE * least / each)) if each else MOST_STEPS
 
 
@@ -223,8 +228,8 @@ class SubdomainScene:
 
 
 def part_of(scene: Scene, subdomain: Subdomain) -> SubdomainScene:
-    """Return the part of a scene with the rows of a subdomain; the raster of the scene has these
-    rows and more around them, or all."""
+    """Return the part of a scene with the rows of a subdomain; the raster of the scene contains at
+    least these rows."""
     to, rows = restriction(scene.raster, subdomain)
     places = [each.place[each.is_in(to)] for each in scene.leading]
     begin = to.low + subdomain.own.start
@@ -279,7 +284,7 @@ def _others(sites: Array) -> Sequence[int]:
 
 
 class Halo:
-    """Halo of a part: own rows of other parts."""
+    """Halo of a part: copies of rows that other parts own."""
 
     def __init__(
         self, ranks: MPICommunicator, parts: Sequence[Subdomain], part: SubdomainScene
@@ -293,7 +298,7 @@ class Halo:
             np.arange(len(ours)) + first - early
             for ours, early, first in zip(part.ours, part.early, offsets, strict=True)
         )
-        """Particles of each leader group that the part has, by their number in the group."""
+        """Particles of each leader group that the part has, by their index in the group."""
         own, rank, rows = part.subdomain, ranks.rank, parts[-1].end
         ranks_around = [n for n in range(len(parts)) if n != rank]
         sides = [n for n in ranks_around if _touch(own, parts[n]) or _touch(parts[n], own)]
@@ -321,7 +326,7 @@ class Halo:
         return [np.flatnonzero(np.logical_and.reduce(masks)) for masks in ins]
 
     def renew(self, state: State) -> None:
-        """Update the halo of a state, in place, and the velocities of masses in it. Displacements
+        """Update the halo of a state in place, with the velocities of masses in it. Displacements
         of the step before are omitted if no step reads them."""
         arrays = [
             array for array in state.arrays() if self._looks_back or array is not state.previous
@@ -363,8 +368,8 @@ class Halo:
                 yield as_bytes(array[plane][rows])
 
     def joined(self, state: State) -> State:
-        """Return the state of the whole, of arrays that are joined on access; in other processes
-        than the first, of their shares."""
+        """Return the state of the whole with arrays that are joined on access; in processes other
+        than the first, with their shares."""
         rows_of_part, rows = (
             self._part.subdomain.own,
             [part.end - part.begin for part in self._parts],
@@ -385,7 +390,7 @@ class Halo:
         shares = self.joined(state)
         if self._ranks.is_root:
             starts = (None if start is None else np.asarray(start) for start in shares.starts)
-            # In the order in which the others send.
+            # The order is that in which the other processes send.
             whole = shares.map(np.asarray, ())
             return replace(whole, starts=tuple(starts))
         every: list[Any] = [*shares.arrays(), *(s for s in shares.starts if s is not None)]
@@ -395,7 +400,7 @@ class Halo:
 
 
 def _shared(part: Subdomain, other: Subdomain) -> tuple[int, int]:
-    """Return the rows of a part's halo that are another's own."""
+    """Return the rows of a part's halo that another part owns."""
     return max(part.low, other.begin), min(part.high, other.end)
 
 
@@ -424,8 +429,8 @@ class RowCount:
     """Number of particles in the rows of a lattice.
 
     `low` and `high` are the ends of the body's box of sites; `lines` are the numbers of particles
-    on each line of sites, frame included, from the first on that has any; `period` and `reach` are
-    the number of indices of a repeat cell and of cells that neighbours reach along the first axis;
+    on each line of sites, frame included, from the first nonempty one; `period` and `reach` are the
+    number of indices of a repeat cell and of cells that neighbours reach along the first axis;
     `left_out` are the cells omitted at narrow voids.
     """
 
@@ -476,7 +481,7 @@ class RowCount:
 
 def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
     """Count the particles of a body and its frame in each row; return None without a body. Each
-    process counts on an equal number of lines."""
+    process counts the particles of an equal number of lines."""
     rank = communicator.rank
     lattice, layers = ground.experiment.lattice, ground.layers
     (first, *_), (last, *_) = low, high = window(ground.experiment.body, lattice)

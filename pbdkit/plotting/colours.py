@@ -27,12 +27,13 @@ KINDS = {
 }
 """Names and colours (of Okabe and Ito), in drawing order."""
 CLASS_COLOURS = ("#0072B2", "#F0E442", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+"""Colours of other classes (of Okabe and Ito)."""
 
 
 @dataclass(frozen=True)
 class Palette:
-    """Names and colours by class number, in drawing order: of the kinds of particles, or, not
-    `of_kind`, of the values of a quantity."""
+    """Names and colours by class number, in drawing order. The classes are the kinds of particles
+    if `of_kind`, otherwise the values of a quantity."""
 
     colours: dict[int, tuple[str, str]]
     of_kind: bool
@@ -47,6 +48,7 @@ class Palette:
 
 
 OF_KINDS = Palette(KINDS, True)
+"""Palette of the kinds of particles."""
 
 
 def palette_of(quantity: PlottedQuantity) -> Palette:
@@ -59,14 +61,20 @@ def palette_of(quantity: PlottedQuantity) -> Palette:
     )
 
 
-DOTS, FIELD, BOTH_SIGNS = "viridis", "YlOrRd", "RdBu_r"
+DOTS = "viridis"
+"""Colour map of dots."""
+FIELD = "YlOrRd"
+"""Colour map of fields."""
+BOTH_SIGNS = "RdBu_r"
+"""Colour map of values of both signs."""
 NOTHING = "#E0E0E0"
 """Colour of missing values."""
 NEARLY = 1e-9
-"""Values and differences below this fraction of the largest value count as zero."""
+"""Fraction of the largest value below which values and differences count as zero."""
 FROM_ZERO = 0.3
-"""A scale begins at zero where its lowest value is below this fraction of its highest."""
+"""Ratio of the lowest to the highest value below which a scale begins at zero."""
 LEVELS = 12
+"""Number of levels of contours."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +95,9 @@ def scale_of(
 ) -> Scale:
     """Return the colour scale of a quantity with values in a range.
 
-    Where they have both signs, and zero is neutral, it reaches as far on either side, unless `look`
-    has limits: neutral is zero even then. Raises ExperimentError for a map that is not there.
+    If the values have both signs and zero is neutral, the scale is symmetric about zero unless
+    `look` has limits; zero has the neutral colour in any case. Raises ExperimentError for a colour
+    map that does not exist.
     """
     low, high = values
     largest = max(abs(low), abs(high))
@@ -113,7 +122,7 @@ def scale_of(
         high = low + (largest or 1.0)
     name = look.cmap or (BOTH_SIGNS if diverging else FIELD if filled else DOTS)
     if quantity.is_signed and low < high <= 0.0 and not look.cmap:
-        name += "_r"  # what is next to zero has the same colour on either side
+        name += "_r"  # Values next to zero then have similar colours on both sides.
     norm: Normalize = Normalize(low, high)
     if look.contours:
         levels = MaxNLocator(LEVELS, symmetric=diverging and not has_limits).tick_values(low, high)
@@ -139,7 +148,7 @@ def _map(name: str, about_zero: tuple[float, float] | None) -> Colormap:
 
 
 def _exponent(largest: float) -> int:
-    """Return the power of ten that is written once in the label, instead of zeros at each tick."""
+    """Return the power of ten that is written once in the label instead of at each tick."""
     if largest == 0.0 or not math.isfinite(largest):
         return 0
     power = math.floor(math.log10(largest) + 1e-9)

@@ -1,7 +1,7 @@
 """Pictures of configurations: one or several steps of a run, or of two runs.
 
-Particles are drawn as dots, bonds as lines, a variable as a field of pixels, by what is legible at
-the distance of particles on the page.
+Particles are drawn as dots, bonds as lines, and a variable as a field of pixels, depending on what
+is legible at the distance of particles on the page.
 """
 
 from __future__ import annotations
@@ -146,11 +146,16 @@ def difference_of(
     return dataset.assign_attrs(title=title), name
 
 
-ROOMY_PT, LINED_PT, CROWDED_PT = 8.0, 5.0, 2.4
-"""Thresholds of the distance of particles on the page: above the first there is room for dots on a
-field, above the second bonds are single lines, below the third particles are pixels."""
-DETAILED, MANY_BONDS = 50_000, 200_000
-"""Maximum number of particles drawn as dots, and of bonds drawn as lines."""
+ROOMY_PT = 8.0
+"""Distance of particles on the page, in points, above which dots are drawn on a field."""
+LINED_PT = 5.0
+"""Distance of particles above which bonds are single lines."""
+CROWDED_PT = 2.4
+"""Distance of particles below which particles are pixels."""
+DETAILED = 50_000
+"""Maximum number of particles that are drawn as dots."""
+MANY_BONDS = 200_000
+"""Maximum number of bonds that are drawn as lines."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +192,8 @@ class RenderStyle:
 def choose_style(
     body: ReferenceBody, quantity: PlottedQuantity, look: Look, distance: float
 ) -> RenderStyle:
-    """Choose the rendering style from the options, and else for legibility. Raises ExperimentError
-    for an option that is impossible or too expensive."""
+    """Choose the rendering style from the options, and for legibility if they are not given. Raises
+    ExperimentError for an option that is impossible or too expensive."""
     crowded = len(body.reference) > DETAILED or distance < CROWDED_PT
     of_bonds, filled = quantity.owner == "bond", _is_filled(body, quantity, look, distance)
     if quantity.words:
@@ -241,9 +246,10 @@ def _is_lined(
     return not is_large and (of_bonds or (not filled and distance >= LINED_PT))
 
 
-NUMBERED_PT, LARGEST = 20.0, 2.5
-"""Distance of particles on the page at which numbers are legible, and maximum enlargement of the
-page for them."""
+NUMBERED_PT = 20.0
+"""Distance of particles on the page, in points, from which numbers are legible."""
+LARGEST = 2.5
+"""Maximum enlargement of the page for legible numbers."""
 
 
 class Panel:
@@ -262,10 +268,11 @@ class Panel:
 class Sheet:
     """Axes and panels, each of which shows steps of a recording.
 
-    All have the limits and the scale of an extent. Fields have `finer` times as many pixels, either
-    way, as the picture. `axes` given are used as they are; else a figure is made around them,
-    a `standalone` one or one of pyplot.
-    Raises ExperimentError for what there is no room or no data for.
+    All panels have the limits and the scale of an extent. Fields have `finer` times as many pixels
+    as the picture along each axis. Given `axes` are used as they are; otherwise a figure is created
+    around them, `standalone` or managed by pyplot.
+
+    Raises ExperimentError if there is not enough room or no data.
     """
 
     def __init__(
@@ -303,7 +310,7 @@ class Sheet:
         self._key()
         self._style = replace(
             self._style, distance=self._spacing()
-        )  # the key took some of the page
+        )  # The legend takes part of the page.
         self.panels = [
             Panel(ax, list(self._layers(ax, recording)))
             for ax, recording in zip(self.axes, recordings, strict=True)

@@ -28,18 +28,37 @@ if TYPE_CHECKING:
 
 Kind = Literal["map", "length", "bonds"]
 KINDS: tuple[Kind, ...] = ("map", "length", "bonds")
-COLOURS, BODY, OLD, NEW = "viridis", "#B0B0B0", "#000000", "#D55E00"
-WIDE_IN, LEAST_IN, TALLEST_IN, BESIDE_IN = 5.0, 1.8, 6.0, 1.3
-"""Maximum width of a map, its minimum width and height, its maximum height, and the space of the
-text around it, in inches."""
-LONG, SCALE_IN, THIN = 2.5, 0.7, 0.08
-"""Ratio of width to height above which the colour bar is below the body; its height there; ratio of
-the sides below which the shorter has a single tick."""
-POINTS, DENSE = 30_000, 100.0
-"""Maximum number of particles that are drawn; dot size in points for a single particle."""
-APART, CRACKS = 1.5, 50
-"""Bonds within this multiple of the bond length belong to one crack; maximum number of cracks that
-are measured, the largest first."""
+"""Kinds of pictures of cracks."""
+COLOURS = "viridis"
+"""Colour map of the steps of breaking."""
+BODY = "#B0B0B0"
+"""Colour of the body."""
+OLD = "#000000"
+"""Colour of bonds broken from the start."""
+NEW = "#D55E00"
+"""Colour of broken bonds if all broke in the same step."""
+WIDE_IN = 5.0
+"""Maximum width of a map in inches."""
+LEAST_IN = 1.8
+"""Minimum width and height of a map in inches."""
+TALLEST_IN = 6.0
+"""Maximum height of a map in inches."""
+BESIDE_IN = 1.3
+"""Space for text around a map in inches."""
+LONG = 2.5
+"""Ratio of width to height above which the colour bar is below the body."""
+SCALE_IN = 0.7
+"""Height of such a colour bar in inches."""
+THIN = 0.08
+"""Ratio of the sides below which the shorter side has a single tick."""
+POINTS = 30_000
+"""Maximum number of particles that are drawn."""
+DENSE = 100.0
+"""Size of dots in points, multiplied by the square root of the number of particles."""
+APART = 1.5
+"""Distance between bonds of one crack, as a multiple of the bond length."""
+CRACKS = 50
+"""Maximum number of cracks that are measured, the largest first."""
 DIRECTIONS = 180
 """Number of directions in which a crack is measured; the relative error of the length is below
 4e-5."""
@@ -173,7 +192,7 @@ def _is_long(body: Array) -> bool:
 
 
 def _axes_around(body: Array) -> Axes:
-    """Return the axes of a new figure with the body's aspect ratio, as far as there is room for
+    """Return the axes of a new figure with the aspect ratio of the body, limited by the room for
     text."""
     wide, tall = np.maximum(np.ptp(body, axis=0), 1e-9)
     height = min(max(WIDE_IN * tall / wide, LEAST_IN), TALLEST_IN)

@@ -1,4 +1,4 @@
-"""Curves and histories: one number over another or over the steps, a line for each run.
+"""Curves and histories: one quantity over another or over the steps, with a line for each run.
 
 Curves are force over displacement, stress over strain and energies; histories those of single
 particles and bonds. A dataset of a sweep has a line for each member.
@@ -37,6 +37,7 @@ NEEDED_FORCES = (
     "{type: load-displacement, youngs_modulus: ...} for loads, {type: contact, ...} for obstacles "
     "or {type: reaction, ...} for leader groups to `diagnostics`, and run again"
 )
+"""Message for results without forces."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +118,8 @@ def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
 
 
 def _of_barriers(scene: Scene, step: int) -> Floats:
-    """Return the offset of each obstacle at a step, (obstacle, axis); it stays at its last
-    place."""
+    """Return the offset of each obstacle at a step, (obstacle, axis); after its end it stays at its
+    last place."""
     offsets = []
     for barrier in scene.barriers:
         n = min(step, barrier.group.last(step)) - barrier.group.from_ + 1
@@ -140,19 +141,32 @@ def _of_rows(dataset: xarray.Dataset, rows: NDArray[Any]) -> Floats:
     return np.concatenate(means)
 
 
-SIZE_IN, DPI = (4.8, 3.3), 200
+SIZE_IN = (4.8, 3.3)
+"""Width and height of a figure in inches."""
+DPI = 200
+"""Resolution of a figure."""
 HUES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 """Colours of Okabe and Ito, without yellow, which is invisible on white."""
-MANY, MOST, WITHIN, FEW_POINTS = "viridis", 12, 4, 40
-"""Colour map for more lines than colours; maximum number of lines in a legend, and in one within
-the panel; maximum number of points with markers."""
-BROAD, TALL, NAMED = 44, 34, 34
-"""Characters a line of a label below and beside the panel, and of the legend."""
-QUICK, LEGEND_IN = 20_000, 1.9
-"""Maximum number of points for which the best place of a legend is searched; width of a legend
-beside the panel."""
+MANY = "viridis"
+"""Colour map for more lines than there are colours."""
+MOST = 12
+"""Maximum number of lines in a legend."""
+WITHIN = 4
+"""Maximum number of lines in a legend inside the panel."""
+FEW_POINTS = 40
+"""Maximum number of points that have markers."""
+BROAD = 44
+"""Characters per line of a label below the panel."""
+TALL = 34
+"""Characters per line of a label beside the panel."""
+NAMED = 34
+"""Characters per line of a legend."""
+QUICK = 20_000
+"""Maximum number of points for which the best place of a legend is searched."""
+LEGEND_IN = 1.9
+"""Width of a legend beside the panel in inches."""
 ROUND = [1, 2, 5, 10]
-"""Ticks are multiples of these."""
+"""Numbers of which the distances between ticks are multiples."""
 
 
 @dataclass(frozen=True)
@@ -174,8 +188,8 @@ def new_axes(width: float = SIZE_IN[0], height: float = SIZE_IN[1]) -> Axes:
 
 
 def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
-    """Draw lines with a legend, or with a colour bar labelled `hues` where they are too many for
-    one."""
+    """Draw lines with a legend or, if they are too many for one, with a colour bar labelled
+    `hues`."""
     order = {hue: n for n, hue in enumerate(dict.fromkeys(line.hue for line in lines))}
     shares = _shares(lines, order)
     for line in lines:
@@ -239,7 +253,7 @@ def _scale(ax: Axes, lines: Sequence[Line], order: dict[int, int], hues: str) ->
 
 
 def member_dims(values: Any) -> list[str]:
-    """Return the dimensions of a sweep, or of runs put side by side."""
+    """Return the dimensions of a sweep, or of concatenated runs."""
     return [str(dim) for dim in values.dims if dim not in OF_A_RUN]
 
 
@@ -250,8 +264,8 @@ def hues_of(values: Any) -> str:
 
 
 def lines_of(dataset: xarray.Dataset, x: Any, y: Any) -> list[Line]:
-    """Return the lines of y over x, DataArrays with one dimension of a run between them; each is
-    named by the parameters of its member and contains no NaN."""
+    """Return the lines of y over x, DataArrays with one dimension of a run in common. Each is named
+    by the parameters of its member, and contains no NaN."""
     across, drawn = xarray.broadcast(x, y)
     dims = member_dims(drawn)
     across, drawn = (values.transpose(*dims, ...) for values in (across, drawn))
@@ -288,12 +302,14 @@ Kind = Literal["load-displacement", "stress-strain", "energies"]
 KINDS: tuple[Kind, ...] = ("stress-strain", "load-displacement", "energies")
 """Kinds of curves, in the order in which they are tried."""
 ENERGIES = ("strain_energy", "pe1", "pe1_intact", "pe2")
+"""Names of the variables of energies."""
 NEEDED_DIAGNOSTICS = {
     "stress-strain": "stress over strain needs the diagnostic stress-strain: add "
     "{type: stress-strain, youngs_modulus: ..., width: ...} to `diagnostics`, and run again",
     "energies": "energies need a diagnostic: add {type: pe1}, or of a calibrated rule "
     "{type: strain-energy, youngs_modulus: ...}, to `diagnostics`, and run again",
 }
+"""Messages for results without the variables of a curve, by kind."""
 
 
 def draw_curve(
@@ -351,7 +367,7 @@ def _of_kind(
 
 
 def _energies(dataset: xarray.Dataset) -> list[str]:
-    """Return the energies that have one unit: the energy if there is one, else the
+    """Return the energies that have the same unit: the strain energy if there is one, otherwise the
     pseudo-energies."""
     names = [name for name in ENERGIES if name in dataset]
     units = [dataset[name].attrs.get("units") for name in names]

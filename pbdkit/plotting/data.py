@@ -1,5 +1,5 @@
-"""Data of pictures: the body with its cells and outline, recorded steps, the plotted quantity, and
-variables by name for curves.
+"""Data of pictures: the body with its cells and outline, recorded steps, the quantity that is
+drawn, and variables by name for curves.
 
 Fields fill the cells of the body at rest, quadrilaterals or triangles, up to its outline.
 """
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
 
 
 BRIDGE = 1.35
-"""Triangles with a side longer than this multiple of the median bridge a hole or notch."""
+"""Ratio to the median length above which the side of a triangle bridges a hole or notch."""
 
 
 def cells_of(site: Array, reference: Array) -> Array:
     """Return the rows of the corners of each cell, (cell, 4), in turn; triangles have the last one
     twice.
 
-    `site` (particle, 2) are whole numbers. Where the places of sites (i, j) repeat along i, as on
-    Bravais lattices, cells are Delaunay's of the lattice: squares and rectangles, else triangles.
-    Elsewhere they are Delaunay's triangles without those that bridge gaps. None if all particles
-    are in line.
+    `site` (particle, 2) are whole numbers. If the places of sites (i, j) repeat along i, as on
+    Bravais lattices, the cells are those of the Delaunay tessellation of the lattice: squares,
+    rectangles or triangles. Otherwise they are the Delaunay triangles of the particles without
+    those that bridge gaps. None if all particles are in line.
     """
     cells = _of_sites(site, reference) if len(site) else None
     if cells is None:
@@ -56,7 +56,7 @@ def cells_of(site: Array, reference: Array) -> Array:
 
 
 def triangles_of(reference: Array) -> Array:
-    """Return Delaunay's triangles, (triangle, 3), without those that bridge gaps; none if all
+    """Return the Delaunay triangles, (triangle, 3), without those that bridge gaps; none if all
     places are collinear."""
     from scipy.spatial import Delaunay, QhullError
 
@@ -82,7 +82,7 @@ def _of_sites(site: Array, reference: Array) -> Array | None:
     along, up = _steps(rows, reference, 0), _steps(rows, reference, 1)
     if (rows >= 0).sum() < len(site) or not len(along) or not len(up):
         return None
-    # How far row j + 1 is shifted against row j is the same all along them, on a Bravais lattice.
+    # On a Bravais lattice row j + 1 has the same shift against row j for all j.
     j = np.nonzero((rows[:, :-1] >= 0) & (rows[:, 1:] >= 0))[1]
     of_row = np.full((shape[1] - 1, 2), np.nan)
     of_row[j] = up
@@ -92,8 +92,8 @@ def _of_sites(site: Array, reference: Array) -> Array | None:
     a, b = rows[:-1, :-1].ravel(), rows[1:, :-1].ravel()
     c, d = rows[1:, 1:].ravel(), rows[:-1, 1:].ravel()
     rise = np.broadcast_to(of_row, (shape[0] - 1, *of_row.shape)).reshape(-1, 2)
-    rising = np.hypot(*(along[0] + rise).T)  # a to c
-    falling = np.hypot(*(along[0] - rise).T)  # b to d
+    rising = np.hypot(*(along[0] + rise).T)  # Diagonal from a to c.
+    falling = np.hypot(*(along[0] - rise).T)  # Diagonal from b to d.
     equal = np.abs(rising - falling) <= 1e-6 * rising
     quads = np.stack([a, b, c, d], axis=1)[equal]
     shorter = ~equal & (rising < falling)
@@ -101,7 +101,8 @@ def _of_sites(site: Array, reference: Array) -> Array | None:
     triangles = [np.stack([a, b, c, c], 1)[shorter], np.stack([a, c, d, d], 1)[shorter],
                  np.stack([a, b, d, d], 1)[longer], np.stack([b, c, d, d], 1)[longer]]  # fmt: skip
     cells = np.concatenate([quads, *triangles])
-    complete = np.bitwise_or.reduce([cells[:, k] for k in range(4)]) >= 0  # -1 has the sign bit
+    # -1 has the sign bit set.
+    complete = np.bitwise_or.reduce([cells[:, k] for k in range(4)]) >= 0
     return cells if complete.all() else cells[complete]
 
 
@@ -115,8 +116,8 @@ def _steps(rows: Array, reference: Array, axis: int) -> Array:
 
 
 def whole(cells: Array, pairs: Array, particles: int) -> Array:
-    """Return which cells have none of these pairs of rows, (pair, 2), as a side or diagonal,
-    (cell,)."""
+    """Return a mask of the cells, (cell,), that have none of these pairs of rows, (pair, 2), as a
+    side or diagonal."""
     intact = np.ones(len(cells), np.bool_)
     if not len(pairs):
         return intact
@@ -147,7 +148,7 @@ def _codes(pairs: Array, particles: int) -> Array:
 PARTS = 8
 """Parts of each side of a cut cell, in each of which the outline is straight."""
 MOST_POINTS = 400_000
-"""Maximum number of points at which the distance to the outline is evaluated; where more cells are
+"""Maximum number of points at which the distance to the outline is evaluated. If more cells are
 cut, they are small on the page and have fewer parts."""
 ON_IT = 1e-6
 """Tolerance relative to the cell's size for points on the outline."""
@@ -177,8 +178,8 @@ class CutCells:
 
     `row` (cell,) is the row of each cell in `distance`, -1 where it is not cut; `distance` (cut
     cell, point, point) is the signed distance, positive outside the outline, at points along both
-    sides of the cell: [v, u] lies between the corners as (1 - u)(1 - v), u(1 - v), uv, (1 - u)v
-    weigh them.
+    sides of the cell: the corners have the weights (1 - u)(1 - v), u(1 - v), uv, (1 - u)v at [v,
+    u].
     """
 
     row: Array
@@ -201,8 +202,8 @@ class CutCells:
         return cls(row, distance[is_cut].astype(np.float32))
 
     def outside(self, rows: Array, middles: Array) -> Array:
-        """Return which samples of some cut cells, those at `middles` along both sides, are outside
-        the outline, (cell, v, u)."""
+        """Return a mask of the samples of some cut cells, at `middles` along both sides, that lie
+        outside the outline, (cell, v, u)."""
         points = np.linspace(0.0, 1.0, self.distance.shape[1])
         hats = np.maximum(0.0, 1.0 - np.abs(middles[:, None] - points) * (len(points) - 1))
         hats = hats.astype(np.float32)
@@ -305,7 +306,8 @@ class PlottedQuantity:
             values = np.linalg.norm(values, axis=-1) if along is None else values[..., along]
         if "time" not in variable.dims:
             values = np.repeat(values[None], part.sizes["time"], axis=0)
-        if self.variable == "broken_step":  # -1 where it is whole, as it was at earlier steps
+        # An intact bond has -1, also one that breaks in a later step.
+        if self.variable == "broken_step":
             values = np.where(broken_by(values, part["time"].values[:, None]), values, np.nan)
         return values if self.factor == 1.0 else self.factor * values
 
@@ -491,11 +493,11 @@ class Snapshot:
 
 
 class Trajectory:
-    """The recorded steps of a dataset, with the quantity `color`, if any; in mm and so on where the
-    dataset defines the scale.
+    """Recorded steps of a dataset, with the quantity `color`, if any, in physical units if the
+    dataset defines their scale.
 
-    Raises ExperimentError for a dataset of several runs, for space that is no plane, and for a
-    quantity that cannot be drawn. Only the requested values are read.
+    Raises ExperimentError for a dataset of several runs, for a lattice in space, and for a quantity
+    that cannot be drawn. Only the necessary data are read.
     """
 
     def __init__(self, dataset: xarray.Dataset, color: str | None = None) -> None:
@@ -516,7 +518,7 @@ class Trajectory:
 
     @cached_property
     def _rows(self) -> Array:
-        """Rows of the particles that exist: joined runs may lack some."""
+        """Rows of the particles that exist; concatenated runs may lack some."""
         reference = self._dataset["reference"].transpose("particle", "axis").values
         return np.flatnonzero(np.isfinite(reference).all(axis=1))
 
@@ -580,7 +582,7 @@ class Trajectory:
             values = quantity.values(part) if quantity else None
             for n, row in enumerate(chosen):
                 step = float(self.steps[row])
-                # The fraction of a step at which a bond broke is known only for the last one.
+                # The fraction of a step at which a bond broke is known for the last step only.
                 is_last = row == len(self.steps) - 1
                 broken = broken_by(body.broken_step, math.ceil(step) if is_last else step)
                 yield Snapshot(
@@ -738,7 +740,7 @@ OF_A_RUN = {"time", "step", "crack", "particle", "bond", "axis", "tracked", "end
 
 
 def variable(dataset: xarray.Dataset, name: str) -> xarray.DataArray:
-    """Return a variable, or for `u_x` the component of `u`, without reading its values.
+    """Return a variable, or the component of `u` for `u_x`, without reading its values.
 
     Raises ExperimentError if there is none of that name.
     """
@@ -772,7 +774,7 @@ def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None])
     """Return a DataArray along time and the dimensions of a sweep: the sum or mean over particles
     or bonds, the `chosen` leader group, load or obstacle, in the units of the variable.
 
-    Raises ExperimentError for what is no number a step.
+    Raises ExperimentError if the result is not one number for each step.
     """
     values = variable(dataset, name)
     if "axis" in values.dims:
@@ -795,7 +797,7 @@ def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None])
 
 
 def in_units(values: xarray.DataArray) -> xarray.DataArray:
-    """Return the values, read, in mm and so on where the variable defines the scale."""
+    """Return the values, read, in physical units if the variable defines the scale."""
     factor, units = in_its_units(values.attrs)
     attributes = {"long_name": values.attrs.get("long_name", str(values.name)), "units": units}
     converted = values.astype(float) * factor

@@ -1,7 +1,7 @@
-"""Figures with panels of one body, as large as the texts around them leave room for.
+"""Figures with panels of one body, as large as the texts around them permit.
 
-The panels have the shape of the body, from 200 by 6 particles to 6 by 200. The figure is made
-around what is drawn: nothing is clipped, and nothing lies over anything else.
+The panels have the aspect ratio of the body, from 200 by 6 particles to 6 by 200. The figure is
+sized to fit its content: nothing is clipped, and nothing overlaps.
 """
 
 from __future__ import annotations
@@ -35,45 +35,59 @@ if TYPE_CHECKING:
     from matplotlib.text import Text
     from matplotlib.ticker import Locator
 PAGE_WIDTH_IN = 7.2
-"""Width of a page."""
+"""Width of a page in inches."""
 PAGE_HEIGHT_IN = 8.0
-"""Height of a page."""
+"""Height of a page in inches."""
 SHORT_PAGE_HEIGHT_IN = 5.6
-"""Height of a page with 2 to `SHORT_PAGE_PANELS` panels."""
+"""Height of a page with 2 to `SHORT_PAGE_PANELS` panels, in inches."""
 SHORT_PAGE_PANELS = 6
+"""Maximum number of panels on a page of that height."""
 PANEL_AREA_IN2 = 20.0
-"""Maximum area of one panel."""
+"""Maximum area of one panel in square inches."""
 SMALLEST_PANEL_IN = 0.05
+"""Minimum width and height of a panel in inches."""
 SHORT_AXIS_IN = 0.4
-"""Axes shorter than this have one tick."""
-GAP_IN, TITLE_IN, EDGE_IN = 0.1, 0.26, 0.08
-"""Space between panels, for the title above each, and at the edge of the page."""
-BAR_LENGTH_IN, BAR_WIDTH_IN = 3.4, 0.14
-"""Maximum length and width of a colour bar."""
+"""Length in inches below which an axis has one tick."""
+GAP_IN = 0.1
+"""Space between panels in inches."""
+TITLE_IN = 0.26
+"""Space for the title above each panel in inches."""
+EDGE_IN = 0.08
+"""Space at the edge of the page in inches."""
+BAR_LENGTH_IN = 3.4
+"""Maximum length of a colour bar in inches."""
+BAR_WIDTH_IN = 0.14
+"""Width of a colour bar in inches."""
 SIDE_BAR_HEIGHT_IN = 1.3
-"""Panels that are less tall have their colour bar below them."""
+"""Height of panels in inches below which the colour bar is below them."""
 LABEL_LINES = 3
 """Maximum number of lines of the label of a colour bar beside the panels."""
 CHARACTERS_PER_IN = 14.5
-"""Characters of a line of text in `TEXT_PT`, about."""
-HEADING_PT, TEXT_PT, TICK_PT = 10.0, 9.0, 8.0
+"""Approximate number of characters of text in `TEXT_PT` per inch."""
+HEADING_PT = 10.0
+"""Font size of the heading in points."""
+TEXT_PT = 9.0
+"""Font size of labels in points."""
+TICK_PT = 8.0
+"""Font size of tick labels in points."""
 
 
 PYPLOT = "matplotlib.pyplot"
+"""Module that manages figures."""
 
 
 def new_figure(*, standalone: bool = False, **options: Any) -> Figure:
     """Return a new figure with these arguments of matplotlib.
 
-    Where pyplot is in use, or in a notebook, pyplot manages it, unless it is to be `standalone`, to
-    be shown or saved by the caller.
+    If pyplot is loaded, or in a notebook, pyplot manages the figure unless it is `standalone`,
+    which the caller shows or saves.
     """
     if not standalone and (PYPLOT in sys.modules or in_notebook()):
         pyplot = import_module(PYPLOT)
         figure: Figure = pyplot.figure(**options)
         if hasattr(figure.canvas, "get_renderer"):
             return figure
-        pyplot.close(figure)  # of a backend that cannot measure text
+        pyplot.close(figure)  # The figure belongs to a backend that cannot measure text.
     figure = Figure(**options)
     FigureCanvasAgg(figure)
     return figure
@@ -155,7 +169,8 @@ class Page:
         self._before, self._after = np.array((0.6, 0.5)), np.array((0.1, 0.4))
         """Space between the panels and the edges of the figure: left and below; right and above."""
         self._around, self._overhang = self._before + self._after, 0.1
-        """Inches that are taken around the panels of a page; what tick labels reach beyond one."""
+        """Space around the panels of a page, and length by which tick labels exceed a panel, in
+        inches."""
         self._grid = self._best_grid(1.0)
 
     def _panel(self, title: str) -> Axes:
@@ -173,14 +188,14 @@ class Page:
         handles: list[Line2D] | None = None,
         larger: float = 1.0,
     ) -> None:
-        """Put everything in its place, with the colour bar of a scale and a legend.
+        """Arrange the figure, with the colour bar of a scale and a legend.
 
         A figure without a given size is at most `larger` times as large as the page of a journal.
         Raises ExperimentError if a given size leaves no room for the panels.
         """
         bar = self._bar(scale, text) if scale else None
         legend = self._legend(handles) if handles else None
-        for _ in range(3):  # the space around the panels depends on their size, which depends on it
+        for _ in range(3):  # The space around the panels and their size depend on each other.
             self._grid = self._best_grid(larger)
             self._place_panels()
             self._place_keys(bar, legend)
@@ -190,7 +205,7 @@ class Page:
         self._place_keys(bar, legend)
 
     def _best_grid(self, larger: float) -> PanelGrid:
-        """Return the grid with the largest panels and few places left empty."""
+        """Return the grid with the largest panels and few empty places."""
         count, shape = len(self.axes), self._panels.shape
         tall = SHORT_PAGE_HEIGHT_IN if 1 < count <= SHORT_PAGE_PANELS else PAGE_HEIGHT_IN
         page = self._size or (PAGE_WIDTH_IN * larger, tall * larger)
@@ -249,7 +264,7 @@ class Page:
         self._heading.set_position(np.array((middle[0], block.y1 + TITLE_IN + 0.05)) / page)
 
     def _shorten(self, artist: Text, text: str, width: float) -> None:
-        """Set a text, and leave out its end where it is wider."""
+        """Set a text, and shorten it if it is too wide."""
         artist.set_text(text)
         while len(text) > 2 and self._drawn([artist]).width > width:
             text = text[: -max(2, len(text) // 20)].rstrip("\\") + "…"
@@ -274,7 +289,7 @@ class Page:
         return bar
 
     def _legend(self, handles: list[Line2D]) -> Legend:
-        """Return the legend, in as many columns as there is room for on the page."""
+        """Return the legend, with as many columns as fit on the page."""
         room = self._size[0] if self._size else max(self._grid.size[0], PAGE_WIDTH_IN)
         for columns in range(len(handles), 0, -1):
             legend = self.figure.legend(
@@ -311,12 +326,12 @@ class Page:
         return Bbox(Bbox.union(boxes).get_points() / self.figure.dpi)
 
     def _measure(self) -> None:
-        """Measure the space that is taken around the panels."""
+        """Measure the space around the panels."""
         texts = [text for text in self.figure.texts if text.get_text()]
         drawn = self._drawn([*self.figure.axes, *texts, *self.figure.legends])
         self._before = np.subtract(self._block.min, drawn.min) + EDGE_IN
         self._after = np.subtract(drawn.max, self._block.max) + EDGE_IN
-        # Titles may be wider than the panels, and make the page wider instead of these narrower.
+        # Titles that are wider than the panels make the page wider instead of the panels narrower.
         narrow = self._drawn(self.figure.axes, for_layout_only=True)
         x0 = min(narrow.x0, self._drawn([self._labels[1]]).x0)
         self._around = self._before + self._after
@@ -326,7 +341,7 @@ class Page:
 
 
 def _locator(low: float, high: float, length: float, distance: float) -> Locator:
-    """Return a locator of ticks at a distance in inches at least; of one tick on short axes."""
+    """Return a locator of ticks with a minimum distance in inches; of one tick on short axes."""
     if length < SHORT_AXIS_IN:
         return FixedLocator([0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.1g}")])
     return MaxNLocator(max(1, int(length / distance)), steps=[1, 2, 5, 10])

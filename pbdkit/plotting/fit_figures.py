@@ -19,7 +19,14 @@ if TYPE_CHECKING:
     from pbdkit.fitting.fit_result import Fitted
 
 
-PANEL_IN, MARGIN_IN, CURVE_IN, CURVES = 3.8, 0.75, 2.5, 3
+PANEL_IN = 3.8
+"""Width of a panel in inches."""
+MARGIN_IN = 0.75
+"""Space above and below a panel in inches."""
+CURVE_IN = 2.5
+"""Height of the panel of a curve in inches."""
+CURVES = 3
+"""Number of panels in a row of curves."""
 WITHIN = 3.0
 """Limit of the colours of residuals, in multiples of the noise."""
 
@@ -28,9 +35,9 @@ def draw_fit(fitted: Fitted) -> Figure:
     """Draw each measurement of a fit.
 
     A field has panels of ux and uy, measured and fitted, of the residual over the noise, and of the
-    sensitivity to each parameter; beside each other for wide bodies, else below. Tracks and curves
-    have the measured and fitted values, residual and sensitivity along time or displacement. Raises
-    ExperimentError if matplotlib is missing.
+    sensitivity to each parameter; beside each other for wide bodies, and below each other
+    otherwise. Tracks and curves have the measured and fitted values, residual and sensitivity along
+    time or displacement. Raises ExperimentError if matplotlib is missing.
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.figure_layout import new_figure
@@ -132,8 +139,8 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
 
 
 def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
-    """Return for tracks or a curve the factor of its values, the abscissa, and the labels of both,
-    in the units of the experiment where it has some."""
+    """Return the factor of the values of tracks or a curve, the abscissa, and the labels of both,
+    in the units of the experiment if it has units."""
     numbers, observed = fitted.numbers(n), fitted.misfits[n]
     units = fitted.problem.observations[n].experiment.units
     if units is None:

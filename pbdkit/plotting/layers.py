@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 SAMPLES = 2_000_000
 """Maximum number of samples that are evaluated at a time."""
 MOST = 60_000_000
-"""Maximum total number of samples: a body folded over itself many times has fewer than pixels."""
+"""Maximum total number of samples. A body that is folded over itself many times has fewer samples
+than pixels."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,10 @@ class PixelGrid:
         return np.asarray((position - np.array([xmin, ymin])).astype(np.float32) * scale)
 
     def mean(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
-        """Interpolate the values of cells, (up, across), between those at their corners, (cell, 4),
-        in pixels (cell, 4, 2); NaN outside all cells and where they are `cut` off, and the mean
-        where several overlap. No pixel within a cell is missed: samples are no further apart than
-        pixels are wide."""
+        """Return the values at the pixels, (up, across), interpolated between those at the corners
+        of cells, (cell, 4), with positions in pixels (cell, 4, 2). They are NaN outside all cells
+        and where cells are `cut` off, and the mean where cells overlap. The distance of samples is
+        at most the width of a pixel, so that no pixel within a cell is missed."""
         sums, counts = np.zeros(self.across * self.up), np.zeros(self.across * self.up)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
@@ -59,8 +60,8 @@ class PixelGrid:
             return (sums / counts).reshape(self.up, self.across)
 
     def latest(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
-        """Evaluate values that cannot be averaged likewise: that of the nearest corner; of several
-        in a pixel the largest."""
+        """Return values that cannot be averaged, in the same way: that of the nearest corner, and
+        the largest of several in a pixel."""
         largest = np.full(self.across * self.up, -np.inf)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
@@ -89,7 +90,8 @@ class OutlineCut:
 
 
 def _kept(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
-    """Return which samples of some cells are not cut off, (cell and sample,); None if all are."""
+    """Return a mask of the samples of some cells that are not cut off, (cell and sample,); None if
+    all are kept."""
     rows = cut.row[cells] if cut else np.empty(0, int)
     cut_cells = np.flatnonzero(rows >= 0)
     if cut is None or not len(cut_cells):
@@ -111,10 +113,11 @@ def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
     sides, from 0 to 1."""
     a, b, c, d = (corners[:, k] for k in range(4))
     along = np.maximum(abs(b - a), abs(c - d)), np.maximum(abs(d - a), abs(c - b))
-    # Steps of samples along both sides together reach no further than a pixel: none is missed.
+    # The distance between samples, along both sides together, is at most a pixel, so that none is
+    # missed.
     finest = np.maximum(np.ceil(np.maximum(*(along[0] + along[1]).T)), 1.0)
     finest = np.maximum(finest * min(1.0, math.sqrt(MOST / max(1.0, (finest**2).sum()))), 1.0)
-    # Rounded up to a power of the square root of two: few groups, and not many more samples.
+    # The numbers are rounded up to powers of √2, which gives few groups and not many more samples.
     levels = np.ceil(2 * np.log2(finest) - 1e-6).astype(int)
     for level in np.unique(levels):
         count = math.ceil(2 ** (level / 2))
@@ -125,7 +128,14 @@ def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
             yield cells[start : start + block], middles
 
 
-INK, LINE, TORN, REST = "#404040", "#B0B0B0", "#CC3311", "#888888"
+INK = "#404040"
+"""Colour of dots without values."""
+LINE = "#B0B0B0"
+"""Colour of bonds."""
+TORN = "#CC3311"
+"""Colour of broken bonds."""
+REST = "#888888"
+"""Colour of the outline."""
 
 
 class Layer(ABC):
@@ -140,8 +150,8 @@ class Layer(ABC):
 
 class PixelField(Layer):
     """A quantity of particles over whole cells up to the outline, as pixels; particles outside all
-    cells are dots of a size in points, or a pixel where that would be invisible. A corner outside
-    the outline without a value has the mean of the cells that meet there."""
+    cells are dots of a size in points, or a pixel if a dot would be invisible. A corner outside the
+    outline without a value has the mean of the cells that meet there."""
 
     def __init__(
         self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale, size: float
@@ -207,7 +217,8 @@ class Classes(Layer):
         chosen = chosen[has_class[body.cells_with_frame[chosen]].all(axis=1)]
         alone = _alone(body.cells_with_frame[chosen], has_class & ~body.outside)
         cells = _with(body.cells_with_frame[chosen], alone)
-        # Where cells are cut the body is all there is: both kinds of cells are the same.
+        # If cells are cut the picture contains the body alone, so that both kinds of cells are the
+        # same.
         cut = _cut(body, chosen, len(alone)) if body.inside.all() else None
         corners = self._grid.places(snapshot.position)[cells]
         self._image.set_data(self._grid.latest(corners, ranks[cells], cut))

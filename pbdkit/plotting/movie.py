@@ -36,13 +36,23 @@ Show = Callable[[str, float], None]
 Frame = NDArray[np.uint8]
 """Pixels, (row, column, red green blue)."""
 FORMATS = (".mp4", ".gif")
+"""File name extensions of movies."""
 WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
-DPI, GIF_COLOURS = 120, 128
-SLOWEST, FASTEST, FASTEST_GIF = 0.1, 240, 50
-"""Minimum and maximum frame rates of players, in 1/s."""
+"""Distributions of the modules that write movies."""
+DPI = 120
+"""Resolution of a movie."""
+GIF_COLOURS = 128
+"""Maximum number of colours of a GIF."""
+SLOWEST = 0.1
+"""Minimum frame rate in 1/s."""
+FASTEST = 240
+"""Maximum frame rate in 1/s."""
+FASTEST_GIF = 50
+"""Maximum frame rate of a GIF in 1/s."""
 FINER = 0.6
 """Resolution of fields relative to the pixels of the movie; coarser ones are interpolated."""
 NEARLY_WHITE = 240
+"""Brightness from which a colour of a palette counts as white."""
 FRAMES = 60
 """Maximum number of steps in an animation for notebooks."""
 
@@ -155,7 +165,7 @@ def animation(
 ) -> FuncAnimation:
     """Return a movie as an animation of matplotlib, for notebooks.
 
-    Of longer runs it has 60 steps, evenly chosen. The parameters are those of `plot`.
+    For longer runs it shows 60 evenly spaced steps. The parameters are those of `plot`.
     """
     refuse_no_matplotlib()
     from matplotlib.animation import FuncAnimation
@@ -211,7 +221,7 @@ class MovieSheet:
         )
         (self._panel,) = self.sheet.panels
         self._heading = self._panel.ax.title
-        if self._heading.get_text() != title:  # it was too long
+        if self._heading.get_text() != title:  # The title was too long.
             self._name = ""
 
     def _title(self, step: float) -> str:
@@ -252,7 +262,7 @@ def _with_progress(
 
 
 def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
-    """Encode by ffmpeg in a separate process, for all players, under the name of the file."""
+    """Encode the frames by ffmpeg in a separate process, into a file that all players support."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     first = next(frames)
@@ -268,7 +278,8 @@ def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
                 with suppress(BrokenPipeError), ffmpeg.stdin as pipe:
                     for frame in chain([first], frames):
                         pipe.write(frame.tobytes())
-            except BaseException:  # an interrupt, after which `with` would not wait for its end
+            # After an interrupt `with` would not wait for the end of the process.
+            except BaseException:
                 ffmpeg.kill()
                 ffmpeg.wait()
                 raise
@@ -279,14 +290,15 @@ def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
 
 
 def _write_gif(file: NewFile, few: Frame, frames: Iterator[Frame], fps: float) -> None:
-    """Write with one palette, that of a `few` frames, so that static parts do not flicker."""
+    """Write the frames with one palette, that of a `few` frames, so that static parts do not
+    flicker."""
     from PIL import Image
 
     palette = Image.fromarray(few).quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
     colours = np.reshape(palette.getpalette() or [], (-1, 3))
-    colours[colours.min(axis=1) > NEARLY_WHITE] = 255  # the page stays white
+    colours[colours.min(axis=1) > NEARLY_WHITE] = 255  # The page remains white.
     palette.putpalette(colours.astype(np.uint8).tobytes())
-    target: Any = file  # all that Pillow needs of one
+    target: Any = file  # Pillow needs no further methods of the file.
     drawn = (Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames)
     next(drawn).save(
         target, "GIF", save_all=True, append_images=drawn, duration=round(1000 / fps), loop=0,

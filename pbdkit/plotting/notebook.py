@@ -15,14 +15,17 @@ from pbdkit.stability.forecast import Forecast, forecast
 from pbdkit.stability.relaxation import tuned
 
 LARGEST = 100_000
-"""Maximum number of particles of bodies that are analysed without a request."""
+"""Maximum number of particles of bodies that are analysed automatically."""
 STRAIGHT = "goes straight to the equilibrium, to where steps would lead"
+"""Description of a run of the solver `equilibrium`."""
 STYLE = "font-family:system-ui,sans-serif;font-size:13px;color:#222;background:#fff;padding:8px"
+"""CSS style of the output."""
 TableRows = Iterable[tuple[str, str]]
 
 
 def experiment_html(experiment: Experiment) -> str:
-    """Return a picture of the scene and, where that is fast, the results of `pbdkit check`."""
+    """Return a picture of the scene and, if they are computed fast, the results of `pbdkit
+    check`."""
     try:
         scene = build_scene(experiment)
     except PbdkitError as error:

@@ -23,8 +23,8 @@ POINTS = 0.75
 
 
 class AxesCanvas:
-    """Axes as a canvas: their coordinates are `unit` times lattice units, their limits are
-    constant. Shapes are drawn in the order of their addition."""
+    """Axes as a canvas, with constant limits and coordinates in `unit` per lattice unit. Shapes are
+    drawn in the order in which they are added."""
 
     def __init__(self, ax: Axes, unit: float) -> None:
         self._ax, self._unit, self._order = ax, unit, 1
@@ -48,13 +48,13 @@ class AxesCanvas:
         self._plot(places, color=colour, ms=POINTS * size, alpha=opacity, **style)
 
     def line(self, places: Floats, colour: str, width: float, dashes: str = "") -> None:
-        """Draw a line from place to place; `dashes` as SVG writes them."""
+        """Draw a polyline; `dashes` as in SVG."""
         lengths = [float(part) / width for part in dashes.split()]
         style: Any = (0.0, lengths) if lengths else "-"
         self._plot(places, color=colour, lw=POINTS * width, ls=style)
 
     def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
-        """Fill what lies between closed outlines: an inner one is a hole."""
+        """Fill the area between closed outlines: an inner one is a hole."""
         turned = [line[:: 1 if n == 0 else -1] for n, line in enumerate(outlines)]
         path = Path.make_compound_path(
             *(Path(self._unit * o, closed=False) for o in map(_closed, turned))
@@ -62,7 +62,7 @@ class AxesCanvas:
         self._ax.add_patch(PathPatch(path, fc=fill, ec=edge, lw=POINTS, zorder=self._next))
 
     def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
-        """Draw an arrow from a place; its length is in pixels, y up."""
+        """Draw an arrow from a place, by a vector in pixels, y up."""
         if not np.any(way):
             return
         tip = self._unit * (np.asarray(tail) + np.asarray(way) / self.scale)
@@ -87,7 +87,7 @@ def _closed(outline: Floats) -> Floats:
 
 
 def draw_experiment(experiment: Experiment, look: Look, ax: Axes | None) -> Axes:
-    """Draw the set-up of an experiment on axes, or, without, in a new figure."""
+    """Draw the set-up of an experiment on axes, by default in a new figure."""
     scene = build_scene(experiment)
     if scene.axes != 2:
         raise ExperimentError(f"pictures are of the plane, and this lattice has {scene.axes} axes")

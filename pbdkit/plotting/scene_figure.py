@@ -29,8 +29,11 @@ HEAD = 7.0
 
 class Svg:
     """Picture of the coordinates from `low` to `high` within `limits` in pixels, with a `margin`
-    around them: the picture reaches from `self.low` to `self.high`. y points up. Shapes are drawn
-    in the order of their addition."""
+    around them.
+
+    The whole picture extends from `self.low` to `self.high`, with y upward. Shapes are drawn in the
+    order in which they are added.
+    """
 
     def __init__(
         self, low: Floats, high: Floats, limits: tuple[float, float], margin: float
@@ -132,15 +135,44 @@ def force_of(load: Load) -> Floats:
     return np.array([greatest(f) for f in load.force or load.body_force or ()])
 
 
-WITHIN, MARGIN, ARROW, LEAST, APART = (480.0, 400.0), 44.0, 34.0, 14.0, 14.0
-"""Sizes in pixels: of the picture, of the margin around the body, of the longest and the shortest
-arrow, and the distance between arrows."""
-BODY, OUTLINE, FRAME_POINT, LEADS, HELD = "#0072B2", "#5A87A8", "#DCCB2E", "#D55E00", "#7A3300"
-ACTS, CUT, STANDS, DRIVEN = "#007A5A", "#C2185B", "#9A9A9A", "#404040"
+WITHIN = (480.0, 400.0)
+"""Maximum width and height of the picture in pixels."""
+MARGIN = 44.0
+"""Margin around the body in pixels."""
+ARROW = 34.0
+"""Length of the longest arrow in pixels."""
+LEAST = 14.0
+"""Length of the shortest arrow in pixels."""
+APART = 14.0
+"""Distance between arrows in pixels."""
+BODY = "#0072B2"
+"""Colour of the body."""
+OUTLINE = "#5A87A8"
+"""Colour of the edge of the body."""
+FRAME_POINT = "#DCCB2E"
+"""Colour of frame points."""
+LEADS = "#D55E00"
+"""Colour of moving leaders."""
+HELD = "#7A3300"
+"""Colour of leaders that are held in place."""
+ACTS = "#007A5A"
+"""Colour of loads."""
+CUT = "#C2185B"
+"""Colour of cracks and cuts."""
+STANDS = "#9A9A9A"
+"""Colour of the outlines of obstacles."""
+DRIVEN = "#404040"
+"""Colour of the arrows of moving obstacles."""
 TINTS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
-DOTS, TINTED, ARROWS, BEYOND = 3000, 1500, 5, 0.35
-"""Maximum number of particles for which all are drawn, of dots of a region, and of arrows of a
-group; margin for obstacles relative to the body's size."""
+"""Colours of regions."""
+DOTS = 3000
+"""Maximum number of particles for which all are drawn."""
+TINTED = 1500
+"""Maximum number of dots of a region."""
+ARROWS = 5
+"""Maximum number of arrows of a group."""
+BEYOND = 0.35
+"""Margin for obstacles, relative to the size of the body."""
 Rows = NDArray[np.intp]
 
 
@@ -149,8 +181,9 @@ SceneLegend = tuple[tuple[str, str], ...]
 
 
 class Canvas(Protocol):
-    """Surface on which a scene is drawn: places are in lattice units, sizes and widths in pixels,
-    of which `scale` make a lattice unit; the picture reaches from the corner `low` to `high`."""
+    """Surface on which a scene is drawn. Places are in lattice units; sizes and widths are in
+    pixels, `scale` of which are a lattice unit. The picture extends from the corner `low` to
+    `high`."""
 
     scale: float
     low: Floats
@@ -162,13 +195,13 @@ class Canvas(Protocol):
         """Draw dots of one size."""
 
     def line(self, places: Floats, colour: str, width: float, dashes: str = ...) -> None:
-        """Draw a line from place to place."""
+        """Draw a polyline."""
 
     def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
-        """Fill what lies between closed outlines: an inner one is a hole."""
+        """Fill the area between closed outlines: an inner one is a hole."""
 
     def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
-        """Draw an arrow from a place; its length is in pixels, y up."""
+        """Draw an arrow from a place, by a vector in pixels, y up."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +240,8 @@ def _is_small(scene: Scene) -> bool:
 
 
 def _shown(scene: Scene) -> Floats:
-    """Return the particles of a small body and its frame, or of a large body alone."""
+    """Return the particles to draw: body and frame if the body is small, otherwise the body
+    alone."""
     X = scene.raster.reference()
     return X if _is_small(scene) else X[scene.raster.table_kind == FOLLOWER]
 
@@ -317,8 +351,8 @@ class _Drawing:
             self._note(ACTS, "body force" if loading.load.body_force else "force")
 
     def _arrows(self, at: Floats, ways: Floats, longest: float, colour: str) -> None:
-        """Draw arrows at some of the places, away from them or, where they point into the body,
-        towards them."""
+        """Draw arrows at some of the places: away from them or, where such arrows would point into
+        the body, towards them."""
         extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
         count = min(max(int(extent / APART), 1), ARROWS)
         ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])

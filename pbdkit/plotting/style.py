@@ -37,7 +37,9 @@ def renderer_of(figure: Figure) -> RendererBase:
 LONGEST = 200
 """Maximum number of characters of a title or name."""
 RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+"""Translation of digits to superscripts."""
 SIGNS = {"^2": "²", "^3": "³", " * ": " × "}
+"""Typographic signs in units."""
 
 
 def plain(text: object) -> str:
@@ -46,15 +48,15 @@ def plain(text: object) -> str:
 
 
 def signed(units: str) -> str:
-    """Return units with typographic signs; empty for dimensionless numbers."""
+    """Return units with typographic signs; empty for dimensionless quantities."""
     for typed, sign in SIGNS.items():
         units = units.replace(typed, sign)
     return "" if units == "1" else units
 
 
 def in_its_units(attributes: Mapping[Any, Any]) -> tuple[float, str]:
-    """Return the factor that converts a variable to mm and so on, and those units, where its
-    attributes define them; else 1 and its own units."""
+    """Return the factor that converts a variable to its physical units, and those units, if its
+    attributes define them; otherwise 1 and its own units."""
     if UNITS in attributes and FACTOR in attributes:
         return float(attributes[FACTOR]), str(attributes[UNITS])
     return 1.0, str(attributes.get("units", ""))
@@ -63,9 +65,8 @@ def in_its_units(attributes: Mapping[Any, Any]) -> tuple[float, str]:
 def label(
     meaning: object, units: object = "", exponent: int = 0, *, width: int | None = None
 ) -> str:
-    """Return the label of an axis: quantity and units, with a power of ten for its tick labels;
-    with a `width` in characters it is wrapped, with the units on a line of their own where
-    necessary."""
+    """Return the label of an axis: quantity and units, with a power of ten for its tick labels.
+    With a `width` in characters it is wrapped, with the units on a separate line if necessary."""
     text, unit_text = plain(meaning), signed(plain(units))
     ten = f"10{str(exponent).translate(RAISED)}" if exponent else ""
     unit_text = " ".join(filter(None, (ten, unit_text)))
@@ -83,14 +84,19 @@ def _even(text: str, width: int) -> str:
     return "\n".join(next((wrapped for wrapped in every if len(wrapped) == lines), []))
 
 
-LARGEST_IN, SMALLEST_DPI, LARGEST_DPI = 100.0, 10, 2400
+LARGEST_IN = 100.0
+"""Maximum width and height of a figure in inches."""
+SMALLEST_DPI = 10
+"""Minimum resolution."""
+LARGEST_DPI = 2400
+"""Maximum resolution."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Options of `plot`, `compare` and `animate`, under the names that they have there.
+    """Options of `plot`, `compare` and `animate`, with the same names.
 
-    Raises ExperimentError for numbers that make no picture.
+    Raises ExperimentError for values that are not possible.
     """
 
     filled: bool | None = None

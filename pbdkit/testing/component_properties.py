@@ -81,6 +81,7 @@ from pbdkit.testing.subject import (
 )
 
 WORD = r"[a-z][a-z0-9]*(-[a-z0-9]+)*"
+"""Pattern of the type of a component."""
 
 
 @property_of()
@@ -283,6 +284,7 @@ def _sites(offsets: Iterable[Offset]) -> set[tuple[int, ...]]:
 
 
 NAME = r"[a-z][a-z0-9_]*"
+"""Pattern of the name of a variable."""
 
 
 @property_of(Diagnostic)
@@ -319,17 +321,18 @@ def declares_what_it_remembers(subject: Subject) -> None:
     long name, units ("1" if it has none), and an initial value that its dtype can hold."""
     for scene in subject.scenes:
         numbers = remembered(subject, scene)
-        remembered_names(scene.experiment)  # refuses what is declared twice
+        remembered_names(scene.experiment)  # Raises an error for names that are declared twice.
         for number in numbers:
             if number.name in reserved_names():
                 raise PropertyError(f"every dataset has a '{number.name}': give it another name")
             _refuse_unlabelled(number, f"'{number.name}'", "my_number")
             _refuse_unheld(number, number.initial, "starts at")
-        rotations_of(scene.experiment)  # refuses what is not remembered
+        # Raises an error for rotations that are not state variables.
+        rotations_of(scene.experiment)
 
 
 def remembered(subject: Subject, scene: Scene) -> tuple[Remembered, ...]:
-    """Return the numbers that a rule or a fracture model remembers.
+    """Return the state variables of a rule or a fracture model.
 
     Raises
     ------
@@ -505,8 +508,8 @@ def _content(value: Any) -> bytes:
 
 
 ROUNDING = 1e-12
-"""Some thousand roundings: the last digit of numpy functions may depend on the position in an
-array."""
+"""Relative tolerance of some thousand roundings; the last digit of numpy functions may depend on
+the position in an array."""
 
 
 @property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
@@ -590,7 +593,7 @@ def takes_particles_in_any_order(subject: Subject) -> None:
 
 
 class Alike(np.random.Generator):
-    """Generator that returns the same number in every draw: results then differ only by the
+    """Generator that returns the same number in every draw, so that results differ only by the
     arguments."""
 
     def __getattribute__(self, name: str) -> Any:

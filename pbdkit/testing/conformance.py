@@ -156,7 +156,7 @@ def examine(component: Component | type[Component], **parts: Any) -> Report:
         try:
             instance = examples_of(component)[0]
         except PluginError as error:
-            # The one property of a class: that components can be made of it.
+            # A class is tested for one property: that components can be created.
             return Report(component.__name__, (Outcome("has-examples", "failed", str(error)),))
     return Report(full_name(instance), tuple(_outcomes(instance, parts)))
 
@@ -241,6 +241,6 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
         if outcome.state == "failed":
             pytest.fail(f"{report.component}: {name}: {outcome.reason}", pytrace=False)
         if outcome.state == "skipped":
-            pytest.skip(outcome.reason)  # the property does not apply to this component
+            pytest.skip(outcome.reason)  # The property does not apply to this component.
 
     return test_conformance

@@ -45,7 +45,7 @@ its square."""
 
 
 def whole_state(scene: Scene) -> State:
-    """Return the scene at rest with every bond that cracks and cuts leave."""
+    """Return the scene at rest with all bonds that are not broken by cracks and cuts."""
     state = initial_state(scene)
     state.u[...] = state.previous[...] = 0.0
     return state
@@ -109,8 +109,8 @@ def stiffness(scene: Scene, state: State) -> Floats:
 def pulls_at_rest(scene: Scene, state: State) -> bool:
     """Return whether particles at rest exert forces.
 
-    This is so if fictitious points are displaced: these turn with the body, so that a rotation
-    changes the forces.
+    They do if fictitious points are displaced. These points rotate with the body, so that a
+    rotation changes the forces.
     """
     u = np.zeros_like(state.u, dtype=float)
     return bool(np.abs(SlotFollowers(scene).forces(u, state)).max() > 0.0)
@@ -145,7 +145,8 @@ def asymmetry(K: Floats) -> float:
 
 
 def energy_given_back(K: Floats) -> float:
-    """Return the negative part of the smallest eigenvalue of the symmetric part of K."""
+    """Return the magnitude of the smallest eigenvalue of the symmetric part of K if it is
+    negative."""
     return _share(-np.linalg.eigvalsh((K + K.T) / 2)[0], K)
 
 
@@ -179,8 +180,11 @@ def resumed(scene: Scene, rebuilt: Scene, step: int, start: State | None = None)
 
 
 BODY = {"type": "grid", "columns": 4, "rows": 4}
+"""Body of the solids."""
 TEARS = {"type": "strain", "failure": 0.1}
+"""Fracture model of the solids."""
 SPRINGS = {"type": "springs"}
+"""Rule of the solids."""
 MOST = 2
 """Maximum number of lattices."""
 

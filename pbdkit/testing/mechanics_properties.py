@@ -40,19 +40,22 @@ from pbdkit.testing.states import advanced, displacements
 from pbdkit.testing.subject import NotApplicableError, PropertyError, Subject, place_of, property_of
 
 STEPS = 3
+"""Number of steps."""
 ROUNDING = 1e-11
 """Tolerance relative to the largest displacement."""
 LARGER = 2.0**20
-"""Factor of lengths: a power of two, so that nothing is rounded."""
+"""Factor of lengths, a power of two, so that rounding errors do not change."""
 AXES: dict[str, Floats] = {
     "mirrored in x": np.diag([-1.0, 1.0]),
     "mirrored in y": np.diag([1.0, -1.0]),
     "turned by a right angle": np.array([[0.0, -1.0], [1.0, 0.0]]),
 }
+"""Matrices of the reflections and the rotation."""
 REMEDY = (
     "compare lengths with those of the neighbours at rest, and annotate parameters that are "
     "lengths with `pbdkit.plugin.LENGTH`, powers of lengths with a `pbdkit.plugin.Quantity`"
 )
+"""Remedy for results that depend on the unit of length."""
 EVEN = {"type": "grid", "columns": 5, "rows": 5}
 """Body that is symmetric under reflection and rotation by a right angle."""
 
@@ -66,7 +69,7 @@ def goes_alike_in_all_units(subject: Subject) -> None:
     for scene in subject.scenes[:2]:
         u = displacements(scene, 8)
         if np.abs(advanced(scene, 0.0 * u, 1)).max() > 0.0:
-            continue  # the property `rests` reports it
+            continue  # The property `rests` reports it.
         larger = _scaled_scene(scene.experiment)
         original, scaled = advanced(scene, u, STEPS)[-1], advanced(larger, LARGER * u, STEPS)[-1]
         deviation = np.abs(scaled / LARGER - original).max() / max(1e-300, np.abs(original).max())
@@ -141,7 +144,7 @@ def goes_alike_mirrored_and_turned(subject: Subject) -> None:
     for scene in scenes:
         u = displacements(scene, 9, share=0.5)
         if np.abs(advanced(scene, 0.0 * u, 1)).max() > 0.0:
-            continue  # the property `rests` reports it
+            continue  # The property `rests` reports it.
         X = scene.raster.reference(scene.raster.body_rows)
         original = advanced(scene, u, STEPS)[-1]
         for name, matrix in AXES.items():
@@ -164,7 +167,7 @@ def _even_scene(experiment: Experiment) -> Scene | None:
     Returns
     -------
     Scene or None
-        None if other parts have preferred directions, or remember numbers.
+        None if other parts have preferred directions or state variables.
     """
     parts: Any = (experiment.rule, experiment.frame, experiment.fracture)
     if experiment.lattice.type != "square" or any(part.has_axes for part in parts):
@@ -184,9 +187,11 @@ def _images(X: Floats, matrix: Floats) -> Any:
     return np.abs(images[:, None] - X[None]).max(axis=2).argmin(axis=1)
 
 
-LINEAR, NEARLY = 1e-11, 1e-8
-"""Tolerances relative to the largest stiffness: of linear rules, and of others, for which the
-stiffness is a difference of forces."""
+LINEAR = 1e-11
+"""Tolerance relative to the largest stiffness for linear rules."""
+NEARLY = 1e-8
+"""Tolerance relative to the largest stiffness for other rules, with a stiffness from differences of
+forces."""
 
 
 @property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)

@@ -1,5 +1,5 @@
-"""States for tests and the results of a few steps; numbers that components remember, and moments
-with permuted rows."""
+"""States for tests, the results of a few steps, values of state variables, and moments with
+permuted rows."""
 
 from __future__ import annotations
 
@@ -78,13 +78,14 @@ SEED = 7
 
 
 def numbers_of(part: Component, scene: Scene) -> tuple[Remembered, ...]:
-    """Return the numbers that a fracture model remembers of bonds, or a rule of particles."""
+    """Return the state variables of a fracture model or of a rule."""
     declared = particle_numbers if isinstance(part, FollowerRule) else bond_numbers
     return declared(scene.experiment)
 
 
 def owners(part: Component, scene: Scene) -> Bonds | Particles:
-    """Return the bonds or particles of which a component remembers numbers, as passed to `draw`."""
+    """Return the bonds or particles that have the state variables of a component, as passed to
+    `draw`."""
     return (describe_particles if isinstance(part, FollowerRule) else describe_bonds)(scene)
 
 
@@ -99,9 +100,8 @@ def differences(scene: Scene, seed: int, share: float = 0.3) -> list[Vector]:
 
 
 def stressed(model: Component, seed: int) -> tuple[Any, ...]:
-    """Return the cells to the left and right of some bonds, as numbers of their stress, for a model
-    that softens cells.
-    """
+    """Return the cells to the left and right of some bonds, with state variables for their stress,
+    for a model that softens cells."""
     rng, count = np.random.default_rng(seed), 2 * isinstance(model, SoftensCells)
     return tuple(
         (*rng.uniform(-0.2, 0.5, (3, *SHAPE)), rng.integers(0, 2, SHAPE).astype(float))
@@ -110,7 +110,7 @@ def stressed(model: Component, seed: int) -> tuple[Any, ...]:
 
 
 def here(scene: Scene, seed: int) -> dict[str, Any]:
-    """Return random u and X of some particles, and numbers that the rule remembers, as `own`."""
+    """Return random u and X of some particles, and state variables of the rule as `own`."""
     rng, size = np.random.default_rng(seed + 1), spacing(scene)
     remembered = remembers(scene.experiment.rule, scene, seed)
     return {"u": _vector(0.3 * size, rng), "X": _vector(5 * size, rng), "own": remembered}
@@ -124,7 +124,7 @@ def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ..
     scene, d
         Scene, and the difference along each slot.
     shared
-        Numbers remembered of the particle and its neighbour, by slot; by default initial ones.
+        State variables of the particle and its neighbour, by slot; by default initial ones.
     """
     evaluator, named = Evaluator(scene), scene.constants.of_particle
     neighbours = evaluator.everywhere(scene.neighbourhood.slots[0])
@@ -135,7 +135,7 @@ def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ..
 
 
 def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
-    """Return the move that the sums of contributions give."""
+    """Return the move that follows from the sums of contributions."""
     return Evaluator(scene).move(summed((c, None) for c in contributions), standing(scene, **at))
 
 
@@ -146,14 +146,13 @@ def standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
 
 
 def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
-    """Return numbers that a component remembers of some particles or intact bonds, at the start or
-    two steps later. Numbers of one owner stay together.
-    """
+    """Return state variables of a component for some particles or intact bonds, initially or after
+    two steps. Variables of one owner are kept together."""
     numbers = numbers_of(part, scene)
     if not numbers:
         return ()
     states = [initial_state(scene)]
-    with suppress(PluginError):  # another property reports the failure
+    with suppress(PluginError):  # Another property reports the failure.
         start = state_with(scene, displacements(scene, seed, share=0.1))
         states.append(Stepper(scene).advance(start, 2))
     pools = []
@@ -166,9 +165,8 @@ def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
 
 
 def shared(scene: Scene, own: tuple[Any, ...]) -> list[Any]:
-    """Return the remembered numbers of particle and neighbour along each slot of the first
-    sublattice, for rules that read both; the neighbour is another of the particles.
-    """
+    """Return the state variables of particle and neighbour along each slot of the first sublattice,
+    for rules that read both; the neighbour is another of the particles."""
     if not shares_particles(scene.experiment.rule):
         return []
     slots = range(1, len(scene.neighbourhood.slots[0]) + 1)
@@ -190,8 +188,8 @@ def measured_by(diagnostic: Diagnostic, now: Any) -> dict[str, Any]:
 class Shown:
     """A moment, its cells or its forces with replaced tables or permuted particles.
 
-    Row n contains what row order[n] of the inner object does. Values that have no order of
-    particles are unchanged.
+    Row n contains row order[n] of the inner object. Values that are not in the order of particles
+    are unchanged.
     """
 
     OWN = ("displacement", "previous_displacement", "reference")

@@ -89,9 +89,11 @@ def _compare(value: object, reference: object, subject: str) -> None:
 
 
 STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
+"""Interfaces of components that determine a step."""
 STEP_ROUNDING = 1e-12
 """Tolerance relative to the largest displacement, for some hundred roundings of 1e-16."""
 STEPS = 4
+"""Number of steps."""
 
 
 @property_of(*STEPPED)
@@ -229,7 +231,7 @@ def continues_where_it_stopped(subject: Subject) -> None:
             expected = measured_by(component, StateMoment(whole, Tables(scene)))
             for name in differing(expected, measured):
                 raise PropertyError(f"`{name}` of a run continued at step {STEPS} is another one")
-    with suppress(PluginError):  # reported by other properties
+    with suppress(PluginError):  # Other properties report the error.
         _refuse_other_records(subject.scene, Subject(copy, subject.parts).scene)
 
 
@@ -280,6 +282,7 @@ def _refuse_difference(state: State, expected: State, origin: str, scene: Scene)
 ROUNDING = 1e-11
 """Tolerance relative to the spacing; rotations sum some hundred roundings of 1e-16."""
 ANGLE = 2.0
+"""Angle of rotation in radians."""
 
 
 @property_of(FollowerRule)

@@ -1,5 +1,5 @@
-"""Properties and their subject: a component in small scenes, on every lattice with every
-neighbourhood, and the calls that are made of its functions.
+"""Properties, and their subject: a component in small scenes, on every lattice with every
+neighbourhood, and calls of its functions.
 
 A `FunctionCall` keeps its arguments, so that it can be repeated with others. Arguments and results
 are trees: arrays and numbers in vectors, tuples, lists and dicts; results also in dataclasses.
@@ -145,7 +145,7 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[FunctionCall]:
     inputs = {"d": d, "shared": shared(scene, at["own"])}
     gather = FunctionCall("gather", inputs, partial(gathered, scene), elementwise=True)
     if len({len(flat(parts)) for parts in contributions}) > 1:
-        return [gather]  # they cannot be summed, which is found elsewhere
+        return [gather]  # They cannot be summed, which another property reports.
     sums = summed((c, None) for c in contributions)
     total = each(lambda t: np.broadcast_to(t, SHAPE).copy(), sums)
     functions: dict[str, Callable[[Any, Here], Any]] = {"apply": evaluator.move}
@@ -250,7 +250,7 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Func
             values = np.asarray(measured[variable.name])
             sizes = dict(zip(variable.dims, values.shape, strict=False))
             if values.dtype.kind == "f" and sizes.get("particle") == len(moment.body):
-                # NaN may stand at frame points, and beyond the outline.
+                # NaN is permitted at frame points and outside the outline.
                 allowed = np.isnan(values) & variable.is_recordable(values, moment.inside)
                 measured[variable.name] = np.where(allowed, 0.0, values)
         return measured
@@ -292,16 +292,22 @@ LATTICES: dict[str, dict[str, Any]] = {
     "hexagonal": {"type": "hexagonal", "a": 0.7},
     "oblique": {"type": "oblique", "a": 1.1, "b": 0.9, "angle": 65.0},
 }
+"""Lattices of the scenes."""
 NEIGHBOURS: dict[str, dict[str, Any]] = {
     f"{name}-{shells}": {"type": name, "shells": shells}
     for name, shells in product(("coordination", "chebyshev"), (1, 2))
 }
+"""Neighbour metrics of the scenes."""
 PARTNERS = ({"type": "barycentre"}, {"type": "distance-weighted"})
 """Rules with which lattices and neighbour metrics are tested: a linear and a nonlinear one."""
-MEAN, NATURAL = {"type": "mean"}, {"type": "natural"}
+MEAN = {"type": "mean"}
+"""Frame of the scenes."""
+NATURAL = {"type": "natural"}
+"""Frame with traction-free edges."""
 ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
 """Rule with which frames with traction-free edges are tested."""
 BODY = {"type": "grid", "columns": 6, "rows": 5}
+"""Body of the scenes."""
 PULLED = [
     {"select": {"edge": "left"}, "motion": {"type": "hold"}},
     {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [0.3, 0.1]}},
@@ -318,6 +324,7 @@ PRESSING = {
 }
 """Obstacle of the scenes for diagnostics of obstacles."""
 TEARING = {"type": "threshold", "thresholds": [1.6]}
+"""Fracture model of the scenes."""
 
 
 def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator[Experiment]:
@@ -339,10 +346,10 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     base: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 6, **parts}
     if isinstance(component, Diagnostic):
         base |= {"leaders": PULLED, "fracture": parts.get("fracture", TEARING)}
-        with suppress(Exception):  # another property reports the failure
+        with suppress(Exception):  # Another property reports the failure.
             if any("obstacle" in v.dims for v in component.variables()):
                 base |= {"obstacles": [PRESSING]}
-        neighbours = [n for n in neighbours if n["shells"] == 1]  # the model has one threshold
+        neighbours = [n for n in neighbours if n["shells"] == 1]  # The model has one threshold.
         base |= {"loads": LOADED} if "loads" in getattr(component, "needs", ()) else {}
     choices = {
         "lattice": list(LATTICES.values()),
@@ -519,7 +526,7 @@ def examples_of(component: type[Component]) -> list[Component]:
 def _made(component: type[Component], parameters: dict[str, Any]) -> Component:
     try:
         return component.model_validate(parameters)
-    except TypeError as error:  # an abstract method is missing
+    except TypeError as error:  # An abstract method is missing.
         raise PluginError(f"{component.__name__} cannot be made: {error}") from None
     except ValidationError as error:
         fault = error.errors()[0]

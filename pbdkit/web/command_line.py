@@ -57,7 +57,8 @@ def live(
     async def serve() -> None:
         end = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
-            with suppress(NotImplementedError):  # as on Windows, where Ctrl-C interrupts
+            # Windows does not support this; Ctrl-C interrupts there.
+            with suppress(NotImplementedError):
                 asyncio.get_running_loop().add_signal_handler(number, end.set)
         await server.run(ready, end)
 

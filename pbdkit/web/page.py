@@ -1,6 +1,7 @@
 """Self-contained HTML pages: content, script and style in one file.
 
-Arrays as text inside a page: little-endian, bytes of one place together, gzip, base64.
+Arrays are text inside a page: little-endian numbers, with bytes of equal significance together,
+compressed by gzip and encoded as base64.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./([a-z_]+)\.js";$', re.M)
+"""Pattern of an import in JavaScript."""
 EXPORT = re.compile(r"^export ((?:async )?(?:function\*?|class|const) (\w+))", re.M)
+"""Pattern of an export in JavaScript."""
 
 
 def source(name: str) -> str:
@@ -58,9 +61,9 @@ def _closed(module: str, text: str) -> str:
 
 
 def page(content: dict[str, Any]) -> str:
-    """Return the page as HTML; the content is data in it, and the page makes no request."""
+    """Return the page as HTML. The content is embedded as data, and the page makes no requests."""
     code = script("report")
-    # In JSON, `<` can stand in texts alone; so nothing ends the element that holds it.
+    # In JSON `<` occurs in texts only. It is escaped, so that no text ends the element.
     data = json.dumps(_finite(content), allow_nan=False).replace("<", "\\u003c")
     digest = b64encode(sha256(code.encode()).digest()).decode()
     return Template(source("page.html")).substitute(
@@ -84,6 +87,7 @@ def _finite(value: Any) -> Any:
 
 
 KINDS = {"f4": "<f4", "f8": "<f8", "i4": "<i4", "u1": "<u1"}
+"""Data types of arrays by their names in JavaScript."""
 LARGEST = 1e30
 """Largest number in a page: WebGL does not draw beyond it."""
 
@@ -91,8 +95,8 @@ LARGEST = 1e30
 def packed(values: ArrayLike, kind: str) -> dict[str, Any]:
     """Pack values as one of KINDS, for `packed.js` to read.
 
-    First all lowest bytes of all numbers stand there, then the next ones: numbers that change
-    slowly along the last dimension then take a tenth of the place.
+    The lowest bytes of all numbers come first, then the next ones. Numbers that vary slowly along
+    the last dimension then take a tenth of the size after compression.
     """
     array = np.asarray(values)
     if kind[0] == "f":

@@ -1,8 +1,8 @@
 """Report of a dataset as one self-contained page of HTML: ``pbdkit.report`` and `pbdkit report`.
 
-The sections follow the content of the page: names and units, curves, thinning of steps and
-particles to a budget, bonds, the moving lattice, the experiment, convergence, the page of
-a run, numbers of sweep members, the page of a sweep, and benchmark tables.
+The sections of this file are names and units, curves, selection of steps and particles within a
+maximum size, bonds, the moving lattice, the experiment, convergence, the page of a run, statistics
+of sweep members, the page of a sweep, and benchmark tables.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from pbdkit.web.page import packed, page
 
 
 def meaning_of(variable: xarray.DataArray) -> str:
-    """Return the long name of a variable, or else its name."""
+    """Return the long name of a variable, or its name if there is none."""
     return str(variable.attrs.get("long_name") or variable.name)
 
 
 def units_of(variable: xarray.DataArray) -> str:
-    """Return the units of a variable in a page, mm and so on where it has a scale; empty for
-    dimensionless numbers."""
+    """Return the units of a variable in a page: physical units if the variable has a scale, empty
+    for dimensionless quantities."""
     return signed(in_its_units(variable.attrs)[1])
 
 
@@ -63,7 +63,10 @@ def factor_of(variable: xarray.DataArray) -> float:
     return in_its_units(variable.attrs)[0]
 
 
-MOST_POINTS, MOST_SERIES = 1200, 12
+MOST_POINTS = 1200
+"""Maximum number of points of a curve."""
+MOST_SERIES = 12
+"""Maximum number of curves of a variable."""
 AGAINST = {"nominal_stress": "nominal_strain", "load_resultant": "load_displacement"}
 """Variables that are drawn over another variable as well as over time."""
 
@@ -143,8 +146,8 @@ def _word(dataset: xarray.Dataset, dim: str, n: int) -> str:
 
 
 def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
-    """Return one variable over another; of several pairs the one with the largest values, since a
-    chart has one axis."""
+    """Return one variable over another. A chart has one axis, so that among several pairs the one
+    with the largest values is drawn."""
     pairs = list(zip(_lines(dataset, x, "time"), _lines(dataset, y, "time"), strict=True))
     (label, across), (_, up) = max(pairs, key=lambda pair: float(np.nanmax(np.abs(pair[1][1]))))
     rows = slice(None, None, _every(len(across), points))
@@ -165,15 +168,14 @@ FEWEST_STEPS = 60
 MOST_PARTICLES = 50_000
 """Maximum number of particles that a browser moves smoothly, with their bonds."""
 FEW_LEADERS = 200
-"""Maximum number of leaders that are all shown, whatever is omitted, since they drive the
-motion."""
+"""Number of leaders up to which all are shown, since they drive the motion."""
 
 
 @dataclass(frozen=True)
 class Thinning:
-    """Rows of the steps and particles that are shown: every `stride`-th particle along each axis of
-    the lattice, and all leaders if `with_leaders`; out of `recorded` steps and `count` particles.
-    """
+    """Selection of the steps and particles that are shown: every `stride`-th particle along each
+    axis of the lattice, and all leaders if `with_leaders`, out of `recorded` steps and `count`
+    particles."""
 
     steps: Rows
     particles: Rows
@@ -213,9 +215,9 @@ def thinned(
     budget: int,
     fewest: int = FEWEST_STEPS,
 ) -> Thinning:
-    """Select as many steps and particles as fit into `budget` bytes, where each particle takes
-    `size` bytes a step; steps are omitted down to the `fewest`, then particles. `leaders`
-    (particle,) are included where they are few."""
+    """Select as many steps and particles as fit into `budget` bytes, with `size` bytes for each
+    particle and step. Steps are omitted first, down to the number `fewest`, then particles.
+    `leaders` (particle,) are included if they are few."""
     recorded, count = dataset.sizes.get("time", 1), dataset.sizes["particle"]
     affordable = max(1, budget // (size * count))
     every = math.ceil(recorded / max(affordable, min(recorded, fewest)))
@@ -232,7 +234,8 @@ def thinned(
 
 
 def _on_sublattice(dataset: xarray.Dataset, stride: int) -> NDArray[np.bool_]:
-    """Return which particles lie on every `stride`-th line of the lattice, along i and along j."""
+    """Return a mask of the particles on every `stride`-th line of the lattice, along i and along
+    j."""
     indices: list[NDArray[Any]] = [dataset[n].values for n in ("i", "j") if n in dataset.variables]
     if len(indices) < 2 or any(index.ndim != 1 for index in indices):
         return np.asarray(np.arange(dataset.sizes["particle"]) % stride**2 == 0)
@@ -242,6 +245,7 @@ def _on_sublattice(dataset: xarray.Dataset, stride: int) -> NDArray[np.bool_]:
 LISTED = 300
 """Maximum number of broken bonds in the table of a page."""
 STATES = ("intact", "broken", "cut", "broken from the start", "cannot break")
+"""States of bonds."""
 
 
 @dataclass(frozen=True)
@@ -322,8 +326,8 @@ class BondArrays:
 
 
 def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
-    """Return the bonds of a dataset or, where it has no table, of its scene, unless neighbours are
-    re-evaluated; None if neither has any. Lengths are in the units of the page.
+    """Return the bonds of a dataset or, if it has no table, of its scene, unless neighbours are
+    re-evaluated; None if there are none. Lengths are in the units of the page.
 
     Raises ExperimentError if dataset and scene do not go together.
     """
@@ -332,7 +336,7 @@ def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
 
 
 def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
-    if dataset.sizes.get("bond") == 0:  # particles without neighbours
+    if dataset.sizes.get("bond") == 0:  # No particle has neighbours.
         return None
     if scene is not None and "bond_ends" in dataset.variables:
         return _from_bond_table(BondRecords(dataset, scene), dataset)
@@ -370,7 +374,7 @@ def _from_bond_table(table: BondRecords, dataset: xarray.Dataset) -> BondArrays:
 def _from_table(dataset: xarray.Dataset) -> BondArrays | None:
     """Return the bonds from the dataset alone."""
     complete = (dataset["bond_ends"].values > 0).all(axis=1)
-    if not complete.all():  # of a sweep, in which other members have more
+    if not complete.all():  # In datasets of sweeps other members may have more bonds.
         dataset = dataset.isel(bond=complete)
     ends = dataset["bond_ends"].values
     if not len(ends) or "reference" not in dataset.variables:
@@ -404,11 +408,11 @@ def _states(steps: Array, cut: Array, spared: Array) -> Array:
 
 
 AT_ONCE = 2**28
-"""Maximum number of bytes of a variable that is read at once; larger ones are read a step at a
-time."""
+"""Maximum number of bytes of a variable that is read at once. Larger variables are read step by
+step."""
 FAR = 20.0
-"""Maximum ratio of the size of all positions to that of the body at rest; a larger one has diverged
-and is not followed."""
+"""Ratio of the extent of all positions to that of the body at rest above which a run counts as
+diverged, and its positions are not followed."""
 
 
 def shown_variables(dataset: xarray.Dataset) -> list[str]:
@@ -444,7 +448,7 @@ def read(variable: xarray.DataArray, steps: Rows) -> Iterator[Array]:
 
 
 def in_units(values: Any, factor: float) -> Array:
-    """Return the values times a factor; as they are where that is 1."""
+    """Return the values times a factor, or the same array if the factor is 1."""
     return np.asarray(values) if factor == 1.0 else factor * np.asarray(values)
 
 
@@ -453,8 +457,8 @@ def resting(
 ) -> dict[str, Any]:
     """Return the static content: names, reference, triangles.
 
-    `reference` (particle, axis) is where displacements are counted from, `spacing` the distance of
-    neighbours there, both in the units of the page.
+    `reference` (particle, axis) are the positions of zero displacement, and `spacing` is the
+    distance of neighbours there, both in the units of the page.
     """
     rows, role = thinning.particles, role_of(dataset)
     labels = {n: dataset[n].values for n in ("number", "i", "j") if n in dataset.variables}
@@ -471,8 +475,8 @@ def resting(
 
 
 def _outline(dataset: xarray.Dataset, reference: Array, rows: Rows) -> dict[str, Any]:
-    """Return the signed distance of particles from the outline, negative inside, where it cuts
-    cells: fields end there. In lattice units."""
+    """Return the signed distance of particles from the outline, negative inside, in lattice units,
+    if the outline cuts cells: fields end there."""
     if "inside" not in dataset.variables or dataset["inside"].ndim != 1:
         return {}
     if dataset["inside"].values.all() or (shape := shape_of(dataset)) is None:
@@ -557,7 +561,7 @@ def _box(reference: Array, places: Array) -> list[float]:
 
 
 def spacing_of(reference: Array) -> float:
-    """Estimate the distance of neighbours at rest, where there are no bonds."""
+    """Estimate the distance of neighbours at rest if there are no bonds."""
     sides = np.ptp(reference, axis=0)
     count = len(reference)
     return float(max(math.sqrt(sides.prod() / count), sides.max() / count)) or 1.0
@@ -578,6 +582,7 @@ KeyPath = tuple[str | int, ...]
 MOST_TRIED = 150
 """Maximum number of keys for which omission is tried."""
 PARTS = ("lattice", "body", "neighbours", "rule", "frame", "fracture", "solver")
+"""Parts of an experiment that the summary describes."""
 
 
 def facts(dataset: xarray.Dataset) -> list[list[str]]:
@@ -655,7 +660,7 @@ def _same(brief: dict[str, Any], parts: dict[str, Any]) -> bool:
         rebuilt: dict[str, Any] = Experiment.build(Source("page", brief)).model_dump(
             mode="json", by_alias=True
         )
-    except PbdkitError:  # what is needed, or a part that is not installed here
+    except PbdkitError:  # The key is needed, or the part is not installed here.
         return False
     return rebuilt == parts
 
@@ -671,12 +676,14 @@ def file_name(title: str) -> str:
 
 
 LARGEST = 20_000
-"""Maximum number of particles for which the page predicts stability; beyond, that takes longer than
-the page."""
-FEWEST, MOST = 8, 800
-"""Minimum and maximum number of moves from which a decay is measured."""
+"""Maximum number of particles for which the page contains a prediction of stability, which takes
+longer for larger bodies."""
+FEWEST = 8
+"""Minimum number of moves from which a decay is measured."""
+MOST = 800
+"""Maximum number of moves from which a decay is measured."""
 FADED = 1e-11
-"""Moves below this fraction of the largest one are rounding errors."""
+"""Ratio to the largest move below which moves are rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -691,7 +698,7 @@ class SettlingMoves:
     @property
     def fitted(self) -> Rows:
         """Return the rows from which the decay is measured: the second half of those after the last
-        event above rounding."""
+        event and above rounding errors."""
         rows = np.arange(self.free, len(self.move))
         rows = rows[self.move[rows] > FADED * self.move.max(initial=0.0)]
         return np.asarray(rows[len(rows) // 2 :])
@@ -925,7 +932,8 @@ def _bonds(dataset: xarray.Dataset, origin: Origin) -> tuple[BondArrays | None, 
 
 
 def leaders_of(dataset: xarray.Dataset) -> NDArray[np.bool_]:
-    """Return which particles lead at the first or at the last recorded step, (particle,)."""
+    """Return a mask of the particles that lead at the first or at the last recorded step,
+    (particle,)."""
     if "kind" not in dataset or "time" not in dataset["kind"].dims:
         return np.zeros(dataset.sizes["particle"], np.bool_)
     ends = dataset["kind"].isel(time=[0, -1]).values
@@ -933,8 +941,8 @@ def leaders_of(dataset: xarray.Dataset) -> NDArray[np.bool_]:
 
 
 def reference_of(dataset: xarray.Dataset, scene: Scene | None) -> NDArray[np.float64]:
-    """Return the origin of displacements, (particle, axis), in the units of the page: the
-    reference, or the first recorded step where that is missing."""
+    """Return the positions of zero displacement, (particle, axis), in the units of the page: the
+    reference positions or, if they are missing, those of the first recorded step."""
     if "reference" in dataset.variables and dataset["reference"].ndim == 2:
         return in_units(dataset["reference"].values, factor_of(dataset["reference"]))
     if scene is not None and scene.raster.count == dataset.sizes["particle"]:
@@ -951,8 +959,8 @@ def _finite_values(variable: xarray.DataArray) -> Array:
 
 
 def numbers(dataset: xarray.Dataset, grid: list[str]) -> Iterator[dict[str, Any]]:
-    """Generate one number a member: for every variable common to all members its last and its
-    largest value, for particles the mean and the largest."""
+    """Generate statistics of members. They are the last and the largest value of every variable
+    that is common to all members; for variables of particles their mean and maximum."""
     for name, variable in dataset.data_vars.items():
         if name in (STATUS, MESSAGE, "kind", "position") or not {*grid} <= {*variable.dims}:
             continue
@@ -1008,8 +1016,10 @@ def _last(values: Array) -> Array:
     return np.asarray(values[np.arange(len(values)), last])
 
 
-FEWEST_STEPS_OF_MEMBER, FEWEST_POINTS = 6, 50
-"""Minimum number of steps and of points of each member, as far as recorded."""
+FEWEST_STEPS_OF_MEMBER = 6
+"""Minimum number of steps shown of each member, if recorded."""
+FEWEST_POINTS = 50
+"""Minimum number of points of the curves of each member, if recorded."""
 POINTS = 100_000
 """Maximum number of points in the curves of all members together."""
 
@@ -1111,7 +1121,7 @@ class _Body:
         last = member["position"].isel(time=thinning.steps)
         recorded = (
             last.notnull().any(["particle", "axis"]).values
-        )  # others may have made more steps
+        )  # Other members may have made more steps.
         moved = moving(member, self.reference, replace(thinning, steps=thinning.steps[recorded]))
         return {"bonds": broken} | fixed | {
             "lattice": fixed["lattice"] | moved,
@@ -1146,7 +1156,7 @@ def _labels(dataset: xarray.Dataset, dim: str) -> list[str]:
     if name not in dataset.variables:
         return [str(n) for n in range(dataset.sizes[dim])]
     values = dataset[name].values
-    if values.dtype.kind == "f":  # rounding errors are set to 0
+    if values.dtype.kind == "f":  # Rounding errors are set to 0.
         values = np.where(np.abs(values) < 1e-12 * np.abs(values).max(), 0.0, values)
     return [_label(value) for value in values.tolist()]
 
@@ -1206,12 +1216,16 @@ def _cell(row: dict[str, Any], name: str) -> str:
 
 BUDGET = 4_900_000
 """Maximum size of a page in bytes."""
-FIRST, MOST_BYTES = 20_000_000, 80_000_000
-"""Bytes of the lattice before packing in the first attempt, and the maximum that a browser moves
-smoothly. The ratio of compression depends on the motion, and is only known afterwards."""
-ATTEMPTS, SMALL = 4, 0.6
-"""Maximum number of attempts; a thinned page below this fraction of the budget is repeated with a
-larger one."""
+FIRST = 20_000_000
+"""Number of bytes of the lattice before compression in the first attempt. The compression ratio
+depends on the motion and is known afterwards."""
+MOST_BYTES = 80_000_000
+"""Maximum number of bytes before compression that a browser moves smoothly."""
+ATTEMPTS = 4
+"""Maximum number of attempts."""
+SMALL = 0.6
+"""Fraction of the maximum size below which a page without all steps and particles is built again
+with more of them."""
 
 
 def report(

@@ -14,7 +14,8 @@ from pbdkit.web.session import Session
 LONGEST = 4096
 """Maximum length of a command in bytes."""
 FARTHEST = 1e12
-"""Largest coordinate, in lattice units: squares and differences of it are finite."""
+"""Largest coordinate in lattice units, such that squares and differences of coordinates are
+finite."""
 Step = Annotated[int, Field(ge=0, lt=2**31)]
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Place = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
@@ -151,7 +152,7 @@ def execute(session: Session, command: Command) -> None:
         case Drag():
             session.drag(command.by)
             if session.next_steps:
-                return  # the next step shows it; a picture of now would only keep that one waiting
+                return  # The next step shows the result; a picture now would only delay it.
         case Release():
             session.release()
         case Turn():

@@ -1,7 +1,7 @@
-"""Script of a live session: groups led by hand, changed numbers and cuts, step by step, and its
-conversion to an experiment file.
+"""Script of a live session: leader groups moved by the mouse, changed parameters and cuts, step by
+step, and its conversion to an experiment file.
 
-Long paths of the hand are written to tables beside the file.
+Long paths of the mouse are written to tables beside the file.
 """
 
 from __future__ import annotations
@@ -34,9 +34,11 @@ Way = tuple[float, float]
 
 
 class Hand(Motion):
-    """Motion of a group led by hand, knot by knot; between knots, and after the last, as `path`.
+    """Motion of a leader group that is moved by the mouse, given by knots. Between knots and after
+    the last one it is the same as `path`.
 
-    The knots grow while it is stepped, so that no engine is rebuilt for a move of the mouse.
+    Knots are appended while steps are made, so that an engine is not rebuilt for each movement of
+    the mouse.
     """
 
     type: Literal["hand"] = "hand"
@@ -47,12 +49,13 @@ class Hand(Motion):
         """Return the offset of the path with these knots."""
         if not self._steps:
             return np.zeros(2)
-        # The two lists themselves: a path of copies would cost as much as it is long.
+        # The lists are shared, since copying the path at each call would cost as much as its
+        # length.
         knots: dict[str, Any] = {"steps": self._steps, "displacements": self._ways}
         return Path.model_construct(**knots).offset(n, start)
 
     def knots(self) -> tuple[int, ...]:
-        """Return the last knot; earlier ones are over."""
+        """Return the last knot; earlier ones are in the past."""
         return tuple(self._steps[-1:])
 
     def at(self, n: int) -> Way:
@@ -67,7 +70,7 @@ class Hand(Motion):
         self._add(end, way)
 
     def cut_back(self, n: int) -> None:
-        """Remove what comes after its step n; all steps until then stay the same to the bit."""
+        """Remove the motion after step n; all steps until then remain the same to the last bit."""
         knots = [(step, way) for step, way in self.path if step <= n]
         if len(knots) < len(self._steps):
             begin = knots[-1][0] if knots else 0
@@ -96,8 +99,10 @@ ADJUSTABLE = ("rule", "fracture", "solver")
 """Parts of the experiment with adjustable numbers."""
 SOLVER = {"relaxation": 1.0, "memory": 0.0}
 """Adjustable numbers of the solver, with their defaults."""
-TEST_FACTOR, TEST_VALUE = 1 + 2**-10, 2**-10
-"""Test factor, and test value instead of zero, by which a number is recognised as adjustable."""
+TEST_FACTOR = 1 + 2**-10
+"""Factor by which a number is changed to test whether it is adjustable."""
+TEST_VALUE = 2**-10
+"""Value that replaces zero in this test."""
 SPANS = {"solver.relaxation": (0.01, 2.0), "solver.memory": (0.0, 1.0)}
 """Ranges of the sliders of these numbers."""
 
@@ -106,9 +111,9 @@ SPANS = {"solver.relaxation": (0.01, 2.0), "solver.memory": (0.0, 1.0)}
 class AdjustableNumber:
     """One number by its path in the file, e.g. ``fracture.thresholds.0``.
 
-    `initial` is the number or schedule of the experiment; `turns` are the steps after which it
-    was turned, each with the value from then on; `bounds` what it has to lie between, and `span`
-    what a slider goes over.
+    `initial` is the number or schedule of the experiment, `turns` are the steps after which it was
+    changed, each with the new value, `bounds` are its bounds, and `span` is the range of its
+    slider.
     """
 
     name: str
@@ -173,9 +178,9 @@ class AdjustableNumber:
         return {"steps": list(steps), "values": list(values)}
 
     def _begun(self, until: int) -> list[tuple[int, float]]:
-        """Return the knots of the initial schedule, up to a step. An interval that ends before its
-        knot is written step by step: interpolation to another knot would differ in the last digits.
-        """
+        """Return the knots of the initial schedule up to a step. The last interval is written step
+        by step if it ends before its knot, because interpolation to another knot would differ in
+        the last digits."""
         if not isinstance(self.initial, dict):
             return [(until, self.initial)]
         course = NumberCourse.model_validate(self.initial)
@@ -243,10 +248,10 @@ Parts = dict[str, Any]
 
 @dataclass
 class LeaderScript:
-    """A leader group: as in the file, `of_file`, or led by hand from a step on.
+    """Leader group: as in the file (`of_file`), or moved by the mouse from a step on.
 
-    `ended` is the last step for which it was let lead. A hand's group may stand in place of one
-    that had not begun to lead, `instead_of`.
+    `ended` is the last step in which it leads. A group moved by the mouse may replace one that had
+    not begun to lead, `instead_of`.
     """
 
     of_file: Parts
@@ -265,8 +270,8 @@ class LeaderScript:
         return self.begins <= step <= min(ends, default=step)
 
     def written(self, motion: bool) -> Parts:
-        """Return the group as in an experiment file; without its `motion` a group led by hand
-        rests."""
+        """Return the group as in an experiment file. A group moved by the mouse is at rest if its
+        `motion` is omitted."""
         end = {} if self.ended is None else {"until": self.ended}
         motion_part = self.hand.motion() if self.hand and motion else {"type": "hold"}
         return self.of_file | ({"motion": motion_part} if self.hand else {}) | end
@@ -274,7 +279,8 @@ class LeaderScript:
 
 @dataclass
 class Script:
-    """An experiment and all changes in a session: groups led by hand, changed numbers, cuts."""
+    """An experiment and all changes in a session: groups moved by the mouse, changed parameters,
+    and cuts."""
 
     experiment: Experiment
     parts: Parts
@@ -300,7 +306,8 @@ class Script:
         self.numbers, self.groups, self.cuts = snapshot.numbers, snapshot.groups, snapshot.cuts
 
     def grab(self, group: int, step: int) -> int:
-        """Let the hand lead a group after a step; return the index of the group that it leads."""
+        """Let the mouse move a leader group after a step; return the index of the group that it
+        moves."""
         original = self.groups[group]
         if original.hand is not None:
             return group
@@ -316,14 +323,14 @@ class Script:
         return len(self.groups) - 1
 
     def pick(self, particle: int, step: int) -> int:
-        """Let the hand lead the particle of that number after a step."""
+        """Let the mouse move the particle of that number after a step."""
         self.groups.append(
             LeaderScript({"select": {"numbers": [particle]}, "from": step + 1}, Hand())
         )
         return len(self.groups) - 1
 
     def let_go(self, group: int, step: int) -> None:
-        """Let a group follow after a step."""
+        """Let the particles of a group follow after a step."""
         led_group = self.groups[group]
         if led_group.begins > step:
             del self.groups[group]
@@ -363,13 +370,14 @@ class Script:
                 led_group.hand.cut_back(step - led_group.begins + 1)
 
     def next_turn(self, step: int) -> int:
-        """Return the first step after which a number changes again."""
+        """Return the first step after which a parameter changes again."""
         turns = (when for number in self.numbers.values() for when, _ in number.turns)
         return min((when for when in turns if when > step), default=NEVER)
 
     def playing(self, step: int) -> Parts:
-        """Return the parts to be stepped after a step: numbers as they are until the next change,
-        hands at rest, and of past cuts only one, which keeps bonds breakable."""
+        """Return the parts with which the next steps are made: parameters are constant until the
+        next change, groups moved by the mouse are at rest, and one past cut is included, which
+        keeps bonds breakable."""
         parts = dict(self.parts)
         for number in self.numbers.values():
             if number.turns:
@@ -400,12 +408,12 @@ class Script:
         record = parts.get("record", {})
         if "at" in record:
             parts["record"] = record | {"at": [at for at in record["at"] if at <= last] or [0]}
-        plain: Parts = json.loads(json.dumps(parts))  # nothing in it is there twice
+        plain: Parts = json.loads(json.dumps(parts))  # A copy in which no object occurs twice.
         return plain
 
 
 def parts_of(experiment: Experiment) -> Parts:
-    """Return the parts of an experiment to be stepped, in lattice units and without an end;
+    """Return the parts of an experiment for a session, in lattice units and without a last step;
     optional parts are omitted."""
     parts: Parts = json.loads(experiment.model_dump_json(by_alias=True))
     parts["solver"].pop("settle", None)
@@ -432,7 +440,7 @@ def _begins_after(group: LeaderScript, step: int) -> bool:
 
 
 def _with_key(parts: Parts, key: str, values: list[Any]) -> Parts:
-    """Set a key, or omit it where there are no values."""
+    """Set a key, or omit it if there are no values."""
     rest = {name: part for name, part in parts.items() if name != key}
     return rest | ({key: values} if values else {})
 
@@ -440,11 +448,13 @@ def _with_key(parts: Parts, key: str, values: list[Any]) -> Parts:
 INLINE = 500
 """Maximum number of knots of a path in the experiment; longer ones are written to a table."""
 COMMENT = "# Made by hand with pbdkit live: `pbdkit run` repeats it bit for bit.\n"
+"""First line of a saved session."""
 
 
 @dataclass(frozen=True)
 class Saved:
-    """Path of the saved experiment; `text` is the file if it needs no other, else None."""
+    """Path of the saved experiment; `text` is the content of the file if it refers to no other
+    files, otherwise None."""
 
     path: FilePath
     text: str | None
@@ -505,7 +515,7 @@ def _tables(parts: dict[str, Any], path: FilePath) -> dict[FilePath, str]:
 
 
 def _nodes(parts: Any) -> int:
-    """Return the approximate number of nodes that the reader of files counts."""
+    """Return the approximate number of nodes that the reader of experiment files would count."""
     if isinstance(parts, dict):
         return 1 + sum(1 + _nodes(part) for part in parts.values())
     return 1 + sum(map(_nodes, parts)) if isinstance(parts, list) else 1

@@ -1,8 +1,8 @@
 """Server of a live session: one page and a socket, on this machine only.
 
-A browser sends requests to this machine on behalf of any page. Other pages do not have the token,
-and the browser adds their origin (Origin) and the name under which it reached the server (Host).
-The session runs in a thread of its own, shared by all viewers.
+A browser sends requests to this machine on behalf of any page. Requests of other pages are
+recognised, because these do not have the token, and because the browser adds their origin (Origin)
+and the name of the server (Host). The session runs in a separate thread, shared by all viewers.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ from pbdkit.web.session import Judge, Judgement, Message, Session, scenery, stan
 from pbdkit.web.view_frames import ViewFrame
 
 HOST = "127.0.0.1"
+"""Address on which the server listens."""
 NAMES = (HOST, "localhost")
+"""Names of the server in requests."""
 Headers = Callable[[str], Sequence[str]]
 """Function that returns all values of a header."""
 
@@ -82,6 +84,7 @@ class Access:
 SHORTEST_S = 1 / 60
 """Minimum time in seconds between two pictures."""
 CLOSE_S = 1.0
+"""Time in seconds to wait for the end of the thread of the session."""
 
 
 class Viewer(ABC):
@@ -111,8 +114,8 @@ Asked = tuple[Viewer | None, What]
 
 
 class Conductor:
-    """Passes commands to a session, lets it step in between, and sends the newest picture to each
-    viewer that is ready: no picture waits for another."""
+    """Thread that passes commands to a session, makes steps in between, and sends the newest
+    picture to each viewer that is ready. Pictures are never queued."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -143,8 +146,8 @@ class Conductor:
         self._queue.put((viewer, command))
 
     def close(self) -> None:
-        """End the session's thread after the steps that it is at, or, where these take longer than
-        `CLOSE_S`, with the process."""
+        """End the session's thread after the steps in progress; if these take longer than
+        `CLOSE_S`, it ends with the process."""
         self._queue.put((None, "close"))
         self._judge.close()
         if self._thread.is_alive():
@@ -190,7 +193,7 @@ class Conductor:
                     viewer.tell(message)
         elif what == "leave" and viewer in self._viewers:
             self._viewers.remove(viewer)
-            if not self._viewers:  # no viewer is connected
+            if not self._viewers:  # No viewer is connected.
                 self._try(None, self._session.rest)
         elif isinstance(what, PictureReceived) and viewer:
             viewer.is_ready = True
@@ -238,14 +241,16 @@ class Conductor:
 
 
 MOST_WAITING = 1000
-"""Maximum number of messages to a page that does not read; then it is disconnected."""
+"""Maximum number of messages that wait for a page; if it does not read them, it is disconnected."""
 MOST_PAGES = 8
+"""Maximum number of connected pages."""
 SERVER_CLOSE_S = 0.5
 """Time in seconds for pages to answer at the end; then they are disconnected."""
 POLICY = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; "
     "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+"""Content security policy of the page."""
 
 
 def _silent() -> logging.Logger:
@@ -256,7 +261,7 @@ def _silent() -> logging.Logger:
 
 
 class SocketViewer(Viewer):
-    """A page at the other end of a socket."""
+    """A page, connected by a socket."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
@@ -272,14 +277,14 @@ class SocketViewer(Viewer):
 
     async def send(self, socket: ServerConnection) -> None:
         """Send queued messages until the connection is closed."""
-        with suppress(ConnectionClosed):  # the viewer gets the close event itself
+        with suppress(ConnectionClosed):  # The viewer receives the close event.
             while (message := await self._waiting.get()) is not None:
                 await socket.send(message)
             await socket.close()
 
     def _put(self, message: str | bytes) -> None:
         def put() -> None:
-            if self._waiting.full():  # the viewer does not receive messages
+            if self._waiting.full():  # The viewer does not receive messages.
                 self._waiting.get_nowait()
                 self._waiting.put_nowait(None)
             else:
@@ -314,7 +319,8 @@ class SessionServer:
             server.close()
             with suppress(TimeoutError):
                 await asyncio.wait_for(server.wait_closed(), SERVER_CLOSE_S)
-            for transport in self._transports:  # half-open requests, and pages that do not read
+            # These are half-open requests, and pages that do not read.
+            for transport in self._transports:
                 transport.abort()
 
     async def _started(self) -> Server:
@@ -327,7 +333,8 @@ class SessionServer:
         return server
 
     def _connection(self) -> type[ServerConnection]:
-        """Return the class of connections, of which each leaves its transport here."""
+        """Return the class of connections, which registers the transport of each connection
+        here."""
         transports = self._transports
 
         class Connection(ServerConnection):
@@ -383,7 +390,7 @@ class SessionServer:
 
 
 def page(title: str, nonce: str) -> str:
-    """Return the page of a session; its script and style carry the nonce."""
+    """Return the page of a session, with the nonce in its script and style."""
     return Template(source("live.html")).substitute(
         title=escape(title), nonce=nonce, style=source("live.css"), script=script("socket")
     )

@@ -1,9 +1,9 @@
-"""Live session: an experiment that is stepped while leaders are moved, numbers changed and bonds
+"""Live session: an experiment that is stepped while leaders are moved, parameters changed and bonds
 cut.
 
-Stability is judged in a separate thread, steps are made by the engines of any run, earlier states
-are kept so that the user can go back, and cuts are mapped from the deformed body to the body at
-rest.
+Stability is analysed in a separate thread, steps are made by the same engines as in a run, earlier
+states are kept so that the user can go back, and cuts are mapped from the deformed body to the body
+at rest.
 """
 
 from __future__ import annotations
@@ -43,19 +43,20 @@ from pbdkit.web.view_frames import COLOURS, Camera, ViewFrame
 LARGEST = 4000
 """Maximum number of particles for which the spectrum is computed in about a second."""
 SLOW = 2000
-"""Steps to a thousandth above which a body is called slow."""
+"""Number of steps to a relative distance of 1e-3 above which convergence is called slow."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdict in one word, "stable", "slow", "diverging" or "unknown", with the reason."""
+    """Result of a stability analysis in one word, "stable", "slow", "diverging" or "unknown", with
+    the reason."""
 
     word: str
     why: str
 
 
 def judged(experiment: Experiment) -> Judgement:
-    """Judge the stability of the body in its initial state."""
+    """Analyse the stability of the body in its initial state."""
     try:
         scene = build_scene(experiment)
         if scene.raster.count > LARGEST:
@@ -63,7 +64,7 @@ def judged(experiment: Experiment) -> Judgement:
             return Judgement("unknown", f"{size}; use `pbdkit check` for larger ones")
         analysis = Analysis(scene)
         return _worded(analysis)
-    except Exception as error:  # the session survives any error of a plugin
+    except Exception as error:  # A session continues after errors of plugins.
         return Judgement("unknown", str(error) or type(error).__name__)
 
 
@@ -89,7 +90,7 @@ def _worded(analysis: Analysis) -> Judgement:
 
 
 class Judge:
-    """Judges the newest experiment in a thread of its own."""
+    """Stability analysis of the newest experiment in a separate thread."""
 
     def __init__(self, tell: Callable[[Judgement], None]) -> None:
         self._tell, self._asked = tell, threading.Condition()
@@ -99,13 +100,13 @@ class Judge:
         self._thread.start()
 
     def ask(self, experiment: Experiment) -> None:
-        """Queue an experiment in place of one that still waits."""
+        """Queue an experiment, which replaces one that is still waiting."""
         with self._asked:
             self._newest = experiment
             self._asked.notify()
 
     def close(self) -> None:
-        """End the thread after the current judgement."""
+        """End the thread after the present analysis."""
         with self._asked:
             self._closed = True
             self._asked.notify()
@@ -122,8 +123,8 @@ class Judge:
 
 
 SMALL = 20_000
-"""Maximum number of particles that are stepped by numpy: kernels would be compiled again after some
-changes of numbers, which takes seconds each time."""
+"""Number of particles up to which steps are made by numpy: some changes of parameters would require
+kernels to be compiled again, which takes seconds each time."""
 
 
 class LiveStepper:
@@ -140,7 +141,7 @@ class LiveStepper:
         self._until = -1
 
     def set(self, state: State) -> State:
-        """Build the scene of the step after a state, and return the state as one of it. Raises
+        """Build the scene of the step after a state, and return the state adapted to it. Raises
         ExperimentError if that is impossible."""
         if not self._since <= state.step < self._until:
             experiment = self.script.experiment.of_parts(self.script.playing(state.step))
@@ -166,7 +167,7 @@ class LiveStepper:
 
 def stepped(experiment: Experiment) -> Scene:
     """Build the scene of an experiment to be stepped, with numbers for relaxation and memory. For
-    an equilibrium solver it uses the relaxation that converges fastest, where that is quickly
+    an equilibrium solver it uses the relaxation that converges fastest, if that is quickly
     computed."""
     scene = build_scene(experiment)
     if experiment.solver.makes_steps:
@@ -183,7 +184,7 @@ def stepped(experiment: Experiment) -> Scene:
 
 
 def _led(scene: Scene, groups: Sequence[LeaderScript]) -> tuple[Leading, ...]:
-    """Return the scene's groups, with the motions of the hand where they are led by hand."""
+    """Return the groups of the scene, with the motions of the mouse for those that it moves."""
     groups_of_scene = []
     for leading, group_of_script in zip(
         build_leading(scene.raster, scene.experiment), groups, strict=True
@@ -216,13 +217,15 @@ def fitted(state: State, scene: Scene) -> State:
 
 ROOM = 256 * 2**20
 """Maximum memory of kept states in bytes."""
-FEWEST, MOST = 4, 200
-"""Minimum and maximum number of kept states."""
+FEWEST = 4
+"""Minimum number of kept states."""
+MOST = 200
+"""Maximum number of kept states."""
 
 
 class History:
-    """The initial state and later ones, with distances that grow with their number, so that they
-    fit into the memory."""
+    """The initial state and later ones. The intervals between them increase with their number, so
+    that they fit into the memory."""
 
     def __init__(self, start: State) -> None:
         self._states = [start.copy()]
@@ -275,16 +278,18 @@ def _size(state: State) -> int:
 
 
 SAMPLES = 64
+"""Number of points at which a line is mapped to the body at rest."""
 NEAR = 0.25
 """Tolerance of straightening a line, in units of the spacing."""
-ALONG, WIDTH = 0.29, 1e-3
-"""Position along a bond where it is cut, and width of the cut: bonds cross each other in the
-middle."""
+ALONG = 0.29
+"""Position along a bond where it is cut. It is not in the middle, where bonds cross each other."""
+WIDTH = 1e-3
+"""Width of such a cut."""
 
 
 def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float) -> list[Segment]:
-    """Map a line across the deformed body to straight segments at rest, each place by the
-    displacement of the nearest particle."""
+    """Map a line across the deformed body to straight segments at rest. Each point is displaced by
+    the displacement of the nearest particle."""
     a, b = np.array(line[0]), np.array(line[1])
     count = min(SAMPLES, 2 + int(2 * math.dist(*line) / spacing))
     places = a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
@@ -301,7 +306,8 @@ def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float)
 
 
 def across(ends: Floats) -> Segment:
-    """Return a short segment at rest that crosses a bond and no other that crosses it."""
+    """Return a short segment at rest that crosses a bond and none of the bonds that cross this
+    bond."""
     (x, y), way = ends[0], ends[1] - ends[0]
     middle = np.array([x, y]) + ALONG * way
     aside = WIDTH * np.array([-way[1], way[0]])
@@ -327,7 +333,7 @@ def _straightened(places: Floats, tolerance: float) -> list[int]:
 
 
 LONGEST_S = 0.25
-"""Maximum time in seconds between pictures, whatever the speed."""
+"""Maximum time in seconds between pictures at any speed."""
 REPLAY_S = 0.5
 """Maximum time in seconds for replaying steps from a kept state."""
 
@@ -347,7 +353,7 @@ class GrabbedParticle:
 
 @dataclass
 class Session:
-    """Steps an experiment without end, and executes commands between two steps.
+    """Experiment that is stepped without end, with commands executed between two steps.
 
     All changes are recorded in the script; a change made after going back removes later ones.
     Messages other than pictures are passed to `notify`. Raises ExperimentError if the scene of the
@@ -379,8 +385,8 @@ class Session:
         return self.state.step
 
     def advance(self, steps: int) -> None:
-        """Advance by steps, with the grabbed group moved linearly to the mouse. Where a step fails,
-        the state is restored, the body rests, and an error is reported."""
+        """Advance by steps, with the grabbed group moved linearly to the mouse. If a step fails,
+        the state is restored, stepping stops, and an error is reported."""
         begin = self.step
         self._lead(begin, begin + steps)
         clock = perf_counter()
@@ -403,14 +409,14 @@ class Session:
 
     @property
     def next_steps(self) -> int:
-        """Return the number of steps to the next picture; 0 where the body rests."""
+        """Return the number of steps to the next picture; 0 while stepping is stopped."""
         if not (self.running or self.owed):
             return 0
         limit = max(1, int(LONGEST_S / self.step_s)) if self.step_s else 1
         return min(limit, self.speed if self.running else self.owed)
 
     def rewind(self, step: int) -> None:
-        """Go to a step, or to a kept state before it if replaying would take long, and rest."""
+        """Go to a step, or to a kept state before it if replaying would take long, and stop."""
         self.running, self.owed, self.grabbed = False, 0, None
         step = min(step, self.end)
         snapshot = self.history.before(step)
@@ -492,7 +498,8 @@ class Session:
             self.script.cut(segments, self.step)
 
     def _take(self, grabbed: GrabbedParticle) -> None:
-        step, self.grabbed = self.step, None  # nothing is, where it cannot be led
+        # There is no grabbed particle if the particle cannot be moved.
+        step, self.grabbed = self.step, None
         with self._editing():
             leading = self.stage.scene.leading
             groups = [
@@ -524,8 +531,8 @@ class Session:
 
     @contextmanager
     def _editing(self) -> Iterator[None]:
-        """Change the script in the block after removing what comes after this step. On an error
-        everything is restored."""
+        """Change the script in the block, after changes that follow this step have been removed.
+        After an error everything is restored."""
         script, history = self.script.copy(), self.history.copy()
         state, end = self.state, self.end
         try:
@@ -539,7 +546,7 @@ class Session:
             raise
 
     def _forget_later(self) -> None:
-        """Remove what comes after this step."""
+        """Remove changes after this step."""
         if self.step < self.end:
             self.end = self.step
             self.script.cut_back(self.step)

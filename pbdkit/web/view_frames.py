@@ -1,4 +1,5 @@
-"""Frames of a live session: positions in single precision, thinned for a canvas."""
+"""Frames of a live session: positions in single precision, of selected particles if there are
+many."""
 
 from __future__ import annotations
 
@@ -18,14 +19,21 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 MOST_POINTS = 50_000
+"""Maximum number of particles that are shown."""
 MOST_LEADERS = 2000
 """Maximum number of leaders of a group that are shown."""
 MOST_BONDS = 500_000
+"""Maximum number of bonds that are shown."""
 COLOURS = {"kind": "kind", "displacement": "displacement", "last-step": "way of the last step"}
 """Variables that can colour particles, with their names."""
 HEAD = struct.Struct("<IIIIIIIIdd")
-VALUES, KINDS, BROKEN = 1, 2, 4
-"""Flags for the optional content of a frame."""
+"""Layout of the head of a frame."""
+VALUES = 1
+"""Flag for values of particles in a frame."""
+KINDS = 2
+"""Flag for kinds of particles in a frame."""
+BROKEN = 4
+"""Flag for states of bonds in a frame."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +73,10 @@ class ViewFrame:
 
 
 class Camera:
-    """Takes frames of the states of a body.
+    """Builder of frames from states of a body.
 
-    `every` is n where of large bodies each n-th particle along both axes is shown, those at the
-    ends, and leaders; `rows` are those that are shown, `spacing` how far apart they lie at rest.
+    For large bodies every n-th particle along both axes is shown, with n = `every`, and those at
+    the ends and leaders; `rows` are the shown particles, and `spacing` is their distance at rest.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -103,7 +111,7 @@ class Camera:
         self, scene: Scene, state: State, end: int, pictures: int, step_s: float
     ) -> ViewFrame:
         """Return the frame of a state."""
-        with np.errstate(over="ignore"):  # of what diverges
+        with np.errstate(over="ignore"):  # Displacements of a diverging run may be too large.
             positions = self.positions(state).astype(np.float32)
             values = self._values(state)
         kinds, broken = self._kinds_of(scene, state.step), self._broken_of(state)
