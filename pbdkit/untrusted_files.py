@@ -179,11 +179,11 @@ def _blocks(texts: Any, size: int) -> Iterator[Any]:
         yield texts[start : start + step]
 
 
-MODULE, ENGINE = "netCDF4", "NetCDF4BackendEntrypoint"
-"""Module that reads files without a seal, and the class by which xarray uses it.
-
-By their names xarray would search all distributions, and stop at one with damaged metadata.
-"""
+MODULE = "netCDF4"
+"""Module that reads files without a seal."""
+ENGINE = "NetCDF4BackendEntrypoint"
+"""Class by which xarray uses this module. With its name instead of the class, xarray would search
+all distributions, and stop at one with damaged metadata."""
 BEGINNINGS = (b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"CDF\x02", b"CDF\x05")
 """First bytes of netCDF files of any kind."""
 PATIENCE_S = 10.0

@@ -45,6 +45,7 @@ SYSTEM |= dict.fromkeys(
 """Remedies for errors of the operating system by number; they are no defects of pbdkit."""
 MORE = """\
 `pbdkit COMMAND --help` says what a command takes; `pbdkit --help` has the rest."""
+"""Hint to further help."""
 
 
 @with_no_plugins

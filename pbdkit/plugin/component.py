@@ -1,4 +1,4 @@
-"""Base class of components, its parameters, and remembered numbers of bonds and particles."""
+"""Base class of components, its parameters, and state variables of bonds and particles."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Component(Strict, ABC):
         class Stiff(pbdkit.FollowerRule):
             type: Literal["stiff"] = "stiff"
 
-    A component has no run state: remembered numbers are part of the state of the run.
+    A component has no run state: state variables are part of the state of the run.
     """
 
     model_config = ConfigDict(json_schema_extra=_require_type)
@@ -163,12 +163,12 @@ def _kind(answer: Any) -> str:
 
 
 DTYPES = ("f8", "i1", "i2", "i4", "i8")
-"""Data types of remembered numbers."""
+"""Data types of state variables."""
 
 
 @dataclass(frozen=True)
 class Remembered:
-    """Number that a fracture model remembers for each bond, or a rule for each particle.
+    """State variable of a fracture model, for each bond, or of a rule, for each particle.
 
     Parameters
     ----------
@@ -262,19 +262,19 @@ Drawn = dict[str, NDArray[Any]]
 
 
 class Remembers(ABC):
-    """Component with remembered numbers.
+    """Component with state variables.
 
-    A fracture model remembers numbers for each bond and receives them by name in ``c``; a rule
-    remembers numbers for each particle of the body and receives them by name in ``here.own``.
+    A fracture model has state variables for each bond, which it receives by name in ``c``; a rule
+    has state variables for each particle of the body, in ``here.own``.
     """
 
     @abstractmethod
     def remembered(self) -> tuple[Remembered, ...]:
-        """Return the declarations of the remembered numbers."""
+        """Return the declarations of the state variables."""
 
 
 class Draws(Remembers):
-    """Component with random initial values of remembered numbers."""
+    """Component with random initial values of state variables."""
 
     @abstractmethod
     def draw(self, owners: Any, generator: np.random.Generator) -> Drawn:

@@ -320,7 +320,7 @@ class Moment(ABC):
 
     @abstractmethod
     def remembered(self, name: str) -> NDArray[Any]:
-        """Return a remembered number of the fracture model, (bond,), or of the rule, (particle,).
+        """Return a state variable of the fracture model, (bond,), or of the rule, (particle,).
 
         Bonds are in the order of the dataset; frame points have the initial value.
 

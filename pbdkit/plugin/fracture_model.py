@@ -26,13 +26,13 @@ class FractureModel(TakesFields):
 
     To add a model, write `constants`, `breaks` and `fictitious`; the latter two are static and
     elementwise, as the functions of a rule. Arguments: d = u_k - u_j is the difference along the
-    bond, r its rest offset, c the constants of the slot and the remembered numbers of the bond by
+    bond, r its rest offset, c the constants of the slot and the state variables of the bond by
     name, and p the parameters.
 
     In the intermediate configuration, for each intact bond that can break, a model that derives
-    from `RenewsBonds` first renews its remembered numbers; then ``breaks`` decides. The numbers of
-    broken bonds no longer change. Afterwards a model that derives from `Softens` replaces the
-    difference that the rule sees at intact bonds.
+    from `RenewsBonds` first updates its state variables; then ``breaks`` is evaluated. The state
+    variables of broken bonds no longer change. Afterwards a model that derives from `Softens`
+    replaces the difference that the rule sees at intact bonds.
 
     Optional capabilities are further base classes: `Remembers`, `Draws`, `RenewsBonds`, `Softens`,
     `SoftensCells`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
@@ -82,7 +82,7 @@ class FractureModel(TakesFields):
         r : Vector
             Rest offset X_k - X_j, in lattice units.
         c : Constants
-            Constants of the slot and remembered numbers of the bond.
+            Constants of the slot and state variables of the bond.
         p : Parameters
             Parameters.
 
@@ -129,7 +129,7 @@ class FractureModel(TakesFields):
 
 
 class RenewsBonds(Remembers):
-    """A fracture model with remembered numbers that change from step to step."""
+    """A fracture model with state variables that change from step to step."""
 
     @staticmethod
     @abstractmethod

@@ -30,7 +30,7 @@ class Here(NamedTuple):
         Reference position relative to the middle of the body's box, independent of the position of
         the body to the last bit; None unless the rule declares `uses_reference`.
     own : Numbers
-        Numbers that the rule remembers of the particle, by name.
+        State variables of the particle, by name.
     """
 
     u: Vector
@@ -91,6 +91,7 @@ SCALES_FORCES = (
     "a rule says where particles go, which does not depend on it; it scales forces and stresses, "
     "and stands under `units`, or in each diagnostic that gives them"
 )
+"""Hint for Young's modulus as a key of a rule."""
 
 
 class FollowerRule(TakesFields):
@@ -365,7 +366,7 @@ class MixesCells(Calibrated):
 
 
 class RenewsParticles(Remembers):
-    """A rule with remembered numbers that change from step to step."""
+    """A rule with state variables that change from step to step."""
 
     @staticmethod
     @abstractmethod
@@ -382,7 +383,7 @@ class RenewsParticles(Remembers):
 
 
 class SharesParticles(Remembers):
-    """A rule that reads the remembered numbers of both particle and neighbour.
+    """A rule that reads the state variables of both particle and neighbour.
 
     Frame points and fictitious points remember nothing, so that it can be combined neither with a
     frame nor with bonds that break.
@@ -400,14 +401,14 @@ class SharesParticles(Remembers):
         d, r, w, p
             As in `FollowerRule.gather`.
         own : Numbers
-            Numbers remembered of the particle before the step.
+            State variables of the particle before the step.
         there : Numbers
-            Numbers remembered of the neighbour before the step.
+            State variables of the neighbour before the step.
         """
 
 
 class TurnsParticles(RenewsParticles):
-    """A rule with directions of particles: some remembered numbers are rotations.
+    """A rule with directions of particles: some state variables are rotations.
 
     Each is stored by its cosine and sine. Clamped leaders prescribe them, and turn with their
     motion.
@@ -432,7 +433,7 @@ class AppliesTwice(ABC):
 
 
 def shares_particles(rule: object) -> bool:
-    """Return whether a rule reads the remembered numbers of neighbours."""
+    """Return whether a rule reads the state variables of neighbours."""
     return isinstance(rule, SharesParticles)
 
 

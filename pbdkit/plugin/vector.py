@@ -229,4 +229,4 @@ class Weights(Numbers):
 
 
 class Constants(Numbers):
-    """Constants of a slot and remembered numbers of the bond, read as ``c.name``."""
+    """Constants of a slot and state variables of the bond, read as ``c.name``."""

@@ -57,7 +57,7 @@ class Clamps:
     Attributes
     ----------
     numbers
-        Remembered numbers of particles that are components of the directions they prescribe.
+        State variables of particles that are components of the directions they prescribe.
     """
 
     def __init__(self, scene: Scene) -> None:

@@ -193,9 +193,11 @@ class Shown:
     """
 
     OWN = ("displacement", "previous_displacement", "reference")
+    """Methods that return values of particles."""
     OF_PARTICLES = (
         "body", "inside", "sum_over_neighbours", "gradient", "on_particles", "remembered",
     )  # fmt: skip
+    """Attributes with values of particles, of a moment, its cells or its forces."""
 
     def __init__(self, inner: Any, order: Any = None, tables: Any = None) -> None:
         self._inner, self._tables = inner, tables

@@ -117,6 +117,7 @@ Command = (
     | Save | PictureReceived
 )  # fmt: skip
 _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="do")])
+"""Validation of all commands."""
 
 
 def command_of(message: str | bytes | dict[str, Any]) -> Command:

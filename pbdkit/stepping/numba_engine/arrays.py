@@ -88,7 +88,7 @@ def call_arrays(plan: Plan, program: Program, call: Call, *, by_rows: bool) -> A
 
 
 def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
-    """Return displacements u, those of the step before, and the remembered numbers of a state."""
+    """Return displacements u, those of the step before, and the state variables of a state."""
     return {
         **dict(zip([*plan.each("u_@"), *plan.each("v_@")], [*u, *v], strict=True)),
         **{f"bond{n}": value for n, value in enumerate(state.bond_values)},

@@ -610,9 +610,14 @@ def write_events(plan: Plan) -> Function:
     return out
 
 
-NOBODY, GENERAL, PLAIN, WITH_CELLS = range(4)
-"""Kinds of rows: without followers; with neighbours that may be missing; with all neighbours and
-whole cells; with all neighbours and cut cells."""
+NOBODY = 0
+"""Kind of rows without followers."""
+GENERAL = 1
+"""Kind of rows of particles that may lack neighbours."""
+PLAIN = 2
+"""Kind of rows of particles that have all their neighbours and whole cells."""
+WITH_CELLS = 3
+"""Kind of rows of particles that have all their neighbours, and cut cells."""
 
 
 class Words(NamedTuple):
