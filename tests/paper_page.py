@@ -1,5 +1,6 @@
 """The page validation/reproduction.md: its claims, what was measured of each, and its verdict."""
 
+import re
 from pathlib import Path
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -7,13 +8,13 @@ PAGE = (DOCS / "validation/reproduction.md").read_text("utf-8")
 
 
 def rows(text):
-    """The claims of a section: quote, measured, verdict."""
-    lines = [line for line in text.splitlines() if line.startswith("| “")]
-    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    """Return the claims of a section: quote, measurement, verdict."""
+    pattern = r"^\d+\. (“.*”) – \*\*(.*)\*\*\n\n   (\S.*)$"
+    return [[quote, text, verdict] for quote, verdict, text in re.findall(pattern, text, re.M)]
 
 
 def verdict(quote):
-    (found,) = [row[2].strip("*") for row in rows(PAGE) if quote in row[0]]
+    (found,) = [row[2] for row in rows(PAGE) if quote in row[0]]
     return found
 
 

@@ -19,20 +19,21 @@ from trust import lessons
 DOCS = Path(__file__).parent.parent
 PREFACE = """# Reproduction of the paper
 
-R. dell'Erba (2018, [doi](https://doi.org/10.1007/s00161-018-0663-5); page and figure numbers of the
-pre-print) makes statements about the model that can be tested. Each one is quoted here in a few
-words, beside the measurement and one of three verdicts: **reproduced** by the case as shipped;
-**reproduced only with** a named variant, option or range; **not reproduced**. The verdict is
-computed from the numbers beside it. Where a claim failed, thresholds, frame delay, shells, metric,
-frame and particles around the case were varied. Execution times are taken from the pages that are
-named; all other numbers are measured here.
+This page compares the program with the paper whose model it implements: R. dell'Erba (2018,
+[doi](https://doi.org/10.1007/s00161-018-0663-5)). Each claim of the paper that can be tested is
+quoted in a few words and has one of three verdicts: **reproduced** by the shipped case,
+**reproduced only with** a named variant, option or range, or **not reproduced**. Below the
+quotation is the measurement from which the verdict is computed. If a claim failed, thresholds,
+frame delay, shells, metric, frame and particles near those of the case were tried too.
 
-The paper's time t is step t − 1: its figures at time 401 show step 400. Particles have the paper's
-numbers. The paper does not give all speeds, durations, thresholds and values of K; the values
-chosen here are listed at the head of each experiment (`paper/*`).
+The paper's time t is step t − 1: its figures at time 401 show step 400. Figure numbers are those of
+the pre-print, and particles have the paper's numbers. The paper does not give all speeds,
+durations, thresholds and values of K; the values chosen here are listed at the head of each
+experiment (`paper/*`).
 
-One command makes this page, its pictures and the page on
-[anisotropy and plasticity](anisotropy-and-plasticity.md); no number is typed by hand:
+One command generates this page, its pictures and the page on [anisotropy and plastic-like
+behaviour](anisotropy-and-plasticity.md). All numbers are measured in that run, except for execution
+times, which are taken from the linked pages:
 
     python docs/reproduction
 """
@@ -53,10 +54,10 @@ def sections() -> list[Section]:
 
 
 def main() -> None:
-    """Writes both pages."""
-    found = sections()
-    parts = [PREFACE, counted(found) + "\n", *map(render, found)]
-    parts.append("## What to know before trusting the paper\n\n" + lessons())
+    """Write both pages."""
+    cases = sections()
+    parts = [PREFACE, counted(cases) + "\n", *map(render, cases)]
+    parts.append("## Conclusions\n\n" + lessons())
     (DOCS / "validation/reproduction.md").write_text("\n".join(parts), "utf-8")
     (DOCS / "validation/anisotropy-and-plasticity.md").write_text(announced.page(), "utf-8")
 

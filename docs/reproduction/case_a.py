@@ -4,6 +4,7 @@ import numpy as np
 from claims import Claim, Section
 from drawing import configurations, histories, numbered
 from fits import both, both_text, fit_quality, parabolic
+from one_threshold import which
 from runs import run
 
 LEFT_OF_MIDDLE, ABOVE = 4, 5
@@ -40,7 +41,10 @@ def section() -> Section:
             "Figures 8 and 9: x, y and PE1 of particle 67",
         ),
     ]
-    words = "Square lattice, barycentre, 0.35 a step for ten steps, then released: `paper/a`."
+    words = (
+        "The right edge of a square lattice with the barycentre rule moves by 0.35 per step for "
+        "ten steps and is then released: `paper/a`."
+    )
     return Section("Case a: simple strain and release", words, _claims(), pictures)
 
 
@@ -59,48 +63,49 @@ def _fields() -> list[Claim]:
     return [
         Claim(
             "leaders motion implies a displacement of the first layer that propagates",
-            f"the columns 1 to 8 layers from the leaders first move at steps {first}",
+            f"The columns 1 to 8 layers from the leaders first move at steps {which(first)}.",
             first == list(range(1, 9)),
         ),
         Claim(
             "the x displacement of the points seems do not depend on the y coordinate",
-            f"largest difference between rows at any step: {a.spread():.1g}",
+            f"The largest difference between rows at any step is {a.spread():.1g}.",
             a.spread() < 1e-12,
         ),
         Claim(
             "a light convexity … close to the frame the displacements are lower",
-            f"`paper/a`: rows differ by {a.spread():.1g}. `paper/a-lag`, step 9, the column left "
-            f"of the leaders: {edge:.3f} at the edge, {middle:.3f} in the middle, largest "
-            f"difference {lag.spread():.3f}. `paper/a-chebyshev`: {edge_8:.3f} and "
-            f"{middle_8:.3f}, largest difference {eight.spread():.3f}",
+            f"In `paper/a` rows differ by {a.spread():.1g}. In the column left of the leaders the "
+            f"displacement at step 9 is {edge:.3f} at the edge and {middle:.3f} in the middle of "
+            f"`paper/a-lag` (largest difference at any step {lag.spread():.3f}), and {edge_8:.3f} "
+            f"and {middle_8:.3f} in `paper/a-chebyshev` (largest difference "
+            f"{eight.spread():.3f}).",
             a.spread() > 1e-6,
             "`paper/a-lag` or `paper/a-chebyshev`",
             lower and edge_8 < middle_8,
         ),
         Claim(
             "those close to the frame follow with a little delay owing to the rule of the frame",
-            "within a step the leaders move before the frame. With four neighbours no particle "
-            f"sees that, and the edge row lags by {a.spread():.1g}; with the four diagonals it "
-            f"does ({middle_8 - edge_8:.3f} at step 9), as with a frame one step late "
-            f"({middle - edge:.3f})",
+            "Within a step the leaders move before the frame. With four neighbours this has no "
+            f"effect, and the difference between the middle and the edge is {a.spread():.1g}. It "
+            f"is {middle_8 - edge_8:.3f} at step 9 with eight neighbours and {middle - edge:.3f} "
+            "with a frame delayed by one step.",
             a.spread() > 1e-6,
             "`paper/a-chebyshev` or `paper/a-lag`",
             middle_8 > edge_8 and middle > edge,
         ),
         Claim(
             "avoid this convexity using a different frame or mirroring the followers",
-            f"mirror frame: rows differ by {mirrored.spread():.1g} with four neighbours, where "
-            f"they differ by {a.spread():.1g} without it; by {mirrored_eight.spread():.3f} with "
-            f"eight neighbours, where the mean frame gives {eight.spread():.3f}",
+            f"With a mirror frame rows differ by {mirrored.spread():.1g} with four neighbours "
+            f"({a.spread():.1g} with the mean frame) and by {mirrored_eight.spread():.3f} with "
+            f"eight neighbours ({eight.spread():.3f} with the mean frame).",
             mirrored_eight.spread() < 1e-6,
-            "four neighbours (`paper/a` with `frame: {type: mirror}`), where there is nothing to "
-            "avoid",
+            "four neighbours (`paper/a` with `frame: {type: mirror}`), which have no convexity "
+            "without it either",
             mirrored.spread() < 1e-12,
         ),
         Claim(
             "at t=401 the lattice is not back completely … asymptotic process",
-            f"largest displacement at step 400: {np.abs(a.u[400]).max():.3f} of "
-            f"{np.abs(a.u).max():.2f}",
+            f"The largest displacement at step 400 is {np.abs(a.u[400]).max():.3f}; the largest "
+            f"at any step is {np.abs(a.u).max():.2f}.",
             bool(np.abs(a.u[400]).max() > 0.01),
         ),
     ]
@@ -121,45 +126,47 @@ def _energy() -> list[Claim]:
     return [
         Claim(
             "the maximum value of PE1 is not on the leader line but just on its left",
-            f"step 9: PE1 {at_9[8]:.2f} in the column left of the leaders, {at_9[9]:.2f} on them, "
-            f"{at_9[7]:.2f} one further left",
+            f"At step 9 PE1 is {at_9[8]:.2f} in the column left of the leaders, {at_9[9]:.2f} at "
+            f"the leaders, and {at_9[7]:.2f} one column farther left.",
             int(at_9.argmax()) == 8,
         ),
         Claim(
             "this is also evident in Figure 6 where the PE2 is shown",
-            f"PE2 is largest on the leaders: {moving[0, 9]:.3f} against {moving[0, 8]:.3f} left of "
-            f"them at step 1, {moving[1, 9]:.3f} against {moving[1, 8]:.3f} at step 9",
+            f"PE2 is largest at the leaders: {moving[0, 9]:.3f}, and {moving[0, 8]:.3f} left of "
+            f"them, at step 1; {moving[1, 9]:.3f} and {moving[1, 8]:.3f} at step 9.",
             bool((moving[:, 8] > moving[:, 9]).all()),
         ),
         Claim(
             "PE1 [of 67] increases notably when points are pulled but decrease … when they become "
             "followers",
-            f"the leaders are released after step 10; PE1 of 67 goes on rising to step {peak} and "
-            f"is {fall[0] / pe1[10, LEFT_OF_MIDDLE, ABOVE]:.0f} times as large there as at step "
-            f"10. It rises and falls once. In the column left of the leaders it peaks at step "
-            f"{peaks[9]}",
+            "The leaders are released after step 10. PE1 of 67 increases until step "
+            f"{peak}, to {fall[0] / pe1[10, LEFT_OF_MIDDLE, ABOVE]:.0f} times its value at step "
+            f"10; it has one maximum. In the column left of the leaders the maximum is at step "
+            f"{peaks[9]}.",
             peak <= 11,
             "particles of the column left of the leaders",
             peaks[9] <= 11,
         ),
         Claim(
             "decrease in quite a parabolic-like way",
-            f"{both_text(of_67, peak)}. In the end PE1 falls by a constant share a step, "
-            f"{1 - tail[1] / tail[0]:.1%} at step 150, {1 - tail[-1] / tail[-2]:.1%} at the last",
+            f"{both_text(of_67, peak)}. At the end PE1 decreases by a constant fraction per step: "
+            f"{1 - tail[1] / tail[0]:.1%} at step 150, {1 - tail[-1] / tail[-2]:.1%} at the last "
+            "step.",
             parabolic(both(of_67, peak, 400)),
-            f"steps {peak} to 150 of the fall",
+            f"steps {peak} to 150 of the decrease",
             parabolic(both(of_67, peak, 150)),
         ),
         Claim(
             "similarity with Hooke's law where the energy is proportional to the square",
-            f"1.2 instead of 0.35 a step multiplies PE1 by {ratio:.4f}; (1.2/0.35)² is "
-            f"{(1.2 / 0.35) ** 2:.4f}",
+            f"A speed of 1.2 instead of 0.35 per step multiplies PE1 by {ratio:.4f}; (1.2/0.35)² "
+            f"is {(1.2 / 0.35) ** 2:.4f}.",
             abs(ratio / (1.2 / 0.35) ** 2 - 1) < 1e-9,
         ),
         Claim(
             "if we change point the shape of the curve remain the same but … more flared",
-            f"one peak for each of the columns {list(peaks)}, at steps {list(peaks.values())}; "
-            f"width at half height {list(widths.values())} steps",
+            f"The columns {which(list(peaks))} have one maximum each, at steps "
+            f"{which(list(peaks.values()))}; the widths at half height are "
+            f"{which(list(widths.values()))} steps.",
             list(widths.values()) == sorted(widths.values(), reverse=True),
         ),
     ]
@@ -178,23 +185,25 @@ def _history() -> list[Claim]:
     return [
         Claim(
             "x increases linearly (velocity is constant), after a delay",
-            f"delay: first moves at step {start}. Its speed grows from {speed[0]:.4f} to "
-            f"{speed.max():.4f} a step (at step {start + int(speed.argmax())}) and falls to 0 at "
-            f"step {top}; a line fits the rise with R² = {rise:.3f}",
+            f"The particle first moves at step {start}, so that there is a delay. Its speed "
+            f"increases from {speed[0]:.4f} to {speed.max():.4f} per step (at step "
+            f"{start + int(speed.argmax())}) and decreases to 0 at step {top}; a line fits the "
+            f"rise with R² = {rise:.3f}.",
             rise > 0.99,
         ),
         Claim(
             "later decrease with parabolic like behaviour to the original position",
-            f"{both_text(x, top)}. Over the whole fall they differ by "
-            f"{abs(whole[1] - whole[0]):.0e}; {x[400]:.3f} is left of {x[top]:.3f} at step 400",
+            f"{both_text(x, top)}. Over the whole decrease the two differ by "
+            f"{abs(whole[1] - whole[0]):.0e}. At step 400 the displacement is {x[400]:.3f}; its "
+            f"maximum was {x[top]:.3f}.",
             parabolic(whole),
-            f"steps {top} to 150 of the fall",
+            f"steps {top} to 150 of the decrease",
             parabolic(both(x, top, 150)),
         ),
         Claim(
             "no oscillation can be observed with this kind of rule",
-            f"x of 67 turns {turns} time after it starts to move, and never crosses its rest "
-            f"position; with `paper/a-memory` it crosses it {crossings} times to step 200",
+            f"x of 67 changes direction {turns} time after it starts to move and never crosses "
+            f"its rest position; in `paper/a-memory` it crosses it {crossings} times by step 200.",
             turns == 1 and bool((x >= 0).all()),
         ),
     ]
@@ -208,17 +217,18 @@ def _setting() -> list[Claim]:
     return [
         Claim(
             "speed 1,2 unit/step [the text] … 0.35 unit/step [table 1]",
-            "the two contradict each other; the model is linear, so that they differ by a factor "
-            f"only (`paper/a-text` less 1.2/0.35 times `paper/a`: {scaled:.1g})",
+            "Text and table contradict each other. Because the model is linear, the results "
+            "differ only by a factor: `paper/a-text` minus 1.2/0.35 times `paper/a` is "
+            f"{scaled:.1g}.",
             False,
         ),
         Claim(
             "points are numbered from left to right and from bottom to up",
-            f"67 is to be a central point above the central line. Row by row it would be column "
-            f"{row_wise[0] + 1}, row {row_wise[1] + 1} of 10, below that line; column by column "
-            f"it is column {column + 1}, row {row + 1}",
+            "According to the paper 67 is a central point above the central line. Numbered row by "
+            f"row it would be in column {row_wise[0] + 1}, row {row_wise[1] + 1} of 10, below that "
+            f"line; numbered column by column it is in column {column + 1}, row {row + 1}.",
             row_wise[1] > 4,
-            "the numbers running column by column",
+            "numbers that increase column by column",
             row == 5,
         ),
     ]

@@ -48,7 +48,8 @@ def section_b() -> Section:
         ),
     ]
     words = (
-        "As a without release; mixed coordinates: `paper/b`. The paper gives no K; −0.004 is ours."
+        "As case a, without the release, with the rule of mixed coordinates: `paper/b`. The paper "
+        "does not give K; −0.004 was chosen here."
     )
     return Section("Case b: the Poisson effect", words, _claims_b(), pictures)
 
@@ -65,35 +66,38 @@ def _claims_b() -> list[Claim]:
     return [
         Claim(
             "lateral contraction can be seen",
-            f"step 99: the outer rows are nearer by {narrow.max():.3f} (of 9) at column "
-            f"{int(narrow.argmax()) + 1}; with K = +0.004 they part by {-wider.min():.3f}",
+            f"At step 99 the distance of the outer rows (9 at rest) is {narrow.max():.3f} smaller "
+            f"at column {int(narrow.argmax()) + 1}; with K = +0.004 it is {-wider.min():.3f} "
+            "larger.",
             bool(narrow.max() > 0.01),
         ),
         Claim(
             "there is a relaxation time, because the followers need time",
-            f"67 has half of its contraction of step 100 at step {half_time(b)}, "
-            f"{half_time(b) - 10} steps after the leaders stopped",
+            f"Particle 67 reaches half of its contraction of step 100 at step {half_time(b)}, "
+            f"{half_time(b) - 10} steps after the leaders have stopped.",
             half_time(b) > 11,
         ),
         Claim(
             "[the relaxation time] is due to the rules expression and can be tuned",
-            f"not by K: half of the contraction at step {half_time(strong)} with K = −0.008, "
-            f"{half_time(b)} with −0.004; by the relaxation, 0.5: step {half_time(slow)}",
+            "K does not change it: half of the contraction is reached at step "
+            f"{half_time(strong)} with K = −0.008 and at step {half_time(b)} with −0.004. A "
+            f"relaxation of 0.5 does: step {half_time(slow)}.",
             half_time(strong) != half_time(b),
             "`solver.relaxation`, which the paper does not have",
             half_time(slow) > half_time(b),
         ),
         Claim(
             "PE1 … here is more evident the edge effect leading to concavity toward left",
-            "PE1 left of the leaders is larger at the edge than in the middle row by "
-            f"{near[9]:.2%}, {near[19]:.2%} and {near[99]:.1%} at times 10, 20, 100 ({in_a:.2%} in "
-            "case a): its lines are concave toward the left, to be seen at time 100. In the middle "
-            f"of the sheet they are concave toward the right by then ({middle[99]:.1%})",
+            "Left of the leaders PE1 is larger at the edge than in the middle row by "
+            f"{near[9]:.2%}, {near[19]:.2%} and {near[99]:.1%} at times 10, 20 and 100 "
+            f"({in_a:.2%} in case a): its contours are concave toward the left, visibly at time "
+            "100. In the middle of the sheet they are then concave toward the right "
+            f"({middle[99]:.1%}).",
             near[99] > 0.02 and near[99] > in_a,
         ),
         Claim(
             "the point is above the central line so their y coordinate decrease",
-            f"u_y of 67 falls to {y[100]:.4f} at step 100 and never rises",
+            f"u_y of 67 decreases to {y[100]:.4f} at step 100 and never increases.",
             bool(y[100] < 0 and (np.diff(y) <= 1e-15).all()),
         ),
     ]
@@ -113,7 +117,7 @@ def section_c() -> Section:
             "Figures 11 and 13: x, y and PE1 of particle 67",
         ),
     ]
-    words = "As b with the second shell: `paper/c`."
+    words = "As case b, with the second shell of neighbours: `paper/c`."
     return Section("Case c: the importance of the gradient", words, _claims_c(), pictures)
 
 
@@ -135,42 +139,42 @@ def _claims_c() -> list[Claim]:
     return [
         Claim(
             "lateral contraction can be seen in a less pronounced way",
-            f"largest narrowing at step 99: {narrow[0]:.3f} in b, {narrow[1]:.3f} in c "
-            f"({narrow[2]:.3f} with 24 neighbours). c narrows less than b by "
-            f"{less[0]:.1%}, {less[1]:.1%} and {less[2]:.1%} at the paper's times 10, 20 and 100; "
-            f"the verdict asks for {SEEN:.0%}, to be seen in a figure",
+            f"The largest contraction at step 99 is {narrow[0]:.3f} in b and {narrow[1]:.3f} in c "
+            f"({narrow[2]:.3f} with 24 neighbours). In c it is smaller than in b by "
+            f"{less[0]:.1%}, {less[1]:.1%} and {less[2]:.1%} at the paper's times 10, 20 and 100. "
+            f"The verdict requires {SEEN:.0%}, the smallest difference visible in a figure.",
             min(less) > SEEN,
             "late times (100)",
             less[2] > SEEN,
         ),
         Claim(
             "a lower lateral contraction [of 67], with respect the first gradient case",
-            f"−u_y of 67 at steps 9, 19 and 99 is {values} in b and c: c contracts more at steps "
-            f"{above[0]} to {above[-1]} and less after. With 24 neighbours it is "
-            f"{', '.join(f'{v:.4f}' for v in third)}, more at steps {above_24[0]} to "
-            f"{above_24[-1]}",
+            f"−u_y of 67 in b and c is {values} at steps 9, 19 and 99: the contraction in c is "
+            f"larger at steps {above[0]} to {above[-1]} and smaller afterwards. With 24 "
+            f"neighbours −u_y is {', '.join(f'{v:.4f}' for v in third)}, larger than in b at "
+            f"steps {above_24[0]} to {above_24[-1]}.",
             not above,
             f"steps after {above[-1]}",
             bool(second[2] < first[2]),
         ),
         Claim(
             "with a larger number of neighbours the effect is amortized",
-            f"−u_y of 67 at step 99: {first[2]:.4f} with 4 neighbours, {second[2]:.4f} with 8, "
-            f"{third[2]:.4f} with 24",
+            f"−u_y of 67 at step 99 is {first[2]:.4f} with 4 neighbours, {second[2]:.4f} with 8 "
+            f"and {third[2]:.4f} with 24.",
             bool(first[2] > second[2] > third[2]),
         ),
         Claim(
             "the PE1 plot enhances the convexity of the first line of follower",
-            f"PE1 left of the leaders at step 9 is larger at the edge than in the middle by "
-            f"{bow[0]:.2%} in b and {bow[1]:.2%} in c",
+            "At step 9 PE1 left of the leaders is larger at the edge than in the middle by "
+            f"{bow[0]:.2%} in b and {bow[1]:.2%} in c.",
             bool(bow[1] > 2 * bow[0] > 0),
         ),
         Claim(
             "its evolution with time is quite different",
-            f"half of the contraction of step 100 is reached at step {half_time(c)} in c, "
-            f"{half_time(b)} in b, {half_time(wide)} with 24 neighbours; from step 50 to 100 it "
-            f"grows by {c.u[100, 4, 5, 1] / c.u[50, 4, 5, 1] - 1:.0%} in c and "
-            f"{b.u[100, 4, 5, 1] / b.u[50, 4, 5, 1] - 1:.0%} in b",
+            f"Half of the contraction of step 100 is reached at step {half_time(c)} in c, "
+            f"{half_time(b)} in b and {half_time(wide)} with 24 neighbours. From step 50 to 100 "
+            f"it grows by {c.u[100, 4, 5, 1] / c.u[50, 4, 5, 1] - 1:.0%} in c and "
+            f"{b.u[100, 4, 5, 1] / b.u[50, 4, 5, 1] - 1:.0%} in b.",
             half_time(c) < 0.9 * half_time(b),
         ),
     ]

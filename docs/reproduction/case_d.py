@@ -4,7 +4,18 @@ from claims import Claim, Section
 from drawing import configurations, histories
 from one_threshold import TRIED, fitting, span, times, which
 from runs import Sheet, edges_first, parted, rebound, run, steps_text
-from torn_square import COLUMN, FAMILIES, LASTING, ROW, SPARED, THRESHOLDS, both, kinds, swept, x_of
+from torn_square import (
+    COLUMN,
+    FAMILIES,
+    LASTING,
+    ROW,
+    THRESHOLDS,
+    UNBREAKABLE,
+    both,
+    kinds,
+    swept,
+    x_of,
+)
 
 
 def section() -> Section:
@@ -13,11 +24,11 @@ def section() -> Section:
     pictures = [
         (
             configurations(run("paper/d1"), [1, 5, 6, 7, 100], "d1-pe1.png"),
-            "Figure 14: paper/d1: the rows part together at time 7",
+            "Figure 14: paper/d1: all rows separate at time 7",
         ),
         (
             configurations(run("paper/d2"), [1, 5, 6, 7, 8, 100], "d2-pe1.png"),
-            "Figure 15: paper/d2: the outermost rows part at time 7, the rest at 8",
+            "Figure 15: paper/d2: the outermost rows separate at time 7, the others at 8",
         ),
         (
             histories({n: (run(n), COLUMN, ROW) for n in names}, "d-103.png", 150, log=True),
@@ -26,10 +37,11 @@ def section() -> Section:
     ]
     assert (times("d1"), times("d2")) == ((7, 7), (7, 8))
     words = (
-        "1.2 a step for ten steps, then held, thresholds 5.2 as in f and g, all our choice: "
-        "`paper/d1` with one shell, `paper/d2` with two. “Parts” is the step in which the leader "
-        "of a row loses its last bond to the column beside it; “edges first”, that both outermost "
-        "rows part before every other row."
+        "The right edge moves by 1.2 per step for ten steps and is then held; the thresholds are "
+        "5.2, as in cases f and g. These values were chosen here. `paper/d1` has one shell of "
+        "neighbours, `paper/d2` two. A row *separates* in the step in which its leader loses its "
+        "last bond to the adjacent column; *edges first* means that both outermost rows separate "
+        "before every other row."
     )
     claims = [*_line(), *_rebound(), *_energy()]
     return Section("Case d: simple fracture", words, claims, pictures, both())
@@ -37,7 +49,7 @@ def section() -> Section:
 
 def _line() -> list[Claim]:
     one, two, lag = run("paper/d1"), run("paper/d2"), run("paper/d1-lag")
-    sheets_of = {label: swept(label) for label in FAMILIES if "spared" not in label}
+    sheets_of = {label: swept(label) for label in FAMILIES if "unbreakable" not in label}
     first = {
         label: [t for t, sheet in sheets.items() if edges_first(parted(sheet))]
         for label, sheets in sheets_of.items()
@@ -54,52 +66,56 @@ def _line() -> list[Claim]:
     return [
         Claim(
             "choosing a distance fracture of about 10 units",
-            "the longest bond where bonds are judged (leaders moved, followers not yet) is "
-            f"{fast:.2f} at 1.2 a step for ten steps, in step {at}, and {slow:.2f} at 0.35: a "
-            f"threshold of 10 breaks nothing, and the sheet parts up to {fast:.2f}. The leaders "
-            f"would have to go on to step {late}",
+            "Bonds are tested after leaders have moved and before followers move. The longest "
+            f"bond is then {fast:.2f} at 1.2 per step (in step {at}) and {slow:.2f} at 0.35, so "
+            "that no bond breaks at a threshold of 10; the sheet separates at thresholds up to "
+            f"{fast:.2f}. At a threshold of 10 the leaders would have to move until step {late}.",
             max(fast, slow) > 10,
-            "1.2 a step for twenty steps instead of ten",
+            "1.2 per step for twenty steps instead of ten",
             late <= 20,
         ),
         Claim(
             "the vertical fracture line is different in first or second gradient",
-            f"rows, bottom to top, part at steps {rows['1']} with one shell, {rows['2']} with two",
+            f"From bottom to top the rows separate at steps {rows['1']} with one shell and "
+            f"{rows['2']} with two.",
             rows["1"] != rows["2"],
         ),
         Claim(
             "points close to the frame are detached before the others [first gradient]",
-            f"`paper/d1`: {rows['1']}, all at once; `paper/d1-lag`: {rows['lag']}. Thresholds "
-            f"from {THRESHOLDS[0]:g} to {THRESHOLDS[-1]:g} at which all rows part, and among them "
-            f"those with edges first: {found}",
+            f"The rows separate at steps {rows['1']} in `paper/d1` and {rows['lag']} in "
+            f"`paper/d1-lag`. Thresholds from {THRESHOLDS[0]:g} to {THRESHOLDS[-1]:g} were tried; "
+            "the number with edges first, of those at which all rows separate, is: "
+            f"{found}.",
             len(first["one shell"]) == len(sheets_of["one shell"]),
             f"`paper/d1-lag`, at {share['one shell and lag 1']}",
             edges_first(parted(lag)),
         ),
         Claim(
             "points close to the frame are detached before the others [second gradient]",
-            f"`paper/d2`: {rows['2']}; at {share['two shells']} that were tried in all, and with "
-            f"24 neighbours at {share['24 neighbours']}",
+            f"The rows of `paper/d2` separate at steps {rows['2']}. Edges are first at "
+            f"{share['two shells']} with two shells and at {share['24 neighbours']} with 24 "
+            "neighbours.",
             len(first["two shells"]) == len(sheets_of["two shells"]),
             f"`paper/d2`, at {share['two shells']}",
             edges_first(parted(two)),
         ),
         Claim(
             "this effect is more marked in second gradient case",
-            f"edges before the rest by {_lead(one)} steps in `paper/d1`, {_lead(two)} in "
-            f"`paper/d2` (at the same threshold); at {share['one shell']} and "
-            f"{share['two shells']}; under lag 1 with one shell at "
-            f"{share['one shell and lag 1']}",
+            f"At the same threshold the edges separate {_lead(one)} steps before the last row in "
+            f"`paper/d1` and {_lead(two)} step before it in `paper/d2`. Edges are first at "
+            f"{share['one shell']} with one shell, at {share['two shells']} with two, and at "
+            f"{share['one shell and lag 1']} with one shell and a delayed frame.",
             len(first["one shell"]) < len(first["two shells"]) == len(sheets_of["two shells"]),
             f"`paper/d2`, at {share['two shells']}",
             _lead(two) > _lead(one),
         ),
         Claim(
             "time (1, 5, 6, 7 and 100) … (1, 5, 6, 7, 8 and 100) [when it tears]",
-            f"rows part at time {span('d1')} in `paper/d1` and {span('d2')} in `paper/d2`. Of the "
-            f"thresholds {TRIED[0]:g} to {TRIED[-1]:g} in steps of 0.1 the last rows part after "
-            f"time 5 and by 7 and 8 at {which(fitting('d1', 'd2'))}; at 6 at "
-            f"{_times('d1', 6.0)} and {_times('d2', 6.0)}",
+            f"The rows separate at time {span('d1')} in `paper/d1` and {span('d2')} in "
+            f"`paper/d2`. Thresholds from {TRIED[0]:g} to {TRIED[-1]:g} were tried in steps of "
+            "0.1: the last rows separate after time 5 and not after times 7 and 8 at thresholds "
+            f"of {which(fitting('d1', 'd2'))}. At a threshold of 6 the times are "
+            f"{_times('d1', 6.0)} and {_times('d2', 6.0)}.",
             5.2 in fitting("d1", "d2"),
         ),
     ]
@@ -133,48 +149,52 @@ def _first_break_at_ten() -> int:
 
 def _rebound() -> list[Claim]:
     one, two = run("paper/d1"), run("paper/d2")
-    spared, wide = run("paper/d2-frame-bonds"), run("paper/d2-chebyshev")
-    back, dip = rebound(x_of(spared)), rebound(x_of(wide))
+    tied, wide = run("paper/d2-frame-bonds"), run("paper/d2-chebyshev")
+    back, dip = rebound(x_of(tied)), rebound(x_of(wide))
     assert back is not None
     assert dip is not None
     families = {n: swept(n) for n in FAMILIES if "24" in n or n.startswith("two")}
-    spared_one = rebound(x_of(run("paper/d1", SPARED)))
+    tied_one = rebound(x_of(run("paper/d1", UNBREAKABLE)))
     found = "; ".join(f"{label}: {kinds(sheets)}" for label, sheets in families.items())
-    kept = spared.residual()
+    kept = tied.residual()
     return [
         Claim(
             "x of 103: after the fracture a sort of rebound [second gradient]",
-            f"`paper/d2`: x falls without a turn after its top at step {int(x_of(two).argmax())}. "
-            f"`paper/d2-frame-bonds`: {back[1]:.3f} at step {back[0]}, later {back[2]:.3f}, for "
-            f"good. `paper/d2-chebyshev`, number {wide.number(COLUMN, ROW)}: a dip to {dip[1]:.3f} "
-            f"at step {dip[0]} while the leaders move, then {dip[2]:.3f}, and back. Thresholds: "
-            f"{found}",
+            "In `paper/d2` x decreases monotonically after its maximum at step "
+            f"{int(x_of(two).argmax())}. In `paper/d2-frame-bonds` it decreases to {back[1]:.3f} "
+            f"at step {back[0]} and then increases permanently to {back[2]:.3f}. In "
+            f"`paper/d2-chebyshev`, where the particle has the number {wide.number(COLUMN, ROW)}, "
+            f"it decreases to {dip[1]:.3f} at step {dip[0]} while the leaders move, increases to "
+            f"{dip[2]:.3f}, and returns. The number of thresholds with a rebound is: {found}.",
             rebound(x_of(two)) is not None,
-            "`paper/d2-frame-bonds` (lasting) or `paper/d2-chebyshev` (a dip during the pull)",
+            "`paper/d2-frame-bonds` (permanent) or `paper/d2-chebyshev` (during the motion of the "
+            "leaders)",
             back[0] > LASTING,
         ),
         Claim(
             "differently from first gradient mode",
-            f"one shell rebounds at {kinds(swept('one shell'))}, but `paper/d2` at no more. With "
-            f"frame bonds spared one shell {'does' if spared_one else 'does not'}, two shells do",
+            f"With one shell there is a rebound at {kinds(swept('one shell'))} thresholds, and "
+            "none in `paper/d2` either. If bonds to the frame do not break, there is "
+            f"{'one' if tied_one else 'none'} with one shell and one with two.",
             rebound(x_of(one)) is None and rebound(x_of(two)) is not None,
             "`paper/d2-frame-bonds` against `paper/d1` with `frame_bonds: false`",
-            spared_one is None,
+            tied_one is None,
         ),
         Claim(
             "some fast point on its right try to deviate it to the right",
-            "`paper/d2-frame-bonds`: bonds to frame points which stay near the torn column pull "
-            f"the edge; without those the piece comes back (`paper/d2`: {two.residual():.3f} left "
-            "at step 400)",
+            "In `paper/d2-frame-bonds` the edge is pulled by bonds to frame points that remain "
+            "near the torn column. Without these bonds the piece returns: the largest "
+            f"displacement in `paper/d2` at step 400 is {two.residual():.3f}.",
             rebound(x_of(two)) is not None,
-            "`paper/d2-frame-bonds`, where it is the frame",
+            "`paper/d2-frame-bonds`, where frame points have this effect",
             back[0] > LASTING,
         ),
         Claim(
             "when the group is compacted they go back all together to initial configuration",
-            f"largest displacement of the piece at step 400: {one.residual():.3f} in d1, "
-            f"{two.residual():.3f} in d2, {wide.residual():.1g} in `paper/d2-chebyshev`, but "
-            f"{kept:.2f} in `paper/d2-frame-bonds`, the variant with the lasting rebound",
+            "The largest displacement of the piece at step 400 is "
+            f"{one.residual():.3f} in d1, {two.residual():.3f} in d2 and {wide.residual():.1g} in "
+            f"`paper/d2-chebyshev`, but {kept:.2f} in `paper/d2-frame-bonds`, the variant with the "
+            "permanent rebound.",
             max(one.residual(), two.residual()) < 0.1,
         ),
     ]
@@ -186,8 +206,8 @@ def _energy() -> list[Claim]:
     return [
         Claim(
             "in the fracture case the pseudo energy plot is less indicative",
-            f"step 99, column left of the gap: PE1 {all_bonds[8]:.1f} with the broken bond, "
-            f"{intact[8]:.4f} without",
+            f"At step 99 PE1 in the column left of the gap is {all_bonds[8]:.1f} with the broken "
+            f"bond and {intact[8]:.4f} without it.",
             bool(all_bonds[8] > 10 * intact[8]),
         ),
     ]

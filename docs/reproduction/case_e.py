@@ -19,7 +19,7 @@ def section() -> Section:
     pictures = [
         (
             configurations(e, [1, 3, 9, 401], "e.png", over="nothing"),
-            "Figure 17: case e, configurations at times 1, 3, 9 and 401; the sheet folds",
+            "Figure 17: case e, configurations at times 1, 3, 9 and 401; cells are inverted",
         ),
         (
             configurations(e, [9, 401], "e-pe1.png", over="rest"),
@@ -37,8 +37,8 @@ def section() -> Section:
         ),
     ]
     words = (
-        "Four inner particles move apart along the diagonals, 0.35 a step along each axis for ten "
-        "steps (our choice), then stand: `paper/e`."
+        "Four inner particles move apart along the diagonals by 0.35 per step along each axis for "
+        "ten steps and then stop: `paper/e`. These values were chosen here."
     )
     return Section("Case e: Saint-Venant", words, _claims(), pictures)
 
@@ -61,25 +61,28 @@ def _claims() -> list[Claim]:
     return [
         Claim(
             "remote particles are not interested in what is going on close to the leaders [time 9]",
-            f"the rim has {rim_share(e, 8):.1%} of the leaders' motion at step 8; it first moves "
-            f"at step {start}",
+            f"At step 8 the displacement of the rim is {rim_share(e, 8):.1%} of that of the "
+            f"leaders; the rim first moves at step {start}.",
             rim_share(e, 8) < 0.02,
         ),
         Claim(
             "PE1 and PE2 contour plot [time 9]",
-            f"the inner 6 × 6 particles hold {inner:.1%} of PE1; PE2 in the rim is at most "
-            f"{max(pe2[0].max(), pe2[:, 0].max()) / pe2.max():.1%} of its largest. "
-            f"{folded} of 81 cells are turned over: at our pull the leaders pass their neighbours",
+            f"{inner:.1%} of the sum of PE1 belongs to the inner 6 × 6 particles. PE2 in the rim "
+            f"is at most {max(pe2[0].max(), pe2[:, 0].max()) / pe2.max():.1%} of its largest "
+            f"value. {folded} of 81 cells are inverted: with the chosen displacement the leaders "
+            "pass their neighbours.",
             inner > 0.99,
         ),
         Claim(
             "the local action principle [is verified]",
-            f"it is a delay, no decay: the rim has {rim_share(e, 100):.1%} at step 100 and "
-            f"{rim_share(e, 400):.1%} at step 400, for good. In a sheet of 40 × 40 it has "
+            "The effect arrives later, but does not decay: the displacement of the rim is "
+            f"{rim_share(e, 100):.1%} of that of the leaders at step 100 and permanently "
+            f"{rim_share(e, 400):.1%} from step 400 on. In a sheet of 40 × 40 it is "
             f"{late[0]:.1g} at step 8, {late[1]:.1%} at step 400 and {late[2]:.1%} at step 4000: "
-            f"four times the distance, {rim_share(e, 400) / late[2]:.2f} times less, as 1/r",
+            f"{rim_share(e, 400) / late[2]:.2f} times smaller at four times the distance, in "
+            "proportion to 1/r.",
             rim_share(e, 400) < 0.02,
-            "early times (k layers away nothing moves before step k)",
+            "early times (a particle k layers away does not move before step k)",
             rim_share(e, start - 1) == 0.0,
         ),
     ]

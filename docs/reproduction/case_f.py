@@ -52,8 +52,8 @@ def section() -> Section:
         ),
     ]
     words = (
-        "Hexagonal lattice, two layers of frame, thresholds 5.2, otherwise as d: `paper/f1`, "
-        "`paper/f2`."
+        "As case d, on the hexagonal lattice with two layers of frame and thresholds of 5.2: "
+        "`paper/f1` with one shell of neighbours, `paper/f2` with two."
     )
     return Section(
         "Case f: the lattice", words, [same_parameters(), *_one_shell(), *_two_shells()], pictures
@@ -75,54 +75,59 @@ def _one_shell() -> list[Claim]:
     return [
         Claim(
             "the behaviour is very different from the square lattice case",
-            f"largest displacement of the piece at step 400: {f1.residual():.2f}, square "
-            f"{d1.residual():.3f}; rows part at steps {steps_text(parted(f1))}, square "
-            f"{steps_text(parted(d1))}",
+            f"The largest displacement of the piece at step 400 is {f1.residual():.2f}, and "
+            f"{d1.residual():.3f} on the square lattice. The rows separate at steps "
+            f"{steps_text(parted(f1))}, and {steps_text(parted(d1))} on the square lattice.",
             f1.residual() > 10 * d1.residual(),
         ),
         Claim(
             "two points of the frame remain in the middle",
-            f"{in_the_gap(f1)} in the gap at step 400; {gaps} at the thresholds "
-            f"{which(list(family))}, at which the sheet parts",
+            f"{in_the_gap(f1)} frame points are in the gap at step 400. The number is "
+            f"{which(gaps)} at all thresholds at which the sheet separates "
+            f"({which(list(family))}).",
             in_the_gap(f1) == 2,
         ),
         Claim(
             "they are stressed from two opposite sides … the average of the displacements",
-            f"{in_the_gap(f1)} with the mean, {in_the_gap(run('paper/f1', 'frame.type=first'))} "
-            "with one follower each",
+            f"The number of points in the gap is {in_the_gap(f1)} with the `mean` frame and "
+            f"{in_the_gap(run('paper/f1', 'frame.type=first'))} if each frame point follows one "
+            "particle.",
             in_the_gap(f1) == 2 and in_the_gap(run("paper/f1", "frame.type=first")) == 0,
         ),
         Claim(
             "a different equilibrium configuration is reached",
-            f"at step 400 the piece is off its reference by up to {f1.residual():.2f}; still "
-            f"moving by {f1.of('pe2')[400].max():.1g} a step",
+            "At step 400 the largest displacement of the piece from its reference is "
+            f"{f1.residual():.2f}; it still moves by {f1.of('pe2')[400].max():.1g} per step.",
             f1.residual() > 0.5,
         ),
         Claim(
             "this results in a concave final surface",
-            f"the outer rows of the torn surface stand {dent(f1):.2f} beyond its middle; by more "
-            f"than 0.3 at the thresholds {which(dented)} of {which(list(family))}",
+            f"The outer rows of the torn surface are {dent(f1):.2f} farther right than its "
+            f"middle. Of the thresholds {which(list(family))} the distance exceeds 0.3 at "
+            f"{which(dented)}.",
             dent(f1) > 0.3,
         ),
         Claim(
             "a rebound mechanism [of 133] can be outlined",
-            f"x of 133 falls to {back[1]:.3f} at step {back[0]} and rises to {back[2]:.3f}; "
-            f"thresholds with a rebound: {which(turning)} of {which(list(family))}",
+            f"x of 133 decreases to {back[1]:.3f} at step {back[0]} and increases to "
+            f"{back[2]:.3f}. Of the thresholds {which(list(family))} there is a rebound at "
+            f"{which(turning)}.",
             back[0] > 10,
         ),
         Claim(
             "in the square lattice this [rebound] behaviour does not exist",
-            "the paper itself shows one in figure 16. Here: none in `paper/d1` and `paper/d2`, but "
-            f"one in `paper/d2-frame-bonds`, from {back_square[1]:.3f} to {back_square[2]:.3f}",
+            "Figure 16 of the paper shows a rebound. Here there is none in `paper/d1` and "
+            f"`paper/d2`, but one in `paper/d2-frame-bonds`, from {back_square[1]:.3f} to "
+            f"{back_square[2]:.3f}.",
             not any(square.values()),
-            "`paper/d1` and `paper/d2`, without `paper/d2-frame-bonds`",
+            "`paper/d1` and `paper/d2`, but not with `paper/d2-frame-bonds`",
             not (square["d1"] or square["d2"]),
         ),
         Claim(
             "j=133 [a central point]",
-            f"with two layers of frame 133 is column {COLUMN + 1}, row {ROW + 1} of the body; with "
-            "one layer, all that one shell needs, the number of that particle is "
-            f"{layer.number(COLUMN, ROW)}",
+            f"With two layers of frame particle 133 is in column {COLUMN + 1}, row {ROW + 1} of "
+            "the body. With one layer, which suffices for one shell, this particle has the "
+            f"number {layer.number(COLUMN, ROW)}.",
             layer.number(COLUMN, ROW) == 133,
             "two layers of frame",
             f1.number(COLUMN, ROW) == 133,
@@ -146,43 +151,44 @@ def _two_shells() -> list[Claim]:
     return [
         Claim(
             "also in this case second gradient mode attenuates the effects",
-            f"largest displacement of the piece at step 400: {f2.residual():.2f}, one shell "
-            f"{f1.residual():.2f}; dent of the surface {dent(f2):.2f}, one shell {dent(f1):.2f}",
+            f"The largest displacement of the piece at step 400 is {f2.residual():.2f} "
+            f"({f1.residual():.2f} with one shell), and the depth of the concave surface is "
+            f"{dent(f2):.2f} ({dent(f1):.2f} with one shell).",
             f2.residual() < f1.residual() and abs(dent(f2)) < dent(f1),
         ),
         Claim(
             "no rebound [of 133]",
-            "x falls for good after the fracture; thresholds with a rebound: "
-            f"{which(turning)} of {which(list(family))}",
+            "x decreases monotonically after the fracture. Of the thresholds "
+            f"{which(list(family))} there is a rebound at {which(turning)}.",
             rebound(x_of(f2)) is None,
         ),
         Claim(
             "the equilibrium configuration, after the fracture, is similar to the original",
-            f"`paper/f2`: {f2.residual():.2f} off at step 400, on a piece 9 wide, and frame points "
-            f"hold it there; `paper/f2-early`, thresholds 5: {early.residual():.3f}; "
-            f"`paper/f2-cusp`: {cusped.residual():.3f}. Less than 0.1 "
-            f"at thresholds {which(near)} of {which(list(family))}",
+            f"The largest displacement at step 400 of a piece 9 wide is {f2.residual():.2f} in "
+            f"`paper/f2`, where frame points hold it, {early.residual():.3f} in `paper/f2-early` "
+            f"(thresholds 5) and {cusped.residual():.3f} in `paper/f2-cusp`. Of the thresholds "
+            f"{which(list(family))} it is below 0.1 at {which(near)}.",
             f2.residual() < 0.1,
             "`paper/f2-early` or `paper/f2-cusp`",
             max(early.residual(), cusped.residual()) < 0.1,
         ),
         Claim(
             "after about 100 step … a second fracture happening",
-            f"the last bond of `paper/f2` breaks at step {f2_last}. With thresholds 5.2 and 6.0, "
-            f"`paper/f2-second-fracture`, one more bond breaks at step {second}, between the "
-            f"leaders and the frame; in `paper/f2-cusp` the last breaks at step {cusp}",
+            f"The last bond of `paper/f2` breaks at step {f2_last}. With thresholds of 5.2 and "
+            "6.0 (`paper/f2-second-fracture`) another bond, between the leaders and the frame, "
+            f"breaks at step {second}. In `paper/f2-cusp` the last bond breaks at step {cusp}.",
             f2_last > 60,
             "`paper/f2-second-fracture` or `paper/f2-cusp`",
             80 <= second <= 130 and 80 <= cusp <= 130,
         ),
         Claim(
             "cuspidal point in X coordinate [of 133], after about 100 step",
-            f"`paper/f2`: none. `paper/f2-second-fracture`: none either, the second difference of "
-            f"x is at most {kink:.1g} about step {second}: the broken bond is not of the piece. "
-            f"`paper/f2-cusp` (thresholds 5.1): a bond of the piece to the frame breaks at step "
-            f"{cusp}, and x of 133 falls {bend:.1f} times as fast twenty steps later as before. Of "
-            f"{searched} thresholds from 4.9 to 5.3 a bond of the piece breaks between steps 60 "
-            f"and 150 at {which(felt)}",
+            "There is no cusp in `paper/f2`, and none in `paper/f2-second-fracture`: the second "
+            f"difference of x is at most {kink:.1g} near step {second}, because the broken bond "
+            "does not belong to the piece. In `paper/f2-cusp` (thresholds 5.1) a bond between the "
+            f"piece and the frame breaks at step {cusp}, and twenty steps later x of 133 "
+            f"decreases {bend:.1f} times as fast as before. Of {searched} thresholds from 4.9 to "
+            f"5.3 a bond of the piece breaks between steps 60 and 150 at {which(felt)}.",
             False,
             "`paper/f2-cusp`",
             80 <= cusp <= 130 and bend > 1.5,

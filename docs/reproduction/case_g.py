@@ -23,7 +23,10 @@ def section() -> Section:
             "x, y and PE1 of particle 133, and of 103 in d2",
         ),
     ]
-    words = "As f with two shells; each frame point follows one follower: `paper/g`."
+    words = (
+        "As case f with two shells, but each frame point follows one particle of the body: "
+        "`paper/g`."
+    )
     return Section("Case g: the rule of the frame", words, _claims_g(), pictures)
 
 
@@ -36,26 +39,28 @@ def _claims_g() -> list[Claim]:
     return [
         Claim(
             "there are no more points of the frame in the middle",
-            f"{in_the_gap(g)} in the gap at step 400, with the mean {in_the_gap(f2)}",
+            f"The number of points in the gap at step 400 is {in_the_gap(g)}; with the `mean` "
+            f"frame it is {in_the_gap(f2)}.",
             in_the_gap(g) == 0 and in_the_gap(f2) > 0,
         ),
         Claim(
             "the behaviour is … more similar to the square lattice",
-            f"x of 133 differs from x of 103 in `paper/d2` by {far[1]:.3f} in the mean over steps "
-            f"20 to 400, with the mean frame by {far[0]:.3f}",
+            "The mean difference between x of 133 and x of 103 in `paper/d2` over steps 20 to 400 "
+            f"is {far[1]:.3f}; with the `mean` frame it is {far[0]:.3f}.",
             far[1] < far[0],
         ),
         Claim(
             "also the convexity of the surface fracture is changed … similar to the square lattice",
-            f"at step 99 the torn surface spans {bent['f2']:.2f} in x with the mean frame, "
-            f"{bent['g']:.3f} here, {bent['d2']:.3f} on the square lattice; dent at step 400 "
-            f"{dents[0]:.2f}, {dents[1]:.1g}, {dents[2]:.1g}",
+            "At step 99 the x coordinates of the torn surface span "
+            f"{bent['f2']:.2f} with the `mean` frame, {bent['g']:.3f} in this case and "
+            f"{bent['d2']:.3f} on the square lattice. The depth of the concave surface at step "
+            f"400 is {dents[0]:.2f}, {dents[1]:.1g} and {dents[2]:.1g}.",
             bent["g"] < bent["f2"] / 2,
         ),
         Claim(
             "the final configuration can return close to the initial",
-            f"largest displacement of the piece at step 400: {g.residual():.1g}, with the mean "
-            f"{f2.residual():.2f}",
+            f"The largest displacement of the piece at step 400 is {g.residual():.1g}; with the "
+            f"`mean` frame it is {f2.residual():.2f}.",
             g.residual() < 0.01,
         ),
     ]

@@ -1,5 +1,6 @@
-"""A claim of the paper with what was measured, and the page made of them."""
+"""Claims of the paper with measurements and verdicts, and their Markdown."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 OUT, ONLY, NOT = "reproduced", "reproduced only with", "not reproduced"
@@ -8,10 +9,10 @@ VERDICTS = (OUT, ONLY, NOT)
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim, the numbers, and whether it holds of the case as shipped, or of a variant.
+    """A claim of the paper, a measurement, and whether it holds for the shipped case.
 
-    `variant` names an experiment or says the settings; it counts only where the case as shipped
-    fails and `with_variant`, measured too, is true.
+    `variant` names an experiment or settings; it counts only if the shipped case fails and
+    `with_variant`, which is measured too, is true.
     """
 
     quote: str
@@ -21,16 +22,21 @@ class Claim:
     with_variant: bool = False
 
     @property
-    def verdict(self) -> str:
-        """One of the three, computed."""
+    def kind(self) -> str:
+        """One of `VERDICTS`."""
         if self.holds:
             return OUT
-        return f"{ONLY} {self.variant}" if self.with_variant else NOT
+        return ONLY if self.with_variant else NOT
+
+    @property
+    def verdict(self) -> str:
+        """The kind, with the variant if the claim holds only for it."""
+        return f"{ONLY} {self.variant}" if self.kind == ONLY else self.kind
 
 
 @dataclass(frozen=True)
 class Section:
-    """A case on the page: words before, pictures (file, caption), claims and words after."""
+    """A case on the page: introduction, pictures (file, caption), claims and closing text."""
 
     title: str
     words: str
@@ -44,17 +50,21 @@ def render(section: Section) -> str:
     parts = [f"## {section.title}\n", section.words.strip() + "\n"]
     for file, caption in section.pictures:
         parts.append(f"![{caption}](../pictures/reproduction/{file})\n\n*{caption}*\n")
-    parts.append("| the paper says | measured | verdict |\n| --- | --- | --- |")
-    parts += [f"| “{c.quote}” | {c.measured} | **{c.verdict}** |" for c in section.claims]
-    return "\n".join(parts) + "\n" + (f"\n{section.after}\n" if section.after else "")
+    parts += [
+        f"{n}. “{c.quote}” – **{c.verdict}**\n\n   {c.measured}\n"
+        for n, c in enumerate(section.claims, 1)
+    ]
+    return "\n".join(parts) + (f"\n{section.after}\n" if section.after else "")
 
 
 def counted(sections: list[Section]) -> str:
-    """How many claims have which verdict."""
-    claims = [claim for section in sections for claim in section.claims]
-    only = sum(claim.verdict.startswith(ONLY) for claim in claims)
-    out = sum(claim.verdict == OUT for claim in claims)
+    """Return a sentence and a table with the number of claims of each verdict."""
+    table = {s.title: Counter(c.kind for c in s.claims) for s in sections}
+    total = sum(table.values(), Counter())
+    head = ["| part of the paper | reproduced | only with changes | not reproduced |"]
+    rows = [f"| {name} | {' | '.join(str(n[v]) for v in VERDICTS)} |" for name, n in table.items()]
     return (
-        f"Of {len(claims)} claims {out} are reproduced, {only} only with what is named there, "
-        f"and {len(claims) - out - only} are not reproduced."
+        f"Of {total.total()} claims {total[OUT]} are reproduced, {total[ONLY]} only with the named "
+        f"changes, and {total[NOT]} are not reproduced:\n\n"
+        + "\n".join([*head, "| --- | --- | --- | --- |", *rows])
     )

@@ -1,4 +1,4 @@
-"""How many steps an equilibrium takes, and who can share their work."""
+"""Number of steps to an equilibrium, and their parallel execution."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 from claims import Claim
 from runs import run, run_parts
 
-MEASURED = Path(__file__).parents[1] / "performance.json"
+MEASURED = Path(__file__).parents[1] / "validation" / "performance.json"
 
 
 def cost() -> list[Claim]:
@@ -18,11 +18,10 @@ def cost() -> list[Claim]:
     return [
         Claim(
             "computational costs are low because we do not solve differential equations",
-            "a step is one sum over the neighbours, but many are needed: to within 1 % of the "
-            f"equilibrium of a held sheet of {', '.join(f'{n} × {n}' for n in sizes)} it takes "
-            f"{', '.join(map(str, steps))} steps, {growth:.1f} times as many for twice the size; a "
-            "sparse direct solve of the same equations is one. Few in a small sheet, not in a "
-            "large one",
+            "A step is one sum over the neighbours, but many steps are needed. A held sheet of "
+            f"{', '.join(f'{n} × {n}' for n in sizes)} particles is within 1 % of its equilibrium "
+            f"after {', '.join(map(str, steps))} steps, {growth:.1f} times as many for twice the "
+            "size. A sparse direct solver solves the same equations once.",
             growth < 1.5,
             "sheets of some ten particles a side",
             steps[0] < 400,
@@ -39,12 +38,11 @@ def _shared() -> Claim:
     gains = {r["size"]: r["one_ns"] / r["two_ns"] for r in rows if r["rule"] == "barycentre"}
     return Claim(
         "the job can be parallelized between the GPU cores",
-        "on a GPU nothing was measured: pbdkit has no engine for one. What was: every follower is "
-        "computed from the intermediate configuration alone, so that the work can be split at "
-        f"will, and two threads of a processor give the same positions (they differ by {differ:g} "
-        "in case a). Two threads are "
-        f"{', '.join(f'{g:.2f} ({n}²)' for n, g in gains.items())} times as fast as one "
-        "([performance](performance.md#threads)), slower in small sheets",
+        "Nothing was measured on a GPU. Every follower is computed from the intermediate "
+        "configuration alone, so that the work can be divided in any way; two threads of a "
+        f"processor give the same positions (difference in case a: {differ:g}). Two threads are "
+        f"{', '.join(f'{g:.2f} ({n}²)' for n, g in gains.items())} times as fast as one for "
+        "sheets of that size ([performance](performance.md#threads)).",
         False,
         "threads of a processor, in sheets of "
         f"{' and '.join(f'{n}²' for n, g in gains.items() if g > 1.5)}; a GPU is not measured",

@@ -39,7 +39,7 @@ def parabolic(pair: tuple[float, float]) -> bool:
 def both_text(y: Floats, top: int, middle: int = 150, last: int = 400) -> str:
     """Both R² over the whole fall and its two parts, in words."""
     parts = ((top, last), (top, middle), (middle, last))
-    return "R² of a parabola and of an exponential of as many free parameters: " + "; ".join(
+    return "R² of a parabola and of an exponential with three free parameters each is " + "; ".join(
         f"{p:.5f} and {e:.5f} over steps {low} to {high}"
         for low, high in parts
         for p, e in [both(y, low, high)]

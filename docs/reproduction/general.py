@@ -37,9 +37,9 @@ def section() -> Section:
                 "stiffness.png",
                 ylim=(0.2, 2.05),
             ),
-            "Stiffness for waves along x. The middle line is both of 4 and of 8 neighbours: the "
-            "paper's second shell changes nothing there. Only 24 neighbours, the lowest line, "
-            "soften short waves more; gradient elasticity with l² > 0 stiffens them",
+            "Stiffness for waves along x. The lines of 4 and 8 neighbours coincide: the paper's "
+            "second shell has no effect. Only 24 neighbours, the lowest line, soften short waves "
+            "more; gradient elasticity with l² > 0 stiffens them",
         )
     ]
     words = "Claims of the introduction, sections 3 and 5 and the conclusions that can be tested."
@@ -70,35 +70,37 @@ def _rules() -> list[Claim]:
     differ = float(np.abs(loose.u - held.u).max())
     pairs = [_near(loose, step) for step in (0, 10)]
     changed = (
-        "euclidean neighbours within 1.5, found anew at every step of case a: "
-        f"{len(pairs[0] - pairs[1])} of {len(pairs[0])} pairs of the body are parted by step 10 "
-        f"and {len(pairs[1] - pairs[0])} are new"
+        "With Euclidean neighbours within 1.5, re-evaluated in every step of case a, "
+        f"{len(pairs[0] - pairs[1])} of {len(pairs[0])} pairs of the body are separated by step "
+        f"10, and {len(pairs[1] - pairs[0])} are new"
     )
     signs = elastic_signs()
     return [
         Claim(
             "followers will suffer the leaders motion after (k-1) time steps",
-            f"67 is 5 layers from the leaders and moves first in step {first[0]}, after "
-            f"{first[0] - 1} steps without motion",
+            f"Particle 67 is 5 layers from the leaders and first moves in step {first[0]}, after "
+            f"{first[0] - 1} steps without motion.",
             first[0] == 5,
         ),
         Claim(
             "in a time depending on … how many shell of points are being considered",
-            f"67 first moves in step {first[0]} with 4 neighbours, {first[1]} with the second "
-            f"shell (the diagonals, which reach no further), {first[2]} with two Chebyshev shells",
+            f"Particle 67 first moves in step {first[0]} with 4 neighbours, in step {first[1]} "
+            "with the second shell (the diagonals, which do not reach further), and in step "
+            f"{first[2]} with two Chebyshev shells.",
             first[1] < first[0],
             "Chebyshev neighbours (`paper/d2-chebyshev`)",
             first[2] < first[0],
         ),
         Claim(
             "considering also the second shell of neighbours we obtain second gradient effects",
-            "relative stiffness at k = 0.5 and 1, along x: "
+            "The relative stiffness for waves along x with k = 0.5 and 1 is "
             f"{_pair(plain)} with 4 neighbours, {_pair(soft[('coordination', 2)])} with 8 "
-            f"(the same within {same:.0e}: the second shell changes nothing), "
-            f"{_pair(soft[('chebyshev', 2)])} with 24. Read as 1 + l²k² at k = {small[0]:g}, l² is "
-            f"{', '.join(f'{v:.3f}' for v in lengths)}. The verdict assumes an energy with l² > 0, "
-            "which stiffens short waves; lattice expansions may have l² < 0, and then 24 "
-            "neighbours show an effect, but the paper's 8 still none beyond that of 4",
+            f"(equal within {same:.0e}: the second shell has no effect) and "
+            f"{_pair(soft[('chebyshev', 2)])} with 24. Expressed as 1 + l²k² at k = {small[0]:g}, "
+            f"l² is {', '.join(f'{v:.3f}' for v in lengths)}. The verdict assumes an energy with "
+            "l² > 0, which stiffens short waves. If the negative l² of lattice expansions is "
+            "accepted, 24 neighbours have an effect, but the paper's 8 neighbours still have none "
+            "beyond that of 4.",
             bool((soft[("coordination", 2)] > 1).all()),
             "Chebyshev neighbours",
             bool((soft[("chebyshev", 2)] > 1).all()),
@@ -107,35 +109,38 @@ def _rules() -> list[Claim]:
         energy(),
         Claim(
             "force the followers movement to overcome the baricenter … to oscillate",
-            "a relaxation of 1.1 with noise of 1e-6 makes rows differ by "
+            "With a relaxation of 1.1 and noise of 1e-6 the rows differ by "
             f"{_rows_differ(past, 100):.1g} after 100 steps and {_rows_differ(past, 200):.1g} "
-            f"after 200: no oscillation, it diverges. Memory does it: x of 67 in "
-            f"`paper/a-memory` crosses its rest position {swings} times by step 200",
+            "after 200: the steps diverge instead of oscillating. Momentum causes oscillation: "
+            f"x of 67 in `paper/a-memory` crosses its rest position {swings} times by step 200.",
             False,
             "`paper/a-memory`",
             swings >= 2,
         ),
         Claim(
             "the neighbours can dynamically change to every time step",
-            "possible, but the sheet does not hold together: "
-            f"{changed}; it ends up to {differ:.0f} off that with fixed ones, on a body 9 wide"
+            "Neighbours can be re-evaluated, but the sheet does not hold together. "
+            f"{changed}. The final positions differ by up to {differ:.0f} from those with fixed "
+            "neighbours; the body is 9 wide."
             if differ > 9
-            else f"{changed}; it ends up to {differ:.1g} off that with fixed ones",
+            else f"{changed}. The final positions differ by up to {differ:.1g} from those with "
+            "fixed neighbours.",
             0 < differ < 1,
             "`reevaluate: true`, as an option, and then the sheet does not hold together",
             pairs[0] != pairs[1],
         ),
         Claim(
             "anisotropies [by weighted distance]",
-            f"weighted euclidean neighbours spread a disturbance {1 / ratio:.2f} times as much "
-            "along y as along x ([its own page](anisotropy-and-plasticity.md))",
+            f"With weighted Euclidean neighbours a disturbance spreads {1 / ratio:.2f} times as "
+            "much along y as along x ([details](anisotropy-and-plasticity.md)).",
             ratio < 0.5,
         ),
         Claim(
             "anisotropic elastic behaviour",
-            "the spreading is all: with the same neighbours a push along x moves nothing along y "
-            f"(at most {signs['cross']:.1g}), and a push along y spreads as one along x (within "
-            f"{signs['turned']:.0e}): stretch and shear are one and do not couple, as in diffusion",
+            "Only the spreading is anisotropic. With the same neighbours a displacement along x "
+            f"causes none along y (at most {signs['cross']:.1g}), and a displacement along y "
+            f"spreads like one along x (within {signs['turned']:.0e}): extension and shear are "
+            "alike and not coupled, as in diffusion.",
             max(signs.values()) > 1e-6,
         ),
     ]
@@ -172,50 +177,53 @@ def _shape() -> list[Claim]:
     return [
         Claim(
             "without the frame … this point will be attracted toward the inside and collapse",
-            f"a sheet of height 9 at rest, barycentre, no frame: {sizes[1]:.2f} after 10 steps, "
-            f"{sizes[2]:.2f} after 100, {sizes[3]:.1g} after 400; with mean-displacement, the "
-            f"paper's first example of a rule, it stays ({np.abs(mean.u).max():.1g})",
+            "With the barycentre rule and no frame the height of a sheet at rest decreases from 9 "
+            f"to {sizes[1]:.2f} after 10 steps, {sizes[2]:.2f} after 100 and {sizes[3]:.1g} after "
+            "400. With mean-displacement, the paper's first example of a rule, the sheet stays at "
+            f"rest (displacement {np.abs(mean.u).max():.1g}).",
             sizes[3] < 0.1,
         ),
         Claim(
             "changing lattice we can obtain different results, all other conditions being equal",
-            f"PE1 of the same particle of case a peaks at step {peaks[0]} on the square lattice, "
-            f"{peaks[1]} on the hexagonal one",
+            f"In case a PE1 of the same particle is largest at step {peaks[0]} on the square "
+            f"lattice and at step {peaks[1]} on the hexagonal lattice.",
             peaks[0] != peaks[1],
         ),
         Claim(
             "(locally) minimizing an elastic potential",
-            "the sum of squared differences of displacement over all bonds of the body, case a, "
-            f"falls at {int((np.diff(energy[11:]) <= 0).sum())} of {len(energy) - 12} steps after "
-            "the release",
+            "In case a the sum of squared differences of displacement over all bonds of the body "
+            f"decreases at {int((np.diff(energy[11:]) <= 0).sum())} of {len(energy) - 12} steps "
+            "after the release.",
             bool((np.diff(energy[11:]) <= 0).all()),
         ),
         Claim(
             "automatically takes into account large deformation elasticity",
-            "both end columns turned by 90° (`paper/a-rotation`): the body should turn with them; "
-            f"once settled it is off by up to {error:.2f}, on a body 9 wide, and PE1 is "
-            f"{turned.of('pe1')[-1].max():.1f} where it should be 0",
+            "If both end columns are rotated by 90° (`paper/a-rotation`), the body should rotate "
+            f"with them. After convergence particles are up to {error:.2f} from there, on a body "
+            f"9 wide, and PE1 is {turned.of('pe1')[-1].max():.1f} instead of 0.",
             bool(error < 0.01),
         ),
         Claim(
             "[fictitious elements] recover the original shape of the lattice … elastic behaviour",
-            f"`paper/d1` and `paper/d2`, λ = 1: {run('paper/d1').residual():.3f} and "
-            f"{run('paper/d2').residual():.3f} left at step 400",
+            "With λ = 1 the largest displacement at step 400 is "
+            f"{run('paper/d1').residual():.3f} in `paper/d1` and "
+            f"{run('paper/d2').residual():.3f} in `paper/d2`.",
             max(run("paper/d1").residual(), run("paper/d2").residual()) < 0.1,
         ),
         Claim(
             "a change in their position produces … contraction or loosening of the lattice",
-            f"the piece at the clamp settles at a strain of {stays[0.8][1]:.4f} for λ = 0.8, "
-            f"{stays[1.0][1]:.4f} for 1 and {stays[1.2][1]:.4f} for 1.2 "
-            "([figures](anisotropy-and-plasticity.md))",
+            "The strain of the piece at the clamp converges to "
+            f"{stays[0.8][1]:.4f} for λ = 0.8, {stays[1.0][1]:.4f} for 1 and "
+            f"{stays[1.2][1]:.4f} for 1.2 ([figures](anisotropy-and-plasticity.md)).",
             max(stays[0.8]) < -0.1 < 0.1 < min(stays[1.2]) and max(map(abs, stays[1.0])) < 1e-3,
         ),
         Claim(
             "varying the distances of the fictitious elements … plastic-like … behaviours",
-            "a plastic strain depends on how far the piece was pulled. What stays with λ = 1.2 is "
-            f"{', '.join(f'{s:.5f}' for s in stays[1.2])} at thresholds of "
-            f"{which(PULLS)}, at which the right column had been pulled by {which(ways)} when "
-            "the piece parted: λ − 1 always, by a load on the broken edge that never ends",
+            "A plastic strain would depend on the previous deformation. With λ = 1.2 the "
+            f"remaining strain is {', '.join(f'{s:.5f}' for s in stays[1.2])} at thresholds of "
+            f"{which(PULLS)}, for which the right column had moved by {which(ways)} when the "
+            "sheet separated. It is always λ − 1: the effect of a permanent load on the broken "
+            "edge.",
             float(np.ptp(stays[1.2])) > 0.01,
         ),
     ]

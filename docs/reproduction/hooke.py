@@ -46,14 +46,13 @@ def hooke() -> Claim:
     off = float(np.abs(ratios - [2 + way for way in WAYS]).max())
     return Claim(
         "introduce relative distance between the points into the rule … and simulate Hook law",
-        f"a neighbour that has moved away by {', '.join(f'{way:g}' for way in WAYS)} pulls harder "
-        f"by {', '.join(f'{r:.2f}' for r in ratios[0])} times its way, the same at relaxations "
-        f"{', '.join(f'{w:g}' for w in RELAXATIONS)}: r² less 1 (within {off:.0e}), r the "
-        "distance. The force is r², of the energy Σ r³/3; Hooke's would be a constant times the "
-        "way, at some relaxation. "
-        f"Besides, as printed the rule is unstable: noise of 1e-6 is {noisy[0][60]:.2g} after 60 "
-        f"steps at rest; with a relaxation of 0.6, `paper/a-weighted`, {noisy[1][400]:.1g} after "
-        "400",
+        f"If a neighbour moves away by {', '.join(f'{way:g}' for way in WAYS)}, its force "
+        f"increases by {', '.join(f'{r:.2f}' for r in ratios[0])} times this distance, at "
+        f"relaxations of {', '.join(f'{w:g}' for w in RELAXATIONS)} alike. The force is therefore "
+        f"r² (within {off:.0e}), where r is the distance, with the energy Σ r³/3; Hooke's law "
+        "would give a constant factor. In addition, the rule as printed is unstable: noise of "
+        f"1e-6 grows to {noisy[0][60]:.2g} in 60 steps at rest. With a relaxation of 0.6 "
+        f"(`paper/a-weighted`) it decays to {noisy[1][400]:.1g} in 400 steps.",
         bool(np.ptp(ratios) < 0.01 * ratios.mean()),
     )
 
@@ -65,11 +64,11 @@ def energy() -> Claim:
     off = max(abs(found / exact - 1) for found, exact in zip(net, elastic, strict=True))
     return Claim(
         "potential energy of material points subject to Hook law [PE1]",
-        f"PE1 over the square of a strain of {STRAIN:g}: {square[0]:.3f} in tension along x, "
-        f"{square[1]:.1g} in shear on the square lattice with 4 neighbours, which is blind to it; "
-        f"{net[0]:.3f} and {net[1]:.3f} on the hexagonal one. That is four times the energy of "
-        f"an elastic sheet of ν = 1/3, E = 1 ({elastic[0]:.3f} and {elastic[1]:.3f}), within "
-        f"{off:.0e}",
+        f"PE1 divided by the square of the strain ({STRAIN:g}) is {square[0]:.3f} in tension "
+        f"along x and {square[1]:.1g} in shear on the square lattice with 4 neighbours: PE1 does "
+        f"not contain the shear. On the hexagonal lattice it is {net[0]:.3f} and {net[1]:.3f}, "
+        "four times the energy of an elastic sheet with ν = 1/3 and E = 1 "
+        f"({elastic[0]:.3f} and {elastic[1]:.3f}), within {off:.0e}.",
         square[1] > 0.01,
         "the hexagonal lattice",
         off < 0.01,
