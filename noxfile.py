@@ -89,6 +89,7 @@ def docs(session: nox.Session) -> None:
     unrun = ["-D", "plot_gallery=0", "-D", "nb_execution_mode=off"]
     options = ["-W", "--keep-going", *(unrun if "unrun" in session.posargs else [])]
     session.run("sphinx-build", *options, "-b", "html", "docs", "build/docs")
+    session.run("python", "docs/search_walk.py", "build/docs")
 
 
 if __name__ == "__main__":

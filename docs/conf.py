@@ -20,6 +20,7 @@ urls = dict(entry.split(", ") for entry in DISTRIBUTION.get_all("Project-URL") o
 extensions = [
     "myst_nb",
     "reference_pages",
+    "search_terms",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx_copybutton",

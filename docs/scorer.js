@@ -1,7 +1,7 @@
 // Order of search results: pages for users before reports, decisions, the gallery and the changelog.
 const OFFSETS = [
   ["finite-elements", 3],
-  ["glossary", 1],
+  ["glossary", -3],
   ["keys", -3],
   ["extending", -4],
   ["validation/reproduction", -11],
@@ -11,10 +11,14 @@ const OFFSETS = [
   ["changelog", -9],
 ];
 
+// A term of the index (`{index}` in a page) comes before its definition in the glossary.
+const DEFINITION = -40;
+
 var Scorer = {
   score: ([page, title, anchor, description, score]) => {
     const offset = OFFSETS.find(([name]) => page.startsWith(name));
-    return score + (offset ? offset[1] : 0);
+    const definition = page === "glossary" && anchor.startsWith("#term-");
+    return score + (offset ? offset[1] : 0) + (definition ? DEFINITION : 0);
   },
   objNameMatch: 11,
   objPartialMatch: 6,

@@ -1,20 +1,21 @@
-"""Search the built site for the terms of finite elements, and compare the first page found.
+"""Search the built site for terms of finite elements, and compare the first page that is listed.
 
-`python docs/search_walk.py build/docs` opens `search.html?q=TERM` of each term in Chromium, so that the index
-of Sphinx and `scorer.js` are used as in a reader's browser. It fails if another page comes first.
+`python docs/search_walk.py build/docs` opens `search.html?q=TERM` for each term in Chromium, so
+that the index, `search_terms.yaml` and `scorer.js` are used as in the browser of a reader. It fails
+if another page is listed first.
 """
 
 from __future__ import annotations
 
 import shutil
 import sys
-import threading
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from collections.abc import Iterable
+from importlib.util import find_spec
+from pathlib import Path
+from urllib.parse import quote
 
 EXPECTED = {
-    "boundary condition": "finite-elements",
+    "boundary condition": "modelling finite-elements",
     "Dirichlet": "finite-elements motions",
     "von Mises": "finite-elements dataset",
     "stress concentration": "plate-with-hole",
@@ -73,51 +74,48 @@ EXPECTED = {
     "UMAT": "finite-elements",
     "ParaView": "paraview",
 }
-"""The pages, without extension, of which one comes first for a term."""
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+"""Terms, and the pages of which one must be listed first."""
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+RESULTS = "document.querySelectorAll('#search-results ul.search > li > a')"
+LISTED = f"""{RESULTS}.length > 2
+    || document.querySelector('.search-summary')?.textContent.includes('finished')"""
+FIRST = f"[...{RESULTS}].slice(0, 3).map(link => link.href)"
 
 
-class Silent(SimpleHTTPRequestHandler):
-    """Serve files without a line for each request."""
-
-    def log_message(self, *_: Any) -> None:
-        """Print nothing."""
-
-
-def first_pages(site: str, terms: list[str]) -> dict[str, list[str]]:
-    """Return the first three pages that the search of the site lists for each term."""
+def first_pages(site: Path, terms: Iterable[str]) -> dict[str, list[str]]:
+    """Return the first three results that the search of the site lists for each term."""
     from playwright.sync_api import sync_playwright
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=site))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    root = f"http://127.0.0.1:{server.server_address[1]}/"
-    path = next(filter(None, map(shutil.which, NAMES)))
-    found = {}
+    root = site.resolve().as_uri() + "/"
+    results = {}
     with sync_playwright() as driver:
+        path = next(filter(None, map(shutil.which, BROWSERS)))
         browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
         page = browser.new_page()
-        page.route("**/*", lambda r: r.continue_() if r.request.url.startswith(root) else r.abort())
+        page.route("http*://**", lambda route: route.abort())
         for term in terms:
-            page.goto(f"{root}search.html?q={term}")
-            page.wait_for_function(
-                "document.querySelector('.search-summary')?.textContent.includes('finished')"
-                " || document.querySelectorAll('#search-results ul.search li').length > 5"
-            )
-            links = "[...document.querySelectorAll('#search-results ul.search li > a')]"
-            hrefs = page.evaluate(f"{links}.slice(0, 3).map(link => link.href)")
-            found[term] = [h.removeprefix(root).partition("?")[0] for h in hrefs]
+            page.goto(f"{root}search.html?q={quote(term)}")
+            page.wait_for_function(LISTED)
+            links = page.evaluate(FIRST)
+            results[term] = [link.removeprefix(root).partition("?")[0] for link in links]
         browser.close()
-    server.shutdown()
-    return found
+    return results
+
+
+def missing() -> str:
+    """Return the name of what is not installed, or an empty text."""
+    if find_spec("playwright") is None:
+        return "playwright"
+    return "" if any(map(shutil.which, BROWSERS)) else " or ".join(BROWSERS)
 
 
 def main(site: str) -> int:
-    """Print the terms whose first page is not one of those expected; return their number."""
-    if next(filter(None, map(shutil.which, NAMES)), None) is None:
-        print(f"the search is not tested: none of {', '.join(NAMES)} is installed")
+    """Print the first results of each term; return the number of terms with another page first."""
+    if missing():
+        print(f"the search is not tested: {missing()} is not installed")
         return 0
     wrong = 0
-    for term, pages in first_pages(site, list(EXPECTED)).items():
+    for term, pages in first_pages(Path(site), EXPECTED).items():
         first = pages[0].partition(".html")[0] if pages else "nothing"
         right = first in EXPECTED[term].split()
         wrong += not right

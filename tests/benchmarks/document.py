@@ -50,7 +50,7 @@ def _goals(rows: list[Data]) -> str:
         measured = f"{g['measured']:.3g}{unit}"
         return g["name"], f"{sign} {g['goal']:g}{unit}", measured, spread, met, g["note"]
 
-    head = ("what", "goal", "measured", "quartiles of single turns", "", "")
+    head = ("quantity", "goal", "measured", "quartiles", "", "")
     return _table(head, map(cells, rows))
 
 
@@ -85,8 +85,8 @@ def _threads(rows: list[Data]) -> str:
 
 def _limit(rows: list[Data]) -> str:
     head = (
-        "size", "copying, ns", "bare sweep, ns", "pbdkit, ns", "of the limit",
-        "copying on two threads, ns", "pbdkit, ns", "of the limit",
+        "size", "copying, ns", "bare sweep, ns", "pbdkit, ns", "copying / pbdkit",
+        "copying on two threads, ns", "pbdkit on two threads, ns", "copying / pbdkit",
     )  # fmt: skip
 
     def cells(r: Data) -> tuple[str, ...]:
@@ -104,7 +104,7 @@ def _cache(rows: list[Data]) -> str:
         return r["rule"], r["with"], *ns, f"{r['small_ns'] / r['large_ns']:.0%}"
 
     return _table(
-        ("rule", "with", "100², ns", "3000², ns", "of its rate in the cache"), map(cells, rows)
+        ("rule", "with", "100², ns", "3000², ns", "relative rate"), map(cells, rows)
     )
 
 
@@ -119,7 +119,7 @@ def _cost(found: Data) -> str:
     ]
     head = (
         "engine", "step, µs", "slot, µs", "particle, ns", "neighbour, ns", "far, ns", "farther, ns",
-        "typical deviation", "largest",
+        "typical deviation", "largest deviation",
     )  # fmt: skip
     runs = [
         (r["run"], f"{r['measured_s']:.3g}", f"{r['model_s']:.3g}",
@@ -127,12 +127,12 @@ def _cost(found: Data) -> str:
         for r in found["foretold"]
     ]  # fmt: skip
     per = (
-        f"Setting a scene up: {found['setup_ns_a_particle']:.0f} ns a particle. "
-        f"A record: {found['record_ns_a_particle']:.3g} ns a particle. "
-        f"A file: {found['file_ms']:.0f} ms.\n"
+        f"The set-up of a scene takes {found['setup_ns_a_particle']:.0f} ns per particle, a record "
+        f"{found['record_ns_a_particle']:.3g} ns per particle, and a file "
+        f"{found['file_ms']:.0f} ms.\n"
     )
-    foretold = _table(("whole run, not used for the fit", "measured s", "model s", "off"), runs)
-    return f"{_table(head, fits)}\n{per}\n{foretold}"
+    titles = ("whole run, not used for the fit", "measured s", "predicted s", "difference")
+    return f"{_table(head, fits)}\n{per}\n{_table(titles, runs)}"
 
 
 def _peers(rows: list[Data]) -> str:
@@ -171,7 +171,10 @@ def _choice(rows: list[Data]) -> str:
         return f"{size}²", f"{gain:.0f} ×", f"{_two_digits(cached)}", f"{_two_digits(first)}"
 
     sizes = sorted({r["size"] for r in rows if r["rule"] == "barycentre"})
-    head = ("size", "a step is quicker", "from steps, kernel kept", "from steps, kernel to be made")
+    head = (
+        "size", "ratio of the times of a step", "steps, kernel in the cache",
+        "steps, kernel to be compiled",
+    )  # fmt: skip
     return _table(head, map(cells, sizes))
 
 
@@ -186,7 +189,7 @@ def _interval(found: Data) -> str:
     steps = found["record_ns_a_particle"] / a_step
     rows = ((f"{k}", f"{steps / k:.0%}") for k in (1, 10, 100, 1000))
     text = f"At 1000², 4 neighbours, compiled on one thread, a record costs as much as {steps:.0f} "
-    return f"{text}steps:\n\n" + _table(("recorded every", "longer by"), rows)
+    return f"{text}steps:\n\n" + _table(("recorded every (steps)", "additional time"), rows)
 
 
 def _gpu(rows: list[Data]) -> str:
