@@ -9,7 +9,7 @@ PAGE = (DOCS / "validation/reproduction.md").read_text("utf-8")
 
 def rows(text):
     """Return the claims of a section: quote, measurement, verdict."""
-    pattern = r"^\d+\. (“.*”) – \*\*(.*)\*\*\n\n   (\S.*)$"
+    pattern = r"^\d+\. (“.*”) – \*\*(.*)\*\*\n\n    (\S.*)$"
     return [[quote, text, verdict] for quote, verdict, text in re.findall(pattern, text, re.M)]
 
 

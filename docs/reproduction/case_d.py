@@ -173,8 +173,9 @@ def _rebound() -> list[Claim]:
         ),
         Claim(
             "differently from first gradient mode",
-            f"With one shell there is a rebound at {kinds(swept('one shell'))} thresholds, and "
-            "none in `paper/d2` either. If bonds to the frame do not break, there is "
+            "The number of thresholds with a rebound is "
+            f"{kinds(swept('one shell'))} with one shell, and there is none in `paper/d2` either. "
+            "If bonds to the frame do not break, there is "
             f"{'one' if tied_one else 'none'} with one shell and one with two.",
             rebound(x_of(one)) is None and rebound(x_of(two)) is not None,
             "`paper/d2-frame-bonds` against `paper/d1` with `frame_bonds: false`",

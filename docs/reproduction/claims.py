@@ -51,7 +51,7 @@ def render(section: Section) -> str:
     for file, caption in section.pictures:
         parts.append(f"![{caption}](../pictures/reproduction/{file})\n\n*{caption}*\n")
     parts += [
-        f"{n}. “{c.quote}” – **{c.verdict}**\n\n   {c.measured}\n"
+        f"{n}. “{c.quote}” – **{c.verdict}**\n\n    {c.measured}\n"
         for n, c in enumerate(section.claims, 1)
     ]
     return "\n".join(parts) + (f"\n{section.after}\n" if section.after else "")

@@ -68,7 +68,8 @@ def elements() -> list[Claim]:
     return [
         Claim(
             "results similar to those obtainable with FEM but in a much shorter time",
-            "The reference are finite elements (ν = 0.3, left edge clamped, right edge moved). "
+            "The reference is a finite-element solution (ν = 0.3, left edge clamped, right edge "
+            "moved). "
             "The equilibrium of the barycentre rule under the copying frame differs from them by "
             f"{off} with 10 and 20 cells per unit length, so that a finer lattice does not help. "
             f"It is not faster either. Only calibrated rules reach an error of {WANTED}; their "

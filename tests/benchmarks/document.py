@@ -201,7 +201,7 @@ def _ranks(found: Data) -> str:
     ns = {k: found[k] * 1e9 / found["steps"] / found["size"] ** 2 for k in ("1", "2", "shared")}
     mib = [held / 2**20 for held in (found["alone_bytes"], *found["rank_bytes"])]
     rows = [
-        ("one process, one thread", f"{ns['1']:.2f} ns a particle and step", ""),
+        ("one process, one thread", f"{ns['1']:.2f} ns per particle and step", ""),
         ("one process, two threads", f"{ns['2']:.2f} ns", f"{ns['1'] / ns['2']:.2f} × one thread"),
         ("two processes", f"{ns['shared']:.2f} ns",
          f"{ns['1'] / ns['shared']:.2f} × one, {ns['2'] / ns['shared']:.2f} × two threads"),
@@ -227,7 +227,10 @@ def _weak(found: list[Data]) -> str:
             *(f"{share:.1%}" for share in lines),
             f"{1 / (1 + sum(lines)):.0%}",
         ))  # fmt: skip
-    head = ("lattice", "rows a part", "k", "halo and fewer steps a pass", "exchange", "not lost")
+    head = (
+        "lattice", "rows per part", "k", "time for halo and fewer steps per pass",
+        "time for exchange", "efficiency",
+    )  # fmt: skip
     return _table(head, rows)
 
 
