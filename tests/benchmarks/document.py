@@ -103,9 +103,7 @@ def _cache(rows: list[Data]) -> str:
         ns = f"{r['small_ns']:.2f}", f"{r['large_ns']:.2f}"
         return r["rule"], r["with"], *ns, f"{r['small_ns'] / r['large_ns']:.0%}"
 
-    return _table(
-        ("rule", "with", "100², ns", "3000², ns", "relative rate"), map(cells, rows)
-    )
+    return _table(("rule", "with", "100², ns", "3000², ns", "relative rate"), map(cells, rows))
 
 
 def _cost(found: Data) -> str:
