@@ -87,7 +87,8 @@ def docs(session: nox.Session) -> None:
     hour."""
     install(session, "docs")
     unrun = ["-D", "plot_gallery=0", "-D", "nb_execution_mode=off"]
-    options = ["-W", "--keep-going", *(unrun if "unrun" in session.posargs else [])]
+    # All pages are written: the search index of Sphinx has the index entries of written pages only.
+    options = ["-W", "--keep-going", "-a", *(unrun if "unrun" in session.posargs else [])]
     session.run("sphinx-build", *options, "-b", "html", "docs", "build/docs")
     session.run("python", "docs/search_walk.py", "build/docs")
 
