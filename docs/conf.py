@@ -19,9 +19,9 @@ urls = dict(entry.split(", ") for entry in DISTRIBUTION.get_all("Project-URL") o
 
 extensions = [
     "myst_nb",
+    "python_reference",
     "reference_pages",
     "search_terms",
-    "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx_copybutton",
     "sphinx_design",
@@ -55,11 +55,7 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
 }
 
-# The reference comes from the docstrings.
-autodoc_member_order = "bysource"
-autodoc_typehints = "description"
-autodoc_typehints_format = "short"
-add_module_names = False
+toc_object_entries_show_parents = "hide"
 
 html_theme = "pydata_sphinx_theme"
 html_search_scorer = str(HERE / "scorer.js")

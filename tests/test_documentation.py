@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent
 EXTENDING = ROOT / "docs" / "extending"
 PARTS = (ROOT / "docs").rglob("*.md")
 NOTEBOOKS = sorted(p for p in PARTS if "\nfile_format: mystnb\n" in p.read_text())
-FOLDERS = [ROOT / "docs", EXTENDING, ROOT / "docs" / "validation"]
+FOLDERS = [ROOT / "docs", EXTENDING, ROOT / "docs" / "reference", ROOT / "docs" / "validation"]
 PAGES = [ROOT / "README.md", *(page for folder in FOLDERS for page in sorted(folder.glob("*.md")))]
 
 
@@ -169,7 +169,7 @@ def test_readme_lists_the_two_commands_that_ci_runs():
 
 
 FENCES = {"python", "yaml", "console", "sh", "toml", "{code-cell}", "{toctree}", "{eval-rst}",
-          "{glossary}", "{commands}", "{keys}", "{include}", "{literalinclude}",
+          "{glossary}", "{commands}", "{keys}", "{python}", "{include}", "{literalinclude}",
           "text"}  # fmt: skip
 """The kinds of blocks. The first three run above; `toml` is read by
 `plugin/test_documentation`, those in braces by the builder of the site, cells above too. `text` is
