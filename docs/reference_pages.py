@@ -100,9 +100,10 @@ def key_sections(schema: Schema) -> Iterator[str]:
     models = schema["$defs"]
     required = schema["required"]
     yield "## Overview\n"
-    yield "| key | value | default |\n| --- | --- | --- |"
+    yield "| key | value | default | |\n| --- | --- | --- | --- |"
     for name, value in schema["properties"].items():
-        yield f"| `{name}` | {value_text(value, models)} | {default_text(name, value, required)} |"
+        default, text = default_text(name, value, required), cell(value.get("description", ""))
+        yield f"| `{name}` | {value_text(value, models)} | {default} | {text} |"
     yield ""
     seen: set[str] = set()
     for name, value in schema["properties"].items():

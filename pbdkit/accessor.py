@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from functools import wraps
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
@@ -35,6 +36,10 @@ def _method(
     def call(accessor: PbdAccessor, *args: P.args, **kwargs: P.kwargs) -> R:
         return function(accessor._dataset, *args, **kwargs)
 
+    # The first parameter in the docstring is the dataset.
+    call.__doc__ = re.sub(
+        r"(-{10}\n) +\w+ : .*\n( {8}.*\n)+", r"\1", function.__doc__ or "", count=1
+    )
     return call  # type: ignore[return-value]  # its first parameter has a name
 
 
@@ -50,7 +55,13 @@ def _with_figure(function: Callable[P, Axes | list[Axes]]) -> Callable[P, Axes |
 
 
 class PbdAccessor:
-    """The methods that pbdkit gives every dataset: ``dataset.pbd.plot(...)``."""
+    """Methods of pbdkit for datasets: ``ds.pbd.plot(...)``.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Dataset of pbdkit.
+    """
 
     def __init__(self, dataset: xarray.Dataset) -> None:
         self._dataset = in_this_layout(dataset)
@@ -65,33 +76,105 @@ class PbdAccessor:
     save = _method(save)
 
     def experiment(self, components: Iterable[type[Component]] = ()) -> Experiment:
-        """Return the experiment that the dataset carries, which `pbdkit.rerun` runs again.
+        """Return the experiment of the dataset.
 
-        `components` are classes from Python, where it was run with such. Raises ExperimentError
-        where the dataset carries none.
+        Parameters
+        ----------
+        components : iterable of classes
+            Component classes that the experiment uses in addition to the installed ones.
+
+        Returns
+        -------
+        Experiment
+            Experiment with all defaults.
+
+        Raises
+        ------
+        ExperimentError
+            If the dataset has no experiment, or a component is not available.
+
+        Examples
+        --------
+        >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+        >>> ds.pbd.experiment().name
+        'paper/a'
         """
         return experiment_of(self._dataset, components)
 
     def member(self, **choice: Any) -> xarray.Dataset:
-        """Return the part of a sweep in which parameters have these values: ``member(steel=3)``.
+        """Select members of a sweep by the values of its parameters.
 
-        A member alone has its experiment too. Raises ExperimentError for what no member has.
+        Parameters
+        ----------
+        **choice : object
+            Values by name of the parameter, for instance ``relaxation=0.5``: numbers, or texts such
+            as the type of a component.
+
+        Returns
+        -------
+        xarray.Dataset
+            The selected members. If every parameter is given, the dataset of this run, with its
+            experiment.
+
+        Raises
+        ------
+        ExperimentError
+            If the dataset is no sweep, or no member has these values.
+
+        Examples
+        --------
+        >>> experiment = pbdkit.load("paper/a", settings={"steps": 20})
+        >>> values = {"solver.relaxation": [0.5, 1.0]}
+        >>> ds = pbdkit.sweep(experiment, vary=values, workers=1, progress=False)
+        >>> ds.pbd.member(relaxation=0.5).sizes["time"]
+        21
         """
         return member(self._dataset, choice)
 
     def at(self, **index: int) -> xarray.Dataset:
-        """Select particles by site indices: ``at(i=3, j=4)`` is one particle, as
-        ``sel(particle=...)`` selects it, ``at(j=0)`` all particles of a line.
+        """Select particles by site indices.
 
-        Every site has indices of its own, those of one repeat cell too. Raises ExperimentError
-        where no particle is, and for what is no index.
+        Parameters
+        ----------
+        **index : int
+            Site indices `i` and `j`.
+
+        Returns
+        -------
+        xarray.Dataset
+            The particle, if all indices are given; otherwise all particles with these indices.
+            Sites of one repeat cell have different indices.
+
+        Raises
+        ------
+        ExperimentError
+            If no particle has these indices.
+
+        Examples
+        --------
+        >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+        >>> ds.pbd.at(i=4, j=5).particle.item()
+        67
+        >>> ds.pbd.at(j=5).sizes["particle"]
+        12
         """
         rows, whole = rows_at(self._dataset, index), {*index} == {*indices_of(self._dataset)}
         return self._dataset.isel(particle=rows[0] if whole else rows)
 
     def components(self) -> xarray.Dataset:
-        """The dataset with `position_x`, `position_y` in place of `position`, and so on of
-        everything along `axis`: for plots of one against the other, and for tables."""
+        """Split vectors into components, for tables and plots of one component against another.
+
+        Returns
+        -------
+        xarray.Dataset
+            Dataset with `position_x` and `position_y` in place of `position`, and likewise for
+            every variable along `axis`.
+
+        Examples
+        --------
+        >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+        >>> table = ds.pbd.components().isel(time=-1)[["position_x", "position_y"]].to_dataframe()
+        """
         parts: dict[str, xarray.Variable] = {}
         labels = []
         for name, vector in self._dataset.variables.items():
@@ -103,6 +186,12 @@ class PbdAccessor:
         return self._dataset.drop_dims("axis", errors="ignore").assign(parts).set_coords(labels)
 
     def physical(self) -> xarray.Dataset:
-        """The dataset in mm, mm² and, of stresses, forces and energies, MPa, N and mJ, as far as
-        variables have a scale: those of experiments with `units`."""
+        """Convert the dataset to mm, MPa, N and mJ.
+
+        Returns
+        -------
+        xarray.Dataset
+            Dataset with converted variables. Variables without a scale, as all those of experiments
+            without `units`, are unchanged.
+        """
         return in_physical_units(self._dataset)

@@ -1,5 +1,4 @@
-"""The verbs of pbdkit for Python users: from a file, a dict or an object to an experiment, its
-dataset, and what is known of both."""
+"""Functions of pbdkit for Python users: load, run, repeat, sweep, fit and analyse experiments."""
 
 from __future__ import annotations
 
@@ -39,33 +38,35 @@ def load(
     settings: Settings = (),
     allow_outside: bool = False,
 ) -> Experiment:
-    """Return the experiment in a YAML file, or the shipped one of that name.
+    """Read and validate an experiment.
 
     Parameters
     ----------
     name : str or path
-        A file, or the name of a shipped experiment, e.g. "paper/a".
+        YAML file, or name of a shipped experiment such as "paper/a".
     components : iterable of classes
-        Classes from Python that the experiment may name besides the installed ones.
+        Component classes that the experiment uses in addition to the installed ones.
     settings : mapping, or iterable of str
-        Values to change: ``{"steps": 20, "rule": {"relaxation": 0.3}}`` or ``["steps=20",
-        "rule.relaxation=0.3"]``.
+        Values that replace those of the file: ``{"steps": 20, "rule": {"relaxation": 0.3}}`` or
+        ``["steps=20", "rule.relaxation=0.3"]``.
     allow_outside : bool
-        Whether files that the experiment names, of fields and motions, may lie outside its folder.
+        Accept files of fields and motions outside the folder of the experiment.
 
     Returns
     -------
     Experiment
-        Validated as a whole.
+        Validated experiment.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where the file or a setting is wrong, or a plugin is missing or broken.
+        If the file or a setting is invalid, or a plugin is missing or broken.
 
     Examples
     --------
     >>> experiment = pbdkit.load("paper/a", settings={"steps": 20})
+    >>> experiment.steps
+    20
     """
     if not isinstance(name, str | Path):
         raise ExperimentError(
@@ -88,44 +89,51 @@ def run(
     Parameters
     ----------
     experiment : Experiment, mapping, str or path
-        An experiment, a dict of its parts, a file or the name of a shipped one.
-    components, settings
-        As in `load`.
+        Experiment, dict of its parts, YAML file, or name of a shipped experiment.
+    components : iterable of classes
+        Component classes that the experiment uses in addition to the installed ones.
+    settings : mapping, or iterable of str
+        Values that replace those of the experiment, as for `load`.
     output : str or path, optional
-        A file to write as `pbdkit run` does: sealed, and kept while it runs, so that
-        `pbdkit.resume` goes on with it where it is interrupted. The dataset is then that of the
-        file, whose values are read when they are used. By default nothing is written.
+        File to write, with checksums and checkpoints: `resume` continues an interrupted run. The
+        values of the returned dataset are then read from the file when they are used. By default
+        no file is written.
     force : bool
         Replace an existing file.
     progress : bool
-        Show how far the run is.
+        Show a progress bar.
 
     Returns
     -------
     xarray.Dataset
-        What the experiment records, with everything that makes it again in its attributes.
+        Recorded variables. The attributes contain the experiment, so that `rerun` can repeat it.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where the experiment is wrong, a plugin is missing or broken, or the output exists.
+        If the experiment is invalid, a plugin is missing or broken, or the file exists.
     StorageError
-        Where the output cannot be written.
+        If the file cannot be written.
     DivergedError
-        With what was recorded before, where the run leaves the finite numbers, has no equilibrium,
-        or comes apart on the way to one (status "separated").
+        If displacements are not finite, no equilibrium is found, or the body separates into parts.
+        The attribute `dataset` of the error contains the records until then.
 
     Warns
     -----
     SceneWarning, StabilityWarning, AccuracyWarning
-        As `pbdkit run` does, of what is doubtful in the scene or can diverge (but for what takes
-        an analysis: `analyse(experiment).warnings()`), and of a last state
-        that is inside out. They are classes of `pbdkit.errors`, under PbdkitWarning.
+        If a part of the experiment is probably a mistake, if steps can diverge, or if cells have
+        turned over in the last state.
+
+    See Also
+    --------
+    Simulation : step by step.
 
     Examples
     --------
-    >>> ds = pbdkit.run("paper/a", progress=False)
-    >>> ds.position.sel(time=400, particle=67)
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> ds.attrs["status"]
+    'complete'
+    >>> x, y = ds.position.sel(time=20, particle=67)
     """
     loaded = as_experiment(experiment, components, settings)
     return _run(loaded, progress, None if output is None else Path(output), force)
@@ -176,27 +184,35 @@ def _warn(texts: Iterable[str]) -> None:
 def analyse(
     experiment: ExperimentLike, *, components: ComponentClasses = (), settings: Settings = ()
 ) -> Analysis:
-    """Return what is known of a run before its first step.
+    """Predict the stability and the convergence of a run before its first step.
 
     Parameters
     ----------
-    experiment, components, settings
-        As in `run`.
+    experiment : Experiment, mapping, str or path
+        Experiment, as for `run`.
+    components : iterable of classes
+        Component classes that the experiment uses in addition to the installed ones.
+    settings : mapping, or iterable of str
+        Values that replace those of the experiment, as for `load`.
 
     Returns
     -------
     Analysis
-        Stability, eigenvalues, steps to a tolerance, and the step operator as a sparse matrix
-        (``.operator``); ``print`` shows a summary.
+        Spectrum, bounds, number of steps to a tolerance, and the step operator as a sparse matrix
+        (``.operator``). ``print`` shows a summary.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where the experiment is wrong, or a plugin is missing or broken.
+        If the experiment is invalid, or a plugin is missing or broken.
 
     Examples
     --------
-    >>> pbdkit.analyse("paper/a").spectral_radius
+    >>> analysis = pbdkit.analyse("paper/a")
+    >>> analysis.stable
+    True
+    >>> f"{analysis.spectral_radius:.4f}"
+    '0.9932'
     """
     from pbdkit.stability.analysis import Analysis
 
@@ -206,30 +222,37 @@ def analyse(
 def identify(
     experiment: ExperimentLike, *, components: ComponentClasses = (), settings: Settings = ()
 ) -> Identity:
-    """Return what the experiment's rule is physically, on its lattice and neighbours: diffusion or
-    an elastic body, with its constants, from the rule's answer to plane waves.
-
-    Where its numbers differ from place to place it is that of the first of
-    ``experiment.materials()``, which are experiments of one material each, by name.
+    """Identify the continuum that a rule represents: diffusion, or an elastic body.
 
     Parameters
     ----------
-    experiment, components, settings
-        As in `run`.
+    experiment : Experiment, mapping, str or path
+        Experiment, as for `run`. If parameters of its rule vary in space, the first entry of
+        ``experiment.materials()`` is identified.
+    components : iterable of classes
+        Component classes that the experiment uses in addition to the installed ones.
+    settings : mapping, or iterable of str
+        Values that replace those of the experiment, as for `load`.
 
     Returns
     -------
     Identity
-        The kind of continuum and its constants; ``print`` shows a summary.
+        Kind of continuum and its constants. ``print`` shows a summary.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where the experiment is wrong, or a plugin is missing or broken.
+        If the experiment is invalid, or a plugin is missing or broken.
+
+    Notes
+    -----
+    The constants follow from the response of the rule to plane waves on its lattice and neighbours.
 
     Examples
     --------
-    >>> print(pbdkit.identify("material/bar"))
+    >>> identity = pbdkit.identify("material/bar")
+    >>> identity.kind, round(identity.poisson_ratio, 6)
+    ('elasticity', 0.3)
     """
     from pbdkit.identification.probe import identified
 
@@ -240,14 +263,16 @@ def identify(
 def rerun(
     dataset: xarray.Dataset, *, components: ComponentClasses = (), progress: bool = True
 ) -> xarray.Dataset:
-    """Run the experiment that a dataset carries again, bit for bit.
+    """Repeat the run of a dataset, bit for bit.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        The result of a run.
-    components, progress
-        As in `run`.
+        Result of a run.
+    components : iterable of classes
+        Component classes that the experiment uses in addition to the installed ones.
+    progress : bool
+        Show a progress bar.
 
     Returns
     -------
@@ -257,12 +282,18 @@ def rerun(
     Raises
     ------
     ExperimentError, PluginError, DivergedError
-        As `run` does, and for a dataset without an experiment.
+        As `run`, and if the dataset has no experiment.
 
     Warns
     -----
     ReproducibilityWarning
-        Where other versions made the dataset than are installed.
+        If other versions than the installed ones made the dataset.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> bool((pbdkit.rerun(ds, progress=False).position == ds.position).all())
+    True
     """
     experiment = experiment_of(dataset, components)
     _warn_of_versions(dataset, experiment)
@@ -272,33 +303,39 @@ def rerun(
 def resume(
     output: str | Path, *, steps: int | None = None, anyway: bool = False, progress: bool = True
 ) -> xarray.Dataset:
-    """Go on with the unfinished run that was to write a file, or continue a finished one.
+    """Continue an interrupted run, or extend a finished one.
 
     Parameters
     ----------
     output : str or path
-        The file.
+        File that the run writes.
     steps : int, optional
-        The number of steps to which a finished run is continued.
+        Total number of steps to which a finished run is extended.
     anyway : bool
-        Go on also where the experiment, pbdkit or a plugin changed since.
+        Continue even if the experiment, pbdkit or a plugin has changed.
     progress : bool
-        Show how far the run is.
+        Show a progress bar.
 
     Returns
     -------
     xarray.Dataset
-        The dataset in the file: that of the uninterrupted run, bit for bit.
+        Dataset of the file, equal to that of an uninterrupted run, bit for bit.
 
     Raises
     ------
     ExperimentError
-        Where there is nothing to go on with, another process writes the file, or something changed
-        since.
+        If there is no run to continue, another process writes the file, or something has changed.
     StorageError
-        For a damaged store or disk.
+        If the checkpoints are damaged, or the file cannot be written.
     DivergedError
-        As `run` does, with no dataset: the file holds it.
+        As `run`, without a dataset: the file contains it.
+
+    Examples
+    --------
+    >>> settings = {"steps": 20}
+    >>> ds = pbdkit.run("paper/a", settings=settings, output="a.nc", progress=False)
+    >>> pbdkit.resume("a.nc", steps=40, progress=False).sizes["time"]
+    41
     """
     from pbdkit.io.open import open
     from pbdkit.restart import resumption
@@ -340,52 +377,56 @@ def sweep(
     client: Client | None = None,
     progress: bool = True,
 ) -> xarray.Dataset:
-    """Run an experiment over the product of some values, and return one dataset.
+    """Run an experiment for all combinations of parameter values and return one dataset.
 
     Parameters
     ----------
     experiment : Experiment, mapping, str or path
-        As in `run`.
+        Experiment, as for `run`.
     vary : mapping
-        Lists of values by the path of the parameter, of which the product is run.
+        Lists of values by path of the parameter; all combinations are run.
     together : mapping
-        Lists of one length, which are varied at once.
+        Lists of one length by path of the parameter, which are varied simultaneously.
     replicates : int
-        Runs of each member, with seeds of their own.
+        Number of runs of each combination, with different seeds.
     keep : mapping
-        The ``variables`` and ``times`` to keep; by default everything.
+        ``variables`` and ``times`` to keep; by default all.
     names : mapping
-        Names of the new dimensions by path.
+        Names of the new dimensions by path; by default the last word of the path.
     folder : str or path, optional
-        Keeps what is finished: the same call again runs the rest.
+        Folder for finished members. A second call with the same folder runs the missing ones only.
     workers : int, optional
-        Processes of this machine: by default as many as it has processors; 1 is this one alone.
+        Number of processes; by default one for each processor. With 1 no process is started.
     client : dask.distributed.Client, optional
-        A cluster in place of processes of this machine.
+        Cluster that runs the members instead of local processes.
     progress : bool
-        Show how many members have been run.
+        Show a progress bar.
 
     Returns
     -------
     xarray.Dataset
-        What `pbdkit sweep` would write, with the parameters as dimensions. A member that failed is
-        NaN, and its ``message`` is the reason.
+        Dataset with the parameters as dimensions, as `pbdkit sweep` writes it. A member that
+        failed is NaN, with the reason in `message`.
 
     Raises
     ------
     ExperimentError, PluginError
-        Before anything runs.
+        If the sweep or one of its experiments is invalid, before anything runs.
 
     Warns
     -----
     SweepWarning
-        Of members without values.
+        If members have failed.
     StorageWarning
-        Of damaged members in the folder, which run again.
+        If members in the folder are damaged; they are run again.
 
     Examples
     --------
-    >>> pbdkit.sweep("paper/d1", vary={"solver.relaxation": [0.5, 1.0]})
+    >>> experiment = pbdkit.load("paper/a", settings={"steps": 20})
+    >>> values = {"solver.relaxation": [0.5, 1.0]}
+    >>> ds = pbdkit.sweep(experiment, vary=values, workers=1, progress=False)
+    >>> ds.status.dims
+    ('relaxation',)
     """
     from pbdkit.sweeps.execute import called
 
@@ -407,31 +448,39 @@ def fit(
     Parameters
     ----------
     description : mapping, str or path
-        A fit file, the name of a shipped one, or a dict of the same.
+        Fit file, name of a shipped fit, or dict with the same keys.
     experiment : Experiment, mapping, str or path, optional
-        Takes the place of that in the description.
+        Experiment in place of that of the description.
     measured : xarray.Dataset, optional
-        Takes the place of the file of the measurement: a variable for each of its ``columns``, all
-        of one size, as x, y, ux and uy of a field.
+        Measurement in place of the file of the description: a variable for each of its
+        ``columns``, all of one shape, for instance x, y, ux and uy of a displacement field.
     components : iterable of classes
-        As in `load`.
+        Component classes that the experiment uses in addition to the installed ones.
 
     Returns
     -------
     Fitted or FittedStrength
-        The values with their errors and correlations; ``print`` shows a summary. It is a
-        FittedStrength where the description has ``kind: strength``.
+        Estimates with standard errors and correlations; a FittedStrength if the description has
+        ``kind: strength``. ``print`` shows a summary.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where the description, the experiment or the measurement is wrong.
+        If the description, the experiment or the measurement is invalid.
     DivergedError
-        Where no fit is found.
+        If an equilibrium or the minimum is not found.
+
+    Notes
+    -----
+    The sum of squared residuals, each over its noise, is minimised by the Gauss–Newton method; the
+    derivatives follow from the linear system of the equilibrium (docs/fitting.md).
 
     Examples
     --------
-    >>> print(pbdkit.fit("plate-with-hole"))
+    >>> print(pbdkit.fit("fibres"))
+    fracture.scale: 0.0203 ± 0.0013, 95 % from 0.0184 to 0.0239
+    fracture.modulus: 8.3 ± 1.2, 95 % from 6.1 to 10.9
+    ...
     """
     from pbdkit.equilibrium.error_bound import UnconvergedError
     from pbdkit.fitting.fit import fit_experiment
@@ -460,24 +509,30 @@ def fit_strength(
     experiment: ExperimentLike | None = None,
     components: ComponentClasses = (),
 ) -> FittedStrength:
-    """Fit the strength of bonds and its scatter, as `fit` does for ``kind: strength``.
+    """Fit the strength of bonds and its scatter to peaks of repeated tests.
+
+    The function is `fit` for descriptions with ``kind: strength``.
 
     Parameters
     ----------
-    description, experiment, components
-        As in `fit`.
+    description : mapping, str or path
+        Fit file with ``kind: strength``, name of a shipped one, or dict with the same keys.
+    experiment : Experiment, mapping, str or path, optional
+        Experiment in place of that of the description.
+    components : iterable of classes
+        Component classes that the experiment uses in addition to the installed ones.
 
     Returns
     -------
     FittedStrength
-        The values with their intervals; ``print`` shows a summary.
+        Estimates with confidence intervals. ``print`` shows a summary.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where the description, the experiment or the measurement is wrong.
+        If the description or the experiment is invalid.
     DivergedError
-        Where a specimen has no equilibrium.
+        If a specimen has no equilibrium.
     """
     from pbdkit.equilibrium.error_bound import UnconvergedError
     from pbdkit.fitting.fit_file import StrengthFit, read_fit

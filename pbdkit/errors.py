@@ -31,9 +31,9 @@ class PbdkitError(Exception):
 
     Parameters
     ----------
-    message
+    message : str
         Text for the user: place, fault, expectation and remedy. Unprintable characters are escaped.
-    where
+    where : sequence of str or int
         Path of the faulty field in the experiment, for instance ``("leaders", 1, "select")``; empty
         if there is no single field.
 
@@ -105,11 +105,13 @@ class DivergedError(PbdkitError):
     """A run diverged, did not converge to an equilibrium, or separated into parts on the way to
     one.
 
-    Attributes
+    Parameters
     ----------
-    dataset
+    message : str
+        Text for the user.
+    dataset : xarray.Dataset, optional
         The records until then, with status "diverged", "unconverged" or "separated"; None if the
-        run was writing to a file, which holds the same.
+        run writes to a file, which contains the same.
     """
 
     exit_status = 4

@@ -62,7 +62,13 @@ class Command:
     group: str = "Plugins"
 
     def load(self) -> Any:
-        """Import the click command."""
+        """Import the click command.
+
+        Returns
+        -------
+        click.Command
+            Command that the target names.
+        """
         return import_object(self.target)
 
 

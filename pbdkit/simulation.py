@@ -397,9 +397,11 @@ class Simulation:
     Parameters
     ----------
     experiment : Experiment, mapping, str or path
-        Experiment, as for `pbdkit.run`.
-    components, settings
-        As for `pbdkit.load`.
+        Experiment, as for `run`.
+    components : iterable of classes
+        Component classes that the experiment uses in addition to the installed ones.
+    settings : mapping, or iterable of str
+        Values that replace those of the experiment, as for `load`.
     start : Simulation, optional
         Simulation whose current state and step this one starts from. The body must have the same
         particles and bonds. By default the initial state of the experiment.
@@ -415,8 +417,10 @@ class Simulation:
     >>> simulation = pbdkit.Simulation("paper/a")
     >>> with simulation.record("first-steps.nc"):
     ...     simulation.step(50)
-    >>> simulation.state.position.sel(particle=67)
-    >>> simulation.equilibrate()
+    >>> simulation.time
+    50
+    >>> x, y = simulation.state.position.sel(particle=67)
+    >>> certificate = simulation.equilibrate()
     """
 
     processes: int = 1
@@ -647,7 +651,7 @@ class Simulation:
 
     @property
     def time(self) -> int:
-        """Return the current step."""
+        """Number of the current step."""
         return self.driver.state.step
 
     @property

@@ -7,6 +7,7 @@ import inspect
 import sys
 import textwrap
 from pathlib import Path
+from types import ModuleType
 from typing import Literal
 
 import pytest
@@ -79,10 +80,15 @@ EXAMPLES = {
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_examples_run(name, tmp_path, monkeypatch):
+def test_examples_run(name, tmp_path, monkeypatch, interpreted):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    names = {"pbdkit": pbdkit, "Literal": Literal} | vars(pbdkit.plugin) | vars(pbdkit.testing)
+    module = ModuleType("an_example")
+    monkeypatch.setitem(sys.modules, module.__name__, module)  # so that its classes can be found
+    names = vars(module)
+    names.update({"pbdkit": pbdkit, "Literal": Literal})
+    for source in (pbdkit.plugin, pbdkit.testing):
+        names.update({public: getattr(source, public) for public in source.__all__})
     test = doctest.DocTestParser().get_doctest(EXAMPLES[name], names, name, None, 0)
-    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
-    assert runner.run(test).failed == 0
+    test.globs = names  # its own is a copy
+    assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test).failed == 0

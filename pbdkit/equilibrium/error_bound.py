@@ -47,13 +47,26 @@ CORRECTION = "correction, "
 
 @dataclass(frozen=True)
 class Certificate:
-    """Error bound of an equilibrium.
+    """A posteriori bound on the error of an equilibrium.
 
-    `residual` is the largest move of the rule at the state, and `distance` a bound on the distance
-    of any follower from equilibrium, both lengths; `share` is the distance relative to the largest
-    prescribed displacement; `iterations` is the number of linearisations, `inner_iterations` that
-    of iterations of the linear solvers; `bound` is the kind of the bound; `linearised` is true if
-    the rule is not linear, so that the bound is of first order, with a factor of 2.
+    Parameters
+    ----------
+    method : str
+        Linear solver.
+    iterations : int
+        Number of linearisations.
+    inner_iterations : int
+        Number of iterations of the linear solvers.
+    residual : float
+        Largest move of the rule in the state, in lattice units.
+    distance : float
+        Bound on the distance of any follower from equilibrium, in lattice units.
+    share : float
+        The distance over the largest prescribed displacement.
+    bound : str
+        Kind of the bound.
+    linearised : bool
+        Whether the rule is not linear. The bound is then of first order, with a factor of 2.
     """
 
     method: str
@@ -66,7 +79,13 @@ class Certificate:
     linearised: bool
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the error bound as plain values, for JSON."""
+        """Return the bound as plain values, for JSON.
+
+        Returns
+        -------
+        dict
+            Values by name.
+        """
         return asdict(self)
 
     def __str__(self) -> str:

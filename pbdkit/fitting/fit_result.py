@@ -122,26 +122,26 @@ class Fitted:
 
     Parameters
     ----------
-    values
+    values : mapping of str to Estimate
         Estimates by path.
-    correlations : (parameter, parameter)
+    correlations : array of float, shape (parameter, parameter)
         Correlations of the estimates.
-    youngs_modulus
-        Young's modulus if a force is given.
-    misfits
+    youngs_modulus : Estimate or None
+        Young's modulus, if the description gives a force.
+    misfits : tuple of Misfit
         Residuals of each measurement, independent of its weight.
-    ratio
+    ratio : float
         Standard deviation of all residuals over the noise.
     problem, solution
-        The least-squares problem and its solution.
-    profiles
+        Least-squares problem and its solution.
+    profiles : mapping of str to Profile
         Profile likelihoods by path, on request.
-    combinations
+    combinations : tuple of Combination
         Combinations of parameters that are not identifiable separately: identifiable ones, then the
         others.
-    sample
+    sample : Sample or None
         Sample of the posterior, on request.
-    candidates
+    candidates : tuple of Candidate
         Compared models, the best first, on request.
     """
 
@@ -159,11 +159,17 @@ class Fitted:
 
     @property
     def noise(self) -> float:
-        """Return the noise of the first measurement."""
+        """Standard deviation of the noise of the first measurement."""
         return self.misfits[0].noise
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the content of the JSON file as plain values."""
+        """Return the result as plain values, for JSON.
+
+        Returns
+        -------
+        dict
+            Content of the file that `pbdkit fit` writes.
+        """
         named = {path: estimate.as_dict() for path, estimate in self.values.items()}
         modulus = self.youngs_modulus
         return {
@@ -202,12 +208,22 @@ class Fitted:
         return [*self.values], *(array.tolist() for array in numbers)
 
     def field(self, n: int = 0) -> FittedField:
-        """Return the residuals of measurement n, a field.
+        """Return the residuals of a measured field.
+
+        Parameters
+        ----------
+        n : int
+            Number of the measurement, from 0.
+
+        Returns
+        -------
+        FittedField
+            Points, measured displacements and residuals.
 
         Raises
         ------
         ValueError
-            For a measurement of another kind.
+            If the measurement is of another kind.
         """
         observation, rows = [*self.problem.rows()][n]
         if not isinstance(observation, FieldObservation):
@@ -222,10 +238,18 @@ class Fitted:
         )
 
     def distortions(self, n: int = 0) -> dict[str, Estimate]:
-        """Return the fitted amplitudes of the distortions of field n.
+        """Return the fitted amplitudes of the distortions of a measured field.
 
-        Keys are the polynomials, for instance "ux x^2 y^0", with x and y from -1 to 1 over the
-        points.
+        Parameters
+        ----------
+        n : int
+            Number of the measurement, from 0.
+
+        Returns
+        -------
+        dict of str to Estimate
+            Amplitudes by polynomial, for instance "ux x^2 y^0", with x and y from -1 to 1 over the
+            points.
         """
         observation, columns = [*self.problem.own_slices()][n]
         if not isinstance(observation, FieldObservation):
@@ -244,12 +268,22 @@ class Fitted:
         }
 
     def numbers(self, n: int = 0) -> FittedNumbers:
-        """Return the residuals of measurement n, tracks or a curve.
+        """Return the residuals of measured tracks or of a curve.
+
+        Parameters
+        ----------
+        n : int
+            Number of the measurement, from 0.
+
+        Returns
+        -------
+        FittedNumbers
+            Measured and fitted numbers, and residuals.
 
         Raises
         ------
         ValueError
-            For a field.
+            If the measurement is a field.
         """
         observation, rows = [*self.problem.rows()][n]
         if not isinstance(observation, TracksObservation | CurveObservation):
@@ -261,9 +295,20 @@ class Fitted:
         return FittedNumbers(along, measured, measured - residual, residual, what, over, joined)
 
     def information(self, n: int = 0) -> dict[str, Floats]:
-        """Return the information of each number of measurement n about each parameter, (number,) by
-        path.
+        """Return the information of each number of a measurement about each parameter.
 
+        Parameters
+        ----------
+        n : int
+            Number of the measurement, from 0.
+
+        Returns
+        -------
+        dict of str to array of float, shape (number,)
+            Information by path.
+
+        Notes
+        -----
         It is the square of the part of the derivative that is orthogonal to those of all other
         unknowns.
         """

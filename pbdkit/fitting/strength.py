@@ -751,20 +751,20 @@ class FittedStrength:
 
     Parameters
     ----------
-    values
+    values : mapping of str to StrengthEstimate
         Estimates by path.
-    correlations : (parameter, parameter)
+    correlations : array of float, shape (parameter, parameter)
         Correlations of the estimates.
-    variation
+    variation : StrengthEstimate or None
         Coefficient of variation of the strengths of bonds, if their law is known.
-    method
+    method : str
         likelihood or simulation.
-    specimens, failed
+    specimens, failed : int
         Number of specimens, and of broken ones.
-    checked
-        Test whether specimens fail at their first break; None without it.
-    draws
-        WeightedSamples of the parameters.
+    checked : Checked or None
+        Test whether specimens fail at their first break.
+    draws : WeightedSamples
+        Samples of the parameters.
     """
 
     values: Mapping[str, StrengthEstimate]
@@ -781,7 +781,13 @@ class FittedStrength:
         return replace(self, checked=checked)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the content of the JSON file as plain values."""
+        """Return the result as plain values, for JSON.
+
+        Returns
+        -------
+        dict
+            Content of the file that `pbdkit fit` writes.
+        """
         checked = self.checked
         return {
             "values": {path: _plain(estimate) for path, estimate in self.values.items()},

@@ -23,31 +23,31 @@ class Identity:
 
     Parameters
     ----------
-    name, lattice, neighbours, rule
+    name, lattice, neighbours, rule : str
         Name of the experiment, and types of its components.
-    reasons
+    reasons : tuple of str
         Reasons why the rule is neither diffusion nor elasticity.
-    spacing
-        Smallest distance of two sites (lattice units), the unit of length.
-    linear
+    spacing : float
+        Smallest distance of two sites in lattice units, the unit of length.
+    linear : bool
         Whether the move is linear in finite displacements.
-    turns
+    turns : bool
         Whether a finite rotation of the neighbours rotates the move.
-    symmetric
+    symmetric : bool
         Whether particle j has the same weight for k as k has for j.
-    rests_at_edges
+    rests_at_edges : bool
         Whether a particle at rest does not move if neighbours are missing.
-    stencil
+    stencil : Primitive
         Derivatives of the move.
-    spectrum
+    spectrum : WaveSpectrum
         Eigenvalues over all plane waves.
-    relaxation, memory
-        Parameters of the solver.
-    kind
+    relaxation, memory : float
+        Relaxation and momentum of the solver.
+    kind : str
         diffusion, elasticity or neither.
-    long
+    long : LongWaves or None
         Response to long waves; None if there are no slow waves.
-    notes
+    notes : tuple of str
         Further properties, a sentence each.
     """
 
@@ -82,7 +82,7 @@ class Identity:
 
     @property
     def symmetry(self) -> str | None:
-        """Return isotropic, anisotropic (diffusion), square, orthotropic, general; None for
+        """Symmetry: isotropic, anisotropic (diffusion), square, orthotropic, or general; None for
         neither."""
         if self.long is None or self.kind == NEITHER:
             return None
@@ -92,7 +92,7 @@ class Identity:
 
     @property
     def isotropic(self) -> bool:
-        """Return whether the diffusivities of long waves are equal in every direction."""
+        """Whether the diffusivities of long waves are equal in every direction."""
         return self.long is not None and all(
             r.largest - r.smallest <= SAME * abs(self.long.fast.largest)
             for r in (self.long.fast, self.long.slow)
@@ -100,25 +100,30 @@ class Identity:
 
     @property
     def body(self) -> Elasticity | None:
-        """Return the elastic body; isotropic diffusion is one, too, away from free edges."""
+        """Elastic body; isotropic diffusion is one, too, away from free edges."""
         is_elastic = self.kind == ELASTICITY or (self.kind == DIFFUSION and self.isotropic)
         return self.long.elasticity if self.long and is_elastic else None
 
     @property
     def diffusivity(self) -> float | None:
-        """Return D of isotropic diffusion, spacing²/step."""
+        """Diffusivity D of isotropic diffusion, in spacing² per step."""
         is_diffusion = self.kind == DIFFUSION and self.isotropic and self.long
         return self.long.fast.largest if self.long and is_diffusion else None
 
     @property
     def poisson_ratio(self) -> float | None:
-        """Return Poisson's ratio in plane stress of an isotropic body."""
+        """Poisson's ratio in plane stress of an isotropic body."""
         isotropic = self.body is not None and self.body.symmetry == "isotropic"
         return self.body.poisson_ratio(0.0) if self.body and isotropic else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the values of ``pbdkit identify --json``, in units of the spacing and of a
-        step."""
+        """Return the values of ``pbdkit identify --json``, in units of the spacing and of a step.
+
+        Returns
+        -------
+        dict
+            Values by name.
+        """
         names = (
             *("name", "lattice", "neighbours", "rule", "kind", "spacing", "linear", "symmetric"),
             *("rests_at_edges", "symmetry", "reasons", "notes", "diffusivity", "poisson_ratio"),

@@ -34,15 +34,39 @@ UNSEALED = "has no seal: changes since it was written cannot be detected"
 
 
 def open(path: str | Path) -> xarray.Dataset:
-    """Open the dataset of a result file; values are read, and verified, when they are used.
+    """Open a result file.
 
-    The dataset of an unfinished run is that of its last checkpoint, with the status "interrupted".
+    Values are read when they are used, and verified by the checksums of the file. For an unfinished
+    run the dataset of its last checkpoint is returned, with the status "interrupted".
 
-    Raises ExperimentError for an experiment and a sweep specification, and StorageError for a
-    missing file, a file that was changed, that is not netCDF, that pbdkit did not write, that lacks
-    variables, or that a newer pbdkit wrote. A change found later, as values are read, raises
-    StorageError too. Warns, with StorageWarning, of a file without a seal, which is first read once
-    in a separate process.
+    Parameters
+    ----------
+    path : str or path
+        File of a run or a sweep.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dataset of the file.
+
+    Raises
+    ------
+    ExperimentError
+        If the file is an experiment or the specification of a sweep.
+    StorageError
+        If the file does not exist, is no result of pbdkit, was changed or damaged, or was written
+        by a newer version. Changes of values are detected when they are read.
+
+    Warns
+    -----
+    StorageWarning
+        If the file has no checksums. It is then read in a separate process first.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, output="a.nc", progress=False)
+    >>> pbdkit.open("a.nc").attrs["status"]
+    'complete'
     """
     if not isinstance(path, str | Path):
         raise ExperimentError(

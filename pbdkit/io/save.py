@@ -17,26 +17,34 @@ if TYPE_CHECKING:
 
 
 def save(dataset: xarray.Dataset, path: str | Path, *, force: bool = False) -> Path:
-    """Write a dataset as a sealed result, as `pbdkit run` does, and return the path.
-
-    The file appears complete or not at all, and can be read by `pbdkit.open`, `pbdkit verify` and
-    all commands.
+    """Write a dataset as a result file with checksums, as `run` does.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        The result of a run or a sweep.
+        Result of a run or a sweep.
     path : str or path
-        The name of the file, which ends in .nc by custom.
+        File to write, usually with the extension ``.nc``. An incomplete file never appears.
     force : bool
         Replace an existing file.
+
+    Returns
+    -------
+    Path
+        Path of the file.
 
     Raises
     ------
     ExperimentError
-        For a name that is taken, and a dataset that lacks what a result has.
+        If the file exists, or the dataset lacks variables or attributes of a result.
     StorageError
-        Where the file cannot be written.
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> ds.pbd.save("a.nc").name
+    'a.nc'
     """
     file = Path(path)
     refuse_existing(file, force=force)

@@ -350,16 +350,16 @@ def _each(field: str, parts: Any) -> list[Any]:
     return list(parts) if field in LISTS else [parts]
 
 
-def _default(part: str) -> Any:
+def _default(part: str, description: str) -> Any:
     # The value is written as in a file, so that it is resolved in the same way and `--set` can
     # start from it.
-    return Field(default={"type": part})
+    return Field(default={"type": part}, description=description)
 
 
 class Experiment(Strict):
     """Experiment: a scene and its run, validated as a whole.
 
-    It is the same whether created from a file, a dict or objects.
+    Parts are given as dicts, as in an experiment file, or as objects of component classes.
 
     Raises
     ------
@@ -367,31 +367,70 @@ class Experiment(Strict):
         If the experiment is invalid; the message names the field and the remedy.
     PluginError
         If a component belongs to a distribution that is missing or broken.
+
+    Examples
+    --------
+    >>> experiment = pbdkit.Experiment(
+    ...     name="sheet",
+    ...     lattice={"type": "square", "a": 1.0},
+    ...     body={"type": "grid", "columns": 8, "rows": 4},
+    ...     rule={"type": "barycentre"},
+    ...     leaders=[{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
+    ...     steps=10,
+    ... )
+    >>> experiment.frame.type
+    'mean'
     """
 
-    version: Version = 1
-    name: Name
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    units: Units | None = None
-    lattice: Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
-    body: AnyBody
-    regions: dict[RegionName, AnyBody] = Field(default_factory=dict)
-    neighbours: Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)] = _default(
-        "coordination"
+    version: Version = Field(1, description="Version of the format of experiments.")
+    name: Name = Field(description="Name of the experiment, from which output files are named.")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(
+        0, description="Seed of all random numbers."
     )
-    rule: Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)]
-    frame: Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)] = _default("mean")
-    fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default("none")
-    cuts: Annotated[tuple[Cut, ...], Field(strict=False)] = ()
-    initial: AnyInitial = _default("reference")
-    leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
-    loads: Annotated[tuple[Load, ...], Field(strict=False)] = ()
-    obstacles: Annotated[tuple[Obstacle, ...], Field(strict=False)] = ()
-    operations: Annotated[tuple[AnyOperation, ...], Field(strict=False)] = ()
-    steps: Annotated[int, Field(ge=1, lt=2**62)]
-    record: Record = Field(default_factory=Record)
-    diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()
-    solver: AnySolver = _default("stepping")
+    units: Units | None = Field(
+        None, description="Lattice unit, Young's modulus and thickness with their units."
+    )
+    lattice: Annotated[SerializeAsAny[Lattice], open_part(Lattice)] = Field(
+        description="Lattice of the particles."
+    )
+    body: AnyBody = Field(description="Shape of the body: the sites that are particles.")
+    regions: dict[RegionName, AnyBody] = Field(
+        default_factory=dict, description="Named parts of the body, for parameters and selections."
+    )
+    neighbours: Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)] = _default(
+        "coordination", "Neighbours that enter the rule of a particle."
+    )
+    rule: Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)] = Field(
+        description="Rule by which followers move."
+    )
+    frame: Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)] = _default(
+        "mean", "Points around the body in place of neighbours that are missing at its edge."
+    )
+    fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default(
+        "none", "Condition under which bonds break."
+    )
+    cuts: Annotated[tuple[Cut, ...], Field(strict=False)] = Field(
+        (), description="Bonds that are cut at given steps."
+    )
+    initial: AnyInitial = _default("reference", "Displacements and broken bonds before step 1.")
+    leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = Field(
+        (), description="Leader groups: particles with prescribed motion."
+    )
+    loads: Annotated[tuple[Load, ...], Field(strict=False)] = Field(
+        (), description="Forces on followers."
+    )
+    obstacles: Annotated[tuple[Obstacle, ...], Field(strict=False)] = Field(
+        (), description="Rigid bodies that particles cannot enter."
+    )
+    operations: Annotated[tuple[AnyOperation, ...], Field(strict=False)] = Field(
+        (), description="Changes of displacements in each step besides the move of the rule."
+    )
+    steps: Annotated[int, Field(ge=1, lt=2**62)] = Field(description="Number of steps.")
+    record: Record = Field(default_factory=Record, description="Steps that are recorded.")
+    diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = Field(
+        (), description="Further variables of the dataset."
+    )
+    solver: AnySolver = _default("stepping", "Stepping, or equilibrium without steps.")
 
     @classmethod
     def key_hint(cls, key: str) -> str:
@@ -497,10 +536,21 @@ class Experiment(Strict):
             ``{"steps": 20, "rule": {"relaxation": 0.3}}`` changes these values only; a map with a
             `type` replaces the whole part. ``["steps=20"]`` is equivalent.
 
+        Returns
+        -------
+        Experiment
+            The changed experiment.
+
         Raises
         ------
         ExperimentError
             If a path does not exist, or a value is invalid.
+
+        Examples
+        --------
+        >>> experiment = pbdkit.load("paper/a").with_settings({"steps": 20})
+        >>> experiment.steps
+        20
         """
         source = replace(self.as_written(), name=self._source.name)
         if source.files.folder is None:
@@ -548,7 +598,7 @@ class Experiment(Strict):
 
         Returns
         -------
-        dict
+        dict of str to Experiment
             Uniform experiments by label; the experiment itself with an empty label if no parameter
             varies.
         """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import chain
 from typing import Any
 
@@ -16,6 +17,8 @@ from pbdkit.plugin.registry import Registry
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """Dialect of the schema."""
+SECTIONS = re.compile(r"\n\n[A-Z]\w+\n-+\n")
+"""Start of the sections of a docstring, which are for Python users."""
 
 
 def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:
@@ -47,9 +50,12 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
         if field in LISTS:
             part["items"] = {"oneOf": choice} if choice else False
         else:
-            default = {k: v for k, v in part.items() if k == "default"}
+            kept = {k: v for k, v in part.items() if k in ("default", "description")}
             choice += [_deprecated(retired) for retired in RETIRED if retired.field == field]
-            top["properties"][field] = {"oneOf": choice} | default
+            top["properties"][field] = {"oneOf": choice} | kept
+    for model in [top, *definitions.values()]:
+        if "description" in model:
+            model["description"] = SECTIONS.split(model["description"])[0]
     everything = json.dumps([top, definitions], ensure_ascii=False)
     used = sorted(name for name in definitions if f'"#/$defs/{name}"' in everything)
     top |= {"title": "pbdkit experiment", "$defs": {name: definitions[name] for name in used}}

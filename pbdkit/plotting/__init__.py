@@ -44,43 +44,61 @@ def plot(
     dpi: int = 200,
     ax: Axes | Sequence[Axes] | None = None,
 ) -> Axes | list[Axes]:
-    """Draw recorded steps with the same limits and one scale of colours.
+    """Draw the configuration at recorded steps, coloured by a variable.
+
+    Several steps are drawn side by side, with the same limits and one scale of colours.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        The result of one run.
+        Result of one run.
     color : str, optional
-        A variable of particles or bonds: its values, the length of a vector, or a component as
-        `u_x`. By default the kinds of particles.
+        Variable of particles or bonds: its values, the magnitude of a vector, or a component such
+        as `u_x`. By default the kinds of particles are drawn.
     time : float or iterable of float, optional
-        A recorded step, or several, a panel each. By default the last.
+        Recorded step, or several steps, one for each panel; by default the last.
     filled : bool, optional
-        True draws the variable as a field over the body, False as dots; by default a field where
-        dots would hide one another.
+        True draws the variable as a filled field, False as a dot for each particle. By default a
+        field is drawn where dots would overlap.
     contours : bool
-        Draw the field in steps at round levels.
-    bonds, broken : bool
-        Draw bonds (by default where there is room), and broken ones too, dashed.
+        Draw the field in filled contours at round levels.
+    bonds : bool, optional
+        Draw bonds as lines. By default they are drawn where there is room.
+    broken : bool
+        Draw broken bonds too, dashed.
     outline : bool
-        Draw the outline of the body at rest.
+        Draw the outline of the body in the reference configuration.
     numbers : bool
-        Write the numbers of the particles, as many as there is room for.
+        Write the numbers of particles where there is room.
     vmin, vmax : float, optional
-        The lower and the upper limit of the colours. By default those of all panels, and where
-        there are both signs the same on both sides of zero.
+        Limits of the colours. By default those of all drawn values, symmetric about zero if values
+        of both signs occur.
     cmap : str, optional
-        A colour map of matplotlib.
+        Colour map of matplotlib.
     figsize : (float, float), optional
         Width and height of the figure in inches.
     dpi : int
-        Pixels an inch.
+        Pixels per inch.
     ax : Axes or sequence of Axes, optional
-        Axes to draw into, one for each step. By default a new figure is made.
+        Axes to draw into, one for each step. By default a new figure is created.
 
-    Returns the axes: one, or a list where `time` is iterable. Raises ExperimentError for a step
-    that was not recorded, for no step at all, for a variable that cannot be drawn, for options
-    that make no picture, and where matplotlib is missing.
+    Returns
+    -------
+    Axes or list of Axes
+        Axes of the step; a list for several steps, in place of which `ds.pbd.plot` returns their
+        Figure.
+
+    Raises
+    ------
+    ExperimentError
+        If a step was not recorded, the variable cannot be drawn, options contradict each other, or
+        matplotlib is missing.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> ax = ds.pbd.plot("pe1", time=20, cmap="magma")
+    >>> figure = ds.pbd.plot("pe1", time=[0, 20])
     """
     look = Look(
         filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
@@ -110,31 +128,60 @@ def compare(
     figsize: tuple[float, float] | None = None,
     dpi: int = 200,
 ) -> Axes | list[Axes]:
-    """Draw one step of two datasets side by side, with the same limits and one scale of colours.
+    """Draw one step of two datasets side by side, or their difference.
 
     Parameters
     ----------
-    first, second : xarray.Dataset
-        Results of one run each.
+    first : xarray.Dataset
+        Result of one run.
+    second : xarray.Dataset
+        Result of the other run.
     color : str, optional
-        What is drawn, as in `plot`; of a `difference` by default the distance of positions.
+        Variable of particles or bonds, as for `plot`. For a difference the default is the distance
+        between the positions.
     time : float, optional
-        A recorded step, by default the last of each.
+        Recorded step; by default the last of each run.
     difference : bool
-        Draw in one panel `color` of the second less that of the first, at the places that the
-        second has at rest; particles are joined by number.
-
-    The other parameters are those of `plot`.
+        Draw in one panel the values of `second` minus those of `first`, at the reference positions
+        of `second`. Particles are matched by number.
+    filled : bool, optional
+        True draws the variable as a filled field, False as a dot for each particle. By default a
+        field is drawn where dots would overlap.
+    contours : bool
+        Draw the field in filled contours at round levels.
+    bonds : bool, optional
+        Draw bonds as lines. By default they are drawn where there is room.
+    broken : bool
+        Draw broken bonds too, dashed.
+    outline : bool
+        Draw the outline of the body in the reference configuration.
+    numbers : bool
+        Write the numbers of particles where there is room.
+    vmin, vmax : float, optional
+        Limits of the colours. By default those of all drawn values, symmetric about zero if values
+        of both signs occur.
+    cmap : str, optional
+        Colour map of matplotlib.
+    figsize : (float, float), optional
+        Width and height of the figure in inches.
+    dpi : int
+        Pixels per inch.
 
     Returns
     -------
     list of Axes, or Axes
-        Both axes; of a `difference` its own.
+        Both axes; one Axes for a difference.
 
     Raises
     ------
     ExperimentError
-        As `plot` does, and where no particle is in both.
+        As `plot`, and if the datasets have no particle in common.
+
+    Examples
+    --------
+    >>> first = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> second = pbdkit.run("paper/a-weighted", settings={"steps": 20}, progress=False)
+    >>> left, right = first.pbd.compare(second, "pe1")
     """
     look = Look(
         filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
@@ -152,15 +199,36 @@ def plot_experiment(
     figsize: tuple[float, float] | None = None,
     dpi: int = 200,
 ) -> Axes:
-    """Draw the set-up of an experiment before it runs, and return the axes.
+    """Draw the set-up of an experiment before it is run.
 
-    The picture shows the body with its frame and regions, supports and leaders, loads, obstacles,
-    cracks and cuts. Arrows are as long in proportion to each other as motions and forces are.
-    Coordinates are in mm where the experiment has `units`. `ax` are axes to draw into; without them
-    a figure is made, of size `figsize` in inches, with the resolution `dpi`.
+    The picture contains the body with its frame and regions, supports, leaders, loads, obstacles,
+    cracks and cuts. Arrows are proportional to displacements and forces. Coordinates are in mm if
+    the experiment has `units`, otherwise in lattice units.
 
-    Raises ExperimentError where there is no such scene, where space is no plane, and where
-    matplotlib is missing.
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment in the plane.
+    ax : Axes, optional
+        Axes to draw into. By default a new figure is created.
+    figsize : (float, float), optional
+        Width and height of the figure in inches.
+    dpi : int
+        Pixels per inch.
+
+    Returns
+    -------
+    Axes
+        Axes of the picture.
+
+    Raises
+    ------
+    ExperimentError
+        If the scene is invalid or not plane, or matplotlib is missing.
+
+    Examples
+    --------
+    >>> ax = pbdkit.plotting.plot_experiment(pbdkit.load("paper/a"))
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.scene_axes import draw_experiment
@@ -169,15 +237,31 @@ def plot_experiment(
 
 
 def crack(dataset: xarray.Dataset, kind: CrackKind = "map", *, ax: Axes | None = None) -> Axes:
-    """Draw broken bonds and return the axes.
+    """Draw broken bonds, their number, or the length of the longest crack.
 
-    `map` shows the broken bonds on the body at rest, coloured by step of breaking; `length` the
-    length of the longest crack over the steps, measured as the largest distance between the middles
-    of its bonds; `bonds` the number of broken bonds. Bonds that were cut, or broken from the start,
-    count; bonds to the frame do not.
+    Bonds that are cut or broken from the start are included; bonds to the frame are not.
 
-    Raises ExperimentError where bonds could not break, for several runs, and where matplotlib is
-    missing.
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Result of one run in which bonds can break.
+    kind : {"map", "length", "bonds"}
+        "map" draws the broken bonds on the body in the reference configuration, coloured by the
+        step at which they broke; "length" the length of the longest crack over the steps, the
+        largest distance between midpoints of its bonds; "bonds" the number of broken bonds over the
+        steps.
+    ax : Axes, optional
+        Axes to draw into. By default a new figure is created.
+
+    Returns
+    -------
+    Axes
+        Axes of the picture.
+
+    Raises
+    ------
+    ExperimentError
+        If bonds cannot break, the dataset contains several runs, or matplotlib is missing.
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.cracks import draw_crack
@@ -196,17 +280,41 @@ def curve(
     obstacle: int | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a curve and return its axes.
+    """Draw a curve: stress over strain, force over displacement, energies, or any two variables.
 
-    `kind` is which, by default the first that the dataset has. `curve(y)` draws a variable over
-    the time instead and `curve(x, y)` one over another, one number a step each: a component as
-    `reaction_x`, and of what particles have the sum or mean. `group`, `load` and `obstacle` choose
-    the one to draw; without them it is the one that moves farthest. Lengths, forces
-    and energies are in mm, N and mJ where the dataset has their scale. A dataset of a sweep has a
-    line a member.
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Result of a run, or of a sweep: one line for each member then.
+    x : str, optional
+        Variable along the abscissa, with `y`; without `y` the variable that is drawn over time.
+        Variables are a number a step, components such as `reaction_x`, or sums and means over
+        particles.
+    y : str, optional
+        Variable along the ordinate.
+    kind : {"stress-strain", "load-displacement", "energies"}, optional
+        Kind of curve, without `x` and `y`; by default the first of these that the dataset contains.
+    group, load, obstacle : int, optional
+        Leader group, load or obstacle whose force is drawn; by default the one that moves farthest.
+    ax : Axes, optional
+        Axes to draw into. By default a new figure is created.
 
-    Raises ExperimentError for what is not there, with the diagnostic that it takes, and where
-    matplotlib is missing.
+    Returns
+    -------
+    Axes
+        Axes of the curve. Lengths, forces and energies are in mm, N and mJ if the experiment has
+        `units`.
+
+    Raises
+    ------
+    ExperimentError
+        If a variable does not exist; the message names the diagnostic that records it. Also if
+        matplotlib is missing.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> ax = ds.pbd.curve("pe1")
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.curves import draw_curve
@@ -225,17 +333,41 @@ def history(
     bond: Sequence[int] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a variable of particles over the steps and return the axes.
+    """Draw a variable of selected particles, or of a bond, over the steps.
 
-    The particles are selected by number, one or several, or by their site indices: `i` and `j` are
-    one particle, one of them alone is a line of them. `name` is any variable of particles, a vector
-    (its first component is drawn through, the others dashed) or a component as `u_x`; by default
-    the displacement `u`, made of positions where it was not recorded. `track` shows every step.
-    `bond` names a bond by the numbers of its two particles: its strain, or a variable of bonds.
-    Only what is drawn is read.
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Result of one run.
+    name : str, optional
+        Variable of particles or bonds, or a component such as `u_x`. The first component of a
+        vector is a solid line, the others are dashed. By default the displacement `u`, computed
+        from the positions if it was not recorded. `track` contains every step.
+    particle : int or iterable of int, optional
+        Numbers of the particles.
+    i, j : int, optional
+        Site indices: both select one particle, one of them selects a line of particles.
+    bond : sequence of int, optional
+        Numbers of the two particles of a bond. Its strain is drawn, or the variable `name` of
+        bonds.
+    ax : Axes, optional
+        Axes to draw into. By default a new figure is created.
 
-    Raises ExperimentError for what is not there, for more than 200 lines, and where matplotlib is
-    missing.
+    Returns
+    -------
+    Axes
+        Axes of the curves.
+
+    Raises
+    ------
+    ExperimentError
+        If a variable, particle or bond does not exist, there are more than 200 lines, or matplotlib
+        is missing.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> ax = ds.pbd.history("u_x", particle=[67, 68])
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.curves import draw_history

@@ -81,27 +81,56 @@ def animate(
     figsize: tuple[float, float] | None = None,
     dpi: int = DPI,
 ) -> None:
-    """Write a movie of the recorded steps; the scale of colours is that of the whole run.
+    """Write a movie of the recorded steps, with one scale of colours for the whole run.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        The result of one run.
+        Result of one run.
     color : str, optional
-        What is drawn, as in `plot`.
-    file : path
-        MP4 or GIF, as the name ends. The file appears whole or not at all.
+        Variable of particles or bonds, as for `plot`.
+    file : str or path
+        MP4 or GIF file, by its extension. An incomplete file never appears.
     fps : float
-        Recorded steps a second.
+        Recorded steps per second.
     every : int
-        Interval of the recorded steps that are drawn, besides the last.
+        Draw every n-th recorded step only, and the last.
     show : callable
-        Called with what is done and the share that is done.
+        Function that is called with a text and the completed fraction, from 0 to 1.
     replace : bool
-        Put it in the place of an earlier file, which stands until the movie is whole.
+        Replace an existing file.
+    filled : bool, optional
+        True draws the variable as a filled field, False as a dot for each particle. By default a
+        field is drawn where dots would overlap.
+    contours : bool
+        Draw the field in filled contours at round levels.
+    bonds : bool, optional
+        Draw bonds as lines. By default they are drawn where there is room.
+    broken : bool
+        Draw broken bonds too, dashed.
+    outline : bool
+        Draw the outline of the body in the reference configuration.
+    vmin, vmax : float, optional
+        Limits of the colours. By default those of all drawn values, symmetric about zero if values
+        of both signs occur.
+    cmap : str, optional
+        Colour map of matplotlib.
+    figsize : (float, float), optional
+        Width and height of the figure in inches.
+    dpi : int
+        Pixels per inch.
 
-    The other parameters are those of `plot`. Raises ExperimentError as `plot` does, or if what
-    writes movies is missing; StorageError if the file cannot be written.
+    Raises
+    ------
+    ExperimentError
+        As `plot`, and if the library that writes movies is missing.
+    StorageError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> ds.pbd.animate("pe1", "a.gif", every=10, dpi=40)
     """
     path = _movie_file(color, file)
     refuse_no_movie(path)
@@ -163,9 +192,44 @@ def animation(
     figsize: tuple[float, float] | None = None,
     dpi: int = 80,
 ) -> FuncAnimation:
-    """Return a movie as an animation of matplotlib, for notebooks.
+    """Return an animation of matplotlib, for notebooks.
 
-    For longer runs it shows 60 evenly spaced steps. The parameters are those of `plot`.
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Result of one run. At most 60 of its recorded steps are drawn, evenly spaced.
+    color : str, optional
+        Variable of particles or bonds, as for `plot`.
+    filled : bool, optional
+        True draws the variable as a filled field, False as a dot for each particle. By default a
+        field is drawn where dots would overlap.
+    contours : bool
+        Draw the field in filled contours at round levels.
+    bonds : bool, optional
+        Draw bonds as lines. By default they are drawn where there is room.
+    broken : bool
+        Draw broken bonds too, dashed.
+    outline : bool
+        Draw the outline of the body in the reference configuration.
+    vmin, vmax : float, optional
+        Limits of the colours. By default those of all drawn values, symmetric about zero if values
+        of both signs occur.
+    cmap : str, optional
+        Colour map of matplotlib.
+    figsize : (float, float), optional
+        Width and height of the figure in inches.
+    dpi : int
+        Pixels per inch.
+
+    Returns
+    -------
+    matplotlib.animation.FuncAnimation
+        Animation; a notebook displays ``HTML(animation.to_jshtml())``.
+
+    Raises
+    ------
+    ExperimentError
+        As `plot`.
     """
     refuse_no_matplotlib()
     from matplotlib.animation import FuncAnimation

@@ -90,11 +90,16 @@ class Component(Strict, ABC):
 
     model_config = ConfigDict(json_schema_extra=_require_type)
 
-    type: str
+    type: str = Field(description="Word by which experiments select the component.")
 
     @classmethod
     def type_name(cls) -> str:
         """Return the `type` by which experiments select this component.
+
+        Returns
+        -------
+        str
+            Default of the field `type`.
 
         Raises
         ------
@@ -109,7 +114,13 @@ class Component(Strict, ABC):
         return default
 
     def numeric_parameters(self) -> dict[str, float]:
-        """Return the numeric and boolean parameters by name, for elementwise functions."""
+        """Return the numeric and boolean parameters by name, for elementwise functions.
+
+        Returns
+        -------
+        dict of str to float
+            Values by the name of the field.
+        """
         values: dict[str, Any] = {name: getattr(self, name) for name in type(self).model_fields}
         return {k: v for k, v in values.items() if isinstance(v, (int, float))}
 
@@ -172,17 +183,17 @@ class Remembered:
 
     Parameters
     ----------
-    name
+    name : str
         Name of the number, and of the variable in the dataset.
-    long_name, units
+    long_name, units : str
         Attributes of the variable.
-    initial
+    initial : float
         Initial value, unless the component draws it.
-    dtype
+    dtype : str
         ``"f8"``, in the precision of the run, or an integer type.
-    changes
+    changes : bool
         Whether it can change; otherwise it is recorded once.
-    recorded
+    recorded : bool
         Whether it is recorded.
 
     Raises
@@ -219,14 +230,14 @@ class Bonds:
 
     Parameters
     ----------
-    ends
-        Numbers of both particles, lower first, (bond, 2).
-    shell
-        Shell of each bond, from 1, (bond,).
-    rest
-        Rest offset from the first particle to the second, (bond, axis), lattice units.
-    midpoint
-        Midpoint in the reference configuration, (bond, axis), lattice units.
+    ends : array of int, shape (bond, 2)
+        Numbers of both particles, lower first.
+    shell : array of int, shape (bond,)
+        Shell of each bond, from 1.
+    rest : array of float, shape (bond, axis)
+        Rest offset from the first particle to the second, in lattice units.
+    midpoint : array of float, shape (bond, axis)
+        Midpoint in the reference configuration, in lattice units.
     """
 
     ends: NDArray[np.int64]
@@ -244,10 +255,10 @@ class Particles:
 
     Parameters
     ----------
-    number
-        Numbers of the particles, (particle,).
-    X
-        Reference positions, (particle, axis), lattice units.
+    number : array of int, shape (particle,)
+        Numbers of the particles.
+    X : array of float, shape (particle, axis)
+        Reference positions, in lattice units.
     """
 
     number: NDArray[np.int64]
@@ -270,7 +281,13 @@ class Remembers(ABC):
 
     @abstractmethod
     def remembered(self) -> tuple[Remembered, ...]:
-        """Return the declarations of the state variables."""
+        """Return the declarations of the state variables.
+
+        Returns
+        -------
+        tuple of Remembered
+            Declarations, in the order of the values that change.
+        """
 
 
 class Draws(Remembers):
@@ -278,13 +295,18 @@ class Draws(Remembers):
 
     @abstractmethod
     def draw(self, owners: Any, generator: np.random.Generator) -> Drawn:
-        """Return random initial values by name, each (owner,).
+        """Return random initial values by name.
 
         Parameters
         ----------
-        owners
-            Bonds for a fracture model, Particles for a rule.
-        generator
+        owners : Bonds or Particles
+            `Bonds` for a fracture model, `Particles` for a rule.
+        generator : numpy.random.Generator
             Random number generator. It depends on the seed of the experiment only, not on other
             random components, engine or threads.
+
+        Returns
+        -------
+        dict of str to array, shape (owner,)
+            Values by the name of the number. Numbers that are missing start at their `initial`.
         """

@@ -24,16 +24,16 @@ class Variable:
 
     Parameters
     ----------
-    name
+    name : str
         Name of the variable.
-    dims
+    dims : tuple of str
         Dimensions, without the leading `time` or `step`, which is added unless the diagnostic is
         evaluated at the end.
-    long_name, units
+    long_name, units : str
         Attributes of the variable.
-    dtype
+    dtype : str
         Data type.
-    attributes
+    attributes : dict
         Further attributes.
     """
 
@@ -51,10 +51,15 @@ class Variable:
 
         Parameters
         ----------
-        values
+        values : array
             Values of the variable, without the leading dimension.
-        inside
-            Mask of the particles inside the outline, (particle,).
+        inside : array of bool, shape (particle,)
+            Mask of the particles inside the outline.
+
+        Returns
+        -------
+        array of bool
+            Mask, in the shape of `values`.
         """
         allowed: NDArray[np.bool_] = np.isfinite(values)
         if "particle" in self.dims:
@@ -64,8 +69,16 @@ class Variable:
 
 
 class LeaderRows(NamedTuple):
-    """Leader group at a step: rows of its particles, whether it is active, and the axes it leads
-    along.
+    """Leader group at a step.
+
+    Parameters
+    ----------
+    rows : array of int
+        Rows of its particles.
+    leads : bool
+        Whether the group is active at this step.
+    axes : tuple of int
+        Axes along which it prescribes displacements.
     """
 
     rows: NDArray[np.intp]
@@ -78,12 +91,12 @@ class LoadRows(NamedTuple):
 
     Parameters
     ----------
-    rows
+    rows : array of int
         Rows of its particles.
-    share
+    share : array of float
         Share of each particle in the force, or its area for a body force.
-    force
-        Total force, or force per area, over Young's modulus and thickness, (axis,).
+    force : array of float, shape (axis,)
+        Total force, or force per area, over Young's modulus and thickness.
     """
 
     rows: NDArray[np.intp]
@@ -92,7 +105,15 @@ class LoadRows(NamedTuple):
 
 
 class TouchingRows(NamedTuple):
-    """Followers that touch an obstacle: their rows, and the outward normals there, (row, axis)."""
+    """Followers that touch an obstacle.
+
+    Parameters
+    ----------
+    rows : array of int
+        Rows of the particles.
+    normals : array of float, shape (row, axis)
+        Outward unit normals of the obstacle at the particles.
+    """
 
     rows: NDArray[np.intp]
     normals: Floats
@@ -104,11 +125,19 @@ class BondHistory(Bonds):
 
     Parameters
     ----------
-    broken_step
-        Step at which each bond broke, -1 if it is intact, 0 for an initial crack, (bond,).
-    broken_strain
-        Strain at breaking, in the intermediate configuration, (bond,). NaN if the bond is intact,
-        was cut, or broken from the start.
+    ends : array of int, shape (bond, 2)
+        Numbers of both particles, lower first.
+    shell : array of int, shape (bond,)
+        Shell of each bond, from 1.
+    rest : array of float, shape (bond, axis)
+        Rest offset from the first particle to the second, in lattice units.
+    midpoint : array of float, shape (bond, axis)
+        Midpoint in the reference configuration, in lattice units.
+    broken_step : array of int, shape (bond,)
+        Step at which each bond broke, -1 if it is intact, 0 for an initial crack.
+    broken_strain : array of float, shape (bond,)
+        Strain at breaking, in the intermediate configuration. NaN if the bond is intact, was cut,
+        or broken from the start.
     """
 
     broken_step: NDArray[np.int32]
@@ -134,35 +163,44 @@ class CellValues(ABC):
 
         Parameters
         ----------
-        function
+        function : callable
             Elementwise function of (d, r), which hold one vector for each corner, counterclockwise:
             d[k] = u_k - u_0 and the constant r[k] = X_k - X_0. It is called once for each shape and
             part of the body.
-        intact_only
+        intact_only : bool
             Whether to exclude cells with a broken bond between corners.
 
         Returns
         -------
-        NDArray
-            Values, (cell,).
+        array of float, shape (cell,)
+            Values.
         """
 
     @abstractmethod
     def gradient(self) -> Floats:
-        """Return the displacement gradient H = ∂u/∂X at every particle, (particle, component,
-        axis).
+        """Return the displacement gradient H = ∂u/∂X at every particle.
 
-        The mean over the cells at the particle, weighted by their shares inside the outline,
-        extrapolated from the centre of these cells to the particle. Cells with a broken bond
-        between corners are excluded. NaN at frame points, 0 at particles without cells,
-        extrapolated outside the outline.
+        Returns
+        -------
+        array of float, shape (particle, component, axis)
+            Gradient; NaN at frame points, 0 at particles without cells, extrapolated outside the
+            outline.
+
+        Notes
+        -----
+        It is the mean over the cells at the particle, weighted by their shares inside the outline,
+        and extrapolated from the centre of these cells to the particle. Cells with a broken bond
+        between corners are excluded.
         """
 
     def lost_stress(self) -> Floats | None:
-        """Return the stress that softened bonds have lost, (particle, component, axis), or None.
+        """Return the stress that softened bonds have lost.
 
-        The first Piola-Kirchhoff stress over Young's modulus, as the mean over the cells of
-        `gradient`.
+        Returns
+        -------
+        array of float, shape (particle, component, axis), or None
+            First Piola–Kirchhoff stress over Young's modulus, as the mean over the cells of
+            `gradient`; None if no bond softens.
         """
         return None
 
@@ -185,16 +223,25 @@ class ForceValues(ABC):
 
     @abstractmethod
     def on_particles(self) -> Floats:
-        """Return the forces of the neighbours on every particle, (particle, axis), NaN at frame
-        points.
+        """Return the forces of the neighbours on every particle, leaders included.
 
-        Leaders are included. The forces of broken bonds are those of the rule.
+        The forces of broken bonds are those of the rule.
+
+        Returns
+        -------
+        array of float, shape (particle, axis)
+            Forces over Young's modulus and thickness, in lattice units; NaN at frame points.
         """
 
     @abstractmethod
     def energy(self) -> float:
-        """Return the strain energy: ½ uᵀK u = -½ Σ u·f of a linear rule, that of the bonds of a
-        nonlinear one.
+        """Return the strain energy.
+
+        Returns
+        -------
+        float
+            Energy over Young's modulus and thickness: ½ uᵀK u = -½ Σ u·f for a linear rule, the sum
+            over bonds for a nonlinear one.
         """
 
 
@@ -237,6 +284,11 @@ class Moment(ABC):
         ----------
         numbers : tuple of int
             Particle numbers, from 1.
+
+        Returns
+        -------
+        array of int
+            Rows, in the order of the numbers.
         """
 
     @abstractmethod
@@ -245,89 +297,140 @@ class Moment(ABC):
 
         Parameters
         ----------
-        points : tuple of pair of float
+        points : tuple of (float, float)
             Points in lattice units; of several particles the one with the lowest number is taken.
+
+        Returns
+        -------
+        array of int, shape (point,)
+            Rows.
         """
 
     @abstractmethod
     def displacement(self, rows: NDArray[np.intp] | None = None) -> Floats:
-        """Return u = x - X, (particle, axis), in lattice units.
+        """Return the displacements u = x - X.
 
         Parameters
         ----------
         rows : array of int, optional
             Rows of particles; by default all.
+
+        Returns
+        -------
+        array of float, shape (particle, axis)
+            Displacements in lattice units.
         """
 
     @abstractmethod
     def previous_displacement(self) -> Floats:
-        """Return u at the end of the previous step, (particle, axis); at time 0 that of time 0."""
+        """Return the displacements at the end of the previous step.
+
+        Returns
+        -------
+        array of float, shape (particle, axis)
+            Displacements in lattice units; at time 0 those of time 0.
+        """
 
     @abstractmethod
     def reference(self, rows: NDArray[np.intp] | None = None) -> Floats:
-        """Return X, (particle, axis), in lattice units.
+        """Return the reference positions X.
 
         Parameters
         ----------
         rows : array of int, optional
             Rows of particles; by default all.
+
+        Returns
+        -------
+        array of float, shape (particle, axis)
+            Positions in lattice units.
         """
 
     @abstractmethod
     def sum_over_neighbours(
         self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
-        """Return Σ_k function(d, r) over the reference neighbours k of each body particle,
-        (particle,).
+        """Return Σ_k function(d, r) over the reference neighbours k of each body particle.
 
         Parameters
         ----------
-        function
+        function : callable
             Elementwise function of d = u_k - u_j and r = X_k - X_j, as `gather` of a rule.
-        intact_only
+        intact_only : bool
             Whether to exclude broken bonds; otherwise they count with the real neighbour.
 
         Returns
         -------
-        NDArray
+        array of float, shape (particle,)
             Sums; NaN at frame points.
         """
 
     @abstractmethod
     def leader_groups(self) -> tuple[LeaderRows, ...]:
-        """Return the leader groups in the order of the experiment."""
+        """Return the leader groups in the order of the experiment.
+
+        Returns
+        -------
+        tuple of LeaderRows
+            One entry for each group.
+        """
 
     @abstractmethod
     def loads(self) -> tuple[LoadRows, ...]:
-        """Return the loads in the order of the experiment; at time 0 none acts."""
+        """Return the loads in the order of the experiment; at time 0 none acts.
+
+        Returns
+        -------
+        tuple of LoadRows
+            One entry for each load.
+        """
 
     @abstractmethod
     def touching(self) -> tuple[TouchingRows, ...]:
         """Return the followers that touch each obstacle, in the order of the experiment.
 
-        Empty for an obstacle that does not exist at this step.
+        Returns
+        -------
+        tuple of TouchingRows
+            One entry for each obstacle; empty for an obstacle that does not exist at this step.
         """
 
     @abstractmethod
     def broken_bonds(self) -> int:
-        """Return the number of bonds that have broken."""
+        """Return the number of bonds that have broken.
+
+        Returns
+        -------
+        int
+            Number of bonds.
+        """
 
     @abstractmethod
     def bonds(self) -> BondHistory:
-        """Return the table of bonds in the order of the dataset; row n is the bond with number n +
-        1.
+        """Return the table of bonds in the order of the dataset.
+
+        Row n is the bond with number n + 1.
+
+        Returns
+        -------
+        BondHistory
+            Bonds with the time and strain of their breaking.
         """
 
     @abstractmethod
     def remembered(self, name: str) -> NDArray[Any]:
-        """Return a state variable of the fracture model, (bond,), or of the rule, (particle,).
-
-        Bonds are in the order of the dataset; frame points have the initial value.
+        """Return a state variable of the fracture model or of the rule.
 
         Parameters
         ----------
         name : str
             Name of the number.
+
+        Returns
+        -------
+        array, shape (bond,) or (particle,)
+            Values: for each bond in the order of the dataset, or for each particle. Frame points
+            have the initial value.
         """
 
 
@@ -361,10 +464,22 @@ class Diagnostic(Component):
 
     @abstractmethod
     def variables(self) -> tuple[Variable, ...]:
-        """Return the variables in the dataset."""
+        """Return the variables in the dataset.
+
+        Returns
+        -------
+        tuple of Variable
+            Variables, in the order of the values of `measure`.
+        """
 
     def coordinates(self) -> dict[str, NDArray[Any]]:
-        """Return additional dimensions with their coordinates; empty by default."""
+        """Return additional dimensions with their coordinates; by default there are none.
+
+        Returns
+        -------
+        dict of str to array
+            Coordinates by the name of the dimension.
+        """
         return {}
 
     def check(self, particles: int, leader_groups: int) -> None:
@@ -375,9 +490,9 @@ class Diagnostic(Component):
 
         Parameters
         ----------
-        particles
+        particles : int
             Number of particles, frame included.
-        leader_groups
+        leader_groups : int
             Number of leader groups.
 
         Raises
@@ -389,8 +504,7 @@ class Diagnostic(Component):
 
     @abstractmethod
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return the values of the variables, one array each, with the shapes given by their
-        `dims`.
+        """Return the values of the variables, one array for each, in the shapes of their `dims`.
 
         Values must be finite, except NaN at frame points in variables of the body, and at particles
         that are not `inside` in variables that are not defined outside the outline.

@@ -45,12 +45,24 @@ class FractureModel(TakesFields):
     """False if no bond ever breaks; the scene then has no bond state."""
 
     def breaks_frame_bonds(self) -> bool:
-        """Return whether bonds to frame points can break; by default they can."""
+        """Return whether bonds to frame points can break; by default they can.
+
+        Returns
+        -------
+        bool
+            True if they can break.
+        """
         return True
 
     def parameters(self) -> dict[str, float]:
         """Return the numbers that functions see as ``p.name``; by default the model's numeric
-        fields."""
+        fields.
+
+        Returns
+        -------
+        dict of str to float
+            Numbers by name.
+        """
         return self.numeric_parameters()
 
     @abstractmethod
@@ -120,6 +132,11 @@ class FractureModel(TakesFields):
         shells : sequence of sequence of float
             Rest lengths of each shell, in lattice units.
 
+        Returns
+        -------
+        list of str
+            Warnings, one sentence each.
+
         Raises
         ------
         ExperimentError
@@ -142,8 +159,19 @@ class RenewsBonds(Remembers):
 
         Parameters
         ----------
-        d, r, c, p
-            As in `FractureModel.breaks`.
+        d : Vector
+            Difference u_k - u_j, in lattice units.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        c : Constants
+            Constants of the slot and state variables of the bond.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        tuple of Number
+            New values.
         """
 
 
@@ -164,6 +192,11 @@ class KnowsStiffness(ABC):
         setting : Setting
             Lattice and body.
 
+        Returns
+        -------
+        dict of str to float
+            Constants by name; all slots have the same names.
+
         Raises
         ------
         ExperimentError
@@ -181,10 +214,21 @@ class Softens(ABC):
 
         Parameters
         ----------
-        d, r, c, p
-            As in `FractureModel.breaks`.
+        d : Vector
+            Difference u_k - u_j, in lattice units.
         lost : Vector
             Difference to the fictitious point. Damage D softens a bond as (1 - D) d + D lost.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        c : Constants
+            Constants of the slot and state variables of the bond.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        Vector
+            Difference in place of d.
         """
 
 
@@ -193,9 +237,9 @@ class CellStress(NamedTuple):
 
     Parameters
     ----------
-    xx, yy, xy
+    xx, yy, xy : Number
         Components σ_xx, σ_yy and σ_xy.
-    share
+    share : Number
         Share of the cell in the body, 0 to 1; 0 if there is no cell.
     """
 
@@ -224,10 +268,21 @@ class SoftensCells(RenewsBonds):
 
         Parameters
         ----------
-        d, r, c, p
-            As in `FractureModel.breaks`.
+        d : Vector
+            Difference u_k - u_j, in lattice units.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        c : Constants
+            Constants of the slot and state variables of the bond.
+        p : Parameters
+            Parameters.
         left, right : CellStress
             Stress of the cells on both sides of the bond.
+
+        Returns
+        -------
+        tuple of Number
+            New values.
         """
 
     @staticmethod
@@ -242,8 +297,15 @@ class SoftensCells(RenewsBonds):
         ----------
         stress : CellStress
             Stress of the cell.
-        c, p
-            As in `FractureModel.breaks`.
+        c : Constants
+            Constants of the slot and state variables of the bond.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        Number
+            Stress over the stress at which softening begins; 1 at the limit.
         """
 
 
@@ -252,7 +314,13 @@ class StartsCracked(ABC):
 
     @abstractmethod
     def segments(self) -> Sequence[Segment]:
-        """Return the cracks; all bonds that cross them are broken at step 0."""
+        """Return the cracks; all bonds that cross them are broken at step 0.
+
+        Returns
+        -------
+        sequence of Segment
+            Straight cracks, in lattice units.
+        """
 
 
 class BreaksAtStrain(ABC):
@@ -265,8 +333,17 @@ class BreaksAtStrain(ABC):
 
         Parameters
         ----------
-        r, c, p
-            As in `FractureModel.breaks`.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        c : Constants
+            Constants of the slot and state variables of the bond.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        Number
+            Strain.
         """
 
 

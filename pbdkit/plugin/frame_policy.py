@@ -21,13 +21,13 @@ class FrameMap:
 
     Parameters
     ----------
-    point
+    point : array of int, shape (entry,)
         Index of the frame point of each entry, in the order of their numbers, sorted.
-    body
+    body : array of int, shape (entry,)
         Row of the body particle of each entry in the particle table.
-    weight
-        Number for each entry, (entry,), or matrix, (entry, axis, axis).
-    lag
+    weight : array of float, shape (entry,) or (entry, axis, axis)
+        Number or matrix for each entry.
+    lag : int
         Delay in steps; with 1 the displacements of the previous step are used.
     """
 
@@ -43,11 +43,11 @@ class FrameSites(ABC):
 
     Parameters
     ----------
-    cell
+    cell : Cell
         Repeat cell of the lattice.
-    site
-        Site index (i, j) of every frame point in the order of the numbers, (point, 2).
-    low, high
+    site : array of int, shape (point, 2)
+        Site index (i, j) of every frame point in the order of the numbers.
+    low, high : Index
         Smallest and largest site index of the body.
     """
 
@@ -66,9 +66,14 @@ class FrameSites(ABC):
 
     @abstractmethod
     def nearest(self) -> tuple[Indices, Indices]:
-        """Return (point, body): each frame point with every nearest body particle, sorted by both.
+        """Return the body particles nearest to each frame point in the reference configuration.
 
-        Nearest in the reference configuration are those with distance ≤ d_min (1 + 1e-9).
+        Nearest are all those with a distance ≤ d_min (1 + 1e-9).
+
+        Returns
+        -------
+        point, body : array of int, shape (pair,)
+            Frame point and row of the body particle of each pair, sorted by both.
         """
 
     @abstractmethod
@@ -77,8 +82,13 @@ class FrameSites(ABC):
 
         Parameters
         ----------
-        site : (entry, 2)
+        site : array of int, shape (entry, 2)
             Site indices.
+
+        Returns
+        -------
+        array of int, shape (entry,)
+            Rows.
         """
 
 
@@ -114,8 +124,13 @@ class FramePolicy(Component):
 
         Parameters
         ----------
-        reach
+        reach : int
             Reach of the neighbours in site index.
+
+        Returns
+        -------
+        int
+            Number of layers.
         """
 
     @abstractmethod

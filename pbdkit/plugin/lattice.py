@@ -139,8 +139,13 @@ class Cell:
 
         Parameters
         ----------
-        cell
+        cell : iterable of int or array
             Numbers (m, n) of cells along the vectors; numbers or arrays.
+
+        Returns
+        -------
+        Vector
+            Vector in lattice units.
         """
         steps = [n * v for n, v in zip(cell, self.vectors, strict=True)]
         return sum(steps[1:], steps[0])
@@ -156,6 +161,11 @@ class Cell:
             Sublattices.
         cell : Index
             Number of repeat cells between them.
+
+        Returns
+        -------
+        Offset
+            Offset from a site of `source` to one of `target`.
         """
         start, end = self.sites[source], self.sites[target]
         periods = map(mul, cell, self.period)
@@ -172,8 +182,15 @@ class Cell:
 
         Parameters
         ----------
-        source, target, cell
-            As in `offset`.
+        source, target : int
+            Sublattices.
+        cell : Index
+            Number of repeat cells between them.
+
+        Returns
+        -------
+        Index
+            Steps along the primitive vectors.
         """
         start, end = self.sites[source].primitive, self.sites[target].primitive
         along = (sum(map(mul, cell, step)) for step in zip(*self.primitive, strict=True))
@@ -188,6 +205,11 @@ class Cell:
             Sublattice.
         radius : float
             Radius in lattice units.
+
+        Returns
+        -------
+        list of Offset
+            Offsets, the shortest first.
         """
         sites = self.basis
         cells = np.array(list(self._cells_within(radius + 2 * np.linalg.norm(sites, axis=1).max())))
@@ -242,7 +264,13 @@ class Lattice(Component):
 
     @abstractmethod
     def cell(self) -> Cell:
-        """Return the repeat cell, which does not depend on `origin`."""
+        """Return the repeat cell, which does not depend on `origin`.
+
+        Returns
+        -------
+        Cell
+            Repeat cell, with lengths in lattice units.
+        """
 
 
 @dataclass(frozen=True)
@@ -327,6 +355,11 @@ class NeighbourMetric(Component):
         """Return the neighbourhood that is searched at every step, or None.
 
         By default it is None: neighbours remain those of step 0, as in a solid.
+
+        Returns
+        -------
+        Nearness or None
+            Neighbourhood in the current configuration.
         """
         return None
 
@@ -431,6 +464,11 @@ class Tiling:
         ----------
         slot : Slot
             Slot that is in `beside`.
+
+        Returns
+        -------
+        bool
+            True if it crosses a cell.
         """
         left, right = self.beside[slot]
         return left == right

@@ -67,7 +67,13 @@ class ParticleOperation(Component):
     )
 
     def parameters(self) -> dict[str, float]:
-        """Return the numbers that `displacement` sees as ``p.name``; by default the fields"""
+        """Return the numbers that `displacement` sees as ``p.name``; by default the numeric fields.
+
+        Returns
+        -------
+        dict of str to float
+            Numbers by name.
+        """
         return self.numeric_parameters()
 
     @staticmethod

@@ -44,6 +44,15 @@ class Stiffness(NamedTuple):
 
     σ_x = xx ε_x + xy ε_y + x_shear γ, σ_y = xy ε_x + yy ε_y + y_shear γ and
     τ = x_shear ε_x + y_shear ε_y + shear γ.
+
+    Parameters
+    ----------
+    xx, yy, xy
+        Normal stiffnesses: σ_x over ε_x, σ_y over ε_y, and σ_x over ε_y.
+    shear
+        Shear stiffness, τ over γ.
+    x_shear, y_shear
+        Coupling of shear with ε_x and ε_y; 0 if the axes are axes of symmetry.
     """
 
     xx: Any
@@ -60,6 +69,11 @@ class Stiffness(NamedTuple):
         ----------
         through_thickness
             σ_zz over σ_xx + σ_yy.
+
+        Returns
+        -------
+        float
+            Ratio of the moduli.
         """
         return (self.xx - self.xy * self.xy / self.yy) * (1.0 - through_thickness**2)
 
@@ -143,6 +157,11 @@ class FollowerRule(TakesFields):
         setting : Setting
             Lattice and body.
 
+        Returns
+        -------
+        dict of str to float
+            Numbers by name.
+
         Raises
         ------
         ExperimentError
@@ -159,6 +178,11 @@ class FollowerRule(TakesFields):
             Slot; all slots must have the same names.
         setting : Setting
             Lattice and body.
+
+        Returns
+        -------
+        dict of str to float
+            Constants by name.
         """
         return {}
 
@@ -210,10 +234,22 @@ class Calibrated(ABC):
 
     @abstractmethod
     def elasticity(self) -> Stiffness | None:
-        """Return the linear elasticity of the rule; None if its parameters define no material."""
+        """Return the linear elasticity of the rule; None if its parameters define no material.
+
+        Returns
+        -------
+        Stiffness or None
+            Elasticity over Young's modulus and thickness.
+        """
 
     def through_thickness(self) -> float:
-        """Return σ_zz over σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain."""
+        """Return σ_zz over σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain.
+
+        Returns
+        -------
+        float
+            Ratio of the stresses.
+        """
         return 0.0
 
     @staticmethod
@@ -225,8 +261,12 @@ class Calibrated(ABC):
 
         Parameters
         ----------
-        total, here, p
-            As in `FollowerRule.apply`.
+        total : tuple of Vector or Number
+            Sums of the contributions.
+        here : Here
+            Local values of the particle.
+        p : Parameters
+            Parameters.
 
         Returns
         -------
@@ -241,9 +281,7 @@ class Loadable(Calibrated):
     @staticmethod
     @abstractmethod
     def loaded(total: tuple[Any, ...], load: Vector, p: Parameters) -> tuple[Vector | Number, ...]:
-        """Return the sums as if a neighbour exerted the force `load` in addition, elementwise::
-
-            force(loaded(total, f, p), here, p) = force(total, here, p) + f
+        """Return the sums as if a neighbour exerted the force `load` in addition, elementwise.
 
         The contribution to the move must not depend on the positions of the neighbours.
 
@@ -255,6 +293,16 @@ class Loadable(Calibrated):
             Force over Young's modulus and thickness, in lattice units.
         p : Parameters
             Parameters.
+
+        Returns
+        -------
+        tuple of Vector or Number
+            Sums of the contributions with the load.
+
+        Notes
+        -----
+        With the force f it must hold that
+        ``force(loaded(total, f, p), here, p) = force(total, here, p) + f``.
         """
 
 
@@ -268,8 +316,14 @@ class StoresEnergy(Calibrated):
 
         Parameters
         ----------
-        d, r, w, p
-            As in `FollowerRule.gather`.
+        d : Vector
+            Difference u_k - u_j, in lattice units.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        w : Weights
+            Constants of the slot.
+        p : Parameters
+            Parameters.
 
         Returns
         -------
@@ -283,9 +337,9 @@ class Torn(NamedTuple):
 
     Parameters
     ----------
-    left, right
+    left, right : Number
         Largest damage of any bond of the cell to the left and to the right.
-    bond_left, bond_right
+    bond_left, bond_right : Number
         Damage of the bond itself in each of the two cells.
     """
 
@@ -312,11 +366,22 @@ class TearsCells(Calibrated):
 
         Parameters
         ----------
-        d, r, w, p
-            As in `FollowerRule.gather`.
+        d : Vector
+            Difference u_k - u_j, in lattice units.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        w : Weights
+            Constants of the slot.
         t : Torn
             Damage beside the bond. Where it is zero, the result is that of `gather` to the last
             bit.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        tuple of Vector or Number
+            Contributions, as those of `gather`.
         """
 
 
@@ -329,10 +394,17 @@ class MixesCells(Calibrated):
 
         Parameters
         ----------
-        slot, setting
-            As in `FollowerRule.weights`.
+        slot : Slot
+            Slot; all slots must have the same names.
+        setting : Setting
+            Lattice and body.
         c : Stiffness
             Stiffness of the cells over the modulus of the rule; the weights are linear in it.
+
+        Returns
+        -------
+        dict of str to float
+            Weights by name.
         """
 
     def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
@@ -342,8 +414,15 @@ class MixesCells(Calibrated):
 
         Parameters
         ----------
-        slot, setting
-            As in `FollowerRule.weights`.
+        slot : Slot
+            Slot; all slots must have the same names.
+        setting : Setting
+            Lattice and body.
+
+        Returns
+        -------
+        dict of str to float
+            Weights by name.
         """
         return {}
 
@@ -352,14 +431,14 @@ class MixesCells(Calibrated):
 
         Parameters
         ----------
-        c : (cell, 3, 3)
+        c : array of float, shape (cell, 3, 3)
             Stiffness over Young's modulus, in the components xx, yy, xy.
         setting : Setting
             Lattice and body.
 
         Returns
         -------
-        (cell,)
+        array of float, shape (cell,)
             Factor of each cell.
         """
         return np.zeros(len(c))
@@ -377,8 +456,17 @@ class RenewsParticles(Remembers):
 
         Parameters
         ----------
-        total, here, p
-            As in `FollowerRule.apply`.
+        total : tuple of Vector or Number
+            Sums of the contributions.
+        here : Here
+            Local values of the particle.
+        p : Parameters
+            Parameters.
+
+        Returns
+        -------
+        tuple of Number
+            New values.
         """
 
 
@@ -398,12 +486,23 @@ class SharesParticles(Remembers):
 
         Parameters
         ----------
-        d, r, w, p
-            As in `FollowerRule.gather`.
+        d : Vector
+            Difference u_k - u_j, in lattice units.
+        r : Vector
+            Rest offset X_k - X_j, in lattice units.
+        w : Weights
+            Constants of the slot.
+        p : Parameters
+            Parameters.
         own : Numbers
             State variables of the particle before the step.
         there : Numbers
             State variables of the neighbour before the step.
+
+        Returns
+        -------
+        tuple of Vector or Number
+            Contributions; they are summed over the neighbours.
         """
 
 
@@ -417,7 +516,13 @@ class TurnsParticles(RenewsParticles):
     @abstractmethod
     def rotations(self) -> tuple[tuple[str, str], ...]:
         """Return the names of cosine and sine of each rotation, counterclockwise from the
-        reference."""
+        reference.
+
+        Returns
+        -------
+        tuple of (str, str)
+            Names of cosine and sine.
+        """
 
 
 class AppliesTwice(ABC):
@@ -429,7 +534,13 @@ class AppliesTwice(ABC):
 
     @abstractmethod
     def inner(self) -> FollowerRule:
-        """Return the inner rule."""
+        """Return the inner rule.
+
+        Returns
+        -------
+        FollowerRule
+            Rule whose moves `gather` and `apply` receive.
+        """
 
 
 def shares_particles(rule: object) -> bool:

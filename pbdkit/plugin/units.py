@@ -48,16 +48,16 @@ class Quantity:
 
     Parameters
     ----------
-    meaning
+    meaning : str
         Name of the quantity in messages.
-    lattice
+    lattice : str
         Unit in datasets: a stress unit is that of Young's modulus, a thickness unit that of
         thickness.
-    unit
+    unit : str
         Unit in terms of mm and MPa.
-    length, youngs_modulus, thickness
+    length, youngs_modulus, thickness : int
         Exponents.
-    also
+    also : Quantity, optional
         Quantity that is accepted too, such as a length for a fracture energy over Young's modulus.
     """
 
@@ -80,10 +80,15 @@ class Quantity:
 
         Parameters
         ----------
-        value
+        value : object
             Number, or text with a unit.
-        info : ValidationInfo
+        info : pydantic.ValidationInfo
             Context of the validation, with the units of the experiment.
+
+        Returns
+        -------
+        object
+            Number in lattice units, or the value.
         """
         if not isinstance(value, str) or not TEXT.fullmatch(value):
             return value

@@ -62,7 +62,7 @@ class Vector(_Plane[T]):
     __array_ufunc__ = None  # array * vector is then computed by the vector
 
     def each(self, function: Callable[..., Any], *vectors: Iterable[Any]) -> Self:
-        """Return the vector of function(component, ...) for each component.
+        """Return the vector of ``function(component, ...)`` for each component.
 
         Parameters
         ----------
@@ -70,6 +70,11 @@ class Vector(_Plane[T]):
             Function of one component of each vector.
         *vectors : iterable
             Further vectors with as many components.
+
+        Returns
+        -------
+        Vector
+            Vector of the results.
 
         Examples
         --------
@@ -170,6 +175,11 @@ def dot(a: Vector[T], b: Vector[T]) -> T:
     a, b : Vector
         Vectors of one kind.
 
+    Returns
+    -------
+    Number
+        Scalar product.
+
     Examples
     --------
     >>> dot(Vector(1.0, 2.0), Vector(3.0, 4.0))
@@ -190,6 +200,11 @@ def squared_length(v: Vector[T]) -> T:
     ----------
     v : Vector
         Vector.
+
+    Returns
+    -------
+    Number
+        Square of the norm.
     """
     return dot(v, v)
 
@@ -201,6 +216,11 @@ def length(v: Vector[T]) -> T:
     ----------
     v : Vector
         Vector.
+
+    Returns
+    -------
+    Number
+        Norm.
 
     Examples
     --------

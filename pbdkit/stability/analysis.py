@@ -183,9 +183,9 @@ class Analysis:
 
     Examples
     --------
-    >>> import pbdkit
-    >>> round(pbdkit.analyse("paper/a").spectral_radius, 4)
-    0.9932
+    >>> analysis = pbdkit.analyse("paper/a")
+    >>> f"{analysis.spectral_radius:.4f}", analysis.steps_to["1e-3"]
+    ('0.9932', 1010)
     """
 
     scene: Scene
@@ -299,8 +299,7 @@ class Analysis:
 
     @property
     def best_memory(self) -> float | None:
-        """Return (1 - √(1 - ρ))², the memory of fastest convergence without relaxation, for 0 ≤ ρ <
-        1."""
+        """Momentum of fastest convergence without relaxation, (1 - √(1 - ρ))² for 0 ≤ ρ < 1."""
         rule_spectrum = self.spectra.of_rule
         if (
             rule_spectrum is None
@@ -316,10 +315,20 @@ class Analysis:
         return self.spectrum.radius <= 1.0 + NEUTRAL if self.spectrum else None
 
     def stable_at(self, relaxation: float, memory: float) -> bool | None:
-        """Return whether no mode grows with another relaxation and memory.
+        """Return whether no mode grows with another relaxation and momentum.
 
-        None if the rule's own eigenvalues are unknown: the frame has a lag, neighbours are searched
-        at every step, or the body is too large.
+        Parameters
+        ----------
+        relaxation : float
+            Factor of the move in a step.
+        memory : float
+            Factor of the last step, the momentum.
+
+        Returns
+        -------
+        bool or None
+            None if the eigenvalues of the rule are unknown: the frame has a delay, neighbours are
+            searched at every step, or the body is too large.
         """
         rule_spectrum = self.spectra.of_rule
         if rule_spectrum is None:
@@ -328,14 +337,20 @@ class Analysis:
         return bool(np.abs(mu).max(initial=0.0) <= 1.0 + NEUTRAL)
 
     def swing(self, relaxation: float, memory: float) -> Swing | None:
-        """Return the oscillating mode of the longest period with a relaxation and memory.
+        """Return the oscillating mode of the longest period with a relaxation and momentum.
 
-        None if no mode oscillates, or if the rule's own eigenvalues are unknown.
+        Parameters
+        ----------
+        relaxation : float
+            Factor of the move in a step.
+        memory : float
+            Factor of the last step, the momentum.
 
         Returns
         -------
-        Swing
-            Period 2π / arg μ in steps, and decay |μ| a step, √memory for real eigenvalues.
+        Swing or None
+            Period 2π / arg μ in steps and decay |μ| a step, which is √memory for real eigenvalues;
+            None if no mode oscillates, or if the eigenvalues of the rule are unknown.
         """
         rule_spectrum = self.spectra.of_rule
         if rule_spectrum is None:
@@ -422,7 +437,14 @@ class Analysis:
         return sorted(parts)
 
     def warnings(self) -> list[str]:
-        """Return what prevents convergence, with the remedy, and what is left out."""
+        """Return the reasons why steps do not converge, with remedies, and the results that are
+        left out.
+
+        Returns
+        -------
+        list of str
+            Warnings, one sentence each.
+        """
         return [*self.obstructions(), *self.left_out]
 
     def obstructions(self) -> list[str]:

@@ -27,9 +27,9 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
 
     Parameters
     ----------
-    runs
-        Datasets of pbdkit.
-    dim
+    runs : iterable of xarray.Dataset
+        Results of single runs.
+    dim : str
         Name of the new dimension.
 
     Returns
@@ -45,6 +45,15 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     ExperimentError
         If there are no runs, if a dataset has no experiment, or if `dim` is the name of something
         else.
+
+    Examples
+    --------
+    >>> runs = [
+    ...     pbdkit.run("paper/a", settings={"steps": 20, "seed": seed}, progress=False)
+    ...     for seed in (1, 2)
+    ... ]
+    >>> pbdkit.concat(runs).sizes["run"]
+    2
     """
     import xarray
 

@@ -32,7 +32,18 @@ PROPERTIES: tuple[Property, ...] = tuple(
 
 
 def properties_of(component: type[Component]) -> list[Property]:
-    """Return the properties that components of a class must have."""
+    """Return the properties that components of a class must have.
+
+    Parameters
+    ----------
+    component : type
+        Class of components.
+
+    Returns
+    -------
+    list of Property
+        Properties, in the order of `PROPERTIES`.
+    """
     return [p for p in PROPERTIES if issubclass(component, p.interfaces)]
 
 
@@ -94,8 +105,13 @@ class Report:
         return bool(self.ran) and not self.failed
 
     def summary(self) -> str:
-        """Return a line with the numbers of properties that ran and failed, and the reasons of
-        others."""
+        """Summarise the report in one line: how many properties ran, failed and were skipped.
+
+        Returns
+        -------
+        str
+            Line without line break.
+        """
         reasons = Counter(o.reason for o in self.skipped)
         counts = f"{self.component}: {len(self.ran)} properties ran, {len(self.failed)} failed"
         return "; ".join([counts, *(f"{n} skipped: {why}" for why, n in reasons.items())])
@@ -138,9 +154,9 @@ def examine(component: Component | type[Component], **parts: Any) -> Report:
     ----------
     component : Component or type
         Component, or a class, of which the first example is tested.
-    **parts
-        Parts of experiments (``lattice=...``, ``neighbours=...``) that replace the usual ones, for
-        a component that requires them.
+    **parts : object
+        Parts of experiments, ``lattice``, ``neighbours`` and others, that replace the usual ones,
+        for a component that requires them.
 
     Returns
     -------
@@ -149,7 +165,18 @@ def examine(component: Component | type[Component], **parts: Any) -> Report:
 
     Examples
     --------
-    >>> print(pbdkit.testing.examine(MyRule(strength=2.0)))
+    >>> class Sheared(Lattice):
+    ...     '''Lattice with shifted rows.'''
+    ...
+    ...     type: Literal["sheared"] = "sheared"
+    ...
+    ...     def cell(self):
+    ...         return Cell((Vector(1.0, 0.0), Vector(0.25, 1.0)))
+    >>> report = pbdkit.testing.examine(Sheared())
+    >>> report.holds
+    True
+    >>> len(report.ran)
+    16
     """
     instance: Any = component
     if isinstance(component, type):
@@ -166,6 +193,16 @@ def examine_all(components: Sequence[type[Component]]) -> Iterator[Report]:
 
     A component that takes part in none of the usual scenes is tested on the lattices and with the
     neighbour metrics among the classes.
+
+    Parameters
+    ----------
+    components : sequence of type
+        Classes of components.
+
+    Yields
+    ------
+    Report
+        Outcomes of one component.
     """
     for component in components:
         for example in _made(component) or (component,):
@@ -203,8 +240,13 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
     ----------
     *components : Component or type
         Components, or classes, of which all examples are tested.
-    **parts
-        As in `examine`.
+    **parts : object
+        Parts of experiments, ``lattice``, ``neighbours`` and others, that replace the usual ones.
+
+    Returns
+    -------
+    callable
+        Test function, to be assigned to a name that begins with ``test_``.
 
     Raises
     ------
@@ -215,7 +257,16 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
 
     Examples
     --------
-    >>> test_conformance = conformance(MyRule(strength=2.0), MyLattice)
+    In a test module:
+
+    >>> class Sheared(Lattice):
+    ...     '''Lattice with shifted rows.'''
+    ...
+    ...     type: Literal["sheared"] = "sheared"
+    ...
+    ...     def cell(self):
+    ...         return Cell((Vector(1.0, 0.0), Vector(0.25, 1.0)))
+    >>> test_conformance = conformance(Sheared())
     """
     import pytest
 

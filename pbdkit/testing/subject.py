@@ -503,6 +503,16 @@ def examples_of(component: type[Component]) -> list[Component]:
     The first has the first example of each parameter without default; each further example of a
     parameter gives a further component, with all other parameters unchanged.
 
+    Parameters
+    ----------
+    component : type
+        Class of components.
+
+    Returns
+    -------
+    list of Component
+        Components with the examples of their fields, or their defaults.
+
     Raises
     ------
     PluginError

@@ -34,27 +34,27 @@ def live(
     components: ComponentClasses = (),
     output: str | Path | None = None,
 ) -> LiveWidget:
-    """Return a widget for a notebook, in which the body of an experiment follows the mouse.
+    """Return a notebook widget in which the mouse leads the particles of an experiment.
 
     Parameters
     ----------
     experiment : Experiment, mapping, str or path
-        As `pbdkit.run` takes it.
+        Experiment, as for `run`.
     components : iterable of classes
-        As in `pbdkit.load`.
+        Component classes that the experiment uses in addition to the installed ones.
     output : str or path, optional
-        Where what is done to the body can be saved as an experiment that repeats it bit for bit; by
+        File in which the widget saves the session as an experiment that repeats it, bit for bit; by
         default NAME-live.yaml.
 
     Returns
     -------
     LiveWidget
-        Shown by the notebook; ``close()`` ends it.
+        Widget that the notebook displays; ``close()`` ends the session.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where anywidget is missing, or the experiment is wrong.
+        If the experiment is invalid, or anywidget is missing.
     """
     refuse_without("anywidget", "live", "live needs anywidget")
     from pbdkit.model.loading import as_experiment

@@ -1235,34 +1235,40 @@ def report(
     bench: str | Path | None = None,
     replace: bool = True,
 ) -> Path:
-    """Write the page of a run or of a sweep, and return its path.
+    """Write a run or a sweep as one self-contained HTML page.
 
-    The page contains the moving lattice, the histories of particles and bonds, curves, predictions,
-    broken bonds, and how to run it again. It takes at most 5 MB: steps or particles are omitted as
-    necessary, which the page states.
+    The page contains the moving lattice, histories of particles and bonds, curves, predictions,
+    broken bonds and the experiment. It has at most 5 MB: steps or particles are omitted if
+    necessary, and the page states which.
 
     Parameters
     ----------
     dataset : xarray.Dataset, str or path
-        A dataset, or a file that holds one.
+        Dataset or result file.
     path : str or path
-        The page. It appears complete or not at all.
+        Page to write. An incomplete page never appears.
     bench : str or path, optional
-        A file written by ``pbdkit bench --json``.
+        File written by ``pbdkit bench --json``, whose figures the page shows.
     replace : bool
         Replace an existing page.
 
     Returns
     -------
     Path
-        The path of the page.
+        Path of the page.
 
     Raises
     ------
     ExperimentError
-        For a dataset without positions.
+        If the dataset has no positions.
     StorageError
-        Where files cannot be read or written.
+        If a file cannot be read or written.
+
+    Examples
+    --------
+    >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+    >>> pbdkit.report(ds, "a.html").name
+    'a.html'
     """
     measured = speed(Path(bench)) if bench is not None else None
     with _reading(dataset) as read:

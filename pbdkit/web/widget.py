@@ -27,7 +27,15 @@ class _Cells(Viewer):
 
 
 class LiveWidget(anywidget.AnyWidget):
-    """Live session in a notebook. `session` is the session, ``close()`` ends it."""
+    """Live session in a notebook, returned by `live`.
+
+    Parameters
+    ----------
+    session : Session
+        Session that the widget displays.
+    **traits : object
+        Traits of anywidget.
+    """
 
     _esm = script("notebook", exports=True) + "\nexport default { render };\n"
     _css = source("live.css")
