@@ -15,8 +15,8 @@ OPTIONS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshad
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
-# Not for the whole session: while it is open its event loop runs in this thread, and nobody else
-# can start one here.
+# Not for the whole session: while it is open its event loop runs in this thread, and no other
+# can be started here.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """Yield Playwright's browser; tests that use it are skipped if there is none."""

@@ -29,7 +29,7 @@ settings.register_profile("landing", max_examples=40, derandomize=True, deadline
 settings.register_profile("long", max_examples=2000, deadline=None)
 settings.load_profile("landing" if os.environ.get("CI") else "anywhere")
 
-# A shell that runs tests in the background has Ctrl-C ignored; processes started here hear it.
+# A shell that runs tests in the background has Ctrl-C ignored; processes started here receive it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -55,7 +55,7 @@ PAIRS = frozenset(
     if len({name.split(": ")[0] for name in pair} & KINDS.keys()) == 2
     or not all(name.split(": ")[0] in KINDS for name in pair)
 )
-"""All features except those of two rules, two frames or two fracture models."""
+"""Features except those of two rules, two frames or two fracture models."""
 
 FRACTURES = tuple(f"fracture: {name}" for name in KINDS["fracture"])
 OF_FRACTURE = ("fracture field by region", "fracture number in time", "scatter", "cracks")
@@ -411,7 +411,7 @@ class _Writer:
 
     def obstacle(self) -> dict[str, Any]:
         x, y = self.at(0.5, 0.0)
-        # Outlines hold cells that are cut, whose particles lie outside by up to a row.
+        # Outlines have cells that are cut, with particles outside by up to a row.
         below = 0.11 if self.outline is None else 0.11 + self.height
         return {
             "shape": {"half_plane": {"point": [x, y - below], "normal": [0.0, 1.0]}},

@@ -85,7 +85,7 @@ class Copied(NamedTuple):
 
 
 class Body(NamedTuple):
-    """All quantities that are fixed at step 0; lists run over the particles in the order of their
+    """Quantities that are fixed at step 0; lists run over the particles in the order of their
     numbers."""
 
     lattice: Lattice

@@ -38,7 +38,7 @@ def test_what_does_not_go_together_is_refused_with_one_message(first, second, wo
     assert pairs
     for pair in sorted(map(sorted, pairs)):
         if refusal_of(pair) != words:
-            continue  # told by an earlier line
+            continue  # reported by an earlier line
         with pytest.raises(pbdkit.ExperimentError) as refusal:
             run(experiment_of(pair))
         text = str(refusal.value)

@@ -146,7 +146,7 @@ def test_python_is_warned_of_what_the_command_warns_of(call: Any, tensile: dict[
         pbdkit.run(doubtful, progress=False)
     texts = [str(warning.message) for warning in told]
     assert texts == said[: len(texts)]
-    # What takes an analysis Python is told of by one.
+    # Warnings that need an analysis are in its result.
     assert {*said[len(texts) :]} <= {*pbdkit.analyse(doubtful).warnings()}
     assert {warning.filename for warning in told} == {__file__}
     assert any("nothing will move" in text for text in said)

@@ -114,7 +114,7 @@ def against_plain() -> Iterator[Goal]:
 def threads() -> Iterator[Goal]:
     one, two = (Running(moving(3000, **DISTANCE), 4, threads=n) for n in (1, 2))
     quiet = wait_for_quiet()
-    # Many turns: in some of them, hopefully, nobody else wants the second processor.
+    # Many turns: in some of them, hopefully, no other process uses the second processor.
     found = ratio(one, two, 41)
     yield at_least(
         "two threads against one, 3000², distance-weighted", 1.7, found, "" if quiet else BUSY

@@ -4,8 +4,8 @@
 
 Values with their errors, discretisation errors of both, and times of whole calls, from the file to
 values and errors, taken in turns on one thread. Each lattice of pbdkit has for its rival the
-coarsest mesh of quadratic elements whose field of displacements is at least as exact. `--plain`
-also times elements that are assembled again for every state, with derivatives by differences. Needs
+coarsest mesh of quadratic elements with displacements that are at least as exact. `--plain` also
+times elements that are assembled again for every state, with derivatives by differences. Needs
 scikit-fem.
 """
 

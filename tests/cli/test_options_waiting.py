@@ -1,4 +1,4 @@
-"""A user who waits at a terminal gets a message, and no other output has it."""
+"""Messages for a user waiting at a terminal, which no other output contains."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ EVERY_COMMAND = {
     "verify": ["verify", "torn.nc"],
     "identify": ["identify", "e.json", HEALTHY],
     "bench": ["bench", "e.json", HEALTHY, "--steps=1"],
-    "live": ["live", "--help"],  # else it serves until somebody ends it
+    "live": ["live", "--help"],  # else it serves until it is ended
     "fit": ["fit", "--help"],  # `fitting/test_fit` carries some out
     "plugins": ["plugins", "list"],
     "schema": ["schema", "experiment"],

@@ -24,7 +24,7 @@ from tests.components.test_elasticity import (
     tension,
 )
 
-# Fields are given by the start of a run: nobody needs to lead.
+# Fields are given by the start of a run: no leaders are needed.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:leaders. there are none"),
     pytest.mark.filterwarnings("ignore:neighbours. all lie along one line"),

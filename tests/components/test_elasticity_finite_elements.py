@@ -124,7 +124,7 @@ def test_plane_strain():
 
 @pytest.mark.parametrize("cells", [10, 13])
 def test_interpolation_is_exact_for_linear_displacements(cells):
-    """The same holds in cells that a hole cuts, in which missing corners are continued."""
+    """This holds in cells that a hole cuts too, in which missing corners are continued."""
     i, j = np.indices((2 * cells + 1, 2 * cells + 1)) / cells
     u = np.array([0.3 * i - 0.2 * j, 0.1 + 0.5 * j])
     u[:, np.hypot(i - 1, j - 1) < 0.5] = np.nan

@@ -65,7 +65,7 @@ def error_of(ds, rest):
 @samples(4)
 @given(experiments(), st.sampled_from([1e-2, 1e-4, 1e-7]))
 def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tolerance):
-    """All lattices, rules, frames, motions and fracture are compared with the steps themselves."""
+    """Compare all lattices, rules, frames, motions and fracture with the steps themselves."""
     assume(not drawn["neighbours"].get("reevaluate"))
     solver = drawn["solver"] | {"settle": {"tolerance": tolerance}, "engine": "numpy"}
     if drawn["rule"]["type"] == "distance-weighted":

@@ -79,7 +79,7 @@ def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
     try:
         relaxed = {"type": "stepping", "relaxation": 1.0}
         scene = build_scene(pbdkit.Experiment(**experiment | {"solver": relaxed, "steps": steps}))
-        assume(not changes(scene, steps))  # before which equilibria settle, and steps do not wait
+        assume(not changes(scene, steps))  # equilibria do not wait for them
         stepper, state = Stepper(scene), initial_state(scene)
         while not (rests := came_to_rest(state)) and state.step < steps:
             state = stepper.advance(state, 100)

@@ -123,7 +123,7 @@ def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch)
         "steps": 1,
     }
     found = build_scene(pbdkit.Experiment(**given)).cells.share
-    if body["type"] != "dogbone":  # whose distance says more than the way to its fillets
+    if body["type"] != "dogbone":  # its distance contains more than that to its fillets
         monkeypatch.setattr(cut_cells, "NEAREST", 3.0)
     else:
         monkeypatch.setattr(cut_cells, "_width", lambda corners: 0.15)

@@ -99,7 +99,7 @@ def test_runs_settle_in_the_steps_that_check_says(call, name):
     assert said["stable"]
     steps, radius = said["steps_to"]["1e-3"], said["spectral_radius"]
     window = max(2, math.ceil(said["period"] / 2)) if said["period"] else 2
-    window = min(window, steps)  # near critical damping nothing is left of a swing
+    window = min(window, steps)  # near critical damping oscillations vanish
 
     scene = scene_with(name, *whole)
     rests = equilibrium_state(scene_with(name, *whole, *STRAIGHT))[0]

@@ -184,7 +184,7 @@ def test_the_right_model_foretells_best(tmp_path):
     assert order == ["orthotropic", "as given"]
     best, worst = found.candidates
     assert best.differs == 0.0
-    assert 0.8 < best.left_out < 1.6  # in blocks at the ends boundaries are told by others alone
+    assert 0.8 < best.left_out < 1.6  # blocks at the ends depend on others alone
     assert best.behind == 0.0
     assert worst.behind > 3 * worst.behind_error
     assert best.values["rule.modulus_ratio"] == pytest.approx(0.5, abs=0.05)

@@ -71,7 +71,8 @@ def test_case_9_coincident_particles_stay_under_distance_weights(frame):
     scene = scene_of(5, 4, rule="distance-weighted", frame=frame)
     at_origin = -scene.raster.reference(scene.raster.body_rows)
     if frame == "mean":
-        # The frame copies displacements and is not at the origin: look at who does not see it.
+        # The frame copies displacements and is not at the origin: consider
+        # particles without it as a neighbour.
         inside = ((scene.raster.site_of(scene.raster.body_rows) % (4, 3)) != 0).all(axis=1)
     else:
         inside = np.ones(20, bool)

@@ -104,7 +104,7 @@ def test_case_13_the_mode_that_never_decays_is_found_and_decays_below_relaxation
     ds = pbdkit.run(given, components=[Periodic, Even], progress=False)
     u = ds.u.values[:, ds.kind[0] != 2]
     last = np.abs(u[-1] - u[-2]).max()
-    # What is left is the chequerboard, by its own invariant: the mean of (-1)^(i+j) u.
+    # The remainder is the chequerboard, by its own invariant: the mean of (-1)^(i+j) u.
     sign = (-1.0) ** ds.site.values[ds.kind[0] != 2].sum(axis=1)
     weight = pbdkit.analyse(given, components=[Periodic, Even]).operator.current.toarray()[::2, ::2]
     values, vectors = np.linalg.eig(weight.T)
@@ -223,5 +223,5 @@ def test_case_17_in_1e5_steps_without_a_leader_the_frame_does_not_drift():
     invariant = weight @ u[0] / weight.sum()
     np.testing.assert_allclose(u[1], np.tile(invariant, (12, 1)), rtol=0, atol=1e-13)
     np.testing.assert_allclose(u[2], u[1], rtol=0, atol=1e-14)
-    # The plain mean is no invariant of this frame: one who watches it sees a drift.
+    # The plain mean is no invariant of this frame: it drifts.
     assert np.abs(u[2].mean(axis=0) - u[0].mean(axis=0)).max() > 1e-3

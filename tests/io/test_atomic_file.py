@@ -217,7 +217,7 @@ def test_a_folder_and_files_that_belong_together_appear_whole_or_not_at_all(
 
 @pytest.mark.parametrize("letter", ["a", "名"])
 def test_names_may_be_as_long_as_the_system_takes(call: Call, letter: str) -> None:
-    most = 243 - len(".nc")  # a run has files whose names are 12 bytes longer
+    most = 243 - len(".nc")  # a run has files with names that are 12 bytes longer
     name = letter * (most // len(letter.encode())) + ".nc"
     assert call("run", "e.json", "-o", name).code == 0
     assert call("plot", name).code == 0

@@ -41,7 +41,7 @@ OUT = Path("out.nc")
         "mutate_stores.py --trials 2 --kinds breaking",
         "mutate_sweeps.py --trials 2",
         "equilibria.py fracture --trials 3",
-        "equilibria.py certificates --trials 5",
+        "equilibria.py bounds --trials 5",
         "fit_coverage.py --trials 10 --processes 1 --kinds poisson",
     ],
 )

@@ -55,7 +55,7 @@ def test_the_closed_form_of_the_region_against_the_roots(kind, data):
     bound = largest_stable_relaxation(np.array([eigenvalue]), b)
     if abs(b) >= 1.0:
         assert bound is None
-        # The product of both roots is b: whatever the relaxation, one does not settle.
+        # The product of both roots is b: whatever the relaxation, one does not decay.
         assert np.abs(roots(eigenvalue, 0.5, b)).max() >= 1.0 - 1e-12
         return
     if kind == "real":
@@ -176,7 +176,7 @@ def test_the_slowest_mode_of_a_sheet_swings_with_its_period_and_decay(memory, pe
     start = np.stack([np.zeros(len(column)), np.sin(np.pi * column / 19)], axis=1)
     y = advanced(scene, start, 500)[:, 8 * 20 + 9, 1]
     assert period_of(y) == pytest.approx(swing.period, rel=0.005)
-    # What is left of u(t+1) - 2 √b cos ω u(t) + b u(t-1) is rounding.
+    # The remainder u(t+1) - 2 √b cos ω u(t) + b u(t-1) is rounding.
     s = 2 * swing.decay * math.cos(2 * math.pi / swing.period)
     np.testing.assert_allclose(y[2:] - s * y[1:-1] + swing.decay**2 * y[:-2], 0, atol=1e-9)
 

@@ -176,7 +176,8 @@ def test_a_released_translation_runs_out_as_a_geometric_series_of_the_memory():
     motion = {"type": "velocity", "velocity": v.tolist(), "steps": 3}
     everyone = {"select": {"box": [0, 0, 5, 4]}, "motion": motion, "until": 3}
     u = displacements(leaders=[everyone], solver={"type": "stepping", "memory": b}, steps=20)
-    # All stand alike, so that the rule moves nobody: u(t+1) = u(t) + b (u(t) - u(t-1)).
+    # All displacements are equal, so that the rule moves no particle:
+    # u(t+1) = u(t) + b (u(t) - u(t-1)).
     travelled = [min(t, 3) + sum(b**n for n in range(1, t - 2)) for t in range(21)]
     expected = np.array(travelled)[:, None, None] * v
     np.testing.assert_allclose(u, np.broadcast_to(expected, u.shape), rtol=0, atol=1e-14)

@@ -247,7 +247,7 @@ def test_curves_are_in_physical_units_where_they_are_known():
     strip = pbdkit.run("modelling/strip", progress=False)
     ax = strip.pbd.curve(kind="load-displacement")
     (line,) = drawn(ax)
-    np.testing.assert_allclose(line[0][-1], 0.1, rtol=1e-9)  # mm, as the experiment says
+    np.testing.assert_allclose(line[0][-1], 0.1, rtol=1e-9)  # mm, as in the experiment
     assert ax.get_xlabel().endswith("(mm)")
     assert ax.get_ylabel().endswith("(N)")
 

@@ -1,10 +1,10 @@
 """Compare equilibria of random scenes with references.
 
-python tests/reliability/equilibria.py springs|fracture|certificates [--trials N] [--seed S]
+python tests/reliability/equilibria.py springs|fracture|bounds [--trials N] [--seed S]
 
 springs: large loads (pressed, pulled, sheared, turned) against stepping with the load in --parts
 parts, each until convergence. fracture: a load in one step against the same load in as many steps
-as it has increments: which bonds break. certificates: grids against a direct solver: the ratio of
+as it has increments: which bonds break. bounds: grids against a direct solver: the ratio of
 the error bound to the true error, and cases in which it is below. Exits with 1 if something
 differs.
 """
@@ -120,7 +120,7 @@ def fracture(rng: np.random.Generator, _: int, found: Counts) -> None:
         print("differs:", columns, rows, limit, way, count, len(one), len(other), flush=True)
 
 
-def certificates(rng: np.random.Generator, _: int, found: Counts) -> None:
+def bounds(rng: np.random.Generator, _: int, found: Counts) -> None:
     """One elastic or averaging sheet by grids and directly."""
     columns, rows = int(rng.integers(24, 60)), int(rng.integers(8, 50))
     of = LATTICES[str(rng.choice(list(LATTICES)))]
@@ -152,7 +152,7 @@ def certificates(rng: np.random.Generator, _: int, found: Counts) -> None:
 TRIALS: dict[str, Callable[[np.random.Generator, int, Counts], None]] = {
     "springs": springs,
     "fracture": fracture,
-    "certificates": certificates,
+    "bounds": bounds,
 }
 
 

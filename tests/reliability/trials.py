@@ -92,7 +92,7 @@ def often(first_s: float = 0.0) -> None:
 
 def started(work: Callable[[], object], log: Path) -> int:
     """Start a process that does the work and exits as it does; its output is written to the log."""
-    log.touch()  # it may be killed before it says anything
+    log.touch()  # it may be killed before any output
     if pid := os.fork():
         return pid
     code = 70

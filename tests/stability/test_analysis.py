@@ -273,7 +273,7 @@ class Hypotenuse(pbdkit.FollowerRule):
 
 
 class Absolute(Hypotenuse):
-    """The same rule, which drops the imaginary part silently."""
+    """A rule with the same values that drops the imaginary part silently."""
 
     type: str = "absolute"
 

@@ -71,7 +71,7 @@ def test_what_is_reached_is_what_runs_show_on_every_lattice(lattice, neighbours,
     )  # fmt: skip
     lag = pbdkit.analyse(experiment(**parts)).trailing
     if (lattice, neighbours) == ("oblique", "coordination-1"):
-        assert lag is None  # neighbours lie along the columns: nobody feels the leaders
+        assert lag is None  # neighbours lie along the columns: no particle depends on the leaders
         return
     assert (lag.first, lag.last) == (1, 6)
     assert lag.speed == pytest.approx(math.hypot(0.2, 0.1))

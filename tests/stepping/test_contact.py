@@ -434,7 +434,7 @@ def test_masses_are_stopped_by_obstacles() -> None:
     assert x.max() < 5.1 + 1e-12
     first = int(at_wall.all(axis=1).argmax())
     assert first == 3
-    # What is left is what neighbours pull in a step, not a velocity of .05 thrown back.
+    # The remainder is the pull of neighbours in a step, not a reflected velocity of .05.
     assert np.abs(np.diff(x[first : first + 9], axis=0)).max() < 0.005
     assert (np.diff(y[:5], axis=0) > 0.0).all()
 

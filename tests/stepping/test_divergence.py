@@ -14,7 +14,7 @@ from pbdkit.stepping import divergence as guard
 from pbdkit.stepping.divergence import EVERY, Guard
 from pbdkit.stepping.state import initial_state
 
-# That these runs can diverge is said before the first step; here it is what happens then.
+# A warning before the first step reports that these runs can diverge; here they do.
 pytestmark = pytest.mark.filterwarnings("ignore:solver.relaxation. .* can diverge")
 
 BLOWN = {
@@ -158,7 +158,7 @@ def test_who_stops_the_run_while_the_last_good_state_is_looked_for_keeps_what_wa
     calls = iter(range(10**6))
     sink = MemorySink()
     scene = build_scene(pbdkit.Experiment(**given))
-    # Two calls of a hundred steps at most blow up; from the third on somebody wants to stop.
+    # Two calls of a hundred steps at most blow up; from the third on a stop is requested.
     report = record(Simulation.of_scene(scene, watch=Watch(lambda: next(calls) >= 2)), sink)
     assert report.outcome.status == "diverged"
     assert sink.dataset().time.values.tolist() == [0]

@@ -378,7 +378,7 @@ def test_nothing_beyond_the_reach_of_the_leaders_is_touched():
     engine, state = CompiledStepper(scene), initial_state(scene)
     state = engine.advance(state, 20)
     marked = np.nan
-    state.u[:, :, 50:, :] = marked  # whoever looks there spoils what it computes
+    state.u[:, :, 50:, :] = marked  # reading there spoils the result
     state.previous[:, :, 50:, :] = marked
     state = engine.advance(state, 15)
     assert np.isfinite(state.u[:, :, :40, :]).all()
