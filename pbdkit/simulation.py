@@ -385,7 +385,7 @@ DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
 FAILED = ("diverged", "unconverged", "separated")
 """Statuses of runs that reach neither their last step nor equilibrium."""
 LARGEST = 50_000
-"""Maximum number of particles of a body whose diagnostics are evaluated before the run."""
+"""Maximum number of particles of a body for diagnostics to be evaluated before the run."""
 
 
 class Simulation:
@@ -403,7 +403,7 @@ class Simulation:
     settings : mapping, or iterable of str
         Values that replace those of the experiment, as for `load`.
     start : Simulation, optional
-        Simulation whose current state and step this one starts from. The body must have the same
+        Simulation with the state and step from which this one starts. The body must have the same
         particles and bonds. By default the initial state of the experiment.
 
     Raises

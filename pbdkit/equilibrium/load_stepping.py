@@ -188,8 +188,8 @@ def increments(
     stops: Sequence[int] = (),
 ) -> Way:
     """Move a scene, in place, from its initial state, or from one at the moment `since`, to the
-    equilibrium of its last step, and yield the states on the way. `stops` are steps before the last
-    one whose equilibria are included.
+    equilibrium of its last step, and yield the states on the way. The equilibria of `stops`, which
+    are steps before the last one, are included.
 
     The body is in equilibrium before each change of roles or loads, so that leaders that start
     later and floating parts are where slow loading moves them. Floating parts under a load are

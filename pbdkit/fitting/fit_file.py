@@ -332,7 +332,7 @@ class Fit(Strict):
     are estimated, too; with 0 the measured displacements are prescribed. `loss` is the loss
     function of the residuals: all but `linear` reduce the weight of outliers.
 
-    Optional and expensive: `profile` lists parameters whose profile likelihood is computed by
+    Optional and expensive: `profile` lists parameters for a profile likelihood, computed by
     fitting all others again; `sampler` draws from the posterior; `candidates` are other models by
     name, which are compared with this one by cross-validation over a number of `folds`.
     """
@@ -405,8 +405,8 @@ class Peaks(Strict):
     this one. `of` is their quantity: the `force` or the `displacement` of the leader group `group`
     at the peak, or `factor`, the fraction of the experiment's load.
 
-    Instead of `column`, `curve` names the columns specimen, displacement and force of whole curves,
-    whose peaks are used. `broke` is 1 if a specimen broke and 0 if its test ended before, as a list
+    Instead of `column`, `curve` names the columns specimen, displacement and force of whole curves;
+    their peaks are used. `broke` is 1 if a specimen broke and 0 if its test ended before, as a list
     or the name of a column; by default all broke. Forces are those of a body of `youngs_modulus`
     and `thickness`. `group` is by default the one with the largest displacement.
     """

@@ -68,7 +68,7 @@ __all__ = ["Adjoint", "Resting", "along", "scene_like"]
 ACCURACY = 1e-12
 """Relative accuracy of solutions."""
 FORMER = 2
-"""Number of earlier equilibria whose solutions are reused as initial guesses."""
+"""Number of earlier equilibria that provide initial guesses for linear solutions."""
 
 
 @dataclass(frozen=True)

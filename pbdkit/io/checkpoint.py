@@ -4,7 +4,7 @@
 ``about``  constant data: the experiment with its name and number of steps, the versions of pbdkit
            and of plugins, and the `origin`, the arguments of the command
 ``facts``  ``run``: the state of the driver (of the solver `stepping` the displacements and all
-           else that `State` has, the divergence guard, and how far a run has settled; of
+           else that `State` has, the divergence guard, and how far a run has converged; of
            `equilibrium` the state and the load parameter); ``seen``: the last recorded steps;
            ``chosen``: parameters that were `auto`; ``step``, ``rate`` and ``at`` for
            `pbdkit status`

@@ -43,7 +43,7 @@ class Header(NamedTuple):
 
 
 SETTLED = Header(b"", 1)
-"""Header that marks the end of a settled file, which follows a commit."""
+"""Header that marks the end of a finished file, which follows a commit."""
 
 
 def write_header(file: io.FileIO, header: Header) -> None:

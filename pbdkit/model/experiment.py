@@ -121,7 +121,7 @@ def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
 
 
 def _event_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
-    """Check events after the last step, and components whose limit depends on the steps."""
+    """Check events after the last step, and components with limits that depend on the steps."""
     last = max(experiment.record.at or (0,))
     last_cut = max((cut.at for cut in experiment.cuts), default=0)
     jumps, settles = not experiment.solver.makes_steps, experiment.stepping.settle is not None
@@ -638,8 +638,8 @@ class Experiment(Strict):
     def as_written(self) -> Source:
         """Return the data from which the experiment can be created again.
 
-        With `units` these are the original data, whose lengths may have units, if they consist of
-        plain values; otherwise all parts in lattice units.
+        With `units` these are the original data, in which lengths may have units, if they consist
+        of plain values; otherwise all parts in lattice units.
         """
         if self.units and self._source.data is not None and self.is_as_validated:
             with suppress(TypeError, ValueError):

@@ -321,8 +321,8 @@ def _depth(parts: int) -> int:
 
 
 def _margin(scene: Scene) -> int:
-    """Return the number of outermost rows of a part that are empty, that do not move, or whose
-    particles have these or their frame points as neighbours."""
+    """Return the number of outermost rows of a part that are empty, that do not move, or that
+    have these or their frame points as neighbours."""
     return 3 * reach_of(scene, 0).reach + partition.farthest_apart(scene)
 
 

@@ -73,7 +73,7 @@ def _slip(key: str) -> str:
 
 
 def _require_type(schema: dict[str, Any]) -> None:
-    # `type` has a default in Python, but a file tells the components apart by it.
+    # `type` has a default in Python, but in a file it selects the component.
     schema["required"] = ["type", *(k for k in schema.get("required", ()) if k != "type")]
 
 

@@ -1,8 +1,8 @@
 """GPU engine (numba-cuda): kernels that make many steps in a launch, and the state on the device.
 
 A thread moves one particle after the other with the lines of row sweeps, on flat arrays. Every
-place has a group: 0 without a follower, then a number for each sublattice and kind of row whose
-particles have all their neighbours, then one for each sublattice where neighbours may be missing.
+place has a group: 0 without a follower, then a number for each sublattice and kind of row in which
+all neighbours exist, then one for each sublattice where neighbours may be missing.
 Threads are synchronised between the operations of a step, so that none reads what another writes.
 
 The state stays on the device and is fetched at the end of a call. Kernels do not contract products

@@ -326,7 +326,7 @@ def _refuse_contradiction(scene: Scene, leaders: Leaders, step: int) -> None:
 
 
 def is_cut_short(leading: Leading | Barrier, steps: int) -> bool:
-    """Return whether a group leads in the last step, while its motion goes on."""
+    """Return whether a group leads in the last step, before the end of its motion."""
     rests = leading.group.motion.rests_after()
     has_ended = rests is not None and leading.group.from_ - 1 + rests <= steps
     return leading.group.leads(steps) and not has_ended
