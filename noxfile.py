@@ -83,14 +83,20 @@ def gpu(session: nox.Session) -> None:
 @nox.session
 def docs(session: nox.Session) -> None:
     """The documentation site, in build/docs; a warning is an error. `nox -s docs -- unrun` leaves
-    out what notebooks and gallery show: the tests run the one, the other takes a quarter of an
-    hour."""
+    out what notebooks and gallery show, which takes most of the time."""
     install(session, "docs")
-    unrun = ["-D", "plot_gallery=0", "-D", "nb_execution_mode=off"]
+    unrun = ["-D", "gallery_run=0", "-D", "nb_execution_mode=off"]
     # All pages are written: the search index of Sphinx has the index entries of written pages only.
     options = ["-W", "--keep-going", "-a", *(unrun if "unrun" in session.posargs else [])]
     session.run("sphinx-build", *options, "-b", "html", "docs", "build/docs")
     session.run("python", "docs/search_walk.py", "build/docs")
+
+
+@nox.session
+def pages(session: nox.Session) -> None:
+    """Every page of build/docs in a browser, at the width of a phone."""
+    session.install(*nox.project.dependency_groups(PROJECT, "test"))
+    session.run("python", "tests/pages_of_site.py", "build/docs")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from types import ModuleType
 import pytest
 from click import Context
 from click.testing import CliRunner
+from PIL import Image, ImageChops, ImageStat
 
 import pbdkit
 from pbdkit.cli import program
@@ -130,6 +131,19 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
         words = shlex.split(line.removeprefix("$ pbdkit "))
         result = CliRunner().invoke(program, words + FEW * (words[0] == "animate"))
         assert result.exit_code == 0, (line, result.output, result.exception)
+    for movie in tmp_path.glob("*.gif"):
+        assert_same_movie(ROOT / "docs" / "pictures" / movie.name, movie)
+
+
+def assert_same_movie(shown, made):
+    """Compare the frames that were made with those of the movie on the page."""
+    with Image.open(shown) as first, Image.open(made) as second:
+        step = (first.n_frames - 1) // (second.n_frames - 1)
+        for n in range(second.n_frames):
+            first.seek(n * step)
+            second.seek(n)
+            difference = ImageChops.difference(first.convert("RGB"), second.convert("RGB"))
+            assert max(ImageStat.Stat(difference).mean) < 2.0, f"frame {n}"
 
 
 def assert_served_until_interrupted(line):
