@@ -25,7 +25,7 @@ from sphinx.application import Sphinx
 from sphinx.util.display import status_iterator
 
 import pbdkit
-from pbdkit.model.shipped import shipped_data, shipped_names, shipped_text
+from pbdkit.model.shipped import shipped_data, shipped_names, shipped_text, shipped_title
 
 FOLDER = Path(__file__).parent / "gallery"
 """Folder of the pages; it is rewritten by each build."""
@@ -68,7 +68,8 @@ html_theme.sidebar_secondary.remove: true
 # Gallery
 
 Every shipped experiment with its picture, its movie and its file. `pbdkit run NAME` runs one, and
-`pbdkit init --from NAME` copies its file.
+`pbdkit init --from NAME` copies its file. The movies of the paper's cases
+show early steps at shorter intervals.
 """
 PAGE = """# {title}
 
@@ -192,8 +193,8 @@ class Entry:
 
     @property
     def title(self) -> str:
-        """The first clause of the comment."""
-        return re.split(r"[.:](?:\s|$)", " ".join(self.text.split()), maxsplit=1)[0]
+        """The first sentence of the comment."""
+        return shipped_title(self.name).removesuffix(".")
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -206,7 +207,7 @@ class Entry:
 
     def page(self, *, drawn: bool) -> str:
         """Return the Markdown of the page."""
-        text, _, _ = self.text.partition("\n\n")
+        text = re.sub(r"\A.*?\.(?=\s)", "", self.text, count=1, flags=re.S).partition("\n\n")[0]
         text = re.sub(r"docs/(\S+\.md)", r"[](../\1)", text)
         files = [f"{self.stem}.yaml", *(file.name for file in shipped_data(self.name))]
         picture = f"![{self.title}]({self.stem}.png)\n" if drawn else ""
@@ -221,7 +222,9 @@ class Entry:
             first=self.source.count("\n", 0, self.source.index("version:")) + 1,
             downloads=", ".join(f"{{download}}`{file}`" for file in files),
             options="".join(f" {shlex.quote(word)}" for word in self.options),
-            arguments=", ".join(f"{key}={value!r}" for key, value in self.arguments.items()),
+            arguments=", ".join(
+                f"{key}={value!r}".replace("'", '"') for key, value in self.arguments.items()
+            ),
         )
 
     @property
