@@ -56,7 +56,7 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
     "navigation_with_keys": False,
-    "secondary_sidebar_items": {"**": ["page-toc", "edit-this-page"], "gallery/**": []},
+    "secondary_sidebar_items": ["page-toc", "edit-this-page"],
 }
 html_context = {"default_mode": "auto"}
 html_show_sourcelink = False

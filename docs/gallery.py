@@ -35,11 +35,11 @@ FIGSIZE = (5.0, 3.4)
 """Size of pictures and movies in inches."""
 DPI = 150
 """Resolution of pictures."""
-MOVIE_DPI = 110
+MOVIE_DPI = 100
 """Resolution of movies."""
-FRAMES = 40
+FRAMES = 30
 """Maximum number of frames of a movie."""
-FPS = 15
+FPS = 12
 """Frame rate of movies in 1/s."""
 MARGIN = 12
 """Margin of thumbnails in pixels."""
@@ -71,7 +71,10 @@ Every shipped experiment with its picture, its movie and its file. `pbdkit run N
 `pbdkit init --from NAME` copies its file. The movies of the paper's cases
 show early steps at shorter intervals.
 """
-PAGE = """# {title}
+PAGE = """---
+html_theme.sidebar_secondary.remove: true
+---
+# {title}
 
 {text}
 

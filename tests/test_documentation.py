@@ -122,7 +122,7 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_experiments(page)
     install(page)
-    for line in code.splitlines():
+    for line in code.replace("\\\n", "").splitlines():
         if not line.startswith("$ pbdkit "):
             continue
         if line.startswith("$ pbdkit live "):
