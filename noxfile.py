@@ -2,7 +2,7 @@
 # /// script
 # dependencies = ["nox>=2025.2.9"]
 # ///
-"""What must hold of a change, one session a concern: `nox -s lint`, or all of them by `nox`.
+"""Checks of a change, one session for each subject: `nox -s lint`, or all of them by `nox`.
 
 Each has an environment of its own; in one that has the group `dev`: `nox --no-venv --no-install`.
 """
@@ -34,7 +34,7 @@ def tests(session: nox.Session) -> None:
 
 @nox.session
 def lint(session: nox.Session) -> None:
-    """Style and types."""
+    """Check style and types."""
     install(session, "lint")
     session.run("ruff", "check", ".")
     session.run("ruff", "format", "--check", ".")
@@ -45,7 +45,7 @@ def lint(session: nox.Session) -> None:
 
 @nox.session
 def schemas(session: nox.Session) -> None:
-    """The JSON Schemas are those of the program; `nox -s schemas -- write` makes them anew."""
+    """The JSON Schemas are those of the program; `nox -s schemas -- write` writes them again."""
     install(session, "test")
     for what in ("experiment", "dataset", "sweep", "fit"):
         made = session.run("pbdkit", "schema", what, "--builtin", silent=True)

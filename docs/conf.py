@@ -1,4 +1,4 @@
-"""How the documentation site is built: `nox -s docs`, or `sphinx-build -W docs build/docs`."""
+"""Configuration of the documentation site: `nox -s docs`, or `sphinx-build -W docs build/docs`."""
 
 from __future__ import annotations
 

@@ -34,9 +34,9 @@ MOVIES = Path(__file__).parent.parent / "build" / "movies"
 FIGSIZE = (5.0, 3.4)
 """Size of pictures and movies in inches."""
 DPI = 150
-"""Resolution of pictures."""
+"""Resolution of pictures in dots per inch."""
 MOVIE_DPI = 100
-"""Resolution of movies."""
+"""Resolution of movies in dots per inch."""
 FRAMES = 30
 """Maximum number of frames of a movie."""
 FPS = 12
@@ -232,7 +232,7 @@ class Entry:
 
     @property
     def has_movie(self) -> bool:
-        """Whether the experiment makes steps, rather than one equilibrium."""
+        """True if the experiment makes steps, rather than one equilibrium."""
         return "solver: {type: equilibrium" not in self.source
 
     def draw(self) -> None:
