@@ -34,13 +34,14 @@ def tests(session: nox.Session) -> None:
 
 @nox.session
 def lint(session: nox.Session) -> None:
-    """Check style and types."""
+    """Check style, types and prose."""
     install(session, "lint")
     session.run("ruff", "check", ".")
     session.run("ruff", "format", "--check", ".")
     session.run("mypy", "pbdkit")
     theirs = (path for path in Path("plugins").glob("*/pbdkit_*") if path.suffix in ("", ".py"))
     session.run("mypy", *sorted(map(str, theirs)))
+    session.run("python", "tests/prose.py")
 
 
 @nox.session

@@ -401,7 +401,7 @@ COLUMNS = {n: (n, "", "") for n in ("size", "particles", "method", "precision", 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of lines, after Okabe and Ito."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
-"""Markers of methods."""
+"""Markers of the methods in the picture."""
 FLOOR = 1e-18
 """Position on the axis of errors at which errors of exactly zero are drawn."""
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 PATH = click.Path(path_type=Path)
-"""Type of paths."""
+"""Click type of paths."""
 C = TypeVar("C", bound=click.Command)
 F = TypeVar("F", bound=Callable[..., Any])
 

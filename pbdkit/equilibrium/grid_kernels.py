@@ -448,7 +448,7 @@ def relax(grid, b, x, row, weight, start, upwards):
     is a buffer for one row."""
     rows = grid.first.size - 1
     for i in range(1 if upwards else 0, rows + 1, 2):
-        # Row i, and row i - 1, whose adjacent rows are now both relaxed.
+        # Row i, and row i - 1, between two rows that are now relaxed.
         if i < rows:
             if start:
                 clear(x, i)

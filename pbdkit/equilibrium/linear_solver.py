@@ -61,7 +61,7 @@ class Coordinates:
     """Coordinates of the unknowns, `axes` for each particle, stored next to each other.
 
     These are the positions of particles and of leaders, (particle, axis of space), and a mask of
-    the `held` unknowns, whose rows and columns have a diagonal entry alone (None if there are
+    the `held` unknowns; their rows and columns have a diagonal entry alone (None if there are
     none).
     """
 

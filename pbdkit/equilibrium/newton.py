@@ -1,7 +1,7 @@
 """Search for the equilibrium of given roles, bonds and obstacles.
 
 Linear rules need one linearisation, at rest. For other rules Newton's iteration starts from the
-previous equilibrium, pseudo-transient continuation is used for bodies whose bonds have just broken,
+previous equilibrium, pseudo-transient continuation is used for bodies after bonds have broken,
 and an active set of constrained particles for bodies in contact with obstacles.
 """
 

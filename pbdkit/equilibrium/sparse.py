@@ -2,7 +2,7 @@
 
 If x and y are not coupled there are two diagonal blocks, often equal; if only one is coupled to the
 other (mixed coordinates), it is solved first. Within a block, all particles that leaders hold are
-solved together. Each floating part, whose matrix is singular, is solved separately.
+solved together. Each floating part has a singular matrix and is solved separately.
 """
 
 from __future__ import annotations
@@ -601,8 +601,8 @@ class MatrixSystem(System):
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
     def _coordinates(self, axes: list[int], members: Indices) -> Coordinates:
-        """Return the coordinates of these unknowns. Particles whose only axis is prescribed count
-        as leaders."""
+        """Return the coordinates of these unknowns. Particles with one axis, which is prescribed,
+        count as leaders."""
         where, is_guided = members[:: len(axes)] // len(axes), self._guided[:, axes]
         positions = self._X[is_guided[:, 0]] if len(axes) == 1 else self._X[:0]
         guided = is_guided[where].ravel() if len(axes) > 1 and is_guided.any() else None

@@ -198,7 +198,7 @@ def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> S
     """Assemble the matrix at a state with the roles of a step.
 
     Returns None if there is no such matrix: in space, on lattices with several sites in a primitive
-    cell, for longer bonds, for nested rules, and for frames whose points follow distant particles.
+    cell, for longer bonds, for nested rules, and for frame points that follow distant particles.
     """
     grid = PrimitiveRaster.of(scene)
     if grid is None or scene.inner or scene.experiment.neighbours.nearness():
@@ -436,8 +436,8 @@ def without_held(code: NDArray[np.int32], stencils: Floats, held: Held) -> Float
 
 
 def coarser_held(kind: NDArray[np.int8], held: Held, halved: tuple[int, int], below: Any) -> Held:
-    """Return the constrained components of the next grid, of kinds `below`: those whose places
-    coincide with constrained places."""
+    """Return the constrained components of the next grid, of kinds `below`: those with places
+    that coincide with constrained places."""
     coarse = np.zeros((2, *below.shape), bool)
     for axis, component in enumerate(held):
         kinds, out = np.where(component, LED, kind).astype(np.int8), np.zeros_like(below)

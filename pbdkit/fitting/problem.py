@@ -5,7 +5,7 @@ The initial guess minimises the equilibrium gap. With the true parameters θ, me
 u at the particles are in equilibrium: the moves m(u, θ) are zero wherever all neighbours are
 measured. Since m is nearly linear in θ, a few linear problems give θ without computing an
 equilibrium (Claire, Hild and Roux 2004). The guess is biased by noise, but independent of the
-bounds, whose middle may be far from the solution.
+bounds, and their middle may be far from the solution.
 """
 
 from __future__ import annotations

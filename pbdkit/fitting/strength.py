@@ -1,6 +1,6 @@
 """Strength of bonds and its scatter from repeated tests: likelihood, simulated specimens, result.
 
-The load of the first break is computed for bodies whose displacements are proportional to the load.
+The load of the first break is computed for bodies with displacements proportional to the load.
 With the difference d along a bond under the full load of the experiment, the strain of the bond at
 the load factor λ is ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1, p = r·d/|r|², q =
 |d|²/|r|². The strain is a convex function of λ and 0 at λ = 0, so that the strain of a stretched

@@ -33,7 +33,7 @@ MOBILITIES = np.eye(3)[:, [[0, 2], [2, 1]]]
 DIFFUSION = "diffusion"
 """Kind of rules that diffuse each component of the displacement separately."""
 ELASTICITY = "elasticity"
-"""Kind of rules whose equilibria are those of an elastic body."""
+"""Kind of rules with the equilibria of an elastic body."""
 NEITHER = "neither"
 """Kind of rules that are neither diffusion nor elasticity."""
 SAME = 1e-8

@@ -92,7 +92,7 @@ class Identity:
 
     @property
     def isotropic(self) -> bool:
-        """Whether the diffusivities of long waves are equal in every direction."""
+        """True if the diffusivities of long waves are equal in every direction."""
         return self.long is not None and all(
             r.largest - r.smallest <= SAME * abs(self.long.fast.largest)
             for r in (self.long.fast, self.long.slow)

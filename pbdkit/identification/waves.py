@@ -25,7 +25,7 @@ the rest,
     l² = λ² + h²/12
 
 is the contribution of rows beyond the next, and a property of the material. It is exactly c D for a
-rule (1 - P) u + c (1 - P)² u whose P couples adjacent rows. If rows beyond the next attract it is
+rule (1 - P) u + c (1 - P)² u if P couples adjacent rows. If rows beyond the next attract it is
 negative, the wrong sign for gradient elasticity.
 """
 

@@ -129,8 +129,8 @@ class WeighedCells:
         The area fraction times the ratio of the stiffness of the cell to that of the rule, 0 for
         the cells in `mixed`.
     mixed
-        Area fractions of the cells whose stiffness is not proportional to that of the rule, one
-        array for each stiffness.
+        Area fractions of the cells with a stiffness that is not proportional to that of the rule,
+        one array for each stiffness.
     weights
         Weights of the rule by slot, for each stiffness of `mixed`.
     phase

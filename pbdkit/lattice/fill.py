@@ -1,7 +1,7 @@
 """Fill the outline of a body with sites, frame points, whole cells and cut cells.
 
 A cut cell is weighted by the fraction of its area inside the outline. Cells that would connect the
-two sides of a narrow void are omitted: these are cells whose inside is disconnected and, at a
+two sides of a narrow void are omitted: these are cells with a disconnected inside and, at a
 particle in the void, the cells of all sides but one.
 """
 

@@ -324,7 +324,7 @@ class Raster:
         return (lines >= low) & (lines < high)
 
     def sees_frame(self, lines: Indices) -> Mask:
-        """Return the lines of sites whose frame points this process resolves."""
+        """Return the lines of sites with frame points that this process resolves."""
         low, high = self.row_range.framed if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
@@ -536,7 +536,7 @@ class Restriction:
         return self.is_between(place, self.present)
 
     def is_moving(self, place: Indices) -> Mask:
-        """Return a mask of the flat places of the whole whose neighbours are all in the part."""
+        """Return a mask of the flat places of the whole that have all neighbours in the part."""
         return self.is_between(place, self.moving)
 
     def places(self, place: Indices) -> Indices:

@@ -173,7 +173,7 @@ class Stepping(Solver):
 
     @property
     def stepping(self) -> Stepping:
-        """The settings themselves."""
+        """The settings of this solver themselves."""
         return self
 
     @property
@@ -252,7 +252,7 @@ class Equilibrium(Solver):
 
     @property
     def equilibrium(self) -> Equilibrium:
-        """The settings themselves."""
+        """The settings of this solver themselves."""
         return self
 
 

@@ -295,7 +295,8 @@ def curve(
     kind : {"stress-strain", "load-displacement", "energies"}, optional
         Kind of curve, without `x` and `y`; by default the first of these that the dataset contains.
     group, load, obstacle : int, optional
-        Leader group, load or obstacle whose force is drawn; by default the one that moves farthest.
+        Leader group, load or obstacle with the force to draw; by default the one that moves
+        farthest.
     ax : Axes, optional
         Axes to draw into. By default a new figure is created.
 

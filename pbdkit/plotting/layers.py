@@ -131,7 +131,7 @@ def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
 INK = "#404040"
 """Colour of dots without values."""
 LINE = "#B0B0B0"
-"""Colour of bonds."""
+"""Colour of intact bonds."""
 TORN = "#CC3311"
 """Colour of broken bonds."""
 REST = "#888888"

@@ -156,7 +156,7 @@ LEADS = "#D55E00"
 HELD = "#7A3300"
 """Colour of leaders that are held in place."""
 ACTS = "#007A5A"
-"""Colour of loads."""
+"""Colour of the arrows of loads."""
 CUT = "#C2185B"
 """Colour of cracks and cuts."""
 STANDS = "#9A9A9A"
@@ -164,7 +164,7 @@ STANDS = "#9A9A9A"
 DRIVEN = "#404040"
 """Colour of the arrows of moving obstacles."""
 TINTS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
-"""Colours of regions."""
+"""Colours of the regions of a body."""
 DOTS = 3000
 """Maximum number of particles for which all are drawn."""
 TINTED = 1500
@@ -195,7 +195,7 @@ class Canvas(Protocol):
         """Draw dots of one size."""
 
     def line(self, places: Floats, colour: str, width: float, dashes: str = ...) -> None:
-        """Draw a polyline."""
+        """Draw a polyline through places."""
 
     def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
         """Fill the area between closed outlines: an inner one is a hole."""

@@ -87,9 +87,9 @@ def _even(text: str, width: int) -> str:
 LARGEST_IN = 100.0
 """Maximum width and height of a figure in inches."""
 SMALLEST_DPI = 10
-"""Minimum resolution."""
+"""Minimum resolution, in dots per inch."""
 LARGEST_DPI = 2400
-"""Maximum resolution."""
+"""Maximum resolution, in dots per inch."""
 
 
 @dataclass(frozen=True)

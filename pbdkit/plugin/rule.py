@@ -539,7 +539,7 @@ class AppliesTwice(ABC):
         Returns
         -------
         FollowerRule
-            Rule whose moves `gather` and `apply` receive.
+            Rule that computes the moves which `gather` and `apply` receive.
         """
 
 

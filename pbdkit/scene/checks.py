@@ -158,7 +158,7 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
 def carried_by_leaders(
     raster: Raster, leading: Sequence[Leading], loads: Loads | None, steps: int
 ) -> Iterator[str]:
-    """Generate a warning for each load whose particles all lead along its direction while it
+    """Generate a warning for each load on particles that all lead along its direction while it
     acts."""
     for n, loading in enumerate(loads.each if loads else ()):
         load = loading.load

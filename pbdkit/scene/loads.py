@@ -96,7 +96,7 @@ class Loads:
 
     @property
     def courses(self) -> list[Course[float]]:
-        """Time-dependent forces."""
+        """Time-dependent forces of all loads."""
         return [course for loading in self.each for course in loading.load.courses]
 
     def next_change(self, step: int) -> float:

@@ -67,7 +67,7 @@ def sum_in_order(terms: list[Any]) -> Any:
 
 
 class CellStresses:
-    """Cells beside the bonds of a scene whose fracture model softens cells.
+    """Cells beside the bonds of a scene with a fracture model that softens cells.
 
     `ratios` are the components of the stiffness over Young's modulus, constant or of each cell.
     """

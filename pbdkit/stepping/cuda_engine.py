@@ -104,7 +104,7 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
     if level.scene.experiment.rule.uses_reference:
         out.add(1, *_cells(plan))
     out.depth = 1
-    if plan.tears:  # Marked particles count as particles whose neighbours may be missing.
+    if plan.tears:  # Neighbours of marked particles may be missing.
         for n, (s, _) in enumerate(whole, 1):
             out.add(0, f"if group == {n} and flat_torn[j]:", f"    group = {len(whole) + 1 + s}")
     for n, (s, kind) in enumerate(whole, 1):
@@ -219,7 +219,7 @@ class ThreadWriter(PlanWriter):
     operations on different places."""
 
     _list = ""
-    """List of particles whose loop was written last, since the last synchronisation."""
+    """List of particles in the last loop written since the last synchronisation."""
 
     def __init__(self, plan: Plan, out: Function, passes: Passes, wait: str) -> None:
         super().__init__(plan, out, passes)

@@ -33,7 +33,7 @@ from pbdkit.stepping.state import State, shown
 from pbdkit.stepping.step import Call, Cells, Hindrance, Mode, Operation, Reach, Step
 
 REAL = "fiub"
-"""Kinds of numpy data types whose values are real numbers."""
+"""Kinds of numpy data types for real numbers."""
 
 
 class Followers(ABC):

@@ -396,8 +396,8 @@ class PlaceLeaders(LeaderOperation):
         ]
 
     def end_pass(self, kernel: KernelWriter) -> None:
-        """Write lines that place the leaders of the last step but one, whose displacements are read
-        after the pass."""
+        """Write lines that place the leaders of the last step but one, because their displacements
+        are read after the pass."""
         for end, axes in self.endings.items():
             lines = kernel.each(f"flat_v_@[leaders{end}[e]] = target{end}[#, e]", axes)
             kernel.listed(f"leaders{end}", *lines)

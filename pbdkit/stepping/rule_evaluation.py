@@ -54,7 +54,7 @@ class Neighbour:
     `r` is the rest offset, `w` are the weights of the rule, `present` is true where the neighbour
     exists (None: everywhere), `broken` where the bond is broken (None: nowhere). With fracture, `c`
     are the constants and state variables of the bond. `more` are the weights of cells with a
-    different stiffness, whose contributions are added. `shared` are the state variables of the
+    different stiffness; their contributions are added. `shared` are the state variables of the
     particle and of the neighbour, for rules that read both. `torn` is the damage beside the bond,
     for rules that tear cells; these receive the difference unchanged.
     """

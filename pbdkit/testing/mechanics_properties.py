@@ -40,7 +40,7 @@ from pbdkit.testing.states import advanced, displacements
 from pbdkit.testing.subject import NotApplicableError, PropertyError, Subject, place_of, property_of
 
 STEPS = 3
-"""Number of steps."""
+"""Number of steps in a case."""
 ROUNDING = 1e-11
 """Tolerance relative to the largest displacement."""
 LARGER = 2.0**20

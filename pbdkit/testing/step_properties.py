@@ -93,7 +93,7 @@ STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
 STEP_ROUNDING = 1e-12
 """Tolerance relative to the largest displacement, for some hundred roundings of 1e-16."""
 STEPS = 4
-"""Number of steps."""
+"""Number of steps in a case."""
 
 
 @property_of(*STEPPED)

@@ -245,7 +245,7 @@ def _on_sublattice(dataset: xarray.Dataset, stride: int) -> NDArray[np.bool_]:
 LISTED = 300
 """Maximum number of broken bonds in the table of a page."""
 STATES = ("intact", "broken", "cut", "broken from the start", "cannot break")
-"""States of bonds."""
+"""Names of the states of bonds."""
 
 
 @dataclass(frozen=True)
@@ -1248,7 +1248,7 @@ def report(
     path : str or path
         Page to write. An incomplete page never appears.
     bench : str or path, optional
-        File written by ``pbdkit bench --json``, whose figures the page shows.
+        File written by ``pbdkit bench --json``; the page shows its figures.
     replace : bool
         Replace an existing page.
 

@@ -82,7 +82,7 @@ WHOLE = {"type": "strain", "failure": 1e60}
 
 
 def even(bonds):
-    """The same number of bonds has the same strain, along the load."""
+    """Return bonds that all have the same strain, along the load."""
     return BondStrains(np.array([0.01]), np.array([1e-4]), np.array([float(bonds)]))
 
 

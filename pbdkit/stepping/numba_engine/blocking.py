@@ -83,7 +83,7 @@ class TileWriter(PlanWriter):
         self.out.add(1, self.rows(name, write).call("r0", "r1", "moment + s"))
 
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Write a loop over the frame points whose last particle is in the range. Points with
+        """Write a loop over the frame points with their last particle in the range. Points with
         particles on both sides of the end of a piece are computed with the gap."""
         lines = self.each(f"{planes}_@[points[f]] = t_@")
         if lag:  # The point has the displacement that was computed for it in the step before.

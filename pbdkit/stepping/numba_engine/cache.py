@@ -211,7 +211,7 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
 
 def cache_folder() -> Path | None:
     """Return PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; None if it is not writable,
-    or if other users can write to it, whose code could be executed."""
+    or if other users can write to it, because their code could be executed."""
     folder = _asked_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
 """Source of the kernel of a scene: sweeps that move particles, and the loop over steps, to which
 each operation adds its lines.
 
-Rows whose particles have all their neighbours have rest offsets and steps to neighbours as
+Rows in which all neighbours exist have rest offsets and steps to neighbours as
 literals; other rows use more general code. Values that differ between runs (parameters, thresholds,
 places) are arguments.
 """

@@ -244,14 +244,14 @@ def _growth(program: Program) -> Box:
 
 
 BAND = 16384
-"""Number of places whose bonds are updated before the sweep over them, so that their data stay in
-the cache. It is larger on several threads, because of the time to start them."""
+"""Number of places at which bonds are updated before the sweep over them, so that their data stay
+in the cache. It is larger on several threads, because of the time to start them."""
 
 
 class CompiledStepper(Engine):
     """Engine that steps a scene with its own kernel.
 
-    Broken bonds are stored in bit masks of the particles, which are computed anew for states of
+    Broken bonds are stored in bit masks of the particles, which are computed again for states of
     another origin; all other arrays are those of the numpy engine. If neighbours are re-evaluated,
     the kernel sweeps over their list.
     """

@@ -10,8 +10,8 @@ Few particles are next to damaged cells. They are marked in a plane: the sweep m
 if no bond could break, and then computes the marked ones in short chunks. Marks are never removed
 and may be set too early, because without damage both computations give the same numbers.
 
-Bonds whose state variables change are updated and broken in a pass before the sweep. Other bonds
-are broken by the sweep, which records the broken ones.
+Bonds with state variables that change are updated and broken in a pass before the sweep. Other
+bonds are broken by the sweep, which records the broken ones.
 """
 
 from __future__ import annotations

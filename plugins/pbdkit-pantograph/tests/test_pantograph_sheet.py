@@ -1,4 +1,4 @@
-"""What a pantographic sheet does: proposals of its fibres, energy, mechanisms, bias extension."""
+"""Test pantographic sheets: proposals of fibres, energy, mechanisms, bias extension."""
 
 import json
 import runpy
