@@ -35,6 +35,6 @@ class IndexedSections(SphinxTransform):
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the transform."""
+    """Register the transform of sections."""
     app.add_transform(IndexedSections)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

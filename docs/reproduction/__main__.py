@@ -1,6 +1,6 @@
 """Make two pages of validation: reproduction and anisotropy-and-plasticity, and their pictures.
 
-From the root of the repository: ``python docs/reproduction``. Every number is measured anew.
+From the root of the repository: ``python docs/reproduction``. Every number is measured in the run.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ from trust import lessons
 DOCS = Path(__file__).parent.parent
 PREFACE = """# Reproduction of the paper
 
-This page compares the program with the paper whose model it implements: R. dell'Erba (2018,
+This page compares the program with the paper that defines its model: R. dell'Erba (2018,
 [doi](https://doi.org/10.1007/s00161-018-0663-5)). Each claim of the paper that can be tested is
 quoted in a few words and has one of three verdicts: **reproduced** by the shipped case,
 **reproduced only with** a named variant, option or range, or **not reproduced**. Below the
@@ -54,7 +54,7 @@ def sections() -> list[Section]:
 
 
 def main() -> None:
-    """Write both pages."""
+    """Write both pages and their pictures."""
     cases = sections()
     parts = [PREFACE, counted(cases) + "\n", *map(render, cases)]
     parts.append("## Conclusions\n\n" + lessons())

@@ -6,7 +6,7 @@ from runs import Floats, Sheet, run_text
 
 SIZE, STEPS = 61, 60
 PULLS, SPEED = (3.0, 5.2, 7.0), 1.2
-"""Thresholds of the torn sheet, which decide how far it is pulled, and its pull a step."""
+"""Thresholds of the torn sheet, which determine its extension, and its displacement per step."""
 POINT = """version: 1
 name: point-{name}
 lattice: {lattice}
@@ -82,7 +82,7 @@ def spreading(sheet: Sheet) -> Floats:
 
 
 def elastic_signs() -> dict[str, float]:
-    """What an elastic body would show and a diffusing one does not, with weighted neighbours.
+    """Return two quantities that are 0 for diffusion, but not for an elastic body.
 
     cross: the largest u_y where a point was pushed along x. turned: how much u_x after that differs
     from u_y after a push along y, which would feel another stiffness.

@@ -13,7 +13,7 @@ MIRROR = "frame={type: mirror}"
 
 
 def section() -> Section:
-    """All of case a."""
+    """Return the section of case a."""
     a = run("paper/a")
     pictures = [
         (

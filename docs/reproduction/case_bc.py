@@ -8,16 +8,16 @@ from runs import Floats, Sheet, run
 COLUMN, ROW = 4, 5
 TIMES = [1, 10, 20, 100]
 SEEN = 0.05
-"""The least share by which two figures differ to the eye."""
+"""Smallest relative difference that is visible in a figure."""
 
 
 def narrowing(sheet: Sheet) -> Floats:
-    """How much nearer the outer rows are than at rest, (time, column)."""
+    """Return the contraction between the outer rows, (time, column)."""
     return sheet.u[:, :, 0, 1] - sheet.u[:, :, -1, 1]
 
 
 def edge_excess(column: Floats) -> float:
-    """By which share PE1 of a column is larger in its outer rows than in its middle ones."""
+    """Return the relative excess of PE1 of a column in its outer rows over its middle rows."""
     return float(column[[0, -1]].mean() / column[4:6].mean() - 1)
 
 
@@ -28,7 +28,7 @@ def half_time(sheet: Sheet) -> int:
 
 
 def section_b() -> Section:
-    """All of case b."""
+    """Return the section of case b."""
     b = run("paper/b")
     pictures = [
         (
@@ -104,7 +104,7 @@ def _claims_b() -> list[Claim]:
 
 
 def section_c() -> Section:
-    """All of case c."""
+    """Return the section of case c."""
     names = {"1 shell (paper/b)": "paper/b", "2 shells (paper/c)": "paper/c"}
     names["24 neighbours (paper/c-chebyshev)"] = "paper/c-chebyshev"
     pictures = [

@@ -19,7 +19,7 @@ from torn_square import (
 
 
 def section() -> Section:
-    """All of case d."""
+    """Return the section of case d."""
     names = ("paper/d1", "paper/d2", "paper/d2-frame-bonds", "paper/d2-chebyshev")
     pictures = [
         (
@@ -130,7 +130,7 @@ def _times(case: str, threshold: float) -> str:
 
 
 def _lead(sheet: Sheet) -> int:
-    """Steps by which the edge rows part before the last ones."""
+    """Return the number of steps by which the edge rows separate before the last row."""
     rows = _steps(sheet)
     return max(rows) - max(rows[0], rows[-1])
 

@@ -7,14 +7,14 @@ from runs import Sheet, run
 
 
 def rim_share(sheet: Sheet, index: int) -> float:
-    """The largest motion in the rim as a share of that of the leaders, at a recorded time."""
+    """Return the largest displacement of the rim over that of the leaders at a recorded time."""
     size = np.linalg.norm(sheet.u[index], axis=-1)
     rim = np.concatenate([size[0], size[-1], size[:, 0], size[:, -1]])
     return float(rim.max() / size.max())
 
 
 def section() -> Section:
-    """All of case e."""
+    """Return the section of case e."""
     e = run("paper/e")
     pictures = [
         (
@@ -44,7 +44,7 @@ def section() -> Section:
 
 
 def _folded(sheet: Sheet, step: int) -> int:
-    """Cells of four particles whose area has changed its sign."""
+    """Return the number of cells of four particles with a negative area."""
     place = sheet.on_grid(sheet.position)[step]
     one, other = place[1:, 1:] - place[:-1, :-1], place[:-1, 1:] - place[1:, :-1]
     return int((one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0] < 0).sum())

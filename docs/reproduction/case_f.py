@@ -18,20 +18,20 @@ def x_of(sheet: Sheet) -> Floats:
 
 
 def torn(name: str) -> dict[float, Sheet]:
-    """The case at every threshold at which all rows part."""
+    """Return the case at every threshold at which all rows separate."""
     shells = 1 if name == "paper/f1" else 2
     sheets = {float(t): run(name, f"fracture.thresholds={[float(t)] * shells}") for t in THRESHOLDS}
     return {t: sheet for t, sheet in sheets.items() if None not in parted(sheet)}
 
 
 def dent(sheet: Sheet) -> float:
-    """How far the outer rows of the torn surface stand out beyond its middle, at the end."""
+    """Return the depth of the torn surface: outer rows minus middle rows, at the end."""
     surface = sheet.u[-1, -2, :, 0]
     return float(min(surface[:2].mean(), surface[-2:].mean()) - surface[4:6].mean())
 
 
 def section() -> Section:
-    """All of case f."""
+    """Return the section of case f."""
     names = ("paper/f1", "paper/f2", "paper/f2-early", "paper/f2-cusp")
     pictures = [
         (
@@ -197,7 +197,7 @@ def _two_shells() -> list[Claim]:
 
 
 def _search() -> tuple[int, list[float]]:
-    """How many thresholds were tried, and those at which a bond of the piece breaks late."""
+    """Return the number of tried thresholds, and those at which a bond of the piece breaks late."""
     tried, late = np.arange(4.9, 5.301, 0.01).round(2), []
     for threshold in tried:
         limits = f"fracture.thresholds=[{threshold}, {threshold}]"

@@ -8,7 +8,7 @@ from runs import in_the_gap, run
 
 
 def section() -> Section:
-    """All of case g."""
+    """Return the section of case g."""
     g = run("paper/g")
     names = {"mean (paper/f2)": "paper/f2", "first (paper/g)": "paper/g"}
     series = {k: (run(v), COLUMN, ROW) for k, v in names.items()}

@@ -23,7 +23,7 @@ class Claim:
 
     @property
     def kind(self) -> str:
-        """One of `VERDICTS`."""
+        """The verdict without the variant, one of `VERDICTS`."""
         if self.holds:
             return OUT
         return ONLY if self.with_variant else NOT
@@ -46,7 +46,7 @@ class Section:
 
 
 def render(section: Section) -> str:
-    """Markdown."""
+    """Return the Markdown of a section."""
     parts = [f"## {section.title}\n", section.words.strip() + "\n"]
     for file, caption in section.pictures:
         parts.append(f"![{caption}](../pictures/reproduction/{file})\n\n*{caption}*\n")

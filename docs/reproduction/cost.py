@@ -11,7 +11,7 @@ MEASURED = Path(__file__).parents[1] / "validation" / "performance.json"
 
 
 def cost() -> list[Claim]:
-    """What a step costs, and how many are needed."""
+    """Return the claims on the cost of a step and the number of steps."""
     sizes = (10, 20, 40)
     steps = [_settling(n) for n in sizes]
     growth = steps[2] / steps[1]

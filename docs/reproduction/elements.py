@@ -1,4 +1,4 @@
-"""What the paper says of finite elements and of Cauchy's model."""
+"""Claims on finite elements and on Cauchy's model."""
 
 import re
 import sys
@@ -57,7 +57,7 @@ def timed() -> dict[str, dict[str, float]]:
 
 
 def elements() -> list[Claim]:
-    """The claims, one after the other."""
+    """Return the claims in their order on the page."""
     errors = {p.name: [of_the_paper(p, n) for n in (10, 20)] for p in (BAR, CANTILEVER, HOLE)}
     off = ", ".join(f"{a:.1%} and {b:.1%} ({name})" for name, (a, b) in errors.items())
     ours = {p.name: solved(p, 20).at_sites for p in (BAR, CANTILEVER, HOLE)}

@@ -1,4 +1,4 @@
-"""A parabola against an exponential, over the same steps and with as many free parameters."""
+"""Fits of a parabola and of an exponential with three free parameters each."""
 
 import numpy as np
 from runs import Floats
@@ -32,12 +32,12 @@ def both(y: Floats, first: int, last: int) -> tuple[float, float]:
 
 
 def parabolic(pair: tuple[float, float]) -> bool:
-    """Whether the parabola fits well, and no worse than the exponential."""
+    """Return whether the parabola fits well, and not worse than the exponential."""
     return pair[0] > 0.99 and pair[0] >= pair[1]
 
 
 def both_text(y: Floats, top: int, middle: int = 150, last: int = 400) -> str:
-    """Both R² over the whole fall and its two parts, in words."""
+    """Return a text with both R² over the whole decrease and its two parts."""
     parts = ((top, last), (top, middle), (middle, last))
     return "R² of a parabola and of an exponential with three free parameters each is " + "; ".join(
         f"{p:.5f} and {e:.5f} over steps {low} to {high}"

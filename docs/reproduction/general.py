@@ -1,4 +1,4 @@
-"""What the paper says of the model as a whole: introduction, sections 3 and 5, conclusions."""
+"""Claims on the model as a whole: introduction, sections 3 and 5, conclusions."""
 
 import numpy as np
 from announced import PULLS, SPEED, elastic_signs, point_text, spreading, strain, torn_text
@@ -15,7 +15,7 @@ NOISE = "initial={type: noise, amplitude: 1.0e-6}"
 
 
 def section() -> Section:
-    """All claims of no case in particular."""
+    """Return the section of claims that belong to no case."""
     ks = np.linspace(0.05, 2.0, 14)
     bent = {
         label: (ks, softening(ks, *metric))

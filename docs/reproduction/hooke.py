@@ -1,4 +1,4 @@
-"""Whether neighbours that are weighted by their distance make Hooke's law, and PE1 its energy."""
+"""Claims on Hooke's law by weights of the distance, and on PE1 as its energy."""
 
 import numpy as np
 from claims import Claim
@@ -14,8 +14,10 @@ ENERGIES = (0.5 / (1 - 1 / 9), 0.25 / (1 + 1 / 3))
 
 
 def pull(way: float, relaxation: float) -> float:
-    """How much harder a neighbour pulls that has moved away by `way`: the move of the follower in
-    the middle of four leaders, times the sum of its weights, over the relaxation."""
+    """Return the increase of the force of a neighbour that has moved away by `way`.
+
+    It is the move of a follower amid four leaders, times the sum of weights, over the relaxation.
+    """
     leaders = [
         {
             "select": {"nearest": [place]},
@@ -34,7 +36,7 @@ def pull(way: float, relaxation: float) -> float:
 
 
 def hooke() -> Claim:
-    """The claim, with the stability of the rule."""
+    """Return the claim on Hooke's law, with the stability of the rule."""
     noise = "initial={type: noise, amplitude: 1.0e-6}"
     noisy = [
         np.abs(run("paper/a-weighted", f"solver.relaxation={w}", "leaders=[]", noise).u).max(
@@ -58,7 +60,7 @@ def hooke() -> Claim:
 
 
 def energy() -> Claim:
-    """What the paper says of PE1, against the energy of an elastic sheet of ν = 1/3."""
+    """Return the claim on PE1, compared with the energy of an elastic sheet with ν = 1/3."""
     square, net = ([_pe1(lattice, gradient) for gradient in STRAINS] for lattice in LATTICES)
     elastic = [4 * w for w in ENERGIES]
     off = max(abs(found / exact - 1) for found, exact in zip(net, elastic, strict=True))

@@ -19,14 +19,14 @@ def limits(case: str, threshold: float) -> str:
 
 
 def times(case: str, threshold: float = SHIPPED) -> tuple[int, int] | None:
-    """The paper's times at which the first and the last row part; None where not all do so."""
+    """Return the paper's times at which the first and last row separate; None if some do not."""
     rows = parted(run(f"paper/{case}", limits(case, threshold), "steps=15", "diagnostics=[]"))
     steps = [step for step in rows if step is not None]
     return (min(steps) + 1, max(steps) + 1) if len(steps) == len(rows) else None
 
 
 def fits(case: str, threshold: float) -> bool:
-    """Whether the last row parts after the first and not after the last time that is shown."""
+    """Return whether the last row separates after the first and not after the last time shown."""
     torn, (first, last) = times(case, threshold), FIGURES[case]
     return torn is not None and first < torn[1] <= last
 
@@ -49,7 +49,7 @@ def which(thresholds: Sequence[float]) -> str:
 
 
 def same_parameters() -> Claim:
-    """What case f says of its parameters."""
+    """Return the claim of case f on its parameters."""
     one, two = run("paper/d1"), run("paper/d1", "frame.layers=2", "diagnostics=[]")
     shift = float(np.abs(one.u - two.u).max())
     high = steps_text(parted(run("paper/f1", limits("f1", 6.0), "steps=15", "diagnostics=[]")))
