@@ -70,7 +70,7 @@ def elements() -> list[Claim]:
             "results similar to those obtainable with FEM but in a much shorter time",
             "The reference is a finite-element solution (ν = 0.3, left edge clamped, right edge "
             "moved). "
-            "The equilibrium of the barycentre rule under the copying frame differs from them by "
+            "The equilibrium of the barycentre rule under the copying frame differs from it by "
             f"{off} with 10 and 20 cells per unit length, so that a finer lattice does not help. "
             f"It is not faster either. Only calibrated rules reach an error of {WANTED}; their "
             f"steps took {', '.join(f'{r:.1f}' for r in ratio['steps'])} times as long as linear "
