@@ -313,8 +313,8 @@ def resumption(
         Step to which a finished result is continued.
     anyway
         Whether changes of the experiment or of versions are ignored.
-    processes
-        Processes that share the run, however many started it.
+    execution
+        Execution of the run, by default in one process. Any number of processes can resume a run.
 
     Returns
     -------

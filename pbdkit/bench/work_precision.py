@@ -225,7 +225,7 @@ def measure(
 
     For steps the methods are engines, precisions and threads, and the reference is numpy in
     float64. If the solver is `equilibrium`, they are its methods and steps, at several tolerances.
-    Every measurement has a process of its own, without records and diagnostics.
+    Every measurement is made in a separate process, without records and diagnostics.
 
     Parameters
     ----------

@@ -87,9 +87,9 @@ class MirrorFrame(Anchors, LayeredFrame):
     """Frame points mirror the displacement of body particles: u_f = R u_b.
 
     The particle b is the site reflected in the outermost row or column of the body. R changes the
-    sign of the component normal to that row or column, at corners of both. This is the paper's
-    mirroring to represent an infinite sample. The planes of reflection are fixed in space. Requires
-    a body that fills a rectangle of a square or rectangular lattice.
+    sign of the component normal to that row or column, and at corners the signs of both components.
+    This is the paper's mirroring to represent an infinite sample. The planes of reflection are
+    fixed in space. Requires a body that fills a rectangle of a square or rectangular lattice.
     """
 
     type: Literal["mirror"] = "mirror"

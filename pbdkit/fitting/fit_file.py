@@ -179,7 +179,7 @@ class MeasuredField(MeasuredColumns):
     distortion: Distortion = Field(default_factory=Distortion)
 
     def observation(self, experiment: Experiment, modes: int) -> FieldObservation:
-        """Return the observation in equilibrium, whatever the solver of the experiment."""
+        """Return the observation in equilibrium, for any solver of the experiment."""
         if experiment.solver.makes_steps:
             experiment = experiment.model_copy(update={"solver": Equilibrium()})
         scene = build_scene(experiment)

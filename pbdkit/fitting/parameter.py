@@ -80,7 +80,13 @@ class Parameter:
         return float(value)
 
     def put(self, experiment: Experiment, value: float) -> Experiment:
-        """Return the experiment with another value of the parameter."""
+        """Return the experiment with another value of the parameter.
+
+        Raises
+        ------
+        ExperimentError
+            If the value is invalid.
+        """
         part, _, rest = self.path.partition(".")
         name, _, region = rest.partition(".")
         component = getattr(experiment, part) if part in PARTS else None

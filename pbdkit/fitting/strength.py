@@ -244,7 +244,7 @@ class ElasticResponse:
     pull
         Leader group that loads it, if forces or displacements are measured.
     full
-        MachineReading at the full load.
+        Reading of the testing machine at the full load.
     u
         Displacements as planes.
     """
@@ -309,9 +309,9 @@ class Specimen:
     Parameters
     ----------
     peak
-        MachineReading at its peak.
+        Reading of the testing machine at its peak.
     first
-        MachineReading at the first break; None if it does not follow from one equilibrium.
+        Reading at the first break; None if it does not follow from one equilibrium.
     failed
         Whether it failed.
     """

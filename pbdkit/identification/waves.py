@@ -1,15 +1,16 @@
 """Response of a rule to plane waves u = exp(i k·r), its expansion for long waves, and the
 dispersion of slow waves by direction and length.
 
-With L(k) = -(W_0 + Σ W exp(i k·r)), where W_0 is the derivative with respect to the own
-displacement, a step multiplies a wave by 1 - L(k). If a cell has several sites, L couples them. The
-slow waves, in which all sites move nearly alike, satisfy
+With L(k) = -(W_0 + Σ W exp(i k·r)), where W_0 is the derivative with respect to the displacement of
+the particle itself, a step multiplies a wave by 1 - L(k). If a cell has several sites, L couples
+them. The slow waves, in which all sites move nearly alike, satisfy
 
     L(k) X(k) = X(k) A(k),  A(k) = Σ_m A_m,  A_m of degree m in k,
 
-order by order, with the relative shifts of the sites eliminated (X_0: all alike, Y·X = 1 with Y the
-left null vectors of L(0)). The eigenvalues of the 2 × 2 matrix A(k) are the rates of the slow waves
-to every order: a step subtracts A(k) u from u. With one site A = L.
+order by order, with the relative shifts of the sites eliminated. In X_0 all sites have the same
+displacement, and Y·X = 1 with the left null vectors Y of L(0). The eigenvalues of the 2 × 2 matrix
+A(k) are the rates of the slow waves to every order: a step subtracts A(k) u from u. With one site A
+= L.
 
 A lattice may be described by a larger cell than necessary, as the hexagonal lattice is by a
 rectangular cell with two sites. Sites that a translation maps onto one another, stencil included,
@@ -176,8 +177,8 @@ class SlowWaves:
     def series(self, direction: Floats, order: int = 4) -> list[Complex]:
         """Compute A_0 to A_order for k along a direction.
 
-        They are to be multiplied by |k|^m / |direction|^m, and exact, from the moments of the
-        stencil.
+        A_m is to be multiplied by |k|^m / |direction|^m. The terms are exact: they are computed
+        from the moments of the stencil.
         """
         terms = [_moment(self.stencil, direction, m) for m in range(order + 1)]
         translations = _translations(self.stencil.sites).astype(complex)

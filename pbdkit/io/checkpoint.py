@@ -3,16 +3,17 @@
 ========== ====================================================================================
 ``about``  constant data: the experiment with its name and number of steps, the versions of pbdkit
            and of plugins, and the `origin`, the arguments of the command
-``facts``  ``run``: the state of the driver (of the solver `stepping` the displacements and all
-           else that `State` has, the divergence guard, and how far a run has converged; of
-           `equilibrium` the state and the load parameter); ``seen``: the last recorded steps;
-           ``chosen``: parameters that were `auto`; ``step``, ``rate`` and ``at`` for
-           `pbdkit status`
-``arrays`` the arrays that the facts name
+``facts``  ``run``: the state of the driver. With the solver `stepping` it contains the
+           attributes of `State`, the divergence guard and the steady-state monitor; with
+           `equilibrium` the state and the load parameter.
+           ``seen``: the last recorded steps
+           ``chosen``: parameters that were `auto`
+           ``step``, ``rate`` and ``at``: data for `pbdkit status`
+``arrays`` the arrays to which the facts refer
 ========== ====================================================================================
 
-`pbdkit.io.run_store` keeps them on the disk while a run is unfinished, and the result has the last
-one as a group of its own, so that it can be continued.
+`pbdkit.io.run_store` keeps checkpoints on the disk while a run is unfinished. The result contains
+the last one as a separate group, so that the run can be continued.
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
 
 
 def optional_columns() -> list[list[Column]]:
-    """Return the columns that depend on the experiment, whatever its diagnostics: the table of
+    """Return the columns that depend on the experiment but not on its diagnostics: the table of
     bonds, their steps of breaking, the coordinate of what is measured at every step, and those of
     leader groups, loads, obstacles and principal values."""
     bond, by_ends = ("bond",), "counted from 1, by its ends"

@@ -274,7 +274,13 @@ class Recorder:
 
     @np.errstate(all="ignore")
     def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
-        """Record the variables that are due at this step."""
+        """Record the variables that are due at this step.
+
+        The `last` state of a run that stops early is recorded in any case, even if it was observed
+        before; otherwise a step that was observed is skipped. `time` is that of an equilibrium
+        within a step. Raises FloatingPointError if a recorded value is not finite; nothing of the
+        step is then recorded.
+        """
         if (state.step if time is None else time) > self.last_steps.step or last:
             self._put(state, self._record_of(state, last, time))
 

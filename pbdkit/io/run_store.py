@@ -537,8 +537,8 @@ class UnfinishedRun:
 
     @classmethod
     def open(cls, output: Path, *, writing: bool, anyway: bool = False) -> UnfinishedRun:
-        """Open an existing store; with `anyway` even if commits are lost. Nothing on the disk
-        changes where it is damaged. Raises ExperimentError if another process writes it."""
+        """Open an existing store; with `anyway` even if commits are lost. A damaged store is not
+        changed. Raises ExperimentError if another process writes it."""
         store, records = store_of(output), records_of(output)
         try:
             disk = open_locked(records) if writing else io.FileIO(records, "rb")

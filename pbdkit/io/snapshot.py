@@ -427,8 +427,8 @@ class StateCells(CellValues):
         return gradient
 
     def inside_out(self) -> str | None:
-        """Return a warning where cells, or else corners of cells, are inverted, or None. Torn cells
-        do not count: the parts of a broken body move apart."""
+        """Return a warning if cells, or corners of cells, are inverted; None otherwise. Torn cells
+        do not count, since the parts of a broken body move apart."""
         remedy = "let the leaders go less far, or weaken the rule where it couples x and y"
         if description := self._turned(area_share, "cells have turned over"):
             return f"the last state is inside out: {description}; {remedy}"

@@ -328,7 +328,24 @@ def fill_with_cells(
     body: Body, lattice: Lattice, tiling: Tiling, lines: Lines | None = None
 ) -> Filling:
     """Find the cells that lie partly or wholly inside the outline. The body consists of all their
-    corners."""
+    corners.
+
+    Parameters
+    ----------
+    body
+        The outline. A body of given sites has the whole cells between these.
+    lattice
+        The lattice.
+    tiling
+        Cells of the lattice.
+    lines
+        Lines of sites to fill; all by default.
+
+    Returns
+    -------
+    Filling
+        Sites, with the area fractions of cells.
+    """
     low, high = window(body, lattice)
     margin = margin_of(tiling)
     low, high = tuple(n - margin for n in low), tuple(n + margin + 1 for n in high)

@@ -503,7 +503,7 @@ class Raster:
 
 @dataclass(frozen=True)
 class Restriction:
-    """Rows of repeat cells of a raster on a raster of their own.
+    """Rows of repeat cells of a raster, as a separate raster.
 
     Features of a scene have a method `restrict`, which returns the feature of these rows.
 

@@ -16,7 +16,7 @@ MAX_PARTICLES = 50_000
 """Largest number of particles for which the step operator is assembled."""
 
 MAX_BOND_ENDS = 800_000
-"""Largest number of bond ends, two a bond."""
+"""Largest number of bond ends, two for each bond."""
 
 MAX_EVALUATIONS = 2e8
 """Largest number of evaluations of the rule. They grow with the square of the number of neighbours
@@ -65,7 +65,7 @@ class Swing:
 
 
 def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
-    """Return the eigenvalues μ of the step with relaxation and memory, (2n,).
+    """Return the eigenvalues μ of the step with relaxation and momentum, (2n,).
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
 
     Notes
     -----
-    Both roots of μ² - (1 + b - w (1 - λ)) μ + b = 0. Without memory they are 1 - w (1 - λ), and
+    Both roots of μ² - (1 + b - w (1 - λ)) μ + b = 0. Without momentum they are 1 - w (1 - λ), and
     zeros.
     """
     half = (1.0 + memory - relaxation * (1.0 - eigenvalues)) / 2.0
@@ -85,8 +85,8 @@ def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
 
 
 def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | None:
-    """Return the relaxation below which all modes decay with this memory, apart from those with λ =
-    1.
+    """Return the relaxation below which all modes decay with this momentum, apart from those with λ
+    = 1.
 
     None if no positive relaxation is stable (an eigenvalue above 1, |memory| ≥ 1) or all are.
     """

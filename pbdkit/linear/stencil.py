@@ -198,11 +198,11 @@ class Bound:
     Parameters
     ----------
     smallest, largest
-        min Re λ and max Re λ of the rule's step without relaxation and memory.
+        min Re λ and max Re λ of the rule's step without relaxation and momentum.
     imaginary
         max |Im λ| of the same.
     radius
-        max |μ| of the step with the relaxation and memory of the solver.
+        max |μ| of the step with the relaxation and momentum of the solver.
     """
 
     smallest: float

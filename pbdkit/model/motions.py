@@ -49,7 +49,7 @@ def in_place_of(
 
     Parameters
     ----------
-    given
+    parameters
         Raw parameters.
     info
         Validation context.
@@ -324,11 +324,11 @@ class Measured(Motion):
 class Newton(Motion):
     """Each particle is a mass that moves by Newton's law, with the step as the unit of time:
 
-    mass · a = fraction of `force` + force of the neighbours - damping · v.
+    mass · a = (fraction of `force`) + (force of the neighbours) - damping · v.
 
     Forces are over Young's modulus and thickness, in lattice units; `mass` and `damping` are those
-    of each particle. Integrated by the symplectic Euler method, v += a, u += v, with the forces at
-    the end of the last step.
+    of each particle. The equation is integrated by the symplectic Euler method, v += a, u += v,
+    with the forces at the end of the last step.
     """
 
     type: Literal["newton"] = "newton"
@@ -354,7 +354,7 @@ class Newton(Motion):
         pull
             Forces of the neighbours, (particle, axis).
         share
-            Fraction of the force on each particle, (particle,).
+            Fraction of the force that acts on each particle, (particle,).
         """
         force = share[:, None] * np.array([at(component, step) for component in self.force])
         force += pull - self.damping * velocity

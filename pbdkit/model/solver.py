@@ -115,7 +115,10 @@ Memory = Annotated[
 
 class Settle(Strict):
     """Settings that end a run early, once the distance of every follower from equilibrium is below
-    a tolerance."""
+    a tolerance.
+
+    `tolerance` is relative to the largest prescribed displacement.
+    """
 
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
 
@@ -189,7 +192,7 @@ class Stepping(Solver):
 
     @property
     def courses(self) -> dict[str, Course[float]]:
-        """Time dependence of relaxation and memory, by name."""
+        """Time-dependent relaxation and momentum, by name."""
         settings = {"relaxation": self.relaxation_setting, "memory": self.memory_setting}
         return {name: value for name, value in settings.items() if isinstance(value, Course)}
 
@@ -221,7 +224,7 @@ class Stepping(Solver):
         return _number(self.memory_setting, "memory")
 
     def with_weights(self, relaxation: float, memory: float) -> Stepping:
-        """Return the settings with these values of relaxation and memory."""
+        """Return the settings with these values of relaxation and momentum."""
         values = {"relaxation_setting": relaxation, "memory_setting": memory}
         return self.model_copy(update=values)
 

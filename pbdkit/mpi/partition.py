@@ -2,9 +2,9 @@
 joining of parts.
 
 A part has its own rows and a halo of rows of the adjacent parts. The outermost rows, as many as
-neighbours reach, are empty; in the same number of rows next to them particles, except for leaders,
-are frame points that follow no particle. In each step the number of valid rows decreases by the
-reach of a step, so that several steps can be made before the halo is exchanged.
+neighbours reach, are empty; in the same number of rows next to them, all particles except leaders
+are treated as frame points that follow no particle. In each step the number of valid rows decreases
+by the reach of a step, so that several steps can be made before the halo is exchanged.
 """
 
 from __future__ import annotations

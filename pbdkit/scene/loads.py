@@ -34,7 +34,8 @@ class Loading:
     rows, place
         Rows and flat places of its particles.
     share
-        Fraction of the force on each particle, or the area of each particle for a body force.
+        Fraction of the force that acts on each particle, or the area of each particle for a body
+        force.
     """
 
     load: Load
@@ -115,7 +116,18 @@ class Loads:
 def build_loads(
     raster: Raster, tiling: Tiling, cells: WeighedCells | None, experiment: Experiment
 ) -> Loads | None:
-    """Find the particles of every load, and the fraction of the load on each."""
+    """Find the particles of every load, and the fraction of the load on each.
+
+    Returns
+    -------
+    Loads or None
+        None if the experiment has no loads.
+
+    Raises
+    ------
+    ExperimentError
+        If a load selects no particle or a frame point, or a force is not finite.
+    """
     body, loads = Selecting(raster, experiment.regions), list[Loading]()
     for n, load in enumerate(experiment.loads):
         rows = body.select(load.select, ("loads", n, "select"))
@@ -136,8 +148,8 @@ def build_loads(
 def _areas(raster: Raster, tiling: Tiling, cells: WeighedCells | None) -> Floats:
     """Return the area of each particle, (sublattice, cell, cell).
 
-    It is an equal part of the weighted area of every cell at the particle, or the area of a site of
-    the lattice if cells are not weighted.
+    The weighted area of every cell is divided equally among its corners. If cells are not weighted,
+    each particle has the area of a site of the lattice.
     """
     cell = raster.cell
     if cells is None or cells.share is None:

@@ -282,7 +282,11 @@ def way_out(
 
 def clearance(x: Any, y: Any, kinds: Any, points: Any, first: Any, radii: Any) -> Any:
     """Return 0 at places outside all outlines, otherwise minus the depth in the outline in which
-    the place is deepest."""
+    the place is deepest.
+
+    `kinds`, `first` and `radii` (inner, outer, size) have a row for each outline; `points` are
+    those of all outlines.
+    """
     depth = 0.0
     for w in range(len(kinds)):
         inner, outer = radii[w, 0], radii[w, 1]

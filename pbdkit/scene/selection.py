@@ -41,9 +41,9 @@ def shares(at: Floats) -> Floats:
     Returns
     -------
     NDArray
-        Fraction of the force on each particle, (particle,). If all lie on a line it is proportional
-        to half the sum of the distances to the two adjacent particles, otherwise it is the same for
-        all.
+        Fraction of the force that acts on each particle, (particle,). If all lie on a line it is
+        proportional to half the sum of the distances to the two adjacent particles, otherwise it is
+        the same for all.
     """
     order = np.lexsort(at.T)
     offset = at - at[order[0]]

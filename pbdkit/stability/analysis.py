@@ -110,7 +110,7 @@ class Spectra:
 
     @property
     def of_rule(self) -> Spectrum | None:
-        """Return the spectrum of the rule's own step, without relaxation and memory.
+        """Return the spectrum of the rule's own step, without relaxation and momentum.
 
         None if the frame has a delay, or if the spectrum is unknown.
         """
@@ -244,7 +244,7 @@ class Analysis:
 
     @property
     def spectrum(self) -> Spectrum | None:
-        """Return the spectrum of the solver's step, with relaxation, memory and lag."""
+        """Return the spectrum of the solver's step, with relaxation, momentum and frame delay."""
         return self.spectra.spectrum
 
     @property
@@ -288,7 +288,7 @@ class Analysis:
 
     @property
     def largest_stable_relaxation(self) -> float | None:
-        """Return the relaxation below which all modes decay, with the memory of the experiment.
+        """Return the relaxation below which all modes decay, with the momentum of the experiment.
 
         It is 2 (1 + b) / (1 - λ_min) for real eigenvalues.
         """

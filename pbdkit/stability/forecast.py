@@ -85,7 +85,7 @@ class Forecast:
     spectral_radius, smallest_eigenvalue, largest_stable_relaxation, stable, steps_to
         See `pbdkit.Analysis`.
     period, decay
-        Period in steps, and decay a step, of the slowest oscillating mode; None without memory or
+        Period in steps, and decay a step, of the slowest oscillating mode; None without momentum or
         if no mode oscillates.
     exact
         Whether the analysis holds for the whole run, or is linearised at the start.

@@ -122,7 +122,7 @@ class Lag:
         Largest distance of a follower from its equilibrium once it has become steady.
     reached
         The distance at the end of these steps if the body starts in equilibrium. It is accurate to
-        10 % if a computation by steps would take too long, and None if the step has a memory, too.
+        10 % if a computation by steps would take too long, and None if the step has momentum, too.
     """
 
     first: int

@@ -145,8 +145,8 @@ class Contact:
 
     def push_out(self, u: Floats, moment: float) -> None:
         """Push the body's particles out of the obstacles at the end of a step, or at a moment
-        within it; `u` are planes, with guided particles placed along their led axes. Particles that
-        lead along both axes may be moved, too."""
+        within it; `u` are planes, with guided particles placed along their led axes. Leaders may be
+        moved, too, and are placed afterwards."""
         outlines, places = self._outlines(moment), [np.empty(0, np.intp)]
         for outline in outlines:
             for block in self._blocks():

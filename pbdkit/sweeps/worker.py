@@ -1,4 +1,4 @@
-"""Run one member of a sweep and return a report, in which exceptions are part. Kept results are
+"""Run one member of a sweep and return a report; exceptions become reports, too. Kept results are
 bytes: names and shapes as JSON, then the values."""
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ from pbdkit.errors import refuse_without
 def live(
     experiment: str, port: int, no_browser: bool, output: Path | None, settings: tuple[str, ...]
 ) -> None:
-    """Step an experiment in the browser: lead it with the mouse, change its numbers, cut it, and
+    """Step an experiment in the browser: move it with the mouse, change its parameters, cut it, and
     save the session as an experiment.
 
     The page is served to this machine only, under a secret address. Ctrl-C ends it.

@@ -166,7 +166,7 @@ class LiveStepper:
 
 
 def stepped(experiment: Experiment) -> Scene:
-    """Build the scene of an experiment to be stepped, with numbers for relaxation and memory. For
+    """Build the scene of an experiment to be stepped, with values for relaxation and momentum. For
     an equilibrium solver it uses the relaxation that converges fastest, if that is quickly
     computed."""
     scene = build_scene(experiment)

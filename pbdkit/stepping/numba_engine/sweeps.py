@@ -266,7 +266,7 @@ def tearing_arrays(scene: Scene) -> dict[str, Any]:
 
 
 def _table_shape(scene: Scene) -> tuple[int, int]:
-    """Return the largest number of cells around a particle, and of bonds of one."""
+    """Return the largest number of cells around a particle, and of bonds of such a cell."""
     around = scene.neighbourhood.cells_around
     return (
         max(len(of.cells) for of in around),
@@ -693,8 +693,8 @@ def write_whole(
     damage: RowDamage | None = None,
 ) -> None:
     """Write the lines, in a loop, for a particle that has all its neighbours, with the expressions
-    for each and for its `lost` bonds. If cells can be torn, particles with a `mark` are not moved;
-    with a given `damage` only these are."""
+    for each and for its `lost` bonds. If cells can be torn, particles with a `mark` are not moved
+    or, if `damage` is given, only these are moved."""
     out.add(1, *displacements(plan, level))
     if plan.judged:
         out.add(1, f"bits = int64({lost})", "now = bits")
