@@ -12,7 +12,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import cache, cached_property
 from importlib import import_module
 from typing import Any
@@ -30,7 +30,7 @@ from pbdkit import plotting
 from pbdkit.accessor import PbdAccessor
 
 MODULES = (pbdkit.errors, pbdkit, plotting, pbdkit.plugin, pbdkit.testing)
-"""Modules whose `__all__` are the public names. A name of several is documented in the last."""
+"""Modules that declare public names in `__all__`; a name of several is documented in the last."""
 ACCESSOR = "ds.pbd."
 """Prefix of the methods of the accessor. Functions of `pbdkit.plotting` are documented as such."""
 FULL_NAMES = {
@@ -53,7 +53,7 @@ STYLE = Config(napoleon_use_ivar=True)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the directive."""
+    """Register the directive in Sphinx."""
     app.add_directive("python", PythonReference)
     return {"parallel_read_safe": True}
 
@@ -66,6 +66,9 @@ class PythonReference(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Return the table and the entries."""
         entries = [entry_of(line) for line in self.content if line.strip()]
+        for entry in entries:
+            if inspect.isroutine(entry.value) or inspect.isclass(entry.value):
+                self.env.note_dependency(inspect.getfile(inspect.unwrap(entry.value)))
         text = "\n".join([*table(entries), *(line for e in entries for line in e.lines())])
         return self.parse_text_to_nodes(f"```{{eval-rst}}\n{text}\n```")
 
@@ -108,7 +111,7 @@ class Entry:
 
     @property
     def is_called(self) -> bool:
-        """Whether users call the object; classes of results are only returned."""
+        """True if users call the object; classes of results are only returned."""
         if inspect.isclass(self.value):
             is_public = any(self.value in vars_of(module) for module in MODULES)
             return is_public and bool(constructor_parameters(self.value))
@@ -117,10 +120,11 @@ class Entry:
     @property
     def parameters(self) -> list[inspect.Parameter]:
         """Parameters of a call."""
+        if inspect.isclass(self.value):
+            has_fields = self.is_called or is_dataclass(self.value)
+            return constructor_parameters(self.value) if has_fields else []
         if not self.is_called:
             return []
-        if inspect.isclass(self.value):
-            return constructor_parameters(self.value)
         parameters = [*inspect.signature(self.value).parameters.values()]
         is_bound = self.name.startswith(ACCESSOR) or (
             self.kind == "method" and parameters and parameters[0].name in ("self", "cls")
@@ -129,7 +133,7 @@ class Entry:
 
     @property
     def signature(self) -> str:
-        """Signature without annotations."""
+        """Signature of a call, without annotations."""
         plain = [p.replace(annotation=inspect.Parameter.empty) for p in self.parameters]
         return str(inspect.Signature(plain)) if self.is_called else ""
 
@@ -147,7 +151,7 @@ class Entry:
 
 def entry_of(line: str) -> Entry:
     """Return the entry that a line of the directive describes."""
-    name, _, listed = line.strip().partition(":")
+    name, colon, listed = line.strip().partition(":")
     if name.startswith(ACCESSOR):
         return Entry(name, getattr(PbdAccessor, name.removeprefix(ACCESSOR)), "function")
     module, _, attribute = name.rpartition(".")
@@ -157,7 +161,7 @@ def entry_of(line: str) -> Entry:
     if not inspect.isclass(value):
         return Entry(name, value, "data", comment=comment_of(attribute, value))
     kind = "exception" if issubclass(value, BaseException) else "class"
-    members = (member_of(value, member) for member in listed.split() or members_of(value))
+    members = (member_of(value, m) for m in (listed.split() if colon else members_of(value)))
     return Entry(name, value, kind, tuple(members))
 
 
@@ -226,11 +230,20 @@ def constructor_parameters(cls: type) -> list[inspect.Parameter]:
     return [*inspect.signature(cls).parameters.values()]
 
 
+class ShortDefault(str):
+    """Text in place of a long default in a signature."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
 def parameter_of(name: str, field: Any) -> inspect.Parameter:
     """Return a field of a model as a keyword."""
     default = field.get_default(call_default_factory=True)
     if field.is_required():
         default = inspect.Parameter.empty
+    elif isinstance(default, BaseModel):
+        default = ShortDefault(f"{type(default).__name__}()")
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
 
 

@@ -20,7 +20,7 @@ var Scorer = {
     const definition = page === "glossary" && anchor.startsWith("#term-");
     return score + (offset ? offset[1] : 0) + (definition ? DEFINITION : 0);
   },
-  objNameMatch: 11,
+  objNameMatch: 15,
   objPartialMatch: 6,
   objPrio: { 0: 15, 1: 5, 2: -5 },
   objPrioDefault: 0,

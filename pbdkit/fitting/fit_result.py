@@ -35,11 +35,11 @@ class FittedField:
 
     Parameters
     ----------
-    points : (point, axis)
+    points : array of float, shape (point, axis)
         Points of the measurement.
-    measured : (point, axis)
+    measured : array of float, shape (point, axis)
         Measured displacements without the fitted distortion.
-    residual : (point, axis)
+    residual : array of float, shape (point, axis)
         Measured minus fitted displacements.
     """
 
@@ -54,13 +54,13 @@ class FittedNumbers:
 
     Parameters
     ----------
-    along : (number,)
+    along : array of float, shape (number,)
         Time or displacement.
-    measured, fitted, residual : (number,)
+    measured, fitted, residual : array of float, shape (number,)
         Measured and fitted numbers, and their difference.
-    what, over
+    what, over : str
         Labels of the numbers and of `along`.
-    joined
+    joined : bool
         Whether the numbers are one curve.
     """
 

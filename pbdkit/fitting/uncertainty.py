@@ -56,13 +56,13 @@ class Estimate:
 
     Parameters
     ----------
-    value, error
+    value, error : float
         Value and standard error.
-    identifiable
+    identifiable : bool
         Whether the data determine the value.
-    on_bound
+    on_bound : bool
         Whether the value is at a bound, beyond which the fit might be better.
-    unit
+    unit : str
         Unit of both; empty if the experiment has no units.
     """
 
@@ -318,11 +318,11 @@ class Profile:
 
     Parameters
     ----------
-    values : (value,)
+    values : array of float, shape (value,)
         Values of the parameter.
-    rises : (value,)
+    rises : array of float, shape (value,)
         Increase of -2 log L.
-    low, high
+    low, high : float or None
         Ends of the 95 % interval; None if the data do not bound it within the bounds of the fit.
     """
 
@@ -454,11 +454,11 @@ class Sample:
 
     Parameters
     ----------
-    draws : (draw, parameter)
+    draws : array of float, shape (draw, parameter)
         Values of the parameters.
-    acceptance
+    acceptance : float
         Fraction of accepted moves.
-    memory
+    memory : float
         Autocorrelation time in steps; NaN if there are too few steps.
     """
 

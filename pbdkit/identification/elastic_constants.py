@@ -46,9 +46,9 @@ class Elasticity:
 
     Parameters
     ----------
-    stiffness : (3, 3)
-        Elastic constants C in the order xx, yy, xy of Voigt, spacing²/step.
-    mobility : (2, 2)
+    stiffness : array of float, shape (3, 3)
+        Elastic constants C in Voigt's order xx, yy, xy, in spacing² per step.
+    mobility : array of float, shape (2, 2)
         Inverse of B, scaled to tr B = 2. A step moves a particle by mobility · div σ.
     """
 
@@ -106,18 +106,33 @@ class Elasticity:
         return float(4 * c66 / stretching) if stretching else None
 
     def youngs_modulus(self, degrees: float) -> float:
-        """Compute Young's modulus of a bar in plane stress cut along a direction, in units of
-        `stiffness`.
+        """Compute Young's modulus of a bar in plane stress that is cut along a direction.
 
-        It is 0 if the bar can be stretched without energy.
+        Parameters
+        ----------
+        degrees : float
+            Direction of the bar, counterclockwise from x in degrees.
+
+        Returns
+        -------
+        float
+            Modulus in units of `stiffness`.
         """
         longitudinal, _ = self._strains(degrees)
         return float(np.linalg.det(self.stiffness) / longitudinal) if longitudinal else 0.0
 
     def poisson_ratio(self, degrees: float) -> float | None:
-        """Compute -ε_across / ε_along of a bar in plane stress cut along a direction.
+        """Compute Poisson's ratio of a bar in plane stress that is cut along a direction.
 
-        None if the bar cannot be stretched.
+        Parameters
+        ----------
+        degrees : float
+            Direction of the bar, counterclockwise from x in degrees.
+
+        Returns
+        -------
+        float or None
+            -ε_across / ε_along; None if the bar cannot be stretched.
         """
         longitudinal, transverse = self._strains(degrees)
         return -transverse / longitudinal if longitudinal else None

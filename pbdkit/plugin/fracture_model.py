@@ -96,7 +96,7 @@ class FractureModel(TakesFields):
         c : Constants
             Constants of the slot and state variables of the bond.
         p : Parameters
-            Parameters.
+            Parameters of the model.
 
         Returns
         -------
@@ -116,7 +116,7 @@ class FractureModel(TakesFields):
         r : Vector
             Rest offset of the bond.
         p : Parameters
-            Parameters.
+            Parameters of the model.
 
         Returns
         -------
@@ -166,7 +166,7 @@ class RenewsBonds(Remembers):
         c : Constants
             Constants of the slot and state variables of the bond.
         p : Parameters
-            Parameters.
+            Parameters of the model.
 
         Returns
         -------
@@ -186,7 +186,7 @@ class KnowsStiffness(ABC):
         Parameters
         ----------
         slot : Slot
-            Slot.
+            Slot of the bond.
         rule : Calibrated
             Rule with an elasticity.
         setting : Setting
@@ -223,7 +223,7 @@ class Softens(ABC):
         c : Constants
             Constants of the slot and state variables of the bond.
         p : Parameters
-            Parameters.
+            Parameters of the model.
 
         Returns
         -------
@@ -275,7 +275,7 @@ class SoftensCells(RenewsBonds):
         c : Constants
             Constants of the slot and state variables of the bond.
         p : Parameters
-            Parameters.
+            Parameters of the model.
         left, right : CellStress
             Stress of the cells on both sides of the bond.
 
@@ -300,7 +300,7 @@ class SoftensCells(RenewsBonds):
         c : Constants
             Constants of the slot and state variables of the bond.
         p : Parameters
-            Parameters.
+            Parameters of the model.
 
         Returns
         -------
@@ -338,7 +338,7 @@ class BreaksAtStrain(ABC):
         c : Constants
             Constants of the slot and state variables of the bond.
         p : Parameters
-            Parameters.
+            Parameters of the model.
 
         Returns
         -------

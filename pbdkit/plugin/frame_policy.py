@@ -47,7 +47,7 @@ class FrameSites(ABC):
         Repeat cell of the lattice.
     site : array of int, shape (point, 2)
         Site index (i, j) of every frame point in the order of the numbers.
-    low, high : Index
+    low, high : tuple of int
         Smallest and largest site index of the body.
     """
 

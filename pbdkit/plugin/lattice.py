@@ -37,9 +37,9 @@ class BasisSite:
     ----------
     at : Vector of float
         Position in the cell, in lattice units.
-    index : Index
+    index : tuple of int
         Site index within the period of the cell.
-    primitive : Index
+    primitive : tuple of int
         Index in the primitive basis, in which Chebyshev distances are counted.
     """
 
@@ -56,9 +56,9 @@ class Offset:
     ----------
     target : int
         Sublattice of the other site.
-    cell : Index
+    cell : tuple of int
         Number of repeat cells along each axis.
-    site, primitive : Index
+    site, primitive : tuple of int
         Differences of site index and of primitive index.
     rest : Vector of float
         Vector in lattice units.
@@ -99,9 +99,9 @@ class Cell:
         Cell vectors in lattice units, as many as space has axes.
     sites : tuple of BasisSite
         Basis; by default one site at the corner.
-    period : Index
+    period : tuple of int
         Period of the site index along each vector; by default 1.
-    primitive : tuple of Index
+    primitive : tuple of tuple of int
         Cell vectors in the primitive basis; by default unit vectors.
     """
 
@@ -159,7 +159,7 @@ class Cell:
         ----------
         source, target : int
             Sublattices.
-        cell : Index
+        cell : tuple of int
             Number of repeat cells between them.
 
         Returns
@@ -184,12 +184,12 @@ class Cell:
         ----------
         source, target : int
             Sublattices.
-        cell : Index
+        cell : tuple of int
             Number of repeat cells between them.
 
         Returns
         -------
-        Index
+        tuple of int
             Steps along the primitive vectors.
         """
         start, end = self.sites[source].primitive, self.sites[target].primitive
@@ -281,7 +281,7 @@ class Slot:
     ----------
     source, target : int
         Sublattices.
-    cell, site : Index
+    cell, site : tuple of int
         Steps between repeat cells and between site indices.
     rest : Vector of float
         Rest offset X_k - X_j, in lattice units.
@@ -435,7 +435,7 @@ class Tiling:
     ----------
     polygons : tuple of CellPolygon
         Cells.
-    beside : dict of Slot to pair of Side
+    beside : dict of Slot to (Side, Side)
         Cells to the left and right of a slot; a diagonal has one cell twice. It is empty unless the
         neighbours of every site are the corners of the cells around it, which are triangles or
         parallelograms: 8 on the square and rectangular lattices, 6 on the hexagonal one.

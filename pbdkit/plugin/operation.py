@@ -88,7 +88,7 @@ class ParticleOperation(Component):
         new : Vector
             Displacement after the move of the rule and preceding operations.
         p : Parameters
-            Parameters.
+            Parameters of the operation.
 
         Returns
         -------

@@ -47,11 +47,11 @@ class Stiffness(NamedTuple):
 
     Parameters
     ----------
-    xx, yy, xy
+    xx, yy, xy : float or array
         Normal stiffnesses: σ_x over ε_x, σ_y over ε_y, and σ_x over ε_y.
-    shear
+    shear : float or array
         Shear stiffness, τ over γ.
-    x_shear, y_shear
+    x_shear, y_shear : float or array
         Coupling of shear with ε_x and ε_y; 0 if the axes are axes of symmetry.
     """
 
@@ -67,7 +67,7 @@ class Stiffness(NamedTuple):
 
         Parameters
         ----------
-        through_thickness
+        through_thickness : float or array
             σ_zz over σ_xx + σ_yy.
 
         Returns
@@ -200,7 +200,7 @@ class FollowerRule(TakesFields):
         w : Weights
             Constants of the slot.
         p : Parameters
-            Parameters.
+            Parameters of the rule.
 
         Returns
         -------
@@ -220,7 +220,7 @@ class FollowerRule(TakesFields):
         here : Here
             Local values of the particle.
         p : Parameters
-            Parameters.
+            Parameters of the rule.
 
         Returns
         -------
@@ -266,7 +266,7 @@ class Calibrated(ABC):
         here : Here
             Local values of the particle.
         p : Parameters
-            Parameters.
+            Parameters of the rule.
 
         Returns
         -------
@@ -292,7 +292,7 @@ class Loadable(Calibrated):
         load : Vector
             Force over Young's modulus and thickness, in lattice units.
         p : Parameters
-            Parameters.
+            Parameters of the rule.
 
         Returns
         -------
@@ -323,7 +323,7 @@ class StoresEnergy(Calibrated):
         w : Weights
             Constants of the slot.
         p : Parameters
-            Parameters.
+            Parameters of the rule.
 
         Returns
         -------
@@ -376,7 +376,7 @@ class TearsCells(Calibrated):
             Damage beside the bond. Where it is zero, the result is that of `gather` to the last
             bit.
         p : Parameters
-            Parameters.
+            Parameters of the rule.
 
         Returns
         -------
@@ -461,7 +461,7 @@ class RenewsParticles(Remembers):
         here : Here
             Local values of the particle.
         p : Parameters
-            Parameters.
+            Parameters of the rule.
 
         Returns
         -------
@@ -493,7 +493,7 @@ class SharesParticles(Remembers):
         w : Weights
             Constants of the slot.
         p : Parameters
-            Parameters.
+            Parameters of the rule.
         own : Numbers
             State variables of the particle before the step.
         there : Numbers

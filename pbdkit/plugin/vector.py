@@ -199,7 +199,7 @@ def squared_length(v: Vector[T]) -> T:
     Parameters
     ----------
     v : Vector
-        Vector.
+        Vector of numbers or arrays.
 
     Returns
     -------
@@ -215,7 +215,7 @@ def length(v: Vector[T]) -> T:
     Parameters
     ----------
     v : Vector
-        Vector.
+        Vector of numbers or arrays.
 
     Returns
     -------

@@ -56,11 +56,11 @@ class Outcome:
 
     Parameters
     ----------
-    property
+    property : str
         Name of the property.
-    state
-        "held", "failed" or "skipped".
-    reason
+    state : {"held", "failed", "skipped"}
+        Result of the property.
+    reason : str
         Fault, or reason for which it was skipped.
     """
 
@@ -75,9 +75,9 @@ class Report:
 
     Parameters
     ----------
-    component
+    component : str
         Name of the component, with its parameters.
-    outcomes
+    outcomes : tuple of Outcome
         Outcomes, in the order of the properties.
     """
 

@@ -460,13 +460,13 @@ class Property:
 
     Parameters
     ----------
-    name
+    name : str
         Name, in lower case with hyphens.
-    interfaces
+    interfaces : tuple of type
         Interfaces of the components.
-    check
+    check : callable
         Function that raises PropertyError if the property does not hold.
-    is_needed
+    is_needed : bool
         Whether later properties presuppose this one: if it fails they are skipped, so that a fault
         is reported once.
     """
