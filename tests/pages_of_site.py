@@ -35,7 +35,7 @@ class Files(SimpleHTTPRequestHandler):
     """Files of the site, without a log."""
 
     def log_message(self, *args: Any) -> None:
-        """Write nothing."""
+        """Write no log of requests."""
 
 
 def faults_of(page: Any, address: str) -> Iterator[str]:

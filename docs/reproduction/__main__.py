@@ -40,7 +40,7 @@ times, which are taken from the linked pages:
 
 
 def sections() -> list[Section]:
-    """The model as a whole, then every case."""
+    """Return the sections: the model as a whole, then every case."""
     return [
         general.section(),
         case_a.section(),

@@ -57,7 +57,7 @@ SETTLED = 1500
 
 
 def point_text(name: str) -> str:
-    """The experiment of a point disturbance."""
+    """Return the experiment of a point disturbance."""
     lattice, neighbours, b, _ = CASES[name]
     centre = f"[{SIZE // 2}, {SIZE // 2 * b:g}]"
     return POINT.format(
@@ -72,7 +72,7 @@ def point_text(name: str) -> str:
 
 
 def spreading(sheet: Sheet) -> Floats:
-    """D_x and D_y: half the growth of the second moments of u_x, a step."""
+    """Return D_x and D_y: half the growth of the second moments of u_x per step."""
     place = sheet.on_grid(sheet.position[:1])[0]
     u = sheet.u[-2:, ..., 0]
     weight = u / u.sum(axis=(1, 2), keepdims=True)
@@ -98,26 +98,26 @@ def elastic_signs() -> dict[str, float]:
 
 
 def predicted(name: str) -> Floats:
-    """Half the mean square of the rest offsets along each axis."""
+    """Return half the mean square of the rest offsets along each axis."""
     offsets = np.array(CASES[name][3])
     return (offsets**2).mean(axis=0) / 2
 
 
 def torn_text(threshold: float, placement: float, until: int = 400, steps: int = SETTLED) -> str:
-    """A sheet torn apart; its right column leads to step `until`."""
+    """Return the experiment of a torn sheet; its right column leads to step `until`."""
     return TORN.format(
         speed=SPEED, threshold=threshold, placement=placement, until=until, steps=steps
     )
 
 
 def strain(sheet: Sheet) -> float:
-    """The strain of the piece at the clamp, from its left to its torn column, at the end."""
+    """Return the strain of the piece at the clamp, from its left to its torn column, at the end."""
     u = sheet.u[-1, :-1, :, 0].mean(axis=1)
     return float((u[-1] - u[0]) / (len(u) - 1))
 
 
 def page() -> str:
-    """Markdown of the whole page."""
+    """Return the Markdown of the whole page."""
     return f"""# Anisotropy and plastic-like behaviour
 
 The paper mentions anisotropic and plastic-like bodies without examples. This page measures both. It

@@ -22,7 +22,7 @@ def edge_excess(column: Floats) -> float:
 
 
 def half_time(sheet: Sheet) -> int:
-    """The first step with half the contraction of 67 at step 100."""
+    """Return the first step with half the contraction of 67 at step 100."""
     y = sheet.u[:, COLUMN, ROW, 1]
     return int(np.flatnonzero(y <= y[100] / 2)[0])
 
@@ -122,7 +122,7 @@ def section_c() -> Section:
 
 
 def _less(name: str) -> tuple[Floats, list[int]]:
-    """Contraction of 67 at steps 9, 19, 99, and the steps at which it exceeds case b's."""
+    """Return the contraction of 67 at steps 9, 19, 99, and the steps at which that of b is less."""
     y, first = -run(name).u[:, COLUMN, ROW, 1], -run("paper/b").u[:, COLUMN, ROW, 1]
     return y[[9, 19, 99]], [int(s) for s in np.flatnonzero(y > first + 1e-15)]
 

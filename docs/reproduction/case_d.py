@@ -136,7 +136,7 @@ def _lead(sheet: Sheet) -> int:
 
 
 def _longest(speed: float) -> tuple[float, int]:
-    """The longest bond of d1, where none breaks, and its step."""
+    """Return the longest bond of d1, where none breaks, and its step."""
     pull = f"leaders.1.motion.velocity=[{speed}, 0.0]"
     return run("paper/d1", "fracture.thresholds=[1000.0]", pull, "steps=20").longest_bond()
 

@@ -13,7 +13,7 @@ TIMES = [1, 7, 8, 9, 10, 12, 27]
 
 
 def x_of(sheet: Sheet) -> Floats:
-    """x displacement of 133."""
+    """Return the x displacement of particle 133."""
     return sheet.u[:, COLUMN, ROW, 0]
 
 

@@ -31,7 +31,7 @@ def cost() -> list[Claim]:
 
 
 def _shared() -> Claim:
-    """Threads of a processor; no graphics processor was measured."""
+    """Return the claim about parallel processors, measured with threads; no GPU was measured."""
     one, two = (run("paper/a", "solver.engine=compiled", f"solver.threads={n}") for n in (1, 2))
     differ = float(np.abs(one.position - two.position).max())
     rows = json.loads(MEASURED.read_text("utf-8"))["threads"]
@@ -51,7 +51,7 @@ def _shared() -> Claim:
 
 
 def _settling(size: int) -> int:
-    """Steps until a sheet held after a pull is within 1 % of the pull from its equilibrium."""
+    """Return the steps after a pull until a sheet is within 1 % of the pull from equilibrium."""
     leaders = [
         {"select": {"edge": "left"}, "motion": {"type": "hold"}},
         {

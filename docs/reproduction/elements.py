@@ -33,7 +33,7 @@ ELASTIC = "rule={type: elastic, poisson_ratio: 0.3}"
 
 
 def of_the_paper(problem: Problem, cells: int) -> float:
-    """Relative L2 error of the barycentre's equilibrium, under the copying frame."""
+    """Return the relative L2 error of the barycentre's equilibrium, under the copying frame."""
     parts = BARYCENTRE if problem is HOLE else BARYCENTRE | between_edges(problem, cells)
     sites = cells if problem is HOLE else 2 * cells
     return error_at(problem, solved(problem, cells, **parts).u, sites)

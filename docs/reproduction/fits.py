@@ -6,13 +6,13 @@ from scipy.optimize import minimize_scalar
 
 
 def fit_quality(y: Floats, degree: int) -> float:
-    """R² of a polynomial fitted to a series."""
+    """Return R² of a polynomial fitted to a series."""
     x = np.arange(len(y))
     return _r_squared(y, np.polyval(np.polyfit(x, y, degree), x))
 
 
 def exponential_quality(y: Floats) -> float:
-    """R² of c + A exp(-r t) fitted to a series: three free parameters, as a parabola has."""
+    """Return R² of c + A exp(-r t) fitted to a series, with three free parameters as a parabola."""
     t = np.arange(len(y))
 
     def fitted(log_rate: float) -> Floats:
@@ -26,7 +26,7 @@ def exponential_quality(y: Floats) -> float:
 
 
 def both(y: Floats, first: int, last: int) -> tuple[float, float]:
-    """R² of a parabola and of an exponential over the steps first to last."""
+    """Return R² of a parabola and of an exponential over the steps first to last."""
     part = y[first : last + 1]
     return fit_quality(part, 2), exponential_quality(part)
 

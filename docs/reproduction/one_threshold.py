@@ -14,7 +14,7 @@ SHIPPED = 5.2
 
 
 def limits(case: str, threshold: float) -> str:
-    """The setting of one threshold for all shells of a case."""
+    """Return the setting of one threshold for all shells of a case."""
     return f"fracture.thresholds={[threshold] * (1 if case.endswith('1') else 2)}"
 
 
@@ -32,19 +32,19 @@ def fits(case: str, threshold: float) -> bool:
 
 
 def fitting(*cases: str) -> list[float]:
-    """The thresholds that were tried, and fit the figures of all these cases."""
+    """Return the thresholds, among those tried, that fit the figures of all these cases."""
     return [float(t) for t in TRIED if all(fits(case, float(t)) for case in cases)]
 
 
 def span(case: str) -> str:
-    """The times at which the rows of a case part at the shipped threshold."""
+    """Return the times at which the rows of a case part at the shipped threshold."""
     torn = times(case)
     assert torn is not None
     return f"{torn[0]} to {torn[1]}" if torn[0] < torn[1] else f"{torn[0]}"
 
 
 def which(thresholds: Sequence[float]) -> str:
-    """A list of thresholds in words."""
+    """Return a list of thresholds as text."""
     return ", ".join(f"{t:g}" for t in thresholds) or "none"
 
 

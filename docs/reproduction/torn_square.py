@@ -27,7 +27,7 @@ FAMILIES = {
 
 
 def swept(label: str) -> dict[float, Sheet]:
-    """A family at all thresholds at which every row parts."""
+    """Run a family at all thresholds at which every row parts."""
     name, *settings = FAMILIES[label]
     return sweep(name, THRESHOLDS, *settings)
 

@@ -64,7 +64,7 @@ def _settings() -> list[str]:
 
 
 def _spans(thresholds: list[float]) -> str:
-    """Thresholds in steps of 0.02, as spans."""
+    """Return thresholds in steps of 0.02 as a text of ranges."""
     breaks = np.flatnonzero(np.diff(thresholds) > 0.03) + 1
     parts = np.split(np.array(thresholds), breaks)
     return ", ".join(f"{p[0]:.2f} to {p[-1]:.2f}" if len(p) > 1 else f"{p[0]:.2f}" for p in parts)

@@ -1,8 +1,8 @@
-"""The laws that scenes obey, over as many random scenes as are asked for.
+"""Test the laws that scenes obey, over a number of random scenes.
 
     python tests/reliability/scene_laws_at_length.py [--count N] [--seed S] [--law NAME ...]
 
-Scenes are those in which every pair of features meets, drawn anew from seed after seed. Prints each
+Scenes are those in which every pair of features meets, drawn from seed after seed. Prints each
 fault with the features and the experiment; exits with 1 where there is any.
 """
 
@@ -25,7 +25,7 @@ from scene_laws import LAWS, Faults, Tree
 import pbdkit
 
 REFUSED = "nothing holds a part"
-"""What comes off a body that is torn cannot rest: the one refusal that a scene may end in."""
+"""A part that comes off a torn body cannot rest: the one refusal in which a scene may end."""
 
 
 def scenes(seed: int) -> Iterator[tuple[int, Features]]:
@@ -35,7 +35,7 @@ def scenes(seed: int) -> Iterator[tuple[int, Features]]:
 
 
 def faults_of(law: str, experiment: Tree, number: int) -> Faults | None:
-    """What breaks the law; None where the scene has no equilibrium, and says so."""
+    """Return the violation of the law; None if the run reports that there is no equilibrium."""
     try:
         return LAWS[law](experiment, number)
     except pbdkit.ExperimentError as error:
@@ -45,7 +45,7 @@ def faults_of(law: str, experiment: Tree, number: int) -> Faults | None:
 
 
 def main() -> int:
-    """Counts what comes out."""
+    """Count the outcomes of the trials."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
