@@ -3,23 +3,26 @@
 import prose
 import pytest
 
-TEXTS = prose.project_texts()
+
+@pytest.fixture(scope="module")
+def texts():
+    return prose.project_texts()
 
 
 def planted(file, content):
     return [fault.split(": ", 1) for fault in prose.faults(prose.texts_of(file, content))]
 
 
-def test_the_project_has_no_faults():
-    assert list(prose.faults(TEXTS)) == []
+def test_the_project_has_no_faults(texts):
+    assert list(prose.faults(texts)) == []
 
 
 @pytest.mark.parametrize(
     ("kind", "persons", "verbs"), [("docstring", 8, 200), ("message", 8, 0), ("page", 8, 0)]
 )
-def test_counts_are_those_of_well_kept_packages(kind, persons, verbs):
+def test_counts_are_those_of_well_kept_packages(texts, kind, persons, verbs):
     folder = "docs/" if kind == "page" else "pbdkit/"
-    chosen = [t.text for t in TEXTS if t.kind == kind and t.file.startswith(folder)]
+    chosen = [t.text for t in texts if t.kind == kind and t.file.startswith(folder)]
     counts = prose.counts(chosen)
     assert counts["texts"] > 1000
     assert counts["person words per 10 000"] <= persons
@@ -46,8 +49,9 @@ def test_faults_are_found_in_docstrings_comments_and_messages():
 
 
 def test_faults_are_found_in_pages_and_experiments():
-    page = "# Title\n\nThe `whose` of\n$who$ [it](settles.md).\n\n```\nsaid so\n```\n\nA body whose end\nsettles.\n"
-    assert [place for place, _ in planted("a.md", page)] == ["a.md:10", "a.md:11"]
+    code = "# Title\n\nThe `whose` of\n$who$ [it](settles.md).\n\n```\nsaid so\n```\n"
+    found = planted("a.md", code + "\nA body whose end\nsettles.\n")
+    assert [place for place, _ in found] == ["a.md:10", "a.md:11"]
     assert [place for place, _ in planted("a.yaml", "steps: 1\nmemory: 0 # it settles")] == [
         "a.yaml:2"
     ]
