@@ -173,6 +173,25 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target).exists(), target
 
 
+TEXTS = [
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(ROOT.glob("plugins/*/README.md")),
+    ROOT / "ARCHITECTURE.md",
+    ROOT / "README.md",
+]
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=lambda p: f"{p.parent.name}-{p.stem}")
+def test_sources_that_are_named_in_text_exist(page):
+    """Files of commands, and names in backticks, relative to the repository, to the page, or to a
+    folder of the package or the tests."""
+    text = page.read_text("utf-8")
+    names = re.findall(r"(?:python|pytest) ((?:tests|docs|experiments)/[\w/-]+(?:\.py)?)", text)
+    names += re.findall(r"`((?:\w+/)+\w+\.py)`", text)
+    folders = [ROOT, page.parent, ROOT / "pbdkit", ROOT / "pbdkit" / "stepping", ROOT / "tests"]
+    assert [name for name in names if not any((f / name).exists() for f in folders)] == []
+
+
 def test_readme_lists_the_two_commands_that_ci_runs():
     text = (ROOT / "README.md").read_text()
     commands = re.findall(r"^python3 -m venv .*$", text, re.M)

@@ -1,6 +1,7 @@
 """The page docs/validation/reproduction.md, and its main numbers measured again."""
 
 import re
+import runpy
 
 import numpy as np
 import pytest
@@ -48,6 +49,11 @@ def test_pictures_exist_are_small_and_all_are_shown():
     shown = re.findall(r"\(\.\./(pictures/reproduction/[^)]+)\)", PAGE + OTHER)
     assert {DOCS / name for name in shown} == set((DOCS / "pictures/reproduction").iterdir())
     assert all((DOCS / name).stat().st_size <= 150_000 for name in shown)
+
+
+def test_the_times_that_the_page_takes_from_performance_are_found(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS / "reproduction")
+    assert runpy.run_path(str(DOCS / "reproduction" / "cost.py"))["MEASURED"].is_file()
 
 
 @pytest.mark.parametrize("name", NAMED)
