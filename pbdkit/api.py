@@ -489,7 +489,8 @@ def fit(
     if is_strength_fit(description):
         if measured is not None:
             raise ExperimentError(
-                "measured: a fit of strength is to peaks; list them under `measured` of the fit"
+                "measured: a strength fit uses peak loads, not datasets; list them under "
+                "`measured` of the fit"
             )
         return fit_strength(description, experiment=experiment, components=components)
     problem, source = read_fit(

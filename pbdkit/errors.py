@@ -249,7 +249,7 @@ def refuse_without(library: str, extra: str, reason: str) -> None:
     extra : str
         Extra of pbdkit that installs it.
     reason : str
-        What needs the library, in a message: "pictures need matplotlib".
+        What needs the library, in a message: "pictures require matplotlib".
     """
     if find_spec(library) is None:
         raise ExperimentError(f"{reason}: pip install 'pbdkit[{extra}]'")
@@ -257,4 +257,4 @@ def refuse_without(library: str, extra: str, reason: str) -> None:
 
 def refuse_no_matplotlib() -> None:
     """Raise ExperimentError if matplotlib is not installed."""
-    refuse_without("matplotlib", "plot", "pictures need matplotlib")
+    refuse_without("matplotlib", "plot", "pictures require matplotlib")

@@ -92,8 +92,8 @@ NUMBERS = {"Parameters": "p", "Weights": "w", "Constants": "c", "Own": "here.own
 """Names of the arguments of elementwise functions, by the class of their named tuple."""
 
 NO_REFERENCE = (
-    "`here.X` and `here.centred` are given to rules that declare "
-    "`uses_reference: ClassVar[bool] = True`"
+    "`here.X` and `here.centred` exist only in rules that declare `uses_reference: ClassVar[bool] "
+    "= True`"
 )
 """Message about reference positions in rules that do not declare their use."""
 
@@ -133,7 +133,7 @@ def worded(error: BaseException, package: str = "", component: type[Any] | None 
 def remedy(error: BaseException, component: type[Any] | None = None) -> str:
     """Return the remedy for frequent errors in elementwise functions."""
     if isinstance(error, ValueError) and "truth value of an array" in str(error):
-        return "; choose with `pbdkit.plugin.where` in the place of `if`, `and` and `or`"
+        return "; use `pbdkit.plugin.where` instead of `if`, `and` and `or`"
     of_none = isinstance(error, AttributeError | TypeError) and "'NoneType'" in str(error)
     if of_none and not getattr(component, "uses_reference", True):
         return f"; {NO_REFERENCE}"
@@ -304,7 +304,7 @@ def _with_state(plugin: Plugin) -> Plugin:
     """Disable the plugin if the user demands it."""
     why = ""
     if ALL in (names := disabled_names()):
-        why = f"all plugins are disabled (--no-plugins or {DISABLE}={ALL})"
+        why = f"plugins are disabled (--no-plugins or {DISABLE}={ALL})"
     elif any(map(plugin.answers_to, names)):
         why = f"{DISABLE} contains it"
     return replace(plugin, unusable="disabled", why=why) if why else plugin

@@ -78,14 +78,14 @@ def unfinished_source(
     """
     about, origin = unfinished.about, unfinished.about.get("origin")
     if not isinstance(origin, dict):
-        raise StorageError("the checkpoint is damaged: 'origin' is no mapping")
+        raise StorageError("the checkpoint is damaged: 'origin' is not a mapping")
     if "finished" in unfinished.facts:
         return None, origin
     source = _source(about, f"{output}, unfinished", steps, unfinished.facts.get("step"))
     experiment = Experiment.build(source)
     if steps not in (None, about.get("steps")) and not experiment.solver.makes_steps:
         raise ExperimentError(
-            f"{output}: an equilibrium depends on `steps` along its load path: resume it without "
+            f"{output}: the load path to an equilibrium depends on `steps`; resume it without "
             f"--steps, or run it again with --set steps={steps}"
         )
     if not anyway:
@@ -98,7 +98,7 @@ def chosen_parameters(facts: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the parameters of the solver that the run has selected for `auto`."""
     names = facts.get("chosen", [])
     if not isinstance(names, list) or not {*names} <= {"relaxation", "memory"}:
-        raise StorageError("the checkpoint is damaged: 'chosen' is no list of solver parameters")
+        raise StorageError("the checkpoint is damaged: 'chosen' is not a list of solver parameters")
     return tuple(names)
 
 
@@ -119,7 +119,7 @@ def longer(
     """
     about = dataset.attrs
     if about.get("status") not in CONTINUABLE:
-        raise ExperimentError(f"has status {about.get('status')}, and cannot be continued")
+        raise ExperimentError(f"has the status {about.get('status')} and cannot be continued")
     if (result_version := about.get("schema_version")) != SCHEMA_VERSION:
         raise ExperimentError(
             f"has schema_version {result_version}, and this pbdkit writes {SCHEMA_VERSION}; run it "
@@ -208,7 +208,9 @@ def _source(about: Mapping[str, Any], name: str, steps: int | None, completed: A
     refuse_retired(parts, f"{name}: resuming")
     if steps is not None:
         if isinstance(completed, int) and steps <= completed:
-            raise ExperimentError(f"{name}: {completed} steps are done; --steps must be larger")
+            raise ExperimentError(
+                f"{name}: {completed} steps are completed; --steps must be larger"
+            )
         parts["steps"] = steps
     return Source(name, parts)
 
@@ -220,7 +222,7 @@ def _map(about: Mapping[str, Any], key: str) -> dict[str, Any]:
     except (ValueError, TypeError, RecursionError):
         mapping = None
     if not isinstance(mapping, dict):
-        raise StorageError(f"'{key}' is damaged: it is no JSON mapping")
+        raise StorageError(f"'{key}' is damaged: it is not a JSON mapping")
     return mapping
 
 
@@ -345,7 +347,9 @@ def _is_unfinished(output: Path, steps: int | None) -> bool:
         return True
     refuse_other_file(output)
     if not output.exists():
-        raise ExperimentError(f"{output}: there is neither an unfinished run nor a result")
+        raise ExperimentError(
+            f"{output}: there is neither an unfinished run nor a result; `pbdkit run` computes one"
+        )
     if steps is None:
         raise ExperimentError(f"{output}: is finished; --steps N continues it to step N")
     make_room(output)
@@ -459,8 +463,8 @@ def _refuse_other_weights(
         old, new = getattr(stepping, name), getattr(new_stepping, name)
         if not math.isclose(old, new, rel_tol=WEIGHT_TOLERANCE, abs_tol=WEIGHT_TOLERANCE):
             raise ExperimentError(
-                f"{place}the steps were made with {name} {old:.6g}, chosen for the roles of the "
-                f"shorter run's last step, and a run of {scene.experiment.steps} steps takes "
-                f"{new:.6g}; run it again with --set steps={scene.experiment.steps}, or use "
-                "--anyway to continue with the former"
+                f"{place}the completed steps used {name} {old:.6g}, which was chosen for the "
+                "leaders and loads at the end of the shorter run; a run of "
+                f"{scene.experiment.steps} steps uses {new:.6g}; run it again with --set "
+                f"steps={scene.experiment.steps}, or use --anyway to continue with {old:.6g}"
             )

@@ -211,8 +211,8 @@ class SteppingDriver(Driver):
             yield from self._current_state()
         if outcome:
             return outcome
-        obstacle = f", not settled: {self.monitor.obstacle}" if self.monitor else ""
-        return RunOutcome("complete", f"all steps done{obstacle}", steps)
+        obstacle = f", not converged: {self.monitor.obstacle}" if self.monitor else ""
+        return RunOutcome("complete", f"completed all steps{obstacle}", steps)
 
     def _advance(self) -> None:
         """Step to the next state that is recorded or tested. Raises FloatingPointError."""
@@ -254,7 +254,7 @@ class SteppingDriver(Driver):
         cause = self._cause_of_nan()
         if self.rejection and not cause and np.isfinite(self.state.u).all():
             cause = ": displacements are finite, but a recorded variable is not"
-        reason = f"{error} left all bounds under rule '{rule}'{cause}"
+        reason = f"{error} diverged under rule '{rule}'{cause}"
         self.rejection = None
         if self.recorded_step < step - 1:
             good = self.guard.last_good(
@@ -296,7 +296,7 @@ class EquilibriumDriver(Driver):
     Yields the initial state, the states after increments of the load, and the equilibrium.
     """
 
-    choice = Choice("equilibrium", 1, "asked for")
+    choice = Choice("equilibrium", 1, "requested")
     moment = 0.0
     """Time that the load has reached, in steps."""
 
@@ -323,18 +323,20 @@ class EquilibriumDriver(Driver):
             outcome = RunOutcome("complete", str(certificate), state.step, certificate.as_dict())
         except UnconvergedError as error:
             bound = error.certificate
-            outcome = RunOutcome("unconverged", f"{error}: {bound}", state.step, bound.as_dict())
+            outcome = RunOutcome(
+                "unconverged", (f"{error}; the state is {bound}"), state.step, bound.as_dict()
+            )
         except SeparatedError as error:
             outcome = RunOutcome("separated", str(error), state.step)
         except FloatingPointError as error:
-            return RunOutcome("unconverged", f"{error} left all bounds", state.step)
+            return RunOutcome("unconverged", f"{error} diverged", state.step)
         except StoppedError:
-            reason = f"stopped on the way to equilibrium, after step {state.step}"
+            reason = f"stopped before equilibrium was reached, after step {state.step}"
             outcome = self.interruption = RunOutcome("interrupted", reason, state.step)
         self.ends_early = outcome.status != "complete"
         yield state
         if self.rejection:
-            return RunOutcome("unconverged", f"{self.rejection} left all bounds", state.step)
+            return RunOutcome("unconverged", f"{self.rejection} diverged", state.step)
         return outcome
 
     def _way(self, state: State) -> Way:
@@ -445,8 +447,8 @@ class Simulation:
                 )
             if state.step > scene.experiment.steps:
                 raise ExperimentError(
-                    f"start: step {state.step} is reached, and the experiment has "
-                    f"{scene.experiment.steps} steps"
+                    f"start: its state is that of step {state.step}, but the experiment has "
+                    f"{scene.experiment.steps} steps; increase `steps`"
                 )
         self._begin(scene, state, Watch())
         for text in self.warnings:
@@ -633,7 +635,9 @@ class Simulation:
                 next(self._states, None)
             except BaseException:
                 time, recordings, self._recordings = self.time, self._recordings, []
-                self.outcome = RunOutcome("interrupted", f"by an error after step {time}", time)
+                self.outcome = RunOutcome(
+                    "interrupted", f"an error occurred after step {time}", time
+                )
                 for recording in recordings:
                     recording.abandon()
                 raise

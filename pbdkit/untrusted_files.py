@@ -77,10 +77,10 @@ def check_declared(content: h5py.File, size: int) -> None:
     if content.id.links.visit(note_link, info=True) or h5o.visit(
         content.id, note_object, info=True
     ):
-        raise StorageError(f"it holds more than {MOST_OBJECTS} objects")
+        raise StorageError(f"it contains more than {MOST_OBJECTS} objects")
     for name, is_hard in links:
         if not is_hard:
-            raise StorageError(f"its link '{_text(name)}' leads elsewhere; {_REMEDY}")
+            raise StorageError(f"its link '{_text(name)}' is not a hard link; {_REMEDY}")
     for name in objects:
         item = h5o.open(content.id, name)
         if (count := h5a.get_num_attrs(item)) > MOST_OBJECTS:
@@ -88,7 +88,7 @@ def check_declared(content: h5py.File, size: int) -> None:
         for n in range(count):
             _check_attribute(h5a.open(item, index=n), size)
         if isinstance(item, h5g.GroupID) and h5o.get_info(item).rc > 1:
-            raise StorageError(f"its group '{_text(name)}' lies in several groups; {_REMEDY}")
+            raise StorageError(f"its group '{_text(name)}' belongs to several groups; {_REMEDY}")
         if isinstance(item, h5d.DatasetID):
             _check_dataset(item, _text(name), size)
 
@@ -107,7 +107,7 @@ def _check_attribute(attribute: Any, size: int) -> None:
     if _is_ragged(attribute.get_type()):
         count = math.prod(attribute.shape or ())
         if count > max(64, LARGEST_TEXTS // size):
-            raise StorageError(f"its attribute '{_text(attribute.name)}' has {count} parts")
+            raise StorageError(f"its attribute '{_text(attribute.name)}' has {count} elements")
 
 
 def _is_ragged(kind: Any) -> bool:
@@ -122,24 +122,28 @@ def _check_dataset(dataset: Any, name: str, size: int) -> None:
 
     properties, kind = dataset.get_create_plist(), dataset.get_type()
     if properties.get_layout() == h5d.VIRTUAL or properties.get_external_count():
-        raise StorageError(f"the values of its variable '{name}' lie in other files; {_REMEDY}")
+        raise StorageError(f"the values of its variable '{name}' are in other files; {_REMEDY}")
     for n in range(properties.get_nfilters()):
         number, *_, word = properties.get_filter(n)
         if number not in FILTERS:
             raise StorageError(
                 f"its variable '{name}' is stored by the filter {number} ({_text(word)}); "
-                f"pbdkit applies {', '.join(FILTERS.values())}: write it anew with these"
+                f"pbdkit applies {', '.join(FILTERS.values())}: write it again with one of these"
             )
     if _is_dimension_only(dataset):
         return
     shape, stored = dataset.shape or (), dataset.get_storage_size()
     declared = math.prod(shape) * kind.get_size()
     if declared > max(DENSEST * stored, SPARSEST * size) + EMPTY:
-        raise StorageError(f"it cannot hold the {declared:.3g} bytes that '{name}' declares")
+        raise StorageError(
+            f"its size is too small for the {declared:.3g} bytes that '{name}' declares"
+        )
     if properties.get_layout() == h5d.CHUNKED:
         chunk = math.prod(properties.get_chunk()) * kind.get_size()
         if chunk > DENSEST * stored + LARGEST_CHUNK:
-            raise StorageError(f"it cannot hold the chunks of {chunk:.3g} bytes of '{name}'")
+            raise StorageError(
+                f"its size is too small for the chunks of {chunk:.3g} bytes of '{name}'"
+            )
     if h5ds.is_scale(dataset) and declared > machine_memory() // 4:
         raise StorageError(f"'{name}' declares {declared:.3g} bytes, more than fit into memory")
     if _is_ragged(kind):
@@ -163,11 +167,11 @@ def _check_texts(dataset: Any, name: str, size: int) -> None:
 
     texts, total = h5py.Dataset(dataset), 0
     if h5py.check_string_dtype(texts.dtype) is None:
-        raise StorageError(f"its variable '{name}' holds values of variable length")
+        raise StorageError(f"its variable '{name}' has values of variable length")
     for block in _blocks(texts, size):
         total += sum(map(len, block.ravel()))
         if total > size:
-            raise StorageError(f"it cannot hold the texts that '{name}' declares")
+            raise StorageError(f"its size is too small for the texts that '{name}' declares")
 
 
 def _blocks(texts: Any, size: int) -> Iterator[Any]:
@@ -201,7 +205,9 @@ def refuse_no_result(path: Path) -> None:
     """
     with path.open("rb") as file:
         if not file.read(8).startswith(BEGINNINGS):
-            raise StorageError(f"{path}: is no result of pbdkit: it begins as no netCDF file does")
+            raise StorageError(
+                f"{path}: is not a result of pbdkit: its first bytes are not those of netCDF"
+            )
 
 
 def try_reading(path: Path) -> None:
@@ -232,12 +238,12 @@ def read_apart(path: Path, *arguments: str) -> bytes:
     if process.returncode == FAULT:
         raise StorageError(f"{path}: {process.stdout.decode(errors='replace').strip()}")
     messages = process.stderr.decode(errors="replace").strip().splitlines() or [""]
-    ending = f"ends its process (status {process.returncode}: {messages[-1][:200]})"
+    ending = f"ends with status {process.returncode}: {messages[-1][:200]}"
     if messages[0].startswith("Timeout"):
-        ending = f"comes to no end ({PATIENCE_S:g} s)"
+        ending = f"does not end within {PATIENCE_S:g} s"
     elif process.returncode < 0:
-        ending = f"ends its process ({signal.strsignal(-process.returncode)})"
-    raise StorageError(f"{path}: is damaged, or was changed: to read it {ending}")
+        ending = f"ends by a signal: {signal.strsignal(-process.returncode)}"
+    raise StorageError(f"{path}: is damaged, or was changed: the process that reads it {ending}")
 
 
 def answer(read: Callable[..., None]) -> None:
@@ -297,7 +303,9 @@ def _read(path: Path) -> None:
         for variable in file.variables.values():
             size = math.prod(variable.shape) * getattr(variable.dtype, "itemsize", 1)
             if size > limit:
-                raise StorageError(f"it cannot hold the {size:.3g} bytes that it declares")
+                raise StorageError(
+                    f"its size is too small for the {size:.3g} bytes that it declares"
+                )
             entries = variable.shape[0] if variable.ndim else 1
             rows = max(1, PIECE * entries // max(1, size))
             for first in range(0, entries, rows):
@@ -336,7 +344,7 @@ def _print(path: Path, variable: str, most_values: str) -> None:
     bound_time()
     if not h5py.is_hdf5(path):
         raise StorageError(
-            "is no netCDF-4 file; xarray writes one: dataset.to_netcdf(NAME, engine='h5netcdf')"
+            "is not a netCDF-4 file; xarray writes one: dataset.to_netcdf(NAME, engine='h5netcdf')"
         )
     with h5py.File(path, "r") as content:
         check_declared(content, path.stat().st_size)
@@ -359,17 +367,21 @@ def _field(file: Any, variable: str, most_values: int) -> Any:
     field = file.variables[variable]
     if {*field.dimensions} != {"x", "y"} or not {"x", "y"} <= {*file.variables}:
         raise StorageError(
-            f"'{variable}' should be over x and y, with a coordinate for each; it is over "
+            f"'{variable}' should have the dimensions x and y with their coordinates, got "
             f"{', '.join(field.dimensions) or 'nothing'}"
         )
     if (count := math.prod(field.shape)) > most_values:
         raise StorageError(f"'{variable}' has {count} values, more than {most_values}")
     for name in (variable, "x", "y"):
         if file.variables[name].dtype.kind not in "fiu":
-            raise StorageError(f"'{name}' holds {file.variables[name].dtype}, not numbers")
+            raise StorageError(
+                f"'{name}' has the type {file.variables[name].dtype}; expected numbers"
+            )
     for name in ("x", "y"):
         if file.variables[name].dimensions != (name,):
-            raise StorageError(f"'{name}' should be a coordinate: numbers over {name} alone")
+            raise StorageError(
+                f"'{name}' should be a coordinate: numbers with the dimension {name} only"
+            )
     return field
 
 

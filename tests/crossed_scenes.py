@@ -85,7 +85,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
         ("loads", "body force"),
         "loads: loads require fixed neighbours; set neighbours.reeval",
     ),
-    ((ANEW,), ("solver: equilibrium",), "the limit of the steps is not defined if neighbours are"),
+    ((ANEW,), ("solver: equilibrium",), "an equilibrium is not defined if neighbours are"),
     ((ANEW,), ("solver settle",), "the distance from equilibrium has no bound if neighbours are"),
     ((ANEW,), FIELDS_OF_RULE[:2], "fixed neighbours for varying parameters; set"),
     (
@@ -96,9 +96,13 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (
         ("memory auto",),
         ("rule number in time", "fracture number in time"),
-        "'auto' needs constant parameters, and some depend on time",
+        "'auto' requires constant parameters, but some depend on time",
     ),
-    (("memory auto",), (ANEW,), "'auto' needs a spectrum, and there is none if neighbours are"),
+    (
+        ("memory auto",),
+        (ANEW,),
+        "'auto' requires a spectrum, which does not exist if neighbours are",
+    ),
     (
         UNCALIBRATED,
         ("loads", "body force"),
@@ -321,7 +325,7 @@ class _Writer:
     def fracture(self) -> dict[str, Any]:
         limit = self.draw.choice([0.0317, 0.0173, 0.2, 0.0071])
         if self.jumps and self.has("loads", "body force", "obstacles"):
-            limit = 0.6  # what comes off would be pushed on for ever
+            limit = 0.6  # what comes off would be loaded, but not constrained
         base: dict[str | None, dict[str, Any]] = {
             "strain": {"failure": limit},
             "damage": {"onset": limit / 3, "failure": limit},

@@ -75,7 +75,7 @@ BROKEN = {
     "a type with a colon": (rule("a:b"), "TypeError: Rule has the type 'a:b'; a type must begin with a letter or digit"),
     "abstract": (ABSTRACT, "TypeError: Rule does not define apply"),
     "not static": (changed("    @staticmethod\n    def apply", "    def apply"), "TypeError: Rule.apply must be static: write @staticmethod above it, without `self` in apply(total, here, p)"),
-    "wrong signature": (changed("gather(d, r, w, p)", "gather(d, r)"), "TypeError: Rule.gather(d, r) is called as gather(d, r, w, p)"),
+    "wrong signature": (changed("gather(d, r, w, p)", "gather(d, r)"), "TypeError: Rule.gather(d, r) has other arguments; declare gather(d, r, w, p)"),
     "unknown annotation": (changed("strength: float", "strength: 'Nothing'"), "TypeError: the parameters of Rule cannot be described in a JSON Schema: PydanticUserError: "),
     "parameter without a schema": ("from collections.abc import Callable" + changed("strength: float = 1.0", "strength: Callable = print"), "TypeError: the parameters of Rule cannot be described in a JSON Schema: "),
     "twice a type": (rule("twice", "class Twin(Rule):\n    pass\n").replace("[Rule]", "[Rule, Twin]"), "it has two classes with the type 'twice'; change the type of one of them"),

@@ -123,7 +123,7 @@ def of_engines(experiment: Tree, n: int = 0) -> Faults:
         try:
             compiled = run(experiment | {"solver": solver | {"engine": "compiled", "threads": 1}})
         except pbdkit.ExperimentError as error:
-            refused = "the compiled engine cannot be had" in str(error)
+            refused = "the compiled engine is not available" in str(error)
             return faults if refused else [*faults, str(error)]
     return faults + _different(plain, compiled, "the compiled engine")
 

@@ -119,7 +119,7 @@ MISTAKES = {
     "identify of a dataset": (lambda ds: pbdkit.identify(ds), RESULT),
     "sweep of a dataset": (lambda ds: pbdkit.sweep(ds), RESULT),
     "load of a dataset": (lambda ds: pbdkit.load(ds), "load: expected a file or the name", RESULT),
-    "load of a dict": (lambda ds: pbdkit.load({}), "`pbdkit.run` takes it as it is"),
+    "load of a dict": (lambda ds: pbdkit.load({}), "pass it to `pbdkit.run` directly"),
     "run of a number": (lambda ds: pbdkit.run(5), "of type int", "shipped experiment as 'paper/a'"),
     "run of a class": (lambda ds: pbdkit.run(pbdkit.FollowerRule), "got a class; give a file"),
     "rerun of a file": (lambda ds: pbdkit.rerun("a.nc"), "pbdkit.open('a.nc') returns that of"),

@@ -406,7 +406,9 @@ def test_the_search_for_an_equilibrium_does_not_become_another_one(
     given, part = tensile | RUNS["equilibrium, fracture"], tmp_path / "part.nc"
     record(Simulation.of_scene(scene_of(given), watch=stopping_after(9)), NetcdfSink(part))
     steps = given["steps"]
-    with pytest.raises(pbdkit.ExperimentError, match="depends on `steps` along its load path"):
+    with pytest.raises(
+        pbdkit.ExperimentError, match="the load path to an equilibrium depends on `steps`"
+    ):
         resumption(part, Watch(), steps=steps + 5)
     assert resumption(part, Watch(), steps=steps) is not None
 
@@ -475,4 +477,4 @@ def test_what_cannot_be_continued_is_refused(
         assert (refused.code, status in refused.err) == (2, True), refused.err
     record(Simulation.of_scene(scene_of(tensile)), NetcdfSink(tmp_path / "short.nc"))
     refused = call("resume", str(tmp_path / "short.nc"), "--steps", "3")
-    assert "steps are done; --steps must be larger" in refused.err
+    assert "steps are completed; --steps must be larger" in refused.err

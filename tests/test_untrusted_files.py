@@ -37,7 +37,7 @@ NO_RESULTS = {
 @pytest.mark.parametrize("name", NO_RESULTS)
 def test_what_is_no_result_is_told_in_a_line(name, call):
     Path(name).write_bytes(NO_RESULTS[name])
-    said = f"{name}: is no result of pbdkit: it begins as no netCDF file does"
+    said = f"{name}: is not a result of pbdkit: its first bytes are not those of netCDF"
     verified = call("verify", name)
     assert (verified.code, verified.out) == (6, said + "\n")
     for command in ("plot", "explain"):
@@ -50,18 +50,18 @@ def test_an_experiment_a_folder_and_nothing_are_no_results(call):
     assert result.code == 6
     assert result.out.splitlines() == [
         "e.json: is an experiment; `pbdkit run e.json` computes its result and prints the path",
-        "kept: is a folder, no result of pbdkit",
+        "kept: is a folder, not a result of pbdkit",
         "gone.nc: there is no such file",
-        "/dev/null: is no plain file, and no result of pbdkit",
+        "/dev/null: is not a plain file, and not a result of pbdkit",
     ]
 
 
 LIBRARIES = {
-    "crashes": ("import os; os.abort()", r"to read it ends its process \(Aborted"),
-    "ends": ("import os; os._exit(3)", r"to read it ends its process \(status 3"),
+    "crashes": ("import os; os.abort()", "the process that reads it ends by a signal: Aborted"),
+    "ends": ("import os; os._exit(3)", "the process that reads it ends with status 3"),
     "hangs": (
         "import faulthandler as f; f.dump_traceback_later(.3, exit=True)\nwhile True: pass",
-        "to read it comes to no end",
+        "the process that reads it does not end within",
     ),
     "fails": ("raise ValueError('odd')", "cannot be read as netCDF-4: odd"),
     "eats": (
@@ -109,7 +109,7 @@ def test_more_than_a_file_can_hold_is_refused(bare, tmp_path):
     large = shutil.copy(bare, tmp_path / "large.nc")
     with h5py.File(large, "r+") as file:
         file.create_dataset("more", (2**40,), "f8", chunks=(2**16,))
-    with pytest.raises(pbdkit.StorageError, match=r"it cannot hold the 8\.8e\+12 bytes"):
+    with pytest.raises(pbdkit.StorageError, match=r"its size is too small for the 8\.8e\+12 bytes"):
         pbdkit.open(large)
 
 

@@ -89,15 +89,15 @@ def no_texts(file: h5py.File) -> None:
 
 
 HARMFUL = [
-    (bomb, "it cannot hold the 1.2e+10 bytes that 'z' declares"),
-    (external, "the values of its variable 'more' lie in other files; copy the data into one"),
-    (link, "its link 'more' leads elsewhere; copy the data into one netCDF-4 file"),
-    (virtual, "the values of its variable 'more' lie in other files"),
-    (circle, "its group '.' lies in several groups; copy the data into one netCDF-4 file"),
+    (bomb, "its size is too small for the 1.2e+10 bytes that 'z' declares"),
+    (external, "the values of its variable 'more' are in other files; copy the data into one"),
+    (link, "its link 'more' is not a hard link; copy the data into one netCDF-4 file"),
+    (virtual, "the values of its variable 'more' are in other files"),
+    (circle, "its group '.' belongs to several groups; copy the data into one netCDF-4 file"),
     (lzf, "its variable 'more' is stored by the filter 32000 (lzf); pbdkit applies deflate, "),
-    (large_chunk, "it cannot hold the chunks of 2.15e+09 bytes of 'more'"),
-    (one_text_for_many, "its attribute 'more' has 50000 parts"),
-    (no_texts, "its variable 'more' holds values of variable length"),
+    (large_chunk, "its size is too small for the chunks of 2.15e+09 bytes of 'more'"),
+    (one_text_for_many, "its attribute 'more' has 50000 elements"),
+    (no_texts, "its variable 'more' has values of variable length"),
 ]
 
 
@@ -194,7 +194,7 @@ def test_a_field_file_in_the_classic_format_is_told_how_to_be_written(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("f.nc").write_bytes(b"CDF\x01" + bytes(100))
-    with pytest.raises(ValueError, match=r"f\.nc: is no netCDF-4 file; xarray writes one"):
+    with pytest.raises(ValueError, match=r"f\.nc: is not a netCDF-4 file; xarray writes one"):
         read_field(FIELD, OF_PROGRAM)
 
 
@@ -283,7 +283,7 @@ def test_fields_sweeps_and_fits_need_the_same_word(
     ):
         refused = call(command, file)
         assert refused.code == 2
-        assert "outside the folder" in refused.err or "leads elsewhere" in refused.err
+        assert "outside the folder" in refused.err or "is not a hard link" in refused.err
         allowed = call(command, file, "--allow-outside")
         assert "--allow-outside" not in allowed.err
         assert (command, allowed.code) in {("check", 0), ("sweep", 0), ("fit", 2)}

@@ -14,7 +14,7 @@ from pbdkit.hooks import Command, hookimpl, import_object
 @hookimpl
 def pbdkit_commands() -> list[Command]:
     """Return the command `bench`."""
-    does = "Measures speed against error, to choose a solver."
+    does = "Measure speed against error, to choose a solver."
     return [Command("bench", "pbdkit.bench:bench", does, "Understand")]
 
 
@@ -32,13 +32,17 @@ def _sizes(context: click.Context, option: click.Parameter, text: str | None) ->
 @click.command()
 @experiment_argument
 @click.option("--sizes", callback=_sizes, help="Sites along the longer side, e.g. 50,100,200.")
-@click.option("--steps", type=click.IntRange(min=1), help="Steps of each run; else its own.")
-@click.option("--json", "json_file", type=PATH, help="Write the figures.")
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    help="Steps of each run; default those of the experiment.",
+)
+@click.option("--json", "json_file", type=PATH, help="JSON file for the figures.")
 @click.option("--plot", "picture", type=PATH, help="PNG, SVG or PDF.")
 @set_option
 def bench(experiment: str, settings: tuple[str, ...], steps: int | None, **options: Any) -> None:
-    """Measure speed against error, at one or several sizes: engines, precisions and threads; where
-    the solver is `equilibrium`, its methods and the steps, over tolerances."""
+    """Measure speed against error, at one or several sizes: engines, precisions and threads; with
+    the solver `equilibrium`, its methods and steps, over tolerances."""
     changes = (*settings, *([f"steps={steps}"] if steps else ()))
     loaded = load_experiment(experiment, changes)
     show = import_object("pbdkit.bench.work_precision:show_work_precision")

@@ -68,8 +68,10 @@ def resized(experiment: Experiment, size: int) -> tuple[str, ...]:
         if group.select.numbers is not None:
             raise _refusal(
                 experiment,
-                "leaders chosen by number cannot be resized: numbers change with the size; choose "
-                "them by edge, box or nearest, or leave --sizes out to run it as it is",
+                (
+                    "leaders selected by number cannot be resized, since numbers change with the "
+                    "size; select them by edge, box or nearest, or omit --sizes"
+                ),
                 *("leaders", n, "select", "numbers"),
             )
     change = _larger_grid if isinstance(experiment.body, Grid) else _finer_lattice
@@ -107,16 +109,18 @@ def _finer_lattice(experiment: Experiment, size: int) -> Iterator[tuple[str, Any
     if any(box.in_sites for box in boxes):
         raise _refusal(
             experiment,
-            "a grid within another body cannot be resized: its outline moves with the lattice; "
-            "write a rectangle, or leave --sizes out to run it as it is",
+            (
+                "a grid within another body cannot be resized, since its outline moves with the "
+                "lattice; write a rectangle, or omit --sizes"
+            ),
             "body",
         )
     sides = [max(box.high[n] for box in boxes) - min(box.low[n] for box in boxes) for n in (0, 1)]
     constants = {name: getattr(experiment.lattice, name, None) for name in ("a", "b")}
     along = constants["b"] if sides[1] > sides[0] and constants["b"] else constants["a"]
     if along is None:
-        what = f"the lattice '{experiment.lattice.type}' has no constant `a` to divide"
-        raise _refusal(experiment, f"{what}; leave --sizes out", "lattice")
+        what = f"the lattice '{experiment.lattice.type}' has no lattice constant `a`"
+        raise _refusal(experiment, f"{what}; omit --sizes", "lattice")
     factor = max(sides) / max(1, size - 1) / along
     for name, value in constants.items():
         if value is not None:
@@ -259,7 +263,7 @@ def measure(
             )
 
         for row in rows(run_job, Row(size, ""), loaded.steps):
-            report(f"{row.line}, size {size or 'as it is'}")
+            report(f"{row.line}, size {size or 'unchanged'}")
             yield row
 
 
@@ -331,7 +335,7 @@ def _rows_of_method(
 ) -> Iterator[Row]:
     if base.method == "lu":  # LU does not become faster with a larger tolerance.
         if (base.particles or 0) > MAX_PARTICLES_LU:
-            reason = f"left out above {MAX_PARTICLES_LU} particles: its factors take gibibytes"
+            reason = f"omitted above {MAX_PARTICLES_LU} particles: its factors take gibibytes"
             yield replace(base, reason=reason)
             return
         tolerances = tolerances[-1:]
@@ -346,7 +350,7 @@ def _rows_of_method(
         memory = measured["peak_memory_mib"]
         yield replace(base, tolerance=tolerance, peak_memory_mib=memory, error=share, **row)
     for tolerance in tolerances[len(figures) :]:
-        reason = f"{figures[-1]['seconds']:.0f} s for the tolerance before"
+        reason = f"{figures[-1]['seconds']:.0f} s for the previous tolerance"
         yield replace(base, tolerance=tolerance, reason=reason)
 
 
@@ -374,7 +378,7 @@ def _rows_of_steps(
         row = replace(base, tolerance=tolerance, steps=n)
         if n is None:
             eigenvalue = f"the largest eigenvalue is {exact['rate']:.6g}"
-            yield replace(row, reason=f"steps do not settle: {eigenvalue}")
+            yield replace(row, reason=f"steps do not converge: {eigenvalue}")
         elif n in stops:
             i, (built, built_cpu) = stops.index(n), measured["built"]
             error = _error(measured["distances"][i], exact["scale"], exact["within"])
@@ -386,16 +390,20 @@ def _rows_of_steps(
 
 
 COLUMNS = {n: (n, "", "") for n in ("size", "particles", "method", "precision", "threads")} | {
-    "tolerance": ("tolerance", ".0e", "a share of the largest prescribed displacement"),
-    "steps": ("steps", "", "made, or iterations of the linear solver"),
-    "setup_first_s": ("set-up", ".2f", "seconds until the first step, with compiling"),
-    "setup_s": ("cached", ".2f", "the same with what was compiled before"),
-    "ns_per_particle_step": ("ns", ".3g", "a particle and step"),
-    "seconds": ("seconds", ".3g", "from the experiment on, imports and compiling done"),
-    "cpu_s": ("CPU s", ".3g", "of all processors together"),
+    "tolerance": ("tolerance", ".0e", "relative to the largest prescribed displacement"),
+    "steps": ("steps", "", "number of steps, or of iterations of the linear solver"),
+    "setup_first_s": ("set-up", ".2f", "seconds until the first step, including compilation"),
+    "setup_s": ("cached", ".2f", "set-up with kernels from the cache"),
+    "ns_per_particle_step": ("ns", ".3g", "per particle and step"),
+    "seconds": (
+        "seconds",
+        ".3g",
+        ("from the experiment to the result, without imports and compilation"),
+    ),
+    "cpu_s": ("CPU s", ".3g", "sum over all processors"),
     "peak_memory_mib": ("MiB", ".1f", "peak memory above that of the imports"),
-    "certified": ("certified", ".1e", "what the certificate says; *: it misses the tolerance"),
-    "error": ("error", ".1e", "at most, as a share: the largest distance from the first row"),
+    "certified": ("certified", ".1e", "error bound; *: it exceeds the tolerance"),
+    "error": ("error", ".1e", "largest relative distance from the first row"),
 }
 """Heading, format and meaning of each field of a row."""
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -425,7 +433,7 @@ def _columns_with_values(rows: Sequence[Row]) -> list[str]:
 def _cell(row: Row, name: str) -> str:
     value = getattr(row, name)
     if value is None:
-        missing = {"size": "as it is", "error": "left out" if row.reason else ""}
+        missing = {"size": "unchanged", "error": "omitted" if row.reason else ""}
         return missing.get(name, "")
     if name == "error":
         return "0" if value == 0 else f"{value:.1e}" if isfinite(value) else "not finite"
@@ -440,7 +448,7 @@ def lines(rows: Sequence[Row]) -> list[str]:
     texts = [f"{heading}: {meaning}" for heading, _, meaning in columns if meaning]
     for row in (row for row in rows if row.reason):
         place = f"size {_cell(row, 'size')}" + (f", {row.tolerance:.0e}" if row.tolerance else "")
-        texts.append(f"left out: {row.line} at {place}: {row.reason}")
+        texts.append(f"omitted: {row.line} at {place}: {row.reason}")
     return list(dict.fromkeys(texts))
 
 
@@ -488,8 +496,8 @@ def work_precision_figure(rows: Sequence[Row], title: str) -> Figure:
         panels[0].set_yticks([FLOOR, *ticks], ["0", *(f"{tick:.0e}" for tick in ticks)])
     by_step = any(row.ns_per_particle_step for row in measured)
     for ax in panels[-across:]:
-        ax.set_xlabel("ns a particle and step" if by_step else "seconds of processor time")
-    figure.supylabel("largest error, as a share", fontsize=8)
+        ax.set_xlabel("ns per particle and step" if by_step else "seconds of processor time")
+    figure.supylabel("largest relative error", fontsize=8)
     figure.suptitle(title, fontsize=9)
     legend, ncols = panels[0].get_legend_handles_labels(), min(4, len(kinds) or 1)
     figure.legend(*legend, loc="outside lower center", ncols=ncols, fontsize=7, frameon=False)
@@ -529,7 +537,7 @@ def show_work_precision(
         refuse_output(path, force=True, experiment=Path(name))
     refuse_unwritable(picture, json_file)
     total, measured = methods_count(experiment) * max(1, len(sizes)), count(1)
-    with waiting(f"measuring {total} methods, each in a process of its own") as show:
+    with waiting(f"measuring {total} methods, each in a separate process") as show:
 
         def report(text: str) -> None:
             show(f"measured {text}; {next(measured)} of {total}")
@@ -685,9 +693,7 @@ def _compute_exact(job: Task) -> Task:
     _import(*SOLVERS)
     experiment = load(job["experiment"], settings=job["settings"])
     if experiment.fracture.type != "none":
-        reason = (
-            "speed against error is measured where no bond can break; set fracture={type: none}"
-        )
+        reason = "speed against error is measured without fracture; set fracture={type: none}"
         raise experiment.located(ExperimentError(reason, ("fracture",)))
     scene, state, certificate = _equilibrium(experiment)
     exact = _of_followers(scene, state)

@@ -24,14 +24,15 @@ COMPLETING = "_PBDKIT_COMPLETE"
 
 
 FIRST = {
-    "pbdkit run paper/a": "Runs a case, and writes paper-a.nc.",
-    "pbdkit plot paper-a.nc --color pe1": "Draws it into paper-a.png.",
-    "pbdkit init": "Writes experiment.yaml to be changed.",
+    "pbdkit run paper/a": "Run a paper case: paper-a.nc.",
+    "pbdkit plot paper-a.nc --color pe1": "Draw the result: paper-a.png.",
+    "pbdkit init": "Write a template: experiment.yaml.",
 }
 """First commands to type, with their purpose."""
 WELCOME = """\
-pbdkit deforms bodies on lattices. Particles follow their neighbours by rules
-instead of forces. A file says what is to be done; the result is a dataset.
+pbdkit computes the deformation of bodies on lattices. Particles follow their
+neighbours by rules instead of forces. An experiment file describes the run; its
+result is a dataset.
 """
 """Text that is printed without a command."""
 SYSTEM = dict.fromkeys(
@@ -40,11 +41,11 @@ SYSTEM = dict.fromkeys(
 """Errors of the operating system that are no bug of pbdkit, with the remedy."""
 SYSTEM |= dict.fromkeys(
     (errno.EMFILE, errno.ENFILE),
-    "; raise the limit (`ulimit -n`), or let fewer processes work at once",
+    "; raise the limit (`ulimit -n`), or use fewer processes",
 )
 """Remedies for errors of the operating system by number; they are no defects of pbdkit."""
 MORE = """\
-`pbdkit COMMAND --help` says what a command takes; `pbdkit --help` has the rest."""
+`pbdkit COMMAND --help` describes a command, `pbdkit --help` all options."""
 """Hint to further help."""
 
 
@@ -53,10 +54,11 @@ MORE = """\
     cls=CommandTable,
     context_settings={"help_option_names": ["-h", "--help"]},
     invoke_without_command=True,
-    epilog='In bash, `eval "$(_PBDKIT_COMPLETE=bash_source pbdkit)"` lets the tabulator key '
-    "complete commands, settings, variables and steps; docs/experiments.md has zsh and fish.",
+    epilog='In bash, `eval "$(_PBDKIT_COMPLETE=bash_source pbdkit)"` enables completion of '
+    "commands, settings, variables and steps by the tabulator key; for zsh and fish see "
+    "docs/experiments.md.",
 )
-@click.option("--debug", is_flag=True, help="Show a traceback where something fails.")
+@click.option("--debug", is_flag=True, help="Show a traceback if a command fails.")
 @click.version_option(package_name="pbdkit")
 @click.pass_context
 def program(context: click.Context, debug: bool) -> None:
@@ -67,7 +69,7 @@ def program(context: click.Context, debug: bool) -> None:
 
 def _welcome() -> str:
     """Return the first commands to type, and all commands."""
-    lines = [WELCOME, "Type this first:"]
+    lines = [WELCOME, "First commands:"]
     lines += [f"  {typed:<36} {does}" for typed, does in FIRST.items()]
     for group, commands in groupby(builtin_commands().values(), key=lambda command: command.group):
         lines += [f"\n{group}:", *(f"  {command.name:<12} {command.does}" for command in commands)]

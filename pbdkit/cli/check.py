@@ -92,7 +92,7 @@ def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator
     """Yield rows about the time dependence of the run and its cost."""
     if loaded.stepping.is_open:
         reason = "the rule is not linear or bonds can break"
-        remark = "" if predicted.exact else f", of the step linearised at rest: {reason}"
+        remark = "" if predicted.exact else f", for the step linearised at rest: {reason}"
         yield (
             "chosen",
             f"relaxation {predicted.relaxation:.6g}, memory {predicted.memory:.6g}{remark}",
@@ -101,12 +101,12 @@ def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator
         yield from _stability(predicted)
         yield from _convergence(scene, predicted)
         if predicted.period is not None:
-            shrinks = f"shrinking by a factor of {predicted.decay:.4g} a step"
-            yield "oscillates", f"slowest period {predicted.period:.4g} steps, {shrinks}"
+            decay = f"decaying by a factor of {predicted.decay:.4g} per step"
+            yield "oscillates", f"slowest period {predicted.period:.4g} steps, {decay}"
     else:
         count = loaded.record_count - 1
-        equilibria = f" of each of {count} recorded steps" if count > 1 else ""
-        yield "solver", f"goes straight to the equilibrium{equilibria}, to where steps would lead"
+        equilibria = f", one for each of {count} recorded steps" if count > 1 else ""
+        yield "solver", f"computes the equilibrium directly{equilibria}; steps would converge to it"
         from pbdkit.equilibrium.load_stepping import changes
 
         if steps_of_changes := changes(scene, loaded.steps):
@@ -117,10 +117,10 @@ def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator
                 else ""
             )
             steps = "step" if len(steps_of_changes) == 1 else "steps"
-            yield "settles", f"before roles or loads change, after {steps} {listed}{rest}"
+            yield "equilibria", f"also before leaders or loads change, after {steps} {listed}{rest}"
     time = "" if predicted.seconds is None else f"{_seconds(predicted.seconds)} of stepping, "
     memory = f"{predicted.memory_mib:.3g} MiB of memory, {predicted.output_mib:.3g} MiB of output"
-    yield "takes", f"{time}{memory} (estimates)"
+    yield "cost", f"{time}{memory} (estimates)"
 
 
 def _row_of(title: str, groups: Iterable[str], limit: int | None) -> Iterator[Row]:
@@ -175,14 +175,14 @@ def _in_regions(scene: Scene) -> Iterator[str]:
 
 def _stability(predicted: Forecast) -> Iterator[Row]:
     if predicted.spectral_radius is None:
-        yield "stable", "not known beforehand"
+        yield "stable", "not known before the run"
         return
     verdict = "yes" if predicted.stable else "NO, some modes grow"
     remark = (
         ", linearised at the start" * (not predicted.exact) + ", estimated" * predicted.estimated
     )
     bound = predicted.largest_stable_relaxation
-    range_text = f"; stable with relaxations below {bound:.6g}" if bound else ""
+    range_text = f"; stable for a relaxation below {bound:.6g}" if bound else ""
     yield (
         "stable",
         f"{verdict} (spectral radius {predicted.spectral_radius:.6g}{remark}){range_text}",
@@ -202,11 +202,11 @@ def _convergence(scene: Scene, predicted: Forecast) -> Iterator[Row]:
         scene.experiment.steps,
     )
     tolerances = [tolerance for tolerance, needed in steps.items() if needed <= count]
-    verdict = f"the {count} asked for reach {tolerances[-1] if tolerances else 'neither'}"
+    verdict = f"the run of {count} steps reaches {tolerances[-1] if tolerances else 'neither'}"
     if scene.experiment.stepping.settle is not None:
-        verdict = f"the run ends when it has settled, after {count} at the latest"
-    whole = "" if scene.experiment.fracture.type == "none" else ", as long as no bond breaks"
-    yield "settles", f"{text} steps{whole}; {verdict}"
+        verdict = f"the run ends once it has converged, or after {count} steps"
+    whole = "" if scene.experiment.fracture.type == "none" else " if no bond breaks"
+    yield "converges", f"{text} steps{whole}; {verdict}"
 
 
 def _seconds(seconds: float) -> str:
@@ -221,14 +221,17 @@ def _detail_rows(scene: Scene, predicted: Forecast) -> Iterator[Row]:
     """Yield the rows that --verbose adds."""
     experiment = scene.experiment
     records = experiment.record_count
-    yield "records", f"{records} states in {experiment.steps} steps, that of time 0 included"
-    yield "particles", f"{predicted.particles}, of which {predicted.followers} follow in step 1"
+    yield "records", f"{records} states in {experiment.steps} steps, including that at time 0"
+    yield (
+        "particles",
+        f"{predicted.particles}, of which {predicted.followers} are followers in step 1",
+    )
     yield "bonds", f"{predicted.bonds}"
     yield "weights", f"relaxation {predicted.relaxation:.6g}, memory {predicted.memory:.6g}"
     if predicted.spectral_radius is not None:
         remark = "exact" if predicted.exact else "linearised at the start"
         if isinstance(experiment.rule, RenewsParticles):
-            remark += ", what particles remember held as it is there"
+            remark += ", with state variables of particles held constant"
         remark += ", estimated: the steps to 1 %" if predicted.estimated else ""
         smallest = predicted.smallest_eigenvalue
         ends = (
@@ -242,10 +245,12 @@ def _detail_rows(scene: Scene, predicted: Forecast) -> Iterator[Row]:
             for tolerance, needed in predicted.steps_to.items()
             if needed is not None
         )
-        yield from [("steps", f"settle to {text}")] if text else []
+        yield from [("steps", f"for convergence to {text}")] if text else []
     if predicted.lag is not None:
         size, unit = in_lengths(experiment.units)
         end = predicted.lag_reached
-        reached = "" if end is None else f", {size * end:.4g} when they end"
-        text = f"{size * predicted.lag:.4g} {unit} behind equilibrium if the leaders' fastest steps"
-        yield "lag", f"{text} went on{reached}"
+        reached = "" if end is None else f", and {size * end:.4g} at the end of these steps"
+        text = (
+            f"{size * predicted.lag:.4g} {unit} from equilibrium if the leaders continue at their"
+        )
+        yield "distance", f"{text} fastest{reached}"

@@ -40,7 +40,7 @@ MEANT = {
     ("list", "ls"): "`pbdkit experiments` lists shipped experiments, `pbdkit plugins list` plugins",
     ("show", "view", "draw", "picture", "image"): "`pbdkit plot` draws a result or a set-up",
     ("movie", "video", "gif"): "`pbdkit animate` makes a movie",
-    ("continue", "restart"): "`pbdkit resume` goes on with a run",
+    ("continue", "restart"): "`pbdkit resume` continues a run",
     ("validate", "lint", "analyse", "analyze"): "`pbdkit check` checks an experiment",
     (
         "new",
@@ -51,11 +51,11 @@ MEANT = {
     (
         "info",
         "progress",
-    ): "`pbdkit status` shows how far a run is, `pbdkit report` makes a page of it",
+    ): "`pbdkit status` shows the progress of a run, `pbdkit report` writes a page about it",
     ("simulate", "solve", "start"): "`pbdkit run` runs an experiment",
     ("test",): "`pbdkit plugins check` tests a plugin",
-    ("gui", "play", "interactive"): "`pbdkit live` shows a body that follows the mouse",
-    ("version",): "`pbdkit --version` prints it",
+    ("gui", "play", "interactive"): "`pbdkit live` shows a body that is moved by the mouse",
+    ("version",): "`pbdkit --version` prints the version",
 }
 """The remedy for words that are no commands but are often typed as one."""
 
@@ -65,33 +65,33 @@ def pbdkit_commands() -> list[Command]:
     """Return the commands of `pbdkit.cli`."""
     sentences: dict[str, dict[str, str]] = {
         "Start": {
-            "init": "Writes an experiment to start from, or copies a shipped one.",
-            "experiments": "Lists the shipped experiments, or prints one.",
+            "init": "Write an experiment to start from, or copy a shipped one.",
+            "experiments": "List the shipped experiments, or print one.",
         },
         "Run": {
-            "run": "Runs an experiment, and writes its result to a file.",
-            "resume": "Goes on with an interrupted run, or makes one longer.",
-            "status": "Says how far a run is, and when it will end.",
+            "run": "Run an experiment and write its result to a file.",
+            "resume": "Continue an interrupted run, or extend a finished one.",
+            "status": "Show the progress and the remaining time of a run.",
         },
         "Look": {
-            "plot": "Draws a result, or the set-up of an experiment before it runs.",
-            "animate": "Makes a movie of a result.",
-            "curve": "Draws what changes: a curve, a history, the crack.",
-            "export": "Writes a result for ParaView.",
-            "explain": "Says which bonds broke, when and why.",
-            "verify": "Says whether results are as they were written.",
+            "plot": "Draw a result, or the set-up of an experiment before it runs.",
+            "animate": "Make a movie of a result.",
+            "curve": "Draw quantities over time: a curve, a history, the crack.",
+            "export": "Write a result for ParaView.",
+            "explain": "List the bonds that broke, with step and strain.",
+            "verify": "Check that results are unchanged since they were written.",
         },
         "Understand": {
-            "check": "Says before a run whether it is stable, and how long it takes.",
-            "identify": "Says what a rule is physically, with its constants.",
+            "check": "Forecast the stability, time and memory of a run.",
+            "identify": "Identify the physics of a rule, with its constants.",
         },
         "Vary and fit": {
-            "sweep": "Runs an experiment over many values of its parameters.",
-            "fit": "Finds the parameters that meet what was measured, with errors.",
+            "sweep": "Run an experiment for many values of its parameters.",
+            "fit": "Fit parameters to measurements, with standard errors.",
         },
         "Extend": {
-            "plugins": "Lists, checks and begins components of your own.",
-            "schema": "Prints the JSON Schema, for completion in an editor.",
+            "plugins": "List and check plugins, or create one.",
+            "schema": "Print the JSON Schema, for completion in an editor.",
         },
     }
     return [
@@ -145,7 +145,7 @@ class CommandTable(click.Group):
         loaded = _blamed(plugin, offer, offer.load)
         if not isinstance(loaded, click.Command):
             raise PluginError(
-                f"the command '{name}' of {plugin} cannot be used: {offer.target} is no click "
+                f"the command '{name}' of {plugin} cannot be used: {offer.target} is not a click "
                 "command"
             )
         return with_no_plugins(loaded)
@@ -185,9 +185,12 @@ def _sections() -> dict[str, list[tuple[str, str]]]:
         command = offers[0][1]
         does, group = f"{command.does} ({origin})", command.group
         if name in builtin_commands():
-            does, group = f"Left out of {origin}: pbdkit has a command of this name.", "Plugins"
+            does, group = (
+                f"Unavailable from {origin}: pbdkit has a command of this name.",
+                "Plugins",
+            )
         elif len(offers) > 1:
-            does, group = f"Left out of {origin}: {DISABLE_ONE}.", "Plugins"
+            does, group = f"Unavailable: offered by {origin}; {DISABLE_ONE}.", "Plugins"
         sections.setdefault(group, []).append((name, does))
     for plugin in plugins:
         if plugin.unusable not in ("", "disabled"):
@@ -210,7 +213,7 @@ def _no_command(name: str, plugins: list[Plugin]) -> str:
     run = f"; `pbdkit run {name}` runs it" * (name in shipped_names())
     meant = next((f"; {what}" for words, what in MEANT.items() if name in words), "")
     names = [*builtin_commands(), *_offers(plugins)]
-    near = run or meant or did_you_mean(name, names) or "; `pbdkit` alone lists them"
+    near = run or meant or did_you_mean(name, names) or "; `pbdkit` without arguments lists them"
     unusable = "".join(f"; {plugin} is {plugin.fault}" for plugin in plugins if plugin.fault)
     return f"there is no command '{name}'{near}{unusable}"
 

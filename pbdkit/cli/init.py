@@ -47,7 +47,7 @@ def init(file: Path | None, origin: str | None) -> None:
     files = {path.with_name(d.name): d.read_bytes() for d in data} | {path: text.encode()}
     for target in files:
         if os.path.lexists(target):
-            raise ExperimentError(f"{target}: exists and is not changed; name another file")
+            raise ExperimentError(f"{target}: exists and is not replaced; name another file")
     write_together(files)
     remark = f" with {', '.join(d.name for d in data)}" if data else ""
     click.echo(f"{path} written{remark}; next: pbdkit check {path}, then pbdkit run {path}")

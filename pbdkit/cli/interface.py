@@ -39,7 +39,7 @@ LOOK = [
         "--field/--dots",
         "filled",
         default=None,
-        help="Draw a filled field, or a dot for each particle; by default what is legible.",
+        help="Draw a filled field, or a dot for each particle; default the legible one.",
     ),
     click.option("--contours", is_flag=True, help="Draw filled contours at round levels."),
     click.option(
@@ -87,7 +87,7 @@ def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @click.command()
 @experiment_argument
-@click.option("-o", "--output", type=PATH, help="The file to write.")
+@click.option("-o", "--output", type=PATH, help="Output file; default NAME.nc.")
 @set_option
 @click.option(
     "--force", is_flag=True, help="Replace an existing output once the result is complete."
@@ -132,7 +132,7 @@ def run(
 @quiet_option
 @json_option
 def resume(**options: Any) -> int | None:
-    """Continue an interrupted run that was to write OUT.nc; the result is the same bit for bit."""
+    """Continue the interrupted run of OUT.nc; the result is the same bit for bit."""
     from pbdkit.mpi.launch import launched
 
     with launched() as communicator:
@@ -171,7 +171,7 @@ def identify(experiment: str, settings: tuple[str, ...], **options: Any) -> None
 @set_option
 @outside_option
 @look_options
-@click.option("--numbers", is_flag=True, help="Write the numbers of particles if there is room.")
+@click.option("--numbers", is_flag=True, help="Write the numbers of particles if they are legible.")
 @click.option(
     "--dpi", type=int, default=200, show_default=True, help="Resolution in pixels per inch."
 )
@@ -228,14 +228,14 @@ HISTORY = "history"
     "particles",
     type=int,
     multiple=True,
-    help="Number of a particle with a history; repeat it for further particles.",
+    help="Draw the history of this particle; repeat it for further particles.",
 )
 @click.option(
     "--bond",
     nargs=2,
     type=int,
     metavar="A B",
-    help="Numbers of the two particles of a bond with a history.",
+    help="Draw the history of the bond between these two particles.",
 )
 @click.option("--group", type=int, help="Forces of this leader group.")
 @click.option("--load", type=int, help="Forces of this load.")

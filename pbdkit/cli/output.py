@@ -73,7 +73,7 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
 def refuse_unwritable(picture: Path | None, *files: Path | None) -> None:
     """Raise ExperimentError or StorageError if a picture or another file cannot be written."""
     if picture and picture.suffix not in FORMATS:
-        raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
+        raise ExperimentError(f"{picture}: the name of a picture must end in {', '.join(FORMATS)}")
     if picture:
         refuse_no_matplotlib()
     for path in (picture, *files):

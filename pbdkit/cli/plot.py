@@ -41,7 +41,7 @@ def plot(
         return
     refuse_other_file(file)
     if settings:
-        raise ExperimentError(f"--set: changes an experiment, and {file} is a result")
+        raise ExperimentError(f"--set: changes an experiment, but {file} is a result")
     path = output or file.with_suffix(".png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
@@ -69,7 +69,7 @@ def _plot_set_up(
         if value not in (None, False, (), {})
     ]:
         raise ExperimentError(
-            f"--{options[0]}: applies to results; {name} is an experiment, whose set-up is drawn; "
+            f"--{options[0]}: applies to results, but {name} is an experiment; "
             f"`pbdkit run {name}` computes a result"
         )
     experiment = load_experiment(name, settings)
@@ -126,7 +126,7 @@ def _draw(
     **forces: Any,
 ) -> Axes:
     if x is not None and y is None:
-        raise ExperimentError(f"--x {x}: there is no variable to draw over it; add --y VARIABLE")
+        raise ExperimentError(f"--x {x}: requires a variable to draw; add --y VARIABLE")
     if kind in CRACKS:
         return plotting.crack(dataset, kind=CRACKS[kind])
     if kind == HISTORY or (kind is None and (particles or bond)):

@@ -83,7 +83,7 @@ def check_plugins(distributions: tuple[str, ...], verbose: bool, as_json: bool) 
         click.echo(json.dumps({"holds": success, "reports": rows}))
     elif success:
         examples = "1 example" if len(rows) == 1 else f"{len(rows)} examples"
-        click.echo(f"all properties hold for {examples} of its components")
+        click.echo(f"{examples} of its components passed all properties")
     return 0 if success else 3
 
 
@@ -221,7 +221,7 @@ class Project:
         texts = self.files()
         if os.path.lexists(folder):
             raise ExperimentError(
-                f"{folder}: exists and is not changed; choose another name or --dir"
+                f"{folder}: exists and is not replaced; choose another name or --dir"
             )
         write_folder(folder, texts)
         return folder
@@ -246,7 +246,7 @@ def project_of(name: str, interface: str) -> Project:
     class_name = "".join(word.capitalize() for word in kind.split("-"))
     module, remedy = distribution.replace("-", "_"), f"; try {PREFIX}my-{kind}"
     if not class_name.isidentifier() or class_name in RESERVED_NAMES:
-        raise ExperimentError(f"'{name}' gives no valid name for a class{remedy}")
+        raise ExperimentError(f"'{name}' cannot be converted to the name of a class{remedy}")
     reserved = {*keyword.kwlist, *sys.stdlib_module_names}
     spec = None if module in reserved else find_spec(module)
     if module in reserved or (spec and spec.origin):  # A folder without __init__.py has no origin.

@@ -83,10 +83,10 @@ def _run_in_words(facts: dict[str, Any]) -> Iterator[str]:
         position = f"{standing.order:>5}  {standing.step:>4}  {_name(standing):<13}"
         yield f"{position}  {strain:<11}  {limit}"
     if rows and all(standing.breaks_above is None for standing in rows):
-        remedy = "models declare it by `breaking_strain`"
-        yield f"{model} has no strain above which a bond breaks: {remedy}"
+        remedy = "a fracture model declares it by `breaking_strain`"
+        yield f"{model} declares no strain above which a bond breaks: {remedy}"
     if len(rows) > MAX_LISTED:
-        yield f"and {len(rows) - MAX_LISTED} more: --json lists all"
+        yield f"and {len(rows) - MAX_LISTED} more; --json lists all"
     if facts["nearest"]:
         yield f"nearest to breaking: {_name(facts['nearest'])}: {_standing(facts['nearest'])}"
 
@@ -96,17 +96,17 @@ def _bond_in_words(facts: dict[str, Any]) -> Iterator[str]:
     yield f"bond {_name(s)}: shell {s.shell}, rest length {s.rest_length:.6g}"
     if s.state == "broken":
         strain = _number(s.strain_at_break, "an unknown strain")
-        order = f"number {s.order} of the {facts['broken_in_all']} broken"
+        order = f"bond {s.order} of {facts['broken_in_all']} in the order of breaking"
         yield f"broke in step {s.step} at strain {strain}, {order}"
         if s.breaks_above is not None:
-            yield f"fracture {facts['fracture']} breaks it above {s.breaks_above:.6g}"
+            yield f"fracture {facts['fracture']}: it breaks above the strain {s.breaks_above:.6g}"
     elif s.state == "cut":
         yield f"cut at the beginning of step {s.step}"
     else:
         yield _standing(s)
     if s.state == "intact":
         step, strain = facts["most_strained"]["step"], facts["most_strained"]["strain"]
-        yield f"largest strain of the recorded steps in step {step}: {strain:.6g}"
+        yield f"largest strain in a recorded step: {strain:.6g}, in step {step}"
     yield from (f"{name} {value:.6g}" for name, value in facts["remembered"].items())
     yield from _around_in_words(facts["around"], s.step)
 
@@ -115,12 +115,12 @@ def _around_in_words(around: list[BondStatus], step: int | None) -> Iterator[str
     """Describe the other bonds at the ends of a bond: those that broke before it, with it and after
     it."""
     broken = [standing for standing in around if standing.step is not None]
-    groups = {"broken around it": broken}
+    groups = {"adjacent bonds broken": broken}
     if step is not None:
         relations: dict[str, Any] = {
-            "broken around it before": lt,
-            "in the same step": eq,
-            "after": gt,
+            "adjacent bonds broken before": lt,
+            "adjacent bonds broken in the same step": eq,
+            "adjacent bonds broken after": gt,
         }
         groups = {
             title: [standing for standing in broken if relation(standing.step, step)]
@@ -131,8 +131,10 @@ def _around_in_words(around: list[BondStatus], step: int | None) -> Iterator[str
         yield f"{title}: {bonds or 'none'}"
     unbroken = [standing for standing in around if standing.step is None]
     maximum = max(unbroken, key=lambda standing: standing.strain, default=None)
-    remark = f", the most strained {_name(maximum)}: {_standing(maximum)}" if maximum else ""
-    yield f"not broken around it: {len(unbroken)}{remark}"
+    remark = (
+        f"; the largest strain is that of {_name(maximum)}: {_standing(maximum)}" if maximum else ""
+    )
+    yield f"adjacent bonds not broken: {len(unbroken)}{remark}"
 
 
 def _name(s: BondStatus) -> str:
@@ -143,7 +145,7 @@ def _standing(s: BondStatus) -> str:
     """Describe an unbroken bond in a few words."""
     words = f"{s.state}, strain {s.strain:.6g} in step {s.at_step}"
     if s.breaks_above is not None and s.share is not None:
-        words += f", breaks above {s.breaks_above:.6g} ({s.share:.3g} of the way)"
+        words += f", breaks above {s.breaks_above:.6g} ({s.share:.3g} of this limit)"
     return words
 
 
@@ -165,7 +167,7 @@ def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> 
     path = output or file.with_suffix(SUFFIX)
     if path.suffix != SUFFIX:
         raise ExperimentError(
-            f"{path}: must end in {SUFFIX}, by which ParaView recognises the format"
+            f"{path}: the name must end in {SUFFIX}, by which ParaView recognises the format"
         )
     refuse_output(path, force=force)
     if not path.parent.is_dir():

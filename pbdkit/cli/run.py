@@ -82,7 +82,7 @@ def refuse_unfinished(path: Path, *, force: bool) -> None:
     """
     if not make_room(path, discard=force):
         raise ExperimentError(
-            f"{path}: there is an unfinished run; `pbdkit resume {path}` continues it, "
+            f"{path}: this run is unfinished; `pbdkit resume {path}` continues it, "
             "--force discards it, -o names another file"
         )
 
@@ -104,7 +104,7 @@ def run_together(execution: Execution, quiet: bool, work: Callable[[Execution, b
     try:
         return work(execution, False)
     except NotSharedError as error:
-        text = str(error).replace("; run it in one process", "; the first of them runs it alone")
+        text = str(error).replace("; run it in one process", "; the first process runs it alone")
         warn([text], quiet)
     # A signal that is sent to all processes must not end those that are waiting.
     with nullcontext() if execution.communicator.is_root else stop_on_signals():
@@ -136,8 +136,9 @@ def advice_on_failure(path: Path, file: NetcdfSink) -> Iterator[None]:
     except ExperimentError:
         if file.kept:
             click.echo(
-                f"the records until then are kept, and `pbdkit plot {path}` draws them; resuming "
-                "would fail in the same way: change the experiment, and run it with --force",
+                f"the records up to this step are kept, and `pbdkit plot {path}` draws them; "
+                "resuming would fail in the same way: change the experiment, and run it with "
+                "--force",
                 err=True,
             )
         raise
@@ -175,7 +176,7 @@ def report_end(
     elif outcome.status not in SUCCESSFUL:
         remark = "" if file.written == path else f"; {path} is unchanged"
         click.echo(
-            f"{outcome_text}; the records until then are in {file.written}{remark}", err=True
+            f"{outcome_text}; the records up to this step are in {file.written}{remark}", err=True
         )
 
 

@@ -18,14 +18,14 @@ def status(output: Path, as_json: bool) -> None:
     facts = status_of(output)
     if facts is None:
         refuse_other_file(output)
-        state = "is finished" if output.exists() else "there is no such run"
+        state = "the run is finished" if output.exists() else "there is no such run"
         raise ExperimentError(f"{output}: {state}; runs of less than a second have no status")
     if as_json:
         click.echo(json.dumps(facts))
         return
     click.echo(f"{output}: step {facts['step']} of {facts['steps']}, {facts['state']}")
     if facts["rate"]:
-        click.echo(f"rate: {facts['rate']:.3g} steps a second")
+        click.echo(f"rate: {facts['rate']:.3g} steps per second")
     if facts["state"] == "running" and facts["left_s"] is not None:
         click.echo(f"time left: about {_duration(facts['left_s'])}")
     elif facts["state"] != "running":

@@ -66,7 +66,7 @@ def _client(address: str | None) -> Iterator[Any]:
     try:
         import distributed
     except ImportError:
-        what = "--dask needs dask.distributed: pip install 'pbdkit[sweep]'"
+        what = "--dask requires dask.distributed: pip install 'pbdkit[sweep]'"
         raise ExperimentError(what) from None
     # Log messages about lost connections, with tracebacks, would hide the messages of the program.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
@@ -83,13 +83,15 @@ def _report_end(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
     count, missing = len(summary.members), len(summary.members) - len(summary.ends)
     failures = summary.failures
     if summary.path is None:
-        text = f"interrupted: {count - missing} of {count} members are finished, in {folder}"
+        text = (
+            f"interrupted: {count - missing} of {count} members are finished and stored in {folder}"
+        )
         text = text if count else "interrupted while members were validated; none was run"
-        click.echo(f"pbdkit: {text}; the same command runs the others", err=True)
+        click.echo(f"pbdkit: {text}; the same command runs the remaining ones", err=True)
         return stop.exit_status
     if not quiet:
         stored = count - summary.run
-        remark = f" ({summary.run} run now, {stored} before)" if stored else ""
+        remark = f" ({summary.run} run now, {stored} stored before)" if stored else ""
         click.echo(f"{count - len(failures)} of {count} members complete{remark}: {summary.path}")
     if failures:
         _show(summary)
@@ -106,7 +108,9 @@ def _show(summary: Summary) -> None:
     add_rows(table, ((words, status, text.splitlines()[0]) for words, status, text in rows))
     show_table(table, stderr=True)
     if len(failures) > MAX_LISTED:
-        rest = f"and {len(failures) - MAX_LISTED} more: `status` and `message` in {summary.path}"
+        rest = (
+            f"and {len(failures) - MAX_LISTED} more; see `status` and `message` in {summary.path}"
+        )
         click.echo(rest, err=True)
 
 
@@ -118,7 +122,7 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         refuse_output(picture, force=force)
     refuse_unwritable(picture, path)
     if picture and is_strength_fit(file):
-        raise ExperimentError("a strength fit has no picture; leave --plot out")
+        raise ExperimentError("a strength fit has no picture; omit --plot")
     with waiting(f"fitting {file}", silent=quiet):
         result = pbdkit.fit(file)
     write(path, json.dumps(result.as_dict(), indent=2) + "\n", replace=force)

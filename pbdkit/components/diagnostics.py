@@ -518,7 +518,7 @@ class StressStrain(Diagnostic):
     @model_validator(mode="after")
     def _one_gauge(self) -> StressStrain:
         if self.points and self.numbers:
-            raise ValueError("the gauge has both points and numbers; give one of them")
+            raise ValueError("the gauge has both points and numbers; give only one of them")
         return self
 
     def variables(self) -> tuple[Variable, ...]:
@@ -534,7 +534,7 @@ class StressStrain(Diagnostic):
         by_leaders = not (self.points or self.numbers)
         for name in ("group", "against") if by_leaders else ("group",):
             if (group := getattr(self, name)) >= leader_groups:
-                numbers = f"they are numbered from 0, and there are {leader_groups}"
+                numbers = f"there are {leader_groups}, counted from 0"
                 raise ExperimentError(f"there is no leader group {group}; {numbers}", (name,))
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
@@ -544,8 +544,8 @@ class StressStrain(Diagnostic):
         first, last = (now.reference(rows)[:, axis].mean() for rows in (start, end))
         if abs(last - first) <= 1e-9 * max(abs(first), abs(last)):
             raise ExperimentError(
-                f"the gauge has no length along {self.axis}: both ends lie at {first:g}; choose "
-                "two points at a distance"
+                f"the gauge has no length along {self.axis}: both ends are at {first:g}; choose "
+                "points that differ along this axis"
             )
         u, v = (now.displacement(rows)[:, axis].mean() for rows in (start, end))
         group_position = now.reference(now.leader_groups()[self.group].rows)[:, axis].mean()

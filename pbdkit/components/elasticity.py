@@ -464,7 +464,7 @@ class Orthotropic(CellElastic):
         if self.poisson_ratio**2 * self.modulus_ratio >= 1.0:
             raise ValueError(
                 "the stiffness is not positive definite: poisson_ratio² · modulus_ratio must be "
-                f"below 1, and is {self.poisson_ratio**2 * self.modulus_ratio:g}"
+                f"below 1, got {self.poisson_ratio**2 * self.modulus_ratio:g}"
             )
         return self
 

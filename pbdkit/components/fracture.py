@@ -108,7 +108,9 @@ class Parting(StartsCracked, FractureModel):
     frame_bonds: bool = Field(
         True, description="Allow bonds to frame points to break.", examples=[False]
     )
-    cracks: Cracks = Field((), description="Segments whose bonds are broken from the start.")
+    cracks: Cracks = Field(
+        (), description="Segments; bonds that cross them are broken from the start."
+    )
 
     def parameters(self) -> dict[str, float]:
         """Return λ - 1, and whether fictitious points lie at the reference position."""

@@ -102,8 +102,8 @@ class MirrorFrame(Anchors, LayeredFrame):
         outside, body = frame.site != edge, frame.body_at(2 * edge - frame.site)
         if (body < 0).any() or not outside.any(axis=1).all():
             raise ExperimentError(
-                "a mirror frame requires a body that fills a rectangle of sites wider than the "
-                "frame"
+                "a mirror frame requires a rectangular body of more rows and columns than the "
+                "frame has layers"
             )
         flips = np.where(outside, -1.0, 1.0)
         return FrameMap(np.arange(len(body)), body, flips[:, :, None] * np.eye(2))

@@ -48,7 +48,7 @@ WEAK = 1e-6
 neighbours."""
 NO_FACE = -1
 """Index of a missing face."""
-REMEDY = "let a leader hold it, or take solver: {type: stepping}"
+REMEDY = "constrain it with a leader group, or use solver: {type: stepping}"
 """Remedy for a part that no leader holds."""
 
 
@@ -144,8 +144,8 @@ class ContactSystem(System):
                 x[members] = part.solve(r[members], None, rounding)
             except DriftingError:
                 raise NoEquilibriumError(
-                    f"there is no equilibrium: neither leaders nor obstacles hold a part of "
-                    f"{self._named(members)}, and it is pushed on for ever; {REMEDY}",
+                    f"there is no equilibrium: a part of {self._named(members)} is loaded, but not "
+                    f"constrained by leaders or obstacles; {REMEDY}",
                     ("obstacles",),
                 ) from None
         return self._planes(x)
@@ -225,8 +225,8 @@ class ContactSystem(System):
 
     def _not_unique(self, members: Indices) -> NoEquilibriumError:
         return NoEquilibriumError(
-            "there is no unique equilibrium: leaders and obstacles leave a part of "
-            f"{self._named(members)} free to slide or turn; {REMEDY}",
+            "there is no unique equilibrium: leaders and obstacles do not constrain the rigid-body "
+            f"modes of a part of {self._named(members)}; {REMEDY}",
             ("obstacles",),
         )
 

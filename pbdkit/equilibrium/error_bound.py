@@ -32,13 +32,14 @@ from pbdkit.stepping.program import bends_of, last_event
 from pbdkit.stepping.state import State
 
 WAYS = {
-    "inverse": "the solution for the remaining moves, and the inverse for their rounding",
-    "solution": "the solution for the remaining moves",
-    "iteration": "further iterations, and their rate of decay",
-    "damped": "the solution for the remaining moves, without motions of hardly any stiffness, as "
-    "of parts that hang by one bond",
-    "energy": "further iterations, and the energy of the remaining error",
-    "nothing to solve": "there are no followers",
+    "inverse": "the solution for the residual and the inverse for its rounding error",
+    "solution": "the solution for the residual",
+    "iteration": "further iterations and their rate of convergence",
+    "damped": "the solution for the residual, without motions of almost no stiffness, such as "
+    "those "
+    "of parts attached by one bond",
+    "energy": "further iterations and the energy of the remaining error",
+    "nothing to solve": "the absence of followers",
 }
 """Descriptions of the kinds of bounds."""
 CORRECTION = "correction, "
@@ -91,7 +92,7 @@ class Certificate:
     def __str__(self) -> str:
         way = WAYS[self.bound.removeprefix(CORRECTION)]
         if self.bound.startswith(CORRECTION):
-            way = f"the correction to it; the remaining error is bounded by {way}"
+            way = f"the correction to it; the error after it is bounded by {way}"
         return (
             f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of the largest "
             f"prescribed displacement), by {way}"
@@ -275,7 +276,7 @@ class ErrorBound:
             rounding = system.amplification * self._moves.rounding(state.u)
             return system.solve(moves, ACCURACY * self._scale, state, rounding), ""
         except ExperimentError as error:
-            return None, str(error).partition("; ")[0] + "; let a leader hold it"
+            return None, str(error).partition("; ")[0] + "; constrain it with a leader group"
 
     def _is_linear(self, state: State, system: System) -> bool:
         """Return whether the moves at random displacements, of the size of those of the body, agree
@@ -400,7 +401,7 @@ class SteadyStateMonitor:
         self._fracturing = Fracturing.of(scene)
         self._carrying = _carrying(scene)
         unended = "leaders do not come to rest before its end"
-        self.obstacle = "steps are too few" if ends else unended
+        self.obstacle = "there are too few steps" if ends else unended
         """Reason why the last check found no steady state."""
 
     def look(self, state: State) -> Certificate | None:
@@ -438,12 +439,14 @@ class SteadyStateMonitor:
     def _obstacle(self, state: State, outlook: PredictedEquilibrium, distance: float) -> str:
         at = f"at step {state.step}"
         if not math.isfinite(distance):
-            return f"{at} {outlook.obstacle or 'nothing bounds the distance from equilibrium'}"
+            return f"{at} {outlook.obstacle or 'the distance from equilibrium has no bound'}"
         if distance > self._tolerance:
-            return f"{at} within {distance:.2g} of equilibrium, not within {self._tolerance:.2g}"
+            return (
+                f"{at} the distance from equilibrium, {distance:.2g}, exceeds {self._tolerance:.2g}"
+            )
         ahead = 2.0 * distance  # The distance applies to both ends of a bond.
         if self._fracturing and self._fracturing.may_break(outlook.u, state, ahead):
-            return f"{at} a bond may break on the last {distance:.2g} to equilibrium"
+            return f"{at} a bond may break within the remaining distance of {distance:.2g}"
         return ""
 
 

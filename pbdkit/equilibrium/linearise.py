@@ -32,9 +32,9 @@ from pbdkit.stepping.state import State, initial_state
 
 T = TypeVar("T")
 NOT_SHARED = (
-    "has an equilibrium that several processes cannot share: leaders must hold all of the body, "
-    "it must be stable at rest, its frame show particles nearby, and each axis move the other or "
-    "neither; run it in one process"
+    "has an equilibrium that several processes cannot share: leaders must constrain the whole "
+    "body, it must be stable at rest, frame points must follow nearby particles, and the coupling "
+    "of the axes must be mutual or absent; run it in one process"
 )
 """Reason why ranks do not share the equilibrium of an experiment."""
 

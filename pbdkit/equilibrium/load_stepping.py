@@ -128,7 +128,7 @@ def spacings(scene: Scene) -> int:
 
 
 def changes(scene: Scene, steps: int) -> list[int]:
-    """Return the steps after which roles or loads change, within the first `steps`."""
+    """Return the steps after which leaders or loads change, within the first `steps`."""
     steps_of_changes = {step - 1 for step in scene.loads.changes(steps)} if scene.loads else set()
     for leading in scene.leading:
         steps_of_changes |= {leading.group.from_ - 1, leading.group.last(steps)}
@@ -139,7 +139,7 @@ VALUES_A_CALL = 200_000_000
 """Number of values times steps in a call of an engine, which takes some tenths of a second."""
 GROWING = 1e-6
 """Excess over 1 from which the eigenvalue of a mode counts as growth."""
-RECORD_LAST = "; or record that of the last step alone, `record: {{at: [{}]}}`"
+RECORD_LAST = "; or record the equilibrium of the last step only, `record: {{at: [{}]}}`"
 """Remedy for equilibria of intermediate steps that do not exist."""
 MOST_SETTLINGS = 2000
 """Maximum number of changes of bonds in an increment."""
@@ -148,8 +148,8 @@ TINY = 1e-9
 SMALLEST = 2.0**-12
 """Smallest part of an increment, relative to it."""
 REMEDY = (
-    "To follow what comes after it take solver: {type: stepping, relaxation: auto, memory: auto} "
-    "from there; record: {increments: true} keeps the equilibria within steps"
+    "To continue from there, use solver: {type: stepping, relaxation: auto, memory: auto}; "
+    "record: {increments: true} keeps the equilibria within steps"
 )
 """Remedy for a body that came apart."""
 MOST_ROUNDS = 40
@@ -206,7 +206,7 @@ def increments(
             count = len(scene.leading)
             field, n = ("leaders", n) if n < count else ("obstacles", n - count)
             raise ExperimentError(
-                "never comes to rest, so that there is no equilibrium; take solver: "
+                "never comes to rest, so that there is no equilibrium; use solver: "
                 "{type: stepping}, or a motion that ends",
                 (field, n, "motion"),
             )
@@ -302,7 +302,7 @@ def _step_to(last: int, state: State, scene: Scene, finder: Finder) -> Iterator[
     """Make steps, in calls that are short enough for interruptions. The displacement of floating
     parts under a load depends on the number of steps."""
     watch, first, engine = finder.watch, state.step, chosen_engine(scene)
-    watch.begin("stepping while loads push on what nothing holds")
+    watch.begin("stepping while loads act on unconstrained parts")
     a_call = max(1, int(VALUES_A_CALL / state.u.size))
     while state.step < last:
         reached = engine.advance(state, min(a_call, last - state.step))
@@ -405,8 +405,8 @@ def _refuse_thrown_off(scene: Scene, state: State, farthest: float) -> None:
     if _torn(state) and not (longest := most_of(state)) <= farthest:
         number = Guard(farthest, 0, 0, None).worst(scene, state)
         raise NoEquilibriumError(
-            f"particle {number} would be displaced by {longest:.6g}, farther than the body is "
-            "long: hardly anything holds it"
+            f"particle {number} would be displaced by {longest:.6g}, more than the size of the "
+            "body: it is hardly constrained"
         )
 
 
@@ -446,7 +446,7 @@ def _parting(
     step = max(1, math.ceil(since))
     leader_displacements = [flat[:, each.place] for each in scene.leading if each.group.leads(step)]
     way = max((float(np.abs(u).max(initial=0.0)) for u in leader_displacements), default=0.0)
-    leads = f", leaders displaced by up to {way:.6g}" if way else ""
+    leads = f", with leaders displaced by up to {way:.6g}" if way else ""
     cause = str(error).partition("; ")[0]
     return (
         f"{what} between step {since:.6g} and step {moment:.6g}: {first}{cause}; the last "
@@ -552,8 +552,8 @@ def _stepped(
             vars(state).update(vars(candidate))
             return certificate
     raise UnconvergedError(
-        f"at step {moment:.6g} the load cannot be followed: several equilibria meet there, as in "
-        f"buckling, and rounding would decide between them ({failed})",
+        f"at step {moment:.6g} the load path cannot be followed: it branches into several "
+        f"equilibria, as in buckling, and rounding errors would select one of them ({failed})",
         failed.certificate,
     )
 

@@ -58,9 +58,9 @@ NUDGE = 1e-6
 """Displacement of leaders, in lattice spacings, for derivatives with respect to the load."""
 SHARE = 0.25
 """Fraction of the tolerance that the errors of linear systems may use."""
-UNSTABLE = "the result is not stable"
+UNSTABLE = "the equilibrium is not stable"
 """Message for an unstable equilibrium."""
-ROUNDING = "rounding alone limits the relative distance"
+ROUNDING = "rounding errors limit the relative distance"
 """Message for a tolerance that rounding prevents."""
 FIRM = 1e5
 """Largest ratio of distance to rounding error of a body that is not near a limit point. Beyond it a
@@ -247,11 +247,11 @@ class Search(ABC):
         if self._system.is_stuck:
             return (
                 f"{self._system.methods} does not converge, as for slender or soft bodies; "
-                "take solver.method: lu"
+                "set solver.method: lu"
             )
         if self._is_rounding(best):
             return f"{ROUNDING} to {best:.1g}{_reachable(best)}"
-        return "no correction makes the moves smaller"
+        return "no correction reduces the residual"
 
     def _linearised(self, at: State, what: str) -> System:
         finder = self._finder
@@ -298,7 +298,7 @@ def _reachable(share: float) -> str:
     none."""
     tolerance = 10.0 ** math.ceil(math.log10(share / SHARE)) if 0.0 < share < math.inf else 1.0
     if tolerance < LOOSEST:
-        return f"; take solver.tolerance: {tolerance:.0e}"
+        return f"; set solver.tolerance: {tolerance:.0e}"
     return ": the body is too slender or soft for double precision"
 
 
@@ -401,7 +401,7 @@ class _Newton(Search):
             if not size <= CONTRACTION * min(previous, self._load_change or math.inf):
                 if size <= self._floor():
                     return  # The difference is rounding.
-                reason = "corrections do not become smaller"
+                reason = "corrections do not decrease"
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
             previous_distance, distance = distance, self._distance()
@@ -417,7 +417,7 @@ class _Relaxing(Search):
 
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
         self._damping = 1.0
-        super().__init__(finder, state, moment, state, "relaxing what broke")
+        super().__init__(finder, state, moment, state, "relaxing after bonds broke")
 
     def _linearised(self, at: State, what: str) -> System:
         finder = self._finder
@@ -444,7 +444,7 @@ class _Relaxing(Search):
             share = size / previous if previous and longest <= leap else 1.0
             share = max(FASTEST, FALL * share) if share < 1.0 else min(SLOWEST, share)
             self._damping = min(1.0, max(LEAST_DAMPING, self._damping * share))
-            self._system = self._linearised(self._state, "relaxing what broke")
+            self._system = self._linearised(self._state, "relaxing after bonds broke")
         certificate = self._certified()
         if not self._system.is_stable():
             raise UnconvergedError(UNSTABLE, certificate)
@@ -456,7 +456,7 @@ class _Relaxing(Search):
         if longest > MUCH * NEXT_TO_NOTHING * tolerance:
             return False
         self._damping = NEXT_TO_NOTHING
-        self._system = self._linearised(self._state, "relaxing what broke")
+        self._system = self._linearised(self._state, "relaxing after bonds broke")
         return self._distance() <= tolerance
 
 

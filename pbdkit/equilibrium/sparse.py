@@ -340,14 +340,14 @@ class DiagonalBlock:
 
 
 DRIFTS = (
-    "there is no equilibrium: nothing holds a part of {}, and it is pushed on for ever; let a "
-    "leader hold it"
+    "there is no equilibrium: a part of {} is loaded, but not constrained; constrain it with a "
+    "leader group"
 )
 """Message for a floating part under a load."""
 SOFT_MESSAGE = (
-    "in double precision nothing holds a part of {}: it turns about a single particle, is too "
-    "slender, or held by too soft a region; let leaders hold more of it, or take stiffer regions "
-    "or fewer particles"
+    "in double precision a part of {} is not constrained: it can rotate about a single particle, "
+    "is too slender, or is attached by too soft a region; constrain more of it with leaders, or "
+    "use stiffer regions or fewer particles"
 )
 """Message for a part that is too soft for double precision."""
 
@@ -432,9 +432,9 @@ class MatrixSystem(System):
                     and np.abs(r).max(initial=0.0) > 8 * rounding
                 ):
                     raise NoEquilibriumError(
-                        "there is no unique equilibrium: leaders do not hold a part of "
-                        f"{self._named(block, members)}; let one hold it, or take solver: "
-                        "{type: stepping}",
+                        "there is no unique equilibrium: leaders do not constrain a part of "
+                        f"{self._named(block, members)}; constrain it with a leader group, or use "
+                        "solver: {type: stepping}",
                         ("leaders",),
                     )
 

@@ -65,7 +65,7 @@ class Moves:
             experiment = scene.experiment.model_copy(update={"solver": stepping})
             free = stepped.bare
             stepped = replace(free, experiment=experiment, leading=_resting(scene))
-            choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
+            choice = Choice("numpy" if obstacle() else "compiled", 1, "requested")
             self._engine, _ = make_engine(stepped, choice)
         self._operations: Program = ()
         if self._engine is None:

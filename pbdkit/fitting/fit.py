@@ -182,8 +182,10 @@ def _with_settings(
 def _refuse_too_few(observation: Observation, unknowns: int) -> None:
     if len(observation.measured) < max(1, 2 * unknowns):
         raise ExperimentError(
-            f"only {len(observation.measured)} measured numbers lie within the body and the run, "
-            "which is too few; columns x and y must be in the experiment's lattice units",
+            (
+                f"only {len(observation.measured)} measured numbers lie within the body and the "
+                "run, which are too few; columns x and y must be in the experiment's lattice units"
+            ),
             ("measured", "file"),
         )
 

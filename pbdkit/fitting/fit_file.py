@@ -71,7 +71,7 @@ Term = Annotated[
 def _once(terms: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
     for n, term in enumerate(terms):
         if term in terms[:n]:
-            raise ValueError(f"names {list(term)} twice")
+            raise ValueError(f"lists {list(term)} twice")
     return terms
 
 
@@ -146,10 +146,12 @@ def _rows_of(table: xarray.Dataset, columns: Sequence[str]) -> Floats:
     values = [np.asarray(table[name], float).ravel() for name in columns]
     if len({len(value) for value in values}) > 1:
         sizes = ", ".join(f"{n} {len(v)}" for n, v in zip(columns, values, strict=True))
-        raise ValueError(f"the variables of the dataset need one size: {sizes}")
+        raise ValueError(f"the variables of the dataset must have one size, got {sizes}")
     rows = np.stack(values, axis=1)
     if not len(rows) or not np.isfinite(rows).all():
-        raise ValueError("the variables of the dataset need finite numbers, one at least")
+        raise ValueError(
+            "the variables of the dataset must contain at least one number, and finite ones only"
+        )
     return rows
 
 
@@ -249,8 +251,11 @@ def _refuse_other_unit(points: Floats, scene: Scene) -> None:
     size = np.ptp(points, axis=0).max() if len(points) > MIN_POINTS else body
     if size < MIN_EXTENT * body:
         raise ExperimentError(
-            f"the {len(points)} points lie within {size:.3g}, and the body is {body:.3g} long; "
-            "columns x, y, ux, uy must be in the experiment's lattice units: rescale them",
+            (
+                f"the {len(points)} points extend over {size:.3g}, but the body is {body:.3g} "
+                "long; columns x, y, ux, uy must be in the experiment's lattice units: rescale "
+                "them"
+            ),
             ("measured", "file"),
         )
 
@@ -289,7 +294,7 @@ FOLDER = Path(__file__).parent.parent / "fits"
 
 def _two(bounds: Pair) -> Pair:
     if not bounds[0] < bounds[1]:
-        raise ValueError(f"needs two bounds, the lower first; got {list(bounds)}")
+        raise ValueError(f"expected [lower bound, upper bound], got {list(bounds)}")
     return bounds
 
 
@@ -363,7 +368,7 @@ class Fit(Strict):
             measurement.noise is None for measurement in self.measured
         ):
             raise ValueError(
-                "several measurements need the `noise` of each, which determines their weights"
+                "several measurements require the `noise` of each, which determines their weights"
             )
         if self.force and not isinstance(self.measured[0], MeasuredField):
             raise ValueError(
@@ -372,7 +377,7 @@ class Fit(Strict):
             )
         if self.force and self.force.value == (0.0, 0.0):
             raise ValueError(
-                "`force` is 0 along both axes, which determines no modulus; leave it out"
+                "`force` is 0 along both axes, which does not determine a modulus; omit it"
             )
         curves_without_modulus = [
             measurement
@@ -382,15 +387,15 @@ class Fit(Strict):
         if self.force and curves_without_modulus:
             raise ValueError(
                 "both `force` and a curve without `youngs_modulus` determine Young's modulus; "
-                "leave `force` out"
+                "omit `force`"
             )
         if invalid := [path for path in self.profile if path not in self.unknown]:
             hint = did_you_mean(invalid[0], self.unknown)
             raise ValueError(f"`profile` names '{invalid[0]}', which is not unknown{hint}")
         if self.sampler and self.loss != "linear":
-            raise ValueError("a `sampler` assumes normal noise: it needs `loss: linear`")
+            raise ValueError("a `sampler` assumes normal noise; set `loss: linear`")
         if self.sampler and self.sampler.walkers < 2 * len(self.unknown):
-            raise ValueError("a `sampler` needs at least two walkers for each parameter")
+            raise ValueError("a `sampler` requires at least two walkers for each parameter")
         return self
 
 
@@ -426,15 +431,15 @@ class Peaks(Strict):
     @model_validator(mode="after")
     def _read(self, info: ValidationInfo) -> Self:
         if (self.file is None) == (not self.peaks):
-            raise fault("needs either a file, or the peaks themselves", key="file")
+            raise fault("give either a file or a list of peaks", key="file")
         values, broke = self._columns(info) if self.file is not None else self._listed()
         for n, value in enumerate(values):
             if not 0.0 < value < np.inf:
-                text = f"peaks must be above 0; that of specimen {n + 1} is {value:g}"
+                text = f"peaks must be above 0, but that of specimen {n + 1} is {value:g}"
                 raise fault(text, key="file" if self.file else "peaks")
         if broke.sum() < MIN_BROKEN:
             raise fault(
-                f"{int(broke.sum())} specimens broke; scatter needs at least {MIN_BROKEN}",
+                f"{int(broke.sum())} specimens broke, but scatter requires at least {MIN_BROKEN}",
                 key="file" if self.file else "peaks",
             )
         object.__setattr__(self, "_values", values)
@@ -443,16 +448,18 @@ class Peaks(Strict):
 
     def _listed(self) -> tuple[Floats, Any]:
         if isinstance(self.broke, str):
-            raise fault("names a column without a file; give a list of 0 and 1", key="broke")
+            raise fault("names a column, but there is no file; give a list of 0 and 1", key="broke")
         broke = np.array(self.broke or [1] * len(self.peaks), bool)
         if len(broke) != len(self.peaks):
-            text = f"{len(broke)} numbers for {len(self.peaks)} peaks; give one each"
+            text = f"expected one number for each of {len(self.peaks)} peaks, got {len(broke)}"
             raise fault(text, key="broke")
         return np.array(self.peaks), broke
 
     def _columns(self, info: ValidationInfo) -> tuple[Floats, Any]:
         if self.broke and not isinstance(self.broke, str):
-            raise fault("is a list, and peaks are in a file; name its column", key="broke")
+            raise fault(
+                ("is a list, but peaks are read from a file; name a column of it"), key="broke"
+            )
         further = (self.broke,) if isinstance(self.broke, str) else ()
         if self.curve is None:
             rows = np.array(read_columns(self.file, info, (self.column, *further)))
@@ -512,7 +519,7 @@ class StrengthFit(Strict):
     def _positive(self) -> Self:
         for path, (low, _) in self.unknown.items():
             if low <= 0.0:
-                raise fault(f"strengths and their scatter must be above 0; got {low:g}", key=path)
+                raise fault(f"strengths and their scatter must be above 0, got {low:g}", key=path)
         return self
 
 
@@ -586,7 +593,9 @@ def _with_dataset(source: Source) -> Source:
     data = dict(source.data) if isinstance(source.data, Mapping) else {}
     file = data.get("measured") or {}
     if not isinstance(file, Mapping):
-        raise ExperimentError("measured: a dataset takes the place of one measurement, not several")
+        raise ExperimentError(
+            "measured: a dataset can replace one measurement, but the fit has several"
+        )
     data["measured"] = {**file, "file": DATASET}
     return Source(source.name, data, source.places, source.files)
 

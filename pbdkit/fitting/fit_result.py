@@ -110,7 +110,7 @@ class Misfit:
         )
         if not self.left_out:
             return text
-        return f"{text}; {self.left_out} rows are left out: {self.left_out_because}"
+        return f"{text}; {self.left_out} rows are omitted: {self.left_out_because}"
 
 
 @dataclass(frozen=True)

@@ -144,9 +144,9 @@ def _refuse_shared(scene: Scene, n: int) -> None:
         if k != n and overlap and len(shared):
             x, y = scene.raster.reference(shared[:1])[0]
             raise ExperimentError(
-                f"leader groups {min(k, n)} and {max(k, n)} share the particle at ({x:g}, {y:g}), "
-                "and the displacement of each measured boundary is estimated separately, so that "
-                "it would have two; select the particle in one group, by a box that ends before "
+                f"leader groups {min(k, n)} and {max(k, n)} share the particle at ({x:g}, "
+                f"{y:g}), but the displacement of each measured boundary is estimated "
+                "separately; select the particle in one group only, by a box that ends before "
                 "the corner, or prescribe measured displacements with `modes: 0`",
                 ("leaders", n, "select"),
             )
@@ -164,7 +164,7 @@ def _polynomials(points: Floats, modes: int, n: int) -> Floats:
         )
     if len(points) < modes:
         raise ExperimentError(
-            f"{modes} modes are more than the {len(points)} particles of the boundary; take fewer",
+            f"{modes} modes exceed the {len(points)} particles of the boundary; use fewer modes",
             ("leaders", n, "select"),
         )
     along = (points - middle) @ directions[0]
@@ -173,7 +173,9 @@ def _polynomials(points: Floats, modes: int, n: int) -> Floats:
 
 ON_EDGE = 1e-9
 """Distance from a cell, relative to its size, up to which a point counts as inside."""
-OUTSIDE = "they lie in no whole cell of the body, or in one that is torn from the start"
+OUTSIDE = (
+    "they do not lie in a complete cell of the body, or lie in one that is torn from the start"
+)
 """Reason why points are left out."""
 
 
@@ -626,8 +628,8 @@ class RunObservation(Observation):
             numbers, broken_then, _ = self._run(_with_steps(changed, steps))
             if (broken_then != broken).any():
                 raise ExperimentError(
-                    f"a small change of {parameter.path} breaks other bonds: predictions are no "
-                    "smooth function of it; use data before the first break, or fit thresholds "
+                    f"a small change of {parameter.path} breaks other bonds, so that predictions "
+                    "are not differentiable; use data before the first break, or fit thresholds "
                     "to repeated tests"
                 )
             return numbers
@@ -768,8 +770,10 @@ class CurveObservation(RunObservation):
         range_text = f"the run's {quantity} go from {reached.min():g} to {reached.max():g}"
         if not inside.any() or (self.at_times and not inside.all()):
             raise ExperimentError(
-                f"the curve goes from {self.along.min():g} to {self.along.max():g}, and "
-                f"{range_text}; leave out other rows, or extend the experiment",
+                (
+                    f"the curve goes from {self.along.min():g} to {self.along.max():g}, but "
+                    f"{range_text}; remove the rows outside, or extend the experiment"
+                ),
                 ("measured", "file"),
             )
         left_out = int((~inside).sum())
@@ -794,7 +798,7 @@ class CurveObservation(RunObservation):
         slack = SLACK * (reached.max() - reached.min())
         if self.along.min() < reached.min() - slack or self.along.max() > reached.max() + slack:
             raise UnconvergedError(
-                f"the group goes from {reached.min():g} to {reached.max():g}, and the curve from "
+                f"the group goes from {reached.min():g} to {reached.max():g}, but the curve from "
                 f"{self.along.min():g} to {self.along.max():g}"
             )
         return np.interp(self.along, reached, force)
@@ -835,8 +839,10 @@ def _monotonic_part(places: Floats, forces: Floats) -> tuple[Floats, Floats]:
     signs = np.sign(np.diff(places))
     if not signs.size or signs[0] == 0.0:
         raise ExperimentError(
-            "the group does not move along the force in its first recorded step, so that a "
-            "displacement does not identify a step: give `against: time`",
+            (
+                "the group does not move along the force in its first recorded step, so that a "
+                "displacement does not identify a step; give `against: time`"
+            ),
             ("measured", "against"),
         )
     turns = np.flatnonzero(signs != signs[0])
@@ -1039,8 +1045,10 @@ class TracksObservation(RunObservation):
         """
         if times.min() < 0.0 or times.max() > experiment.steps:
             raise ExperimentError(
-                f"times go from {times.min():g} to {times.max():g}, and the run from 0 to "
-                f"{experiment.steps}; times must be in steps",
+                (
+                    f"times go from {times.min():g} to {times.max():g}, but the run from 0 to "
+                    f"{experiment.steps}; times must be in steps"
+                ),
                 ("measured", "file"),
             )
         steps = np.unique(np.concatenate([np.floor(times), np.ceil(times)])).astype(int)
@@ -1089,7 +1097,7 @@ class TracksObservation(RunObservation):
         self._add(displacements, np.where(is_after, remainder, 0.0), run.driver.state, run)
         if (missing := ~is_after & (remainder > ON_STEP)).any():
             raise ExperimentError(
-                f"the run has no state at time {self.along[missing][0]:g}; leave that time out",
+                f"the run has no state at time {self.along[missing][0]:g}; remove this time",
                 ("measured", "file"),
             )
         return np.asarray(displacements.T.ravel())

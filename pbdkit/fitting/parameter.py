@@ -180,5 +180,5 @@ class Parameter:
                 if step < MIN_STEP * max(abs(value), 0.1):
                     raise ExperimentError(
                         f"{self.path}: {value:.6g} is at its bound, so that it cannot be changed "
-                        "in both directions; choose a number inside"
+                        "in both directions; choose a number inside the bounds"
                     ) from None

@@ -232,8 +232,10 @@ class Problem:
             raise ExperimentError("the group exerts no force in this experiment", ("measured",))
         if product < 0.0:
             raise ExperimentError(
-                "the measured force has the opposite sign of that in this experiment; change it, "
-                "or take another `group` or `axis`",
+                (
+                    "the measured force has the opposite sign of that in this experiment; change "
+                    "it, or use another `group` or `axis`"
+                ),
                 ("measured",),
             )
         z = z.copy()

@@ -57,7 +57,7 @@ def scene_like(scene: Scene, experiment: Experiment) -> Scene:
         or (new_scene.raster.kind != scene.raster.kind).any()
     ):
         raise ExperimentError(
-            "the parameter changes which particles exist, so that there is no derivative; "
+            "the parameter changes the set of particles, so that there is no derivative; "
             "sensitivities exist for parameters of rules, fields, loads and motions"
         )
     return new_scene
@@ -126,7 +126,7 @@ class Resting:
         if scene.barriers:
             raise ExperimentError(
                 "there are no sensitivities with obstacles, since contacts change with the "
-                "displacements; leave the obstacles out",
+                "displacements; remove the obstacles",
                 ("obstacles",),
             )
         state = initial_state(scene)
@@ -134,8 +134,11 @@ class Resting:
         certificate = settle(scene, state, finder=finder)
         if any((a != b).any() for a, b in zip(initial_bonds, _bonds(state), strict=True)):
             raise ExperimentError(
-                "bonds break or soften on the way to this equilibrium, which is then no smooth "
-                "function of parameters; use a smaller load, or fracture: {type: none}",
+                (
+                    "bonds break or soften on the load path to this equilibrium, which then is "
+                    "not a smooth function of parameters; use a smaller load, or fracture: {type: "
+                    "none}"
+                ),
                 ("fracture",),
             )
         former = start.guesses if isinstance(start, Resting) else ()
@@ -164,8 +167,8 @@ class Resting:
             system.refuse_moving_floats(self.state.u, self.finder.moves.rounding(self.state.u))
         except ExperimentError as error:
             raise ExperimentError(
-                "nothing holds a part of the body: its equilibrium depends on the initial state, "
-                "so that there are no sensitivities; constrain it with a leader group",
+                "a part of the body is not constrained: its equilibrium depends on the initial "
+                "state, so that there are no sensitivities; constrain it with a leader group",
                 error.where,
             ) from None
         return system

@@ -207,7 +207,7 @@ class Pull:
             raise ExperimentError(f"there is no leader group {group}", ("measured", "group"))
         if size[group] == 0.0:
             raise ExperimentError(
-                f"leader group {group} does not move; name one that loads the body",
+                f"leader group {group} does not move; use one that loads the body",
                 ("measured", "group"),
             )
         return cls(
@@ -635,8 +635,10 @@ def _refine_nodes(logarithms: Floats, *nodes: Floats) -> tuple[Floats, ...]:
     """Return finer nodes along each axis where the likelihood is not negligible."""
     if not np.isfinite(logarithms).any():
         raise ExperimentError(
-            "no strengths between the bounds agree with these peaks: use wider bounds, and check "
-            "that the peaks are in the experiment's units",
+            (
+                "no strengths between the bounds agree with these peaks; use wider bounds, and "
+                "check that the peaks are in the experiment's units"
+            ),
             ("unknown",),
         )
     is_relevant = logarithms > logarithms.max() - NEGLIGIBLE
@@ -696,7 +698,7 @@ class StrengthEstimate:
             f"{number:.{digits}f}" for number in (self.value, self.error, self.low, self.high)
         )
         text = f"{value} ± {error}, 95 % from {low} to {high}"
-        return text + (", cut off by its bounds" if self.cut else "")
+        return text + (", truncated by its bounds" if self.cut else "")
 
 
 @dataclass(frozen=True)
@@ -735,13 +737,14 @@ class Checked:
 
     def __str__(self) -> str:
         text = (
-            f"{self.bore_more} of {self.count} torn specimens bore more than at their first break"
+            f"{self.bore_more} of {self.count} simulated specimens carried more load than at "
+            "their first break"
         )
         if self.holds:
             return f"the first break is the failure: {text}"
         return (
             f"the first break is not the failure: {text}, on average {np.expm1(self.excess):.1%} "
-            f"more; harmless are {np.expm1(self.limit):.2%}"
+            f"more, which exceeds the limit of {np.expm1(self.limit):.2%}"
         )
 
 
@@ -819,7 +822,7 @@ class FittedStrength:
                 if abs(self.correlations[n, m]) > 0.5:
                     yield f"correlation of {first} and {second}: {self.correlations[n, m]:.2f}"
         unbroken = self.specimens - self.failed
-        yield f"by {self.method}, of {self.specimens} specimens" + (
+        yield f"method {self.method}, from {self.specimens} specimens" + (
             f", {unbroken} of which did not break" if unbroken else ""
         )
         if self.checked:
@@ -984,7 +987,7 @@ def fit_by_simulation(
     """
     if not fit.measured.failed.all():
         raise ExperimentError(
-            "tests that ended before the specimen broke cannot be simulated; leave them out",
+            "tests that ended before the specimen broke cannot be simulated; remove them",
             ("measured", "broke"),
         )
     if fit.measured.of == "factor":
@@ -1045,8 +1048,8 @@ def _refuse_short_load(specimens: Specimens, largest: float) -> None:
     full = elastic.full.force if quantity == "force" else elastic.full.displacement
     if full < MIN_LOAD_RATIO * largest:
         raise ExperimentError(
-            f"the experiment's load ends at a {quantity} of {full:.4g} without fracture, and the "
-            f"strongest specimen bore {largest:.4g}: increase the motion of the leaders by a "
+            f"the experiment's load ends at a {quantity} of {full:.4g} without fracture, but the "
+            f"strongest specimen carried {largest:.4g}; increase the motion of the leaders by a "
             f"factor of at least {MIN_LOAD_RATIO * largest / full:.3g}",
             ("leaders",),
         )
@@ -1073,7 +1076,7 @@ def _fit_by_likelihood(fit: StrengthFit, experiment: Experiment) -> FittedStreng
     law = _law(fit, experiment)
     if {*fit.unknown} != {*law.paths}:
         raise ExperimentError(
-            f"the likelihood needs bounds of both {' and '.join(law.paths)}",
+            f"the likelihood requires bounds of both {' and '.join(law.paths)}",
             ("unknown",),
         )
     elastic = _elastic(fit, experiment, law)
@@ -1112,13 +1115,19 @@ def _law(fit: StrengthFit, experiment: Experiment) -> StrengthLaw:
     name = fit.law or OF_FRACTURE.get(kind)
     if name is None:
         raise ExperimentError(
-            f"fracture '{kind}' has no known law of strengths; give law: weibull or uniform, or "
-            "use method: simulation",
+            (
+                f"the distribution of strengths of fracture '{kind}' is not known; give law: "
+                "weibull or uniform, or use method: simulation"
+            ),
             ("law",),
         )
     if OF_FRACTURE.get(kind, name) != name:
         raise ExperimentError(
-            f"the strengths of fracture '{kind}' are {OF_FRACTURE[kind]}, not {name}", ("law",)
+            (
+                f"law: the strengths of fracture '{kind}' are distributed as {OF_FRACTURE[kind]}, "
+                f"not as {name}"
+            ),
+            ("law",),
         )
     return LAWS[name]
 

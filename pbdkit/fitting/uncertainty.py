@@ -133,7 +133,7 @@ def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> E
     if unit <= 0.0:
         raise ExperimentError(
             f"the force of group {force.group} has the opposite direction in this experiment; "
-            "change its sign, or take the force of another group",
+            "change its sign, or use the force of another group",
             ("force", "value"),
         )
     size = float(np.hypot(*force.value))
@@ -178,8 +178,9 @@ class Candidate:
 
     def __str__(self) -> str:
         return (
-            f"{self.name}: left-out residuals² are {self.left_out:.3f} of the noise's, behind by "
-            f"{self.behind:.3f} ± {self.behind_error:.3f}; {self.differs:.2g} of the noise away"
+            f"{self.name}: mean squared residuals of left-out data are {self.left_out:.3f} "
+            f"noise², exceeding the best by {self.behind:.3f} ± {self.behind_error:.3f}; "
+            f"predictions differ by {self.differs:.2g} of the noise"
         )
 
 
@@ -484,7 +485,7 @@ class Sample:
 
 def refuse_no_sampler() -> None:
     """Raise ExperimentError if emcee is not installed."""
-    refuse_without("emcee", "sample", "the sampler needs emcee")
+    refuse_without("emcee", "sample", "the sampler requires emcee")
 
 
 def sample_posterior(

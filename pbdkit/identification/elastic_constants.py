@@ -245,5 +245,5 @@ def _no_rotation(g: Floats) -> str:
     first, second = ("xy"[a] + "xy"[b] for a, b in (p, q))
     return (
         f"a rigid rotation costs energy: the second-order terms Q_{first}{second} = {g[p][q]:.6g} "
-        f"and Q_{second}{first} = {g[q][p]:.6g} would be one constant"
+        f"and Q_{second}{first} = {g[q][p]:.6g} should be one constant"
     )

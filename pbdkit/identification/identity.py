@@ -144,7 +144,7 @@ SYMMETRIES = {
     "anisotropic": "anisotropic {}",
     "square": "{} with the symmetry of a square",
     "orthotropic": "orthotropic {}",
-    "general": "{} with no axis of symmetry",
+    "general": "{} without an axis of symmetry",
 }
 """Description by symmetry; {} is the kind."""
 Row = tuple[str, str]
@@ -166,7 +166,7 @@ def rows_of(identity: Identity, *, whole: bool = False) -> list[Row]:
 
 
 def _what(identity: Identity) -> Iterator[Row]:
-    yield "it is", verdict(identity)
+    yield "identity", verdict(identity)
     for n, reason in enumerate(identity.reasons):
         yield "because" if n == 0 else "and", reason
     yield (
@@ -191,7 +191,7 @@ def _elastic(identity: Identity, body: Elasticity) -> Iterator[Row]:
         return
     along = [body.poisson_ratio(angle) for angle in (0.0, 90.0)]
     *texts, zener = ["none" if r is None else _number(r) for r in (*along, body.zener)]
-    yield "Poisson's ratio", f"{texts[0]} pulled along x, {texts[1]} along y (plane stress)"
+    yield "Poisson's ratio", f"{texts[0]} under tension along x, {texts[1]} along y (plane stress)"
     yield "anisotropy", f"4 C66 / (C11 + C22 - 2 C12) = {zener}, isotropic 1"
     if body.axis is not None:
         yield "axis of symmetry", f"at {_number(body.axis)}°"
@@ -230,9 +230,12 @@ def _character(identity: Identity) -> Iterator[Row]:
     ends = f"{_number(spectrum.smallest)} to {_number(spectrum.largest)}"
     yield "eigenvalues", ends + turning * (spectrum.imaginary > NEUTRAL)
     yield "linear", yes[identity.linear]
-    yield "symmetric", "yes, k weighs for j as j for k" if identity.symmetric else "no"
-    yield "turns with the body", yes[identity.turns]
-    yield "rests at free edges", yes[identity.rests_at_edges]
+    yield (
+        "symmetric",
+        ("yes, the weight of k for j is that of j for k") if identity.symmetric else "no",
+    )
+    yield "rotation invariant", yes[identity.turns]
+    yield "rest at free edges", yes[identity.rests_at_edges]
 
 
 def _relaxation_text(identity: Identity) -> str:
@@ -241,7 +244,7 @@ def _relaxation_text(identity: Identity) -> str:
     if bound is not None:
         return f"stable below {_number(bound)}{with_memory}"
     grows = identity.spectrum.largest > 1.0 + NEUTRAL or abs(identity.memory) >= 1.0
-    return f"diverges at any{with_memory}" if grows else "no bound"
+    return f"always diverges{with_memory}" if grows else "no bound"
 
 
 def _number(value: float) -> str:
@@ -252,13 +255,13 @@ def _number(value: float) -> str:
 def notes_on(identity: Identity, scene: Scene) -> Iterator[str]:
     """Yield further properties of the rule, a sentence each."""
     if not identity.linear:
-        yield "the rule is not linear: the figures hold for small displacements from rest"
+        yield "the rule is not linear: the values hold for small displacements from rest"
     if scene.experiment.rule.uses_reference:
-        yield "it depends on the place: the figures hold in the middle of the body"
+        yield "the rule depends on the position: the values hold in the middle of the body"
     if scene.experiment.neighbours.nearness():
-        yield "neighbours are searched at every step: the figures hold while they are those at rest"
+        yield "neighbours are re-evaluated: the values hold while they are those at rest"
     if identity.stencil.sites > 1:
-        yield f"{identity.stencil.sites} sites a cell: shifts of them are eliminated"
+        yield f"{identity.stencil.sites} sites per cell: their relative shifts are eliminated"
     if identity.long is not None:
         yield from _notes_of_long_waves(identity, identity.long)
     bound = identity.spectrum.largest_stable_relaxation
@@ -272,28 +275,30 @@ def _notes_of_long_waves(identity: Identity, long: LongWaves) -> Iterator[str]:
     if abs(long.slow.smallest) <= SAME * abs(long.fast.largest):
         yield f"some long waves along {long.slow.at_smallest:.4g}° do not decay at all"
     if identity.kind == DIFFUSION and identity.body:
-        yield "away from free edges it is plane-stress elasticity with Poisson's ratio -1"
+        yield "away from free edges the rule is plane-stress elasticity with Poisson's ratio -1"
     if identity.kind == ELASTICITY and long.elasticity:
         yield from _notes_of_body(long.elasticity)
         if not identity.rests_at_edges:
-            yield "away from free edges it is elastic; at them it pulls inwards"
+            yield (
+                "away from free edges the rule is elastic; at free edges it exerts an inward force"
+            )
     lengths = [length for gradient in long.gradients for length in gradient.material]
     attracting = [f"{g.direction:.4g}°" for g in long.gradients if min(g.material) < -SAME]
     if attracting:
         yield (
-            f"rows beyond the next attract along {', '.join(attracting)}: the wrong sign for "
-            "gradient elasticity, and an effect that vanishes with the spacing"
+            f"rows beyond the nearest attract along {', '.join(attracting)}, which is not the "
+            "sign of gradient elasticity; the effect vanishes with the spacing"
         )
     elif min(lengths, default=0.0) > SAME:
         low, high = np.sqrt(min(lengths)), np.sqrt(max(lengths))
         span = f"{low:.6g}" if high - low < SAME else f"{low:.6g} to {high:.6g}"
-        yield f"it is gradient elasticity, with a length of {span} h"
+        yield f"the rule is gradient elasticity with a length of {span} h"
 
 
 def _notes_of_body(body: Elasticity) -> Iterator[str]:
     if body.least_stiffness < -SAME:
         yield "some uniform strain lowers the energy: the body is stable only with prescribed edges"
     elif body.least_stiffness < SAME:
-        yield "some uniform strain costs no energy"
+        yield "the energy of some uniform strain is zero"
     if np.abs(body.mobility - np.eye(2)).max() > SAME:
         yield "x and y converge to equilibrium at different rates; the equilibrium is elastic"

@@ -113,11 +113,11 @@ def _reasons(
         / spacing
     )
     if not drift <= STILL:
-        yield f"a body at rest does not stay at rest: the rule moves it by {drift:.6g} h a step"
+        yield f"a body at rest does not remain at rest: the rule moves it by {drift:.6g} h per step"
     if not all(_is_linear(rule, place, SMALL * spacing, STRAIGHT) for rule, place in cases):
         yield (
-            "small displacements do not superpose, however small: the rule is not differentiable "
-            "at rest, and plane waves do not describe it"
+            "arbitrarily small displacements do not superpose: the rule is not differentiable at "
+            "rest, and has no plane waves"
         )
     yield from _place_dependence(scene, stencils)
 
@@ -204,17 +204,19 @@ def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> Iterator[s
         return
     corner = f"({places[worst].X.x:.6g}, {places[worst].X.y:.6g})"
     parameters = ", ".join(scene.experiment.rule.numeric_parameters())
-    verdict = f"; no material constant does that: {parameters} is not a Poisson ratio"
-    text = f"it depends on the place: the weights at {corner} are not those in the middle"
+    verdict = f"; a material constant has no such effect: {parameters} is not a Poisson ratio"
+    text = (
+        f"the rule depends on the position: the weights at {corner} differ from those in the middle"
+    )
     # The effect on a translation is the clearest evidence, if there is one.
     defect = differences[worst, : len(slots[0])].sum(axis=0) + differences[worst, -len(slots)]
     entry = int(np.abs(defect).argmax())
     if abs(defect.ravel()[entry]) >= ROUNDING:
         to, along = "xy"[entry // 2], "xy"[entry % 2]
         text = (
-            f"it depends on the place: when everything moves by 1 along {along}, the particle at "
-            f"{corner} of the body moves {defect.ravel()[entry]:.6g} more along {to} a step than "
-            "the one in the middle"
+            f"the rule depends on the position: under a translation by 1 along {along}, the "
+            f"particle at {corner} of the body moves {defect.ravel()[entry]:.6g} more along {to} "
+            "per step than the one in the middle"
         )
     yield text + (verdict if parameters else "")
 
@@ -271,8 +273,10 @@ def identified(scene: Scene) -> Identity:
 def _refuse_no_numbers(stencil: Stencil, rule: str) -> None:
     if not np.isfinite([*stencil.centre, *stencil.neighbours.values()]).all():
         raise ExperimentError(
-            f"'{rule}' returns values that are not finite for small displacements of a body at "
-            "rest: check its divisions",
+            (
+                f"'{rule}' returns values that are not finite for small displacements of a body at "
+                "rest; check its divisions"
+            ),
             ("rule",),
         )
 
@@ -309,5 +313,5 @@ def _drift(first: Floats) -> list[str]:
     velocity = first.trace(axis1=1, axis2=2) / 2
     return [
         "opposite neighbours have different weights: displacements drift, "
-        f"on average by ({velocity[0]:.6g}, {velocity[1]:.6g}) h a step"
+        f"on average by ({velocity[0]:.6g}, {velocity[1]:.6g}) h per step"
     ]

@@ -204,17 +204,17 @@ def slow_waves(stencil: Primitive) -> SlowWaves | str:
     if np.abs(defect).max() > ZERO * scale:
         worst = np.unravel_index(np.abs(defect).argmax(), defect.shape)
         return (
-            "a rigid translation is not preserved: when everything moves by 1 along "
+            "a rigid translation is not preserved: under a translation by 1 along "
             f"{'xy'[worst[1]]}, the rule moves a particle by {-defect[worst]:.6g} along "
-            f"{'xy'[worst[0] % 2]} a step"
+            f"{'xy'[worst[0] % 2]} per step"
         )
     u, sizes, _ = np.linalg.svd(rest)
     left_vectors = u[:, -2:].T
     if len(rest) > 2 and sizes[-3] <= ZERO * scale:
-        return "the sublattices can move against each other at no rate at all: not one body"
+        return "relative displacements of the sublattices do not decay: they are not coupled"
     overlap = left_vectors @ translations
     if abs(np.linalg.det(overlap)) < ZERO:
-        return "the sublattices keep moving once they are shifted, ever faster"
+        return "relative displacements of the sublattices grow without bound"
     left_vectors = np.linalg.inv(overlap) @ left_vectors
     bordered = np.block([[rest, translations], [left_vectors, np.zeros((2, 2))]])
     return SlowWaves(stencil, left_vectors.astype(complex), np.linalg.inv(bordered).astype(complex))

@@ -305,7 +305,7 @@ def kind_of(path: Path) -> str | None:
         return None
     if stat.S_ISREG(mode):
         return None
-    return "a folder" if stat.S_ISDIR(mode) else KINDS.get(stat.S_IFMT(mode), "no plain file")
+    return "a folder" if stat.S_ISDIR(mode) else KINDS.get(stat.S_IFMT(mode), "not a plain file")
 
 
 @contextmanager
@@ -374,7 +374,7 @@ class Destination:
         sync_folder(self._folder)
         if self.written != self.path and not self.replace:
             raise WriteError(
-                f"{self.path}: appeared while this was going on and is left as it is; "
+                f"{self.path}: was created by another program meanwhile, and is not replaced; "
                 f"this result is in {self.written}"
             )
 

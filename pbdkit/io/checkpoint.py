@@ -119,9 +119,11 @@ class Checkpoint:
         try:
             facts = {**self.facts["run"], "seen": self.facts["seen"]}
         except (KeyError, TypeError) as error:
-            raise StorageError(f"the state that was kept is damaged: {error}") from None
+            raise StorageError(f"the stored state is damaged: {error}") from None
         if not _is_like(self.facts["run"], pack(dict(like), "run", Arrays())):
-            raise StorageError("the state that was kept is damaged: it is of other kinds")
+            raise StorageError(
+                "the stored state is damaged: its structure differs from that of the run"
+            )
         state_class = type(like["state"])
         parts: dict[str, Any] = unpack(
             facts, self.arrays, {**CLASSES, **classes, state_class.__name__: state_class}
@@ -130,9 +132,9 @@ class Checkpoint:
         if not (
             isinstance(state, state_class) and isinstance(recorded, RecordedSteps)
         ) or not state.fits(like["state"]):
-            raise StorageError("the state that was kept is not one of this experiment")
+            raise StorageError("the stored state belongs to another experiment")
         if not _is_consistent(state, recorded, parts, steps):
-            raise StorageError("the state that was kept is damaged: inconsistent step counters")
+            raise StorageError("the stored state is damaged: its step counters are inconsistent")
         return parts
 
 
@@ -208,4 +210,4 @@ def unpack(facts: Any, arrays: Mapping[str, NDArray[Any]], classes: Mapping[str,
         parts = {key: unpack(p, arrays, classes) for key, p in facts.items() if key != "is"}
         return classes[facts["is"]](**parts) if "is" in facts else parts
     except (KeyError, TypeError) as error:
-        raise StorageError(f"the state of a run is damaged: {error}") from None
+        raise StorageError(f"the stored state is damaged: {error}") from None

@@ -63,8 +63,8 @@ class BondRecords:
     def __init__(self, dataset: xarray.Dataset, scene: Scene) -> None:
         if "bond_ends" not in dataset.variables:
             raise ExperimentError(
-                "has no table of bonds: nothing could break in this run; run the experiment with "
-                "`fracture`, or with a diagnostic that uses bonds, as pe1 does"
+                "has no table of bonds, since no bond can break in this run; run the experiment "
+                "with `fracture`, or with a diagnostic that uses bonds, such as pe1"
             )
         self._dataset, self._scene = dataset, scene
         self.model: FractureModel = scene.experiment.fracture
@@ -81,8 +81,8 @@ class BondRecords:
         """Rows of the broken bonds, in the order of breaking."""
         if not np.array_equal(self.bonds.ends, dataset["bond_ends"].values):
             raise ExperimentError(
-                "its bonds are not those of the experiment that it carries: the file was changed, "
-                "or another version of a part made it"
+                "its bonds are not those of its experiment: the file was changed, or was written "
+                "with another version of a component"
             )
 
     def _of_bonds(self, name: str, unknown: Any) -> NDArray[Any]:

@@ -139,7 +139,7 @@ def base_columns(axes: int = 2) -> list[Column]:
         coordinate("number", number, dims=each, comment=by_site),
         *(coordinate(name, f"site index {name}", "i4", each) for name in INDICES[:axes]),
         coordinate("role", "role of the particle", "i1", each, extra=roles),
-        coordinate("inside", "whether it lies inside the outline", "bool", each, comment=outside),
+        coordinate("inside", "inside the outline", "bool", each, comment=outside),
         coordinate("axis", "axis", "str"),
         coordinate("site", "site indices", "i4", (*each, "index")),
         coordinate("reference", "reference position", "f8", (*each, "axis"), units=LENGTH.lattice),
@@ -351,7 +351,7 @@ def json_attribute(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
     except (ValueError, TypeError, RecursionError) as error:
         raise StorageError(f"its attribute '{attribute}' is damaged: {error}") from None
     if not isinstance(content, dict):
-        raise StorageError(f"its attribute '{attribute}' is damaged: it holds no map of keys")
+        raise StorageError(f"its attribute '{attribute}' is damaged: it is not a map of keys")
     return content
 
 
@@ -372,7 +372,7 @@ def experiment_of(
     refuse_no_dataset(dataset)
     parts = json_attribute(dataset, "experiment")
     if not parts:
-        raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
+        raise ExperimentError("the dataset contains no experiment: it was not written by pbdkit")
     source = Source("dataset", parts)
     try:
         return Experiment.build(source, components)
@@ -396,7 +396,9 @@ def rows_at(dataset: xarray.Dataset, index: Mapping[str, int]) -> Array:
     matches = np.ones(dataset.sizes.get("particle", 0), np.bool_)
     for name, value in index.items():
         if name not in names:
-            raise ExperimentError(f"particles here are found by {names}, not by '{name}'")
+            raise ExperimentError(
+                f"particles of this dataset are selected by {names}, not by '{name}'"
+            )
         matches &= dataset.variables[name].values == value
     if not matches.any():
         place = ", ".join(f"{name}={value}" for name, value in index.items())

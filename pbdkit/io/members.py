@@ -58,13 +58,15 @@ def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset
     """
     if SWEEP not in dataset.attrs:
         raise ExperimentError(
-            f"{', '.join(choice)}: there is nothing to choose, as this is the result of one run"
+            f"{', '.join(choice)}: cannot be selected, since this is the result of one run; omit it"
         )
     indices: dict[str, int] = {}
     for name, value in choice.items():
         dim, row = _place(dataset, name, value)
         if indices.setdefault(dim, row) != row:
-            raise ExperimentError(f"{name}={value}: no member has this with the other choices")
+            raise ExperimentError(
+                f"{name}={value}: no member has this value together with the other ones"
+            )
     selection = dataset.isel(indices)
     words = ", ".join(f"{name}={value}" for name, value in choice.items())
     title = f"{dataset.attrs.get('title', 'sweep')}, {words}"
@@ -101,7 +103,9 @@ def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
     dims = {dim: dim for dim in grid} | {n: dim for n, dim in coordinates.items() if dim in grid}
     if name not in dims:
         hint = did_you_mean(name, dims)
-        raise ExperimentError(f"{name}: is no parameter of this sweep{hint} ({choices(dataset)})")
+        raise ExperimentError(
+            f"{name}: is not a parameter of this sweep{hint} ({choices(dataset)})"
+        )
     labels = _labels(dataset, name)
     rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, value)]
     if not rows:

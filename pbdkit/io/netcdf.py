@@ -70,7 +70,7 @@ class NetcdfFile:
         self._open("r+")
         for name, rows in written.items():
             if not (isinstance(rows, int) and 0 <= rows <= self._content[name].shape[0]):
-                raise StorageError(f"the store holds no {rows!r} entries of '{name}'")
+                raise StorageError(f"the store does not contain {rows!r} entries of '{name}'")
         self._batch = {name: self._content[name].chunks[0] for name in self.written}
 
     def put(self, values: Values) -> None:
@@ -318,7 +318,7 @@ class NetcdfSink(KeepingSink):
         with self._storing():
             settled = is_whole(file.disk)
             if settled and not file.is_settled():
-                raise damage_error(unfinished.records, "it is another result")
+                raise damage_error(unfinished.records, "its content belongs to another result")
             self._complete(file, status, settled=settled)
 
     def put(self, values: Values) -> None:
@@ -428,11 +428,11 @@ def reopen_dataset(
     }
     written = checkpoint.facts.get("written")
     if not isinstance(written, dict) or not {*waiting} <= {*written} == {*dataset.waiting}:
-        raise StorageError("the store holds another dataset than the experiment makes")
+        raise StorageError("the dataset in the store is not that of the experiment")
     try:
         dataset.reopen({n: [np.asarray(v) for v in batch] for n, batch in waiting.items()}, written)
     except StorageError:
         raise
     except Exception as error:  # The libraries raise various errors for damaged files.
-        raise StorageError(f"the store holds a damaged file: {error}") from None
+        raise StorageError(f"the file in the store is damaged: {error}") from None
     return dataset

@@ -96,10 +96,10 @@ def open(path: str | Path) -> xarray.Dataset:
 def refuse_no_file(file: Path) -> None:
     """Raise StorageError if the path is not a plain file."""
     if file.is_dir():
-        raise StorageError(f"{file}: is a folder, no result of pbdkit")
+        raise StorageError(f"{file}: is a folder, not a result of pbdkit")
     if not file.is_file():
         what = (
-            "is no plain file, and no result of pbdkit"
+            "is not a plain file, and not a result of pbdkit"
             if file.exists()
             else "there is no such file"
         )
@@ -157,7 +157,7 @@ def reading(
         dataset = _chosen(whole, path, at) if at else whole
         if SWEEP in dataset.attrs and not sweeps:
             raise ExperimentError(
-                f"{path}: holds all members of a sweep, and this looks at one run; choose one with "
+                f"{path}: contains all members of a sweep; select one with "
                 f"--at NAME=VALUE, in Python with ds.pbd.member(NAME=VALUE) ({choices(dataset)})"
             )
         try:
@@ -184,11 +184,11 @@ def fault_of(dataset: xarray.Dataset) -> str | None:
     """Return the reason why this pbdkit cannot read a dataset, or None."""
     version = dataset.attrs.get("schema_version")
     if version is None:
-        return "is no dataset of pbdkit: it has no attribute schema_version"
+        return "is not a dataset of pbdkit: it has no attribute schema_version"
     try:
         newer = [int(part) for part in str(version).split(".")] > [int(SCHEMA_VERSION)]
     except ValueError:
-        return f"has the schema_version '{version}', which no pbdkit writes"
+        return f"has an invalid schema_version, '{version}'"
     if newer:
         return (
             f"has schema_version {version}, and this pbdkit reads up to {SCHEMA_VERSION}; "

@@ -29,19 +29,19 @@ def other_file(path: Path) -> str:
     if path.is_dir():
         inner = path / "sweep.nc"
         sweep = f"is the folder of a sweep; its dataset is {inner}"
-        return sweep if inner.is_file() else "is a folder, no result of pbdkit"
+        return sweep if inner.is_file() else "is a folder, not a result of pbdkit"
     if not path.is_file():
         is_shipped = path.as_posix() in shipped_names()
-        return f"is a shipped experiment; `pbdkit run {path}` makes a result of it" * is_shipped
+        return f"is a shipped experiment; `pbdkit run {path}` computes its result" * is_shipped
     kind = _kind_of_text(path)
     if kind is None:
         return ""
     if kind == FAULTY:
-        return "is no result, by its name an experiment" if path.suffix in TEXTS else ""
+        return "is not a result; by its name it is an experiment" if path.suffix in TEXTS else ""
     if kind == EXPERIMENT:
         return f"is an experiment; `pbdkit run {path}` computes its result and prints the path"
-    description = f"is {kind}, no result; {what_takes(kind, str(path))}"
-    return description if kind else "is no result: those end in .nc"
+    description = f"is {kind}, not a result; {what_takes(kind, str(path))}"
+    return description if kind else "is not a result; the names of results end in .nc"
 
 
 def is_experiment(path: Path) -> bool:
@@ -71,4 +71,6 @@ def refuse_store(path: Path) -> None:
     """Raise ExperimentError for the store of an unfinished run given in place of its output."""
     if path.name.endswith(STORE) and path.is_file():
         output = path.with_name(path.name.removesuffix(STORE))
-        raise ExperimentError(f"{path}: is what was kept of an unfinished run; name {output}")
+        raise ExperimentError(
+            f"{path}: is the store of an unfinished run; give its output, {output}"
+        )

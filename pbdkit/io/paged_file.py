@@ -69,7 +69,9 @@ def read_header(file: io.FileIO) -> Header | None:
         if data.startswith(MAGIC) and data[LAYOUT.size :] == xxhash.xxh3_64_digest(fields):
             return Header(*LAYOUT.unpack(fields)[1:])
         time.sleep(PAUSE_S)
-    raise StorageError(f"{file.name}: is damaged: its first bytes are not what was written")
+    raise StorageError(
+        f"{file.name}: is damaged: its first bytes have changed since they were written"
+    )
 
 
 PAGE = 4096
@@ -171,12 +173,14 @@ class PagedFile(NewFile):
             if extent.start in self._unchecked:
                 if digest(self._on_disk(extent.start, extent.stop - extent.start)) != extent.digest:
                     where = f"bytes {extent.start} to {extent.stop}"
-                    raise BrokenSealError(f"{self.disk.name}: {where} are not what was written")
+                    raise BrokenSealError(
+                        f"{self.disk.name}: {where} have changed since they were written"
+                    )
                 self._unchecked.discard(extent.start)
 
     def give_up(self) -> None:
         """Stop writing to the disk."""
-        self.fail(OSError("given up"))
+        self.fail(OSError("writing was abandoned"))
 
     def forget(self) -> None:
         """Remove what a killed process wrote after the last commit. Raises OSError."""
@@ -198,7 +202,9 @@ class PagedFile(NewFile):
         put_seal(self.disk, [self._settled(e) for e in self.extents if e.stop <= self.size])
         self.sync()
         if not is_whole(self.disk):
-            raise OSError(f"{self.disk.name}: the disk returns other bytes than were written")
+            raise OSError(
+                f"{self.disk.name}: the bytes that the disk returns differ from those written"
+            )
 
     def is_settled(self) -> bool:
         """Return whether the pages are at their positions on the disk; the seal follows the

@@ -84,8 +84,8 @@ class Physical:
                 twin = f"{column.name}{IN_MM}"
                 if twin in names:
                     raise PluginError(
-                        f"the variable '{twin}' stands where '{column.name}' in {LENGTH.unit} does;"
-                        " give it another name"
+                        f"the variable '{twin}' has the name of '{column.name}' in "
+                        f"{LENGTH.unit}; rename it"
                     )
                 attributes = column.extra | {TWIN_OF: column.name}
                 entries.append(replace(column, name=twin, units=LENGTH.unit, extra=attributes))

@@ -106,7 +106,12 @@ class RecordedVariables:
         names, columns = layout.reserved_names(), list(self._remembered)
         for column in columns:
             _reserve_name(
-                column.name, names, f"a part remembers '{column.name}' of each {column.dims[-1]}"
+                column.name,
+                names,
+                (
+                    f"a component declares the state variable '{column.name}' of each "
+                    f"{column.dims[-1]}"
+                ),
             )
         for diagnostic in self._diagnostics:
             coordinates, whose = (
@@ -124,7 +129,7 @@ class RecordedVariables:
                 if unknown := [dim for dim in variable.dims if dim not in dims]:
                     raise PluginError(
                         f"{whose} the variable '{variable.name}' with the dimension "
-                        f"'{unknown[0]}', which it gives no values"
+                        f"'{unknown[0]}', for which it defines no coordinate"
                     )
                 columns.append(layout.diagnostic_column(variable, diagnostic))
         return columns
@@ -180,7 +185,7 @@ class RecordedVariables:
                     shape = tuple(sizes.get(dim, -1) for dim in variable.dims)
                     if np.shape(value) != shape:
                         raise ValueError(
-                            f"'{variable.name}' has the shape {np.shape(value)}, not {shape}"
+                            f"'{variable.name}' has the shape {np.shape(value)}, expected {shape}"
                         )
                     if when is not When.END:
                         _refuse_infinite(
@@ -197,7 +202,9 @@ class RecordedVariables:
 def _reserve_name(name: str, names: set[str], what: str) -> None:
     """Add a name to those in use. Raises PluginError if it is among them already."""
     if name in names:
-        raise PluginError(f"{what}, and that name is taken in the dataset; give it another")
+        raise PluginError(
+            f"{what}, but the dataset already has a variable or dimension of this name; rename it"
+        )
     names.add(name)
 
 

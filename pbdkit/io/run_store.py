@@ -146,7 +146,7 @@ class RunStore:
             raise StorageError(f"{self.path}: is damaged: '{key}' is missing")
         data, digest = row
         if not isinstance(data, bytes) or self._digest(key, data) != digest:
-            raise StorageError(f"{self.path}: is damaged: '{key}' is not what was written")
+            raise StorageError(f"{self.path}: is damaged: '{key}' has changed since it was written")
         self._verified[key] = digest
         return data
 
@@ -163,7 +163,7 @@ class RunStore:
         try:
             return json.loads(self.piece(key))
         except (ValueError, RecursionError):
-            raise StorageError(f"{self.path}: is damaged: '{key}' is no JSON") from None
+            raise StorageError(f"{self.path}: is damaged: '{key}' is not valid JSON") from None
 
     def close(self) -> None:
         """Close without raising, whatever the state of the disk; as a single file where
@@ -176,7 +176,7 @@ class RunStore:
 
     def _open(self, mode: str) -> None:
         if mode != "rwc" and not is_database(self.path):
-            raise StorageError(f"{self.path}: is damaged: it is missing, or no database")
+            raise StorageError(f"{self.path}: is damaged: it is missing, or not a database")
         if mode == "ro":
             try:
                 self._file = look(self.path, self._closing)
@@ -228,7 +228,7 @@ class RunStore:
         del self._listed[COMMIT]
         number = summary.get("number") if isinstance(summary, dict) else None
         if type(number) is not int or summary.get("pieces") != _digest_of_all(self._listed):
-            raise StorageError(f"{self.path}: is damaged: not all of it is of one commit")
+            raise StorageError(f"{self.path}: is damaged: its parts belong to different commits")
         self.commits = number
 
     def _digest(self, key: str, data: bytes | memoryview) -> bytes:
@@ -315,7 +315,9 @@ def _refuse_others(path: Path) -> None:
     with suppress(FileNotFoundError), Path(f"{path}-journal").open("rb") as journal:
         journal.seek(max(0, journal.seek(0, os.SEEK_END) - len(JOURNAL_MARK)))
         if journal.read() == JOURNAL_MARK:
-            raise StorageError(f"{path}-journal: names another file; pbdkit did not write it")
+            raise StorageError(
+                f"{path}-journal: refers to another file, and was not written by pbdkit; remove it"
+            )
 
 
 def _digest_of_all(listed: dict[str, bytes]) -> str:
@@ -426,13 +428,13 @@ def store_state(output: Path) -> StoreState:
     header = header_of(records)
     if not is_database(store):
         if header or size_of(store) > ONE_PAGE or size_of(Path(f"{store}-wal")):
-            raise damage_error(store, "it is missing, or no database")
+            raise damage_error(store, "it is missing, or not a database")
         return StoreState.BEGUN
     with RunStore(store) as database:
         if not database.commits:
             if header and header.commits:
                 raise damage_error(
-                    store, "its log was damaged, cut or removed, and nothing is in it"
+                    store, "its log was damaged, truncated or removed, and it is empty"
                 )
             return StoreState.BEGUN
         if records.exists():
@@ -466,8 +468,8 @@ def _is_result(output: Path, store: RunStore) -> bool:
 def damage_error(path: Path, what: str) -> StorageError:
     """Return the error of a damaged file of an unfinished run."""
     return StorageError(
-        f"{path}: is damaged: {what}; nothing was removed, and a copy of the files that is whole "
-        "can be put in their place; `pbdkit run` with --force discards them"
+        f"{path}: is damaged: {what}; nothing was removed; restore the files from an intact copy, "
+        "or discard them by `pbdkit run` with --force"
     )
 
 
@@ -515,7 +517,7 @@ class UnfinishedRun:
         """Create a store beside the output; the temporary file, open as `disk`, becomes its
         records."""
         store, records = store_of(output), records_of(output)
-        conflict = StorageError(f"{output}: another run began to write it meanwhile")
+        conflict = StorageError(f"{output}: another run has started to write it")
         try:
             os.link(temporary, records)
         except FileExistsError:
@@ -645,7 +647,7 @@ class UnfinishedRun:
             raise StorageError(f"{self._store.path}: is damaged: parts of it are missing")
         end = extents[-1].stop if extents else 0
         if end > os.fstat(self.disk.fileno()).st_size:
-            raise StorageError(f"{self.disk.name}: is shorter than it was written")
+            raise StorageError(f"{self.disk.name}: is shorter than when it was written")
         return PagedFile(self.disk, layout["size"], pages, extents, read_only=read_only)
 
     def close(self) -> None:
@@ -670,7 +672,7 @@ class UnfinishedRun:
     def _dict(self, key: str) -> dict[str, Any]:
         facts = self._store.facts(key)
         if not isinstance(facts, dict):
-            raise StorageError(f"{self._store.path}: is damaged: '{key}' is no map of keys")
+            raise StorageError(f"{self._store.path}: is damaged: '{key}' is not a map of keys")
         return facts
 
     def _note_commits(self) -> None:
@@ -683,23 +685,23 @@ class UnfinishedRun:
         the store lacks commits that their header counts."""
         commits, store = self._store.commits, self._store.path
         if header is None or (header is SETTLED and "finished" not in self.facts):
-            raise damage_error(self.records, "its first bytes are not what was written")
+            raise damage_error(self.records, "its first bytes have changed since they were written")
         if header is not SETTLED and header.identity != self._store.identity:
-            raise damage_error(store, f"it belongs to another run than {self.records}")
+            raise damage_error(store, f"{self.records} belongs to another run")
         if commits < header.commits and not anyway:
             raise StorageError(
-                f"{store}: is damaged: it holds {commits} commits of {header.commits}, and the "
-                "last lie in a log that was damaged, cut or removed; nothing was changed; `pbdkit "
-                f"resume {self.output}` with --anyway goes on from the last commit that it holds, "
-                f"of step {self.facts.get('step')}"
+                f"{store}: is damaged: it contains {commits} of {header.commits} commits; the log "
+                "with the last ones was damaged, truncated or removed; nothing was changed; "
+                f"`pbdkit resume {self.output}` with --anyway continues from the last commit in "
+                f"it, of step {self.facts.get('step')}"
             )
 
     def _refuse_newer(self) -> None:
         version = self.about.get("format")
         if version != FORMAT:
             raise StorageError(
-                f"{self._store.path}: is of format {version}, and this pbdkit reads {FORMAT}; take "
-                "the pbdkit that wrote it"
+                f"{self._store.path}: has the format {version}, but this pbdkit reads {FORMAT}; "
+                "use the version of pbdkit that wrote it"
             )
 
 

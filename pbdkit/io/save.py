@@ -50,8 +50,8 @@ def save(dataset: xarray.Dataset, path: str | Path, *, force: bool = False) -> P
     refuse_existing(file, force=force)
     if fault := fault_of(dataset):
         raise ExperimentError(
-            f"save: the dataset {fault.partition(':')[0]}, which a result needs; parts and tables "
-            "of a result are written by `to_netcdf`"
+            f"save: the dataset {fault.partition(':')[0]}, which a result requires; use "
+            "`to_netcdf` for a part of a result"
         )
     write_dataset(dataset, file, replace=force)
     return file
@@ -88,6 +88,6 @@ def refuse_existing(path: Path, *, force: bool) -> None:
         raise ExperimentError(f"{path}: exists; force=True replaces it")
     if not make_room(path, discard=force):
         raise ExperimentError(
-            f"{path}: an unfinished run of it is here; pbdkit.resume({str(path)!r}) goes on with "
-            "it, force=True discards it"
+            f"{path}: this run is unfinished; pbdkit.resume({str(path)!r}) continues it, "
+            "force=True discards it"
         )

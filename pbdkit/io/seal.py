@@ -123,7 +123,7 @@ class SealedFile(io.RawIOBase):
             self._file.seek(begin)
             if digest(self._file.read(end - begin)) != self.seal.table["digest"][n]:
                 where = f"bytes {begin} to {end} of {self.seal.size}"
-                raise BrokenSealError(f"{self.path}: {where} are not what was written")
+                raise BrokenSealError(f"{self.path}: {where} have changed since they were written")
             self._unchecked[n] = False
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ def seal_of(file: io.FileIO) -> Seal | None:
         whole_table = (stops[-1] if count else 0) == size and bool((stops[1:] > stops[:-1]).all())
         if seal.foot() == foot and whole_table:
             return seal
-    raise BrokenSealError(f"{file.name}: its seal is not what was written")
+    raise BrokenSealError(f"{file.name}: its seal has changed since it was written")
 
 
 def is_whole(file: io.FileIO) -> bool:

@@ -429,10 +429,10 @@ class StateCells(CellValues):
     def inside_out(self) -> str | None:
         """Return a warning if cells, or corners of cells, are inverted; None otherwise. Torn cells
         do not count, since the parts of a broken body move apart."""
-        remedy = "let the leaders go less far, or weaken the rule where it couples x and y"
-        if description := self._turned(area_share, "cells have turned over"):
-            return f"the last state is inside out: {description}; {remedy}"
-        if description := self._turned(corner_share, "cells have a corner that has turned over"):
+        remedy = "reduce the displacement of the leaders, or the coupling of x and y in the rule"
+        if description := self._turned(area_share, "cells are inverted"):
+            return f"the last state has inverted cells: {description}; {remedy}"
+        if description := self._turned(corner_share, "cells have an inverted corner"):
             return f"the last state is folded: {description}; {remedy}"
         return None
 
@@ -455,8 +455,8 @@ class StateCells(CellValues):
         if not turned:
             return None
         return (
-            f"{turned} of {total} {what}, the worst, at particle {number}, to {worst:.3g} of its "
-            "area at rest"
+            f"{turned} of {total} {what}; the worst, at particle {number}, has {worst:.3g} times "
+            "its area at rest"
         )
 
     def _intact(self, patch: Patch) -> NDArray[np.bool_]:
@@ -641,7 +641,7 @@ class StateMoment(Moment):
         if name in of_particles:
             return read_only(self._raster.table(of_particles[name][None])[:, 0])
         names = [*of_bonds, *of_particles]
-        raise ValueError(f"no part remembers '{name}'{did_you_mean(name, names)}")
+        raise ValueError(f"no component has a state variable '{name}'{did_you_mean(name, names)}")
 
     def _of_bonds(self, planes: NDArray[Any]) -> NDArray[Any]:
         """Return values on the planes of bonds by bond, (bond,)."""

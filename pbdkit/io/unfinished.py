@@ -63,12 +63,12 @@ def unfinished_dataset(output: Path) -> Any:
     refuse_retired(parts, f"{output}, which is unfinished,")
     scene = build_scene(Experiment.build(Source(f"{output}, unfinished", parts)))
     if not isinstance(state, State) or not state.fits(initial_state(scene)):
-        raise StorageError(f"{output}: its store holds a state of another experiment")
+        raise StorageError(f"{output}: the state in its store belongs to another experiment")
     compress = scene.experiment.record.compression == "zlib"
     target = reopen_dataset(file, columns_of(scene), checkpoint, compress=compress)
     recorder = Recorder(scene, Overlay(target))
     recorder.last_steps = recorded
-    reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
+    reason = f"unfinished: step {state.step} of {scene.experiment.steps} at the last checkpoint"
     with suppress(FloatingPointError):  # A state that is not finite is not part of the dataset.
         recorder.observe(state, last=True)
     recorder.finish(state, RunOutcome("interrupted", reason, state.step), {})

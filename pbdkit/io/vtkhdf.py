@@ -150,7 +150,7 @@ def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace:
     import h5py
 
     if "position" not in dataset.variables:
-        raise ExperimentError("there are no positions to write: keep the variable `position`")
+        raise ExperimentError("there are no positions to write; keep the variable `position`")
     grid = grid_of(dataset, scene)
     with open_atomic(path, NewFile, replace=replace) as new, h5py.File(new, "w") as file:
         _write(file, dataset, grid)

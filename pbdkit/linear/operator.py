@@ -191,7 +191,10 @@ def step_operator(
         If neighbours are searched at every step.
     """
     if scene.experiment.neighbours.nearness():
-        text = "no step operator: neighbours are searched at every step; choose fixed neighbours"
+        text = (
+            "there is no step operator if neighbours are re-evaluated; set "
+            "neighbours.reevaluate: false"
+        )
         raise ExperimentError(text, ("neighbours",))
     state, step = state or initial_state(scene), step or scene.experiment.steps
     return _Assembly(scene, state, step).operator()

@@ -244,7 +244,7 @@ class _Followers:
             value = array_of(evaluate(SMALL * self._unit), self._shape)[:, 0]
             derivatives = derivative(evaluate, self._shape, self._unit)
         if np.iscomplexobj(value):
-            raise ValueError(f"it returned values of {value.dtype}, not real numbers")
+            raise ValueError(f"it returned values of the type {value.dtype}, not real numbers")
         if finite and not (np.isfinite(value).all() and np.isfinite(derivatives).all()):
             raise ValueError(f"its {name} at rest, or a derivative of it, is not finite")
         # Axes: mover, place, axis of the response, axis of u.

@@ -30,14 +30,14 @@ def excess(scene: Scene) -> str:
     """Return the reason why a scene is too large for a step operator, or an empty string."""
     particles, neighbourhood = scene.raster.count, scene.neighbourhood
     if particles > MAX_PARTICLES:
-        return f"{particles} particles, {MAX_PARTICLES} at most"
+        return f"{particles} particles exceed the maximum of {MAX_PARTICLES}"
     degree = 2 * len(neighbourhood.planes) // len(neighbourhood.slots)
     limit = min(
         MAX_BOND_ENDS // degree,
         int(MAX_EVALUATIONS / degree**2) if degree > LARGE_NEIGHBOURHOOD else particles,
     )
     if particles > limit:
-        return f"{particles} particles with {degree} neighbours each, {limit} at most"
+        return f"{particles} particles with {degree} neighbours each exceed the maximum of {limit}"
     return ""
 
 

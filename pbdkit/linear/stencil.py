@@ -32,7 +32,7 @@ from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.rule_evaluation import Evaluator, summed
 
-NO_REMEDY = "; no relaxation helps: look at the rule, and keep |memory| below 1"
+NO_REMEDY = "; no relaxation makes it stable: check the rule, and keep |memory| below 1"
 """End of the message about a bound if no relaxation is stable."""
 TINY = 1e-100
 """Imaginary step of derivatives, as a fraction of the spacing."""

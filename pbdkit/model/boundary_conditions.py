@@ -43,7 +43,7 @@ class Cut(Strict):
     from_: Place = Field(alias="from", description="One end of the cut.", examples=[[0.0, 4.5]])
     to: Place = Field(description="Other end of the cut.", examples=[[5.0, 4.5]])
     at: Annotated[int, Field(ge=0, lt=2**31)] = Field(
-        0, description="Step at whose beginning the cut is made; 0 is before the first step."
+        0, description="Step at the beginning of which the cut is made; 0 is before the first step."
     )
 
     @model_validator(mode="after")

@@ -110,7 +110,7 @@ def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
          "bonds cannot be cut if neighbours are re-evaluated, because bonds are not permanent; "
          "set neighbours.reevaluate: false, or remove cuts"),
         ("solver", reevaluates and jumps,
-         "the limit of the steps is not defined if neighbours are re-evaluated; "
+         "an equilibrium is not defined if neighbours are re-evaluated; "
          "set neighbours.reevaluate: false or solver: {type: stepping}"),
         ("solver", reevaluates and settles,
          "the distance from equilibrium has no bound if neighbours are re-evaluated; "
@@ -140,11 +140,11 @@ def _event_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
          f"'{(rule if remembers else experiment.fracture).type}' depends on the history, so that "
          "the distance from equilibrium has no bound; remove solver.settle"),
         ("solver", jumps and remembers,
-         f"the rule '{rule.type}' depends on the history, so that the limit of the steps depends "
-         "on all of them; use solver: {type: stepping}"),
+         f"the rule '{rule.type}' depends on the history, so that there is no equilibrium that is "
+         "independent of the steps; use solver: {type: stepping}"),
         *(("solver", (jumps or settles) and not operation.rests,
-           f"'{operation.type}' can move particles at rest, so that the equilibrium is not known; "
-           "use solver: {type: stepping} without settle")
+           f"'{operation.type}' can move particles at rest, so that the equilibrium is not "
+           "determined; use solver: {type: stepping} without settle")
           for operation in experiment.operations),
     ]  # fmt: skip
 
@@ -328,7 +328,7 @@ def _numbered(fields: Mapping[str, Any]) -> Iterator[tuple[str | int, ...]]:
 
 
 def _declares_variables(part: Diagnostic) -> Diagnostic:
-    with blaming(part, "to declare what it measures"):
+    with blaming(part, "to declare its variables"):
         as_values(part.variables(), "variables")
     return part
 

@@ -114,7 +114,7 @@ def but_got(value: Any) -> str:
         )
     kind = "a class" if isinstance(value, type) else f"an object of type {type(value).__name__}"
     if isinstance(value, Mapping) or hasattr(value, "refuse_unvalidated"):
-        return f"got {kind}, which needs no loading: `pbdkit.run` takes it as it is"
+        return f"got {kind}; pass it to `pbdkit.run` directly"
     return (
         f"got {kind}; give a file, the name of a shipped experiment as 'paper/a', a dict "
         "of its parts, or a pbdkit.Experiment"
@@ -129,8 +129,7 @@ def _an_experiment(value: Any) -> Any:
     if not isinstance(value, (str, dict)):
         raise fault(
             "expected the name of a shipped experiment, a file in the folder of this one, or the "
-            "experiment itself, got "
-            f"{brief(value)}"
+            f"experiment itself, got {brief(value)}"
         )
     return value
 

@@ -126,7 +126,7 @@ def _columns(header: list[str], names: Sequence[str], path: FilePath) -> dict[st
     for name in names:
         if header.count(name) != 1:
             problem = f"two '{name}'" if name in header else f"no '{name}'"
-            text = f"requires columns {', '.join(names)}, named in its first line; there are"
+            text = f"requires the columns {', '.join(names)}, named in its first line, which has"
             hint = _separators(header) or did_you_mean(name, {*header} - {*names})
             raise fault(f"{path}:1: {text} {problem}{hint}", key="file")
     return {name: header.index(name) for name in names}
@@ -248,7 +248,7 @@ class Measured(Motion):
             )
         if len(set(self.points)) < len(self.points):
             x, y = next(p for p, count in Counter(self.points).items() if count > 1)
-            raise ValueError(f"({x:g}, {y:g}) is measured twice; remove one of them")
+            raise ValueError(f"({x:g}, {y:g}) occurs twice among the measured points; remove one")
         return self
 
     def offset(self, n: float, start: Floats) -> Floats:
@@ -473,7 +473,7 @@ class Table(Tabulated):
         if rows[0] == [0.0, 0.0, 0.0]:  # The start of every motion.
             del rows[0]
         if wrong := [row[0] for row in rows if row[0] < 1 or row[0] % 1]:
-            text = f"{parameters['file']}: steps are whole numbers from 1, got {wrong[0]:g}"
+            text = f"{parameters['file']}: expected whole numbers from 1 as steps, got {wrong[0]:g}"
             raise fault(f"{text}; the displacement at step 0 is zero", key="file")
         steps, displacements = [int(row[0]) for row in rows], [tuple(row[1:]) for row in rows]
         return rest | {"steps": steps, "displacements": displacements}

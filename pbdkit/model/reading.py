@@ -319,7 +319,7 @@ class _Reading:
             if event.value == "<<" and event.implicit[0]:
                 self._refuse(event, "merge keys (<<) are not supported; repeat the keys")
             if any("\ud800" <= c <= "\udfff" for c in event.value):
-                self._refuse(event, "half a character (\\ud800 to \\udfff) is not supported")
+                self._refuse(event, "an unpaired surrogate (\\ud800 to \\udfff) is not supported")
         return event
 
     def _value(self, event: Any, where: Where) -> Any:
@@ -557,7 +557,7 @@ def _entry(data: Any, part: str | int, label: str) -> Any:
     if isinstance(data, dict):
         return data[part if part in data else str(part)]
     if not isinstance(data, list):
-        raise ExperimentError(f"{label}: '{part}' is the key of a single value, which has none")
+        raise ExperimentError(f"{label}: '{part}' is given as a key below a single value; omit it")
     if not isinstance(part, int) or part >= len(data):
         text = f"'{part}' is not an index of a list of {len(data)}; indices are counted from 0"
         raise ExperimentError(f"{label}: {text}")

@@ -55,7 +55,9 @@ def read_field(value: dict[str, Any], files: FileResolver) -> Gridded:
         If the file or the variable does not exist, or is not a function of x and y.
     """
     if value.keys() != {"file", "variable"}:
-        raise ValueError(f"a field from a file has file and variable, got {', '.join(value)}")
+        raise ValueError(
+            f"a field from a file requires the keys file and variable, got {', '.join(value)}"
+        )
     path, variable = files.path(value["file"], "netCDF"), value["variable"]
     if not isinstance(variable, str) or not variable.isprintable() or len(variable) > MAX_NAME:
         raise ValueError(f"variable should be the name of a variable in {path}")
@@ -146,7 +148,7 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     if fault["type"] == "literal_error" and isinstance(value, str):
         hint = did_you_mean(value, re.findall(r"'([^']*)'", context["expected"]))
     if fault["type"] == "float_type" and isinstance(value, str) and TEXT.fullmatch(value):
-        hint = "; this takes a plain number, and no unit"
+        hint = "; expected a plain number without a unit"
     if fault["type"] in ("float_type", "int_type") and isinstance(value, str):
         hint = hint or _meant_number(value)
     return where, f"{message}, got {brief(value)}{hint}"
@@ -168,7 +170,7 @@ def _decimal_commas(fault: Any) -> str:
     if fault["type"] != "too_long" or not isinstance(items, (list, tuple)):
         return ""
     doubled = len(items) == 2 * maximum and all(type(item) is int for item in items)
-    return "; decimals have a point and no comma, as in 0.01" if doubled else ""
+    return "; write decimals with a point instead of a comma, as in 0.01" if doubled else ""
 
 
 def _bound(context: Any) -> float:

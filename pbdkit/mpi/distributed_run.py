@@ -73,7 +73,7 @@ class BuildCommunicator(Communicator):
         """Return the values of all processes, by rank."""
         values = self._inner.allgather((True, value))
         if not all(goes_on for goes_on, _ in values):
-            raise ElsewhereError("another process has given up")
+            raise ElsewhereError("another process has failed")
         return [each for _, each in values]
 
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
@@ -147,7 +147,9 @@ def _built(experiment: Experiment, ranks: Communicator) -> Scene:
     if any(
         p.low < p.begin - halo or p.high > p.end + halo for p in cut.subdomains(scene, ranks.size)
     ):
-        raise ExperimentError("its points follow particles farther away than it says", ("frame",))
+        raise ExperimentError(
+            "its points follow particles farther away than it declares", ("frame",)
+        )
     return scene
 
 

@@ -246,7 +246,7 @@ def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> 
     """Raise NotSharedError for the first feature that ranks do not support, with its field."""
     for clash, field, text in unfit:
         if clash:
-            refusal = f"{text}, which several processes cannot share yet; run it in one process"
+            refusal = f"{text}, which is not supported on several processes; run it in one process"
             raise scene.experiment.located(NotSharedError(refusal, field))
 
 
@@ -326,7 +326,7 @@ def _margin(scene: Scene) -> int:
     return 3 * reach_of(scene, 0).reach + partition.farthest_apart(scene)
 
 
-STUCK = "the iteration that several processes share gets nowhere; run it in one process"
+STUCK = "the distributed iteration does not converge; run it in one process"
 """Message for an iteration that makes no progress."""
 
 
@@ -390,12 +390,12 @@ def _refuse_solver(scene: Scene) -> None:
             (
                 grid is None,
                 ("neighbours",),
-                "an equilibrium whose neighbours lie farther away than in the next cell",
+                "an equilibrium with neighbours beyond adjacent cells",
             ),
             (
                 grid is None or not grid.is_the_scenes,
                 ("lattice",),
-                "the equilibrium of a lattice with several sites a cell",
+                "an equilibrium on a lattice with several sites per cell",
             ),
             (
                 method not in ("auto", "multigrid"),
@@ -406,7 +406,7 @@ def _refuse_solver(scene: Scene) -> None:
             (
                 not asks_for_grids(experiment, method, scene.raster.total),
                 ("solver", "method"),
-                "an equilibrium so small that factors of a matrix find it",
+                "an equilibrium of so few particles",
             ),
         ],
     )

@@ -32,7 +32,7 @@ def launched() -> Iterator[Communicator]:
     if RANK not in os.environ and size == 1:
         yield SERIAL
         return
-    refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
+    refuse_without("mpi4py", "mpi", "a run on several processes requires mpi4py")
     try:
         from mpi4py import MPI
     except (ImportError, RuntimeError) as error:
@@ -43,8 +43,9 @@ def launched() -> Iterator[Communicator]:
     if MPI.COMM_WORLD.size == 1:
         if size > 1:
             raise ExperimentError(
-                f"{size} processes were started, and mpi4py finds each alone: it loads the MPI of "
-                "another launcher; start them by that one's mpiexec"
+                f"{size} processes were started, but mpi4py finds only one in each: its MPI "
+                "library is not that of the launcher; use the mpiexec of the library that mpi4py "
+                "loads"
             )
         yield SERIAL
         return

@@ -108,7 +108,7 @@ def scale_of(
         high = high if look.vmax is None else look.vmax
         if not low < high:
             raise ExperimentError(
-                f"no value lies between the limits of the colours: values are {values[0]:g} to "
+                f"no value lies between the colour limits: values are {values[0]:g} to "
                 f"{values[1]:g}; give both vmin and vmax"
             )
         diverging = quantity.is_signed and low < 0.0 < high
@@ -138,7 +138,7 @@ def _map(name: str, about_zero: tuple[float, float] | None) -> Colormap:
     """Return the colour map of a name, cropped so that its middle is at zero in `about_zero`."""
     if name not in colormaps:
         suggestion = did_you_mean(name, colormaps) or "; viridis, YlOrRd and RdBu_r are"
-        raise ExperimentError(f"'{name}' is not a colour map{suggestion}")
+        raise ExperimentError(f"'{name}' is not a colour map of matplotlib{suggestion}")
     cmap = colormaps[name]
     if about_zero is not None:
         largest = max(map(abs, about_zero))

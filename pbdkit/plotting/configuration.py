@@ -61,7 +61,7 @@ def draw(
     is_list = isinstance(time, Iterable)
     rows = [recording.row(step) for step in _listed(time)]
     if not rows:
-        raise ExperimentError("a figure needs at least one time")
+        raise ExperimentError("a figure requires at least one time")
     snapshots = list(recording.snapshots(rows))
     titles = [f"step {snapshot.step}" for snapshot in snapshots]
     if not is_list or len(snapshots) == 1:
@@ -69,7 +69,9 @@ def draw(
     extent = extent_of(recording, snapshots, look)
     targets = None if ax is None else [*ax] if isinstance(ax, Iterable) else [ax]
     if targets is not None and len(targets) != len(snapshots):
-        raise ExperimentError(f"{len(snapshots)} steps need as many axes; {len(targets)} are given")
+        raise ExperimentError(
+            f"expected one axes for each of {len(snapshots)} steps, got {len(targets)}"
+        )
     sheet = Sheet([recording] * len(snapshots), titles, recording.title, extent, look, targets)
     for panel, snapshot in zip(sheet.panels, snapshots, strict=True):
         panel.show(snapshot)
@@ -126,12 +128,12 @@ def difference_of(
     quantity, _ = (quantity_of(dataset, color) for dataset in reversed(runs))
     if quantity.owner != "particle":
         raise ExperimentError(
-            f"difference: expected a variable of particles, and '{color}' is one of bonds"
+            f"difference: expected a variable of particles, but '{color}' is one of bonds"
         )
     states = [d.isel(time=Trajectory(d).row(time)) for d in runs]
     numbers = np.intersect1d(states[0]["number"].values, states[1]["number"].values)
     if not len(numbers):
-        raise ExperimentError("the two have no particle in common: no number is in both")
+        raise ExperimentError("the two datasets have no particle in common")
     a, b = (d.isel(particle=np.flatnonzero(np.isin(d["number"], numbers))) for d in states)
     minuend, subtrahend = (d[quantity.variable].transpose("particle", "axis", missing_dims="ignore")
                      for d in (a, b))  # fmt: skip
@@ -215,17 +217,17 @@ def _is_filled(body: ReferenceBody, quantity: PlottedQuantity, look: Look, dista
     )
     if requested and not possible:
         raise ExperimentError(
-            f"contours need numbers at particles as color, and '{quantity.variable}' has none; "
-            "leave them out, or name another variable"
+            f"contours require values at particles, but '{quantity.variable}' has none; omit "
+            "contours, or use another variable"
         )
     if look.filled is False and is_large:
         raise ExperimentError(
-            f"{len(body.reference)} particles are too many for dots; at most {DETAILED}"
+            f"{len(body.reference)} particles are too many for dots; at most {DETAILED} are drawn"
         )
     wanted = requested or (look.filled is None and possible and (is_large or distance < ROOMY_PT))
     if wanted and not len(body.cells):
         if requested or is_large:
-            raise ExperimentError("contours need a body of particles that are not in line")
+            raise ExperimentError("contours require particles that do not lie on one line")
         return False
     return bool(wanted)
 
@@ -236,11 +238,13 @@ def _is_lined(
     requested, is_large = look.bonds or look.broken, len(body.ends) > MANY_BONDS
     if requested and not len(body.ends):
         raise ExperimentError(
-            "there are no bonds to draw: a dataset has them where there is fracture, a cut, or a "
-            "diagnostic that uses them"
+            "the dataset has no bonds to draw; run the experiment with fracture, a cut, or a "
+            "diagnostic that uses bonds"
         )
     if requested and is_large:
-        raise ExperimentError(f"{len(body.ends)} bonds are too many to draw; at most {MANY_BONDS}")
+        raise ExperimentError(
+            f"{len(body.ends)} bonds are too many to draw; at most {MANY_BONDS} are drawn"
+        )
     if look.bonds is not None:
         return look.bonds
     return not is_large and (of_bonds or (not filled and distance >= LINED_PT))

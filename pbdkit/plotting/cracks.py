@@ -67,7 +67,9 @@ DIRECTIONS = 180
 def draw_crack(dataset: xarray.Dataset, kind: Kind, ax: Axes | None) -> Axes:
     """Draw broken bonds as `pbdkit.plotting.crack` does."""
     if kind not in KINDS:
-        raise ExperimentError(f"there is no picture '{kind}' of a crack; take {', '.join(KINDS)}")
+        raise ExperimentError(
+            f"'{kind}' is not a picture of a crack; use one of {', '.join(KINDS)}"
+        )
     broken, values = _broken(dataset), np.empty(0)
     title = str(dataset.attrs.get("title", ""))
     if kind == "map":
@@ -104,21 +106,26 @@ class CrackBonds:
 def _broken(dataset: xarray.Dataset) -> CrackBonds:
     if "broken_step" not in dataset.variables:
         raise ExperimentError(
-            "no bond could break: give the experiment `fracture` or `cuts`, and run again"
+            "no bond can break in this run; add `fracture` or `cuts` to the experiment, and run "
+            "it again"
         )
     if extra_dims := member_dims(dataset["broken_step"]):
         raise ExperimentError(
-            f"these are several runs, along {', '.join(extra_dims)}: take one by isel"
+            f"the dataset contains several runs, along {', '.join(extra_dims)}; select one with "
+            "isel"
         )
     steps = dataset["broken_step"].values
     rows = np.flatnonzero(steps >= 0)
     rows = rows[np.argsort(steps[rows], kind="stable")]
     if not len(rows):
-        raise ExperimentError("no bond broke, nothing is to be drawn")
+        raise ExperimentError("there is no crack to draw: no bond broke")
     particles = rows_of(dataset["number"].values, dataset["bond_ends"].values[rows])
     present = (particles >= 0).all(axis=1)
     if not present.any():
-        raise ExperimentError("no broken bond is between particles of this dataset")
+        raise ExperimentError(
+            "there is no crack to draw: the dataset does not contain both "
+            "particles of any broken bond"
+        )
     rows, particles = rows[present], particles[present]
     of_body = (dataset["role"].values[particles] == OF_BODY).all(axis=1)
     of_body = of_body if of_body.any() else np.ones_like(of_body)

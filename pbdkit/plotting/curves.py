@@ -33,9 +33,9 @@ from pbdkit.scene.scene import Scene
 FORCE_OF = {"load": "load_resultant", "obstacle": "contact_force", "leader_group": "reaction"}
 """Variables of forces, by the dimension of the bodies that exert them."""
 NEEDED_FORCES = (
-    "a curve of force over displacement needs a diagnostic of forces: add "
-    "{type: load-displacement, youngs_modulus: ...} for loads, {type: contact, ...} for obstacles "
-    "or {type: reaction, ...} for leader groups to `diagnostics`, and run again"
+    "a force-displacement curve requires a diagnostic of forces: add {type: load-displacement, "
+    "youngs_modulus: ...} for loads, {type: contact, ...} for obstacles or {type: reaction, ...} "
+    "for leader groups to `diagnostics`, and run the experiment again"
 )
 """Message for results without forces."""
 
@@ -99,8 +99,8 @@ def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
         return in_units(dataset["load_displacement"])
     if extra_dims := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:
         raise ExperimentError(
-            f"a sweep has no single force-displacement curve (along {', '.join(extra_dims)}): "
-            "select one member with isel, or name x and y"
+            f"a sweep has no single force-displacement curve (along {', '.join(extra_dims)}); "
+            "select one member with isel, or give x and y"
         )
     scene = scene_of(dataset, "the way of leaders and obstacles")
     if dim == "obstacle":
@@ -304,10 +304,14 @@ KINDS: tuple[Kind, ...] = ("stress-strain", "load-displacement", "energies")
 ENERGIES = ("strain_energy", "pe1", "pe1_intact", "pe2")
 """Names of the variables of energies."""
 NEEDED_DIAGNOSTICS = {
-    "stress-strain": "stress over strain needs the diagnostic stress-strain: add "
-    "{type: stress-strain, youngs_modulus: ..., width: ...} to `diagnostics`, and run again",
-    "energies": "energies need a diagnostic: add {type: pe1}, or of a calibrated rule "
-    "{type: strain-energy, youngs_modulus: ...}, to `diagnostics`, and run again",
+    "stress-strain": "a stress-strain curve requires the diagnostic stress-strain: add "
+    "{type: stress-strain, youngs_modulus: ..., width: ...} to `diagnostics`, and run the "
+    "experiment again",
+    "energies": (
+        "energies require a diagnostic: add {type: pe1}, or with a calibrated rule "
+        "{type: strain-energy, youngs_modulus: ...}, to `diagnostics`, and run the experiment "
+        "again"
+    ),
 }
 """Messages for results without the variables of a curve, by kind."""
 
@@ -324,7 +328,7 @@ def draw_curve(
     if y is None:
         x, y = None, x
     if y is not None and kind is not None:
-        raise ExperimentError(f"give y or the kind '{kind}', not both")
+        raise ExperimentError(f"give either y or the kind '{kind}', not both")
     if y is not None:
         drawn = [scalar(dataset, y, chosen)]
         across = scalar(dataset, x or _own_axis(drawn[0]), chosen)
@@ -346,7 +350,7 @@ def _first_kind(dataset: xarray.Dataset) -> Kind:
         if has[kind]:
             return kind
     raise ExperimentError(
-        f"there is no curve in it: {NEEDED_FORCES}; {NEEDED_DIAGNOSTICS['stress-strain']}"
+        f"the dataset has no curve: {NEEDED_FORCES}; {NEEDED_DIAGNOSTICS['stress-strain']}"
     )
 
 
@@ -357,7 +361,7 @@ def _of_kind(
         pair = load_curve(dataset, chosen)
         return _draw(dataset, pair.displacement, [pair.force], ax)
     if kind not in NEEDED_DIAGNOSTICS:
-        raise ExperimentError(f"there is no curve '{kind}'; there are {', '.join(KINDS)}")
+        raise ExperimentError(f"there is no curve '{kind}'; use one of {', '.join(KINDS)}")
     names = ["nominal_stress"] if kind == "stress-strain" else _energies(dataset)
     if any(name not in dataset for name in names) or not names:
         raise ExperimentError(NEEDED_DIAGNOSTICS[kind])
@@ -384,7 +388,7 @@ def _draw(dataset: xarray.Dataset, x: Any, drawn: list[Any], ax: Axes | None) ->
             name = ", ".join(filter(None, parts))
             lines.append(replace(line, name=name, hue=hue, dashed=n > 0))
     if not lines:
-        raise ExperimentError(f"'{drawn[0].name}' has no value that could be drawn")
+        raise ExperimentError(f"'{drawn[0].name}' has no finite value")
     ax = ax or new_axes()
     ax.set_xlabel(label(x.attrs["long_name"], x.attrs["units"], width=BROAD))
     common = "pseudo-energy" if has_several else drawn[0].attrs["long_name"]
@@ -421,7 +425,7 @@ def draw_history(
     lines = [line for n, series in enumerate(drawn) for line in _lines(dataset, series, n, alone)]
     if not 0 < len(lines) <= MOST_LINES:
         what = f"{len(lines)} lines are too many" if lines else "there is no value to draw"
-        raise ExperimentError(f"{what}; name other particles, for at most {MOST_LINES} lines")
+        raise ExperimentError(f"{what}; select other particles, for at most {MOST_LINES} lines")
     values, title = drawn[0].values, str(dataset.attrs.get("title", ""))
     hues = "bond" if bond is not None else "number of the particle"
     if len(drawn) == 1 and (members := hues_of(values)):
@@ -468,7 +472,7 @@ def _numbers(
     accepts."""
     if particle is not None:
         if i is not None or j is not None:
-            raise ExperimentError("name particles by number or by i and j, not by both")
+            raise ExperimentError("select particles either by number or by i and j, not by both")
         return [particle] if isinstance(particle, int | np.integer) else [*particle]
     indices = {
         name: value for name, value in zip(INDICES, (i, j), strict=False) if value is not None
@@ -480,7 +484,7 @@ def _of_particles(dataset: xarray.Dataset, name: str, wanted: list[int] | None) 
     dim = "tracked" if name.partition("_")[0] == "track" else "particle"
     if wanted is None and dim == "particle":
         raise ExperimentError(
-            f"history: no particle is given; write history('{name}', particle=67), or i=4, j=5"
+            f"history: expected a particle; write history('{name}', particle=67), or i=4, j=5"
         )
     from_positions = name.partition("_")[0] == "u" and "u" not in dataset.variables
     values = variable(dataset, name.replace("u", "position", 1) if from_positions else name)
@@ -490,9 +494,9 @@ def _of_particles(dataset: xarray.Dataset, name: str, wanted: list[int] | None) 
     for number in numbers if wanted is None else wanted:
         if number not in numbers:
             remedy = (
-                f"tracked are {numbers.tolist()}"
+                f"tracked particles are {numbers.tolist()}"
                 if dim == "tracked"
-                else f"there are {len(numbers)}"
+                else f"the dataset has {len(numbers)} particles"
             )
             raise ExperimentError(f"there is no particle {number}; {remedy}")
         part = values.isel({dim: int(np.flatnonzero(numbers == number)[0])})
@@ -520,14 +524,14 @@ def _of_bond(dataset: xarray.Dataset, name: str, bond: Sequence[int]) -> Series:
     """Return the strain between two particles, or a state variable of a bond."""
     ends = sorted(bond)
     if len(ends) != 2 or not np.isin(ends, dataset["number"].values).all():
-        raise ExperimentError(f"a bond is named by two numbers of particles, not by {[*bond]}")
+        raise ExperimentError(f"a bond is given by two numbers of particles, got {[*bond]}")
     label = f"{ends[0]}-{ends[1]}"
     if name == "strain":
         return Series(label, None, _strain(dataset, ends))
     values = variable(dataset, name)
     if {"bond", "time"} - {*values.dims}:
         names = [n for n, v in dataset.data_vars.items() if {"bond", "time"} <= {*v.dims}]
-        raise ExperimentError(f"bonds have no history of '{name}'; they have {['strain', *names]}")
+        raise ExperimentError(f"bonds have no history of '{name}'; available: {['strain', *names]}")
     rows = np.flatnonzero((dataset["bond_ends"].values == ends).all(axis=-1))
     if not len(rows):
         raise ExperimentError(f"there is no bond between {ends[0]} and {ends[1]}")

@@ -371,15 +371,15 @@ def refuse_color(
     names = [n for n in drawable if n in dataset.data_vars]
     if makers := makers_of_missing(dataset, name):
         raise ExperimentError(
-            f"'{name}' was not recorded, and cannot be drawn: add {' or '.join(makers)} to "
-            f"`diagnostics`, and run again; drawable: {', '.join(names)}"
+            f"'{name}' was not recorded; add {' or '.join(makers)} to `diagnostics`, and run the "
+            f"experiment again; drawable: {', '.join(names)}"
         )
     vectors = [n for n in (*names, *drawable) if "axis" in dataset[n].dims]
     parts = [f"{n}_{axis}" for n in vectors for axis in axes]
     suggestion = did_you_mean(name, [*drawable, *parts]) or ";"
     raise ExperimentError(
-        f"'{name}' cannot be drawn{suggestion} drawable: {', '.join(names)}; of vectors, the "
-        f"length and components, as {parts[0]}"
+        f"'{name}' cannot be drawn{suggestion} drawable: {', '.join(names)}; of vectors also the "
+        f"components, as {parts[0]}"
     )
 
 
@@ -609,15 +609,15 @@ def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
         sizes = ", ".join(f"{d}: {position.sizes[d]}" for d in extra_dims)
         first = ", ".join(f"{d}=0" for d in extra_dims)
         raise ExperimentError(
-            f"a picture is of one run, and this holds several ({sizes}); pick one with isel or "
-            f"sel: ds.isel({first}).pbd.plot(...)"
+            f"a picture shows one run, but the dataset contains several ({sizes}); select one "
+            f"with isel or sel: ds.isel({first}).pbd.plot(...)"
         )
     if dataset.sizes["axis"] != 2:
         raise ExperimentError(
-            f"pictures are of the plane, and positions here have {dataset.sizes['axis']} axes"
+            f"pictures are two-dimensional, but positions have {dataset.sizes['axis']} axes"
         )
     if "particle" not in dataset.dims or not dataset.sizes["particle"]:
-        raise ExperimentError("there are no particles to draw: keep the dimension `particle`")
+        raise ExperimentError("there are no particles to draw; keep the dimension `particle`")
     if "time" in position.dims:
         run = dataset
     else:
@@ -634,7 +634,7 @@ def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
     if "position" in dataset.variables:
         return dataset
     if "reference" not in dataset.variables or "role" not in dataset.variables:
-        raise ExperimentError("there are no positions to draw: keep the variable `position`")
+        raise ExperimentError("there are no positions to draw; keep the variable `position`")
     unknown = np.where(dataset["role"] == OF_BODY, UNKNOWN, FRAME)
     added = {"position": dataset["reference"]}
     if "kind" not in dataset.variables:
@@ -685,7 +685,7 @@ def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: Look) 
                 classes |= _numbers(snapshot.values)
     lowest, highest = np.min(low, axis=0), np.max(high, axis=0)
     if not (lowest <= highest).all():
-        raise ExperimentError("no particle has a place in what is to be drawn: positions are NaN")
+        raise ExperimentError("there are no positions to draw: all are NaN")
     margin = max(body.spacing, MARGIN * float(np.max(highest - lowest)))
     (xmin, ymin), (xmax, ymax) = lowest - margin, highest + margin
     box = _no_thinner(xmin, xmax, ymin, ymax)
@@ -764,7 +764,8 @@ def _unknown(dataset: xarray.Dataset, name: str, axes: list[str]) -> str:
             names += parts
     if makers := makers_of_missing(dataset, name):
         return (
-            f"'{name}' was not recorded: add {' or '.join(makers)} to `diagnostics`, and run again"
+            f"'{name}' was not recorded; add {' or '.join(makers)} to `diagnostics`, and run the "
+            "experiment again"
         )
     suggestion = did_you_mean(name, names) or ";"
     return f"there is no variable '{name}'{suggestion} available: {', '.join(names)}"
@@ -779,9 +780,9 @@ def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None])
     values = variable(dataset, name)
     if "axis" in values.dims:
         components = ", ".join(f"'{name}_{axis}'" for axis in dataset["axis"].values)
-        raise ExperimentError(f"'{name}' is a vector; take one of {components}")
+        raise ExperimentError(f"'{name}' is a vector; use one of {components}")
     if values.dtype.kind not in "biuf":
-        raise ExperimentError(f"'{name}' holds no numbers")
+        raise ExperimentError(f"'{name}' contains no numbers")
     for dim, argument in CHOSEN_BY.items():
         if dim in values.dims:
             values = _one_of(values, dim, argument, chosen.get(argument))
@@ -791,7 +792,8 @@ def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None])
     run_dims = [str(d) for d in values.dims if d in OF_A_RUN]
     if len(run_dims) > 1:
         raise ExperimentError(
-            f"'{name}' is no single number a step: it has {' and '.join(run_dims)}"
+            f"'{name}' has more than one value per step: it has the dimensions "
+            f"{' and '.join(run_dims)}"
         )
     return in_units(values)
 

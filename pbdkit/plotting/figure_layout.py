@@ -226,8 +226,8 @@ class Page:
         best = max(fitting, key=lambda g: g.width * (count / (g.columns * g.rows)) ** 0.7)
         if min(best.width, best.height) < SMALLEST_PANEL_IN:
             raise ExperimentError(
-                f"figsize: {page[0]:g} by {page[1]:g} inches leave no room for {count} panels "
-                "beside what is written there; give a larger size, or fewer times"
+                f"figsize: {page[0]:g} by {page[1]:g} inches are too small for {count} panels "
+                "and their texts; give a larger size, or fewer times"
             )
         return best
 

@@ -167,12 +167,12 @@ def _movie_file(color: str | None, file: str | Path | None) -> Path:
     if isinstance(color, str | Path) and Path(color).suffix in FORMATS:
         variable = f"{str(file)!r}, " if file is not None else ""
         raise ExperimentError(
-            f"animate: '{color}' is a file, and the variable comes first; write "
+            f"animate: the first argument is the variable, but '{color}' is a file; write "
             f"animate({variable}file={str(color)!r})"
         )
     named = f"{color!r}, " if color is not None else ""
     raise ExperimentError(
-        f"animate: no file is given; write animate({named}file='movie.mp4'), or in a notebook "
+        f"animate: expected a file; write animate({named}file='movie.mp4'), or in a notebook "
         f"animation({named.rstrip(', ')})"
     )
 
@@ -252,10 +252,10 @@ def refuse_no_movie(path: Path) -> None:
     """Raise ExperimentError if the suffix is not that of a movie, or its writer is not installed,
     and StorageError if the folder does not exist."""
     if path.suffix not in FORMATS:
-        raise ExperimentError(f"{path}: a movie ends in {' or '.join(FORMATS)}")
+        raise ExperimentError(f"{path}: the name of a movie must end in {' or '.join(FORMATS)}")
     writer = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
     for module, name in ((writer, WRITERS[writer]), ("matplotlib", "matplotlib")):
-        refuse_without(module, "movie", f"movies need {name}")
+        refuse_without(module, "movie", f"movies require {name}")
     if not path.parent.is_dir():
         raise StorageError(f"{path}: there is no folder {path.parent}")
 

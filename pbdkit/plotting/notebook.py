@@ -16,7 +16,7 @@ from pbdkit.stability.relaxation import tuned
 
 LARGEST = 100_000
 """Maximum number of particles of bodies that are analysed automatically."""
-STRAIGHT = "goes straight to the equilibrium, to where steps would lead"
+STRAIGHT = "computes the equilibrium directly; steps would converge to it"
 """Description of a run of the solver `equilibrium`."""
 STYLE = "font-family:system-ui,sans-serif;font-size:13px;color:#222;background:#fff;padding:8px"
 """CSS style of the output."""
@@ -29,7 +29,7 @@ def experiment_html(experiment: Experiment) -> str:
     try:
         scene = build_scene(experiment)
     except PbdkitError as error:
-        return _page(experiment.name, "", [("not possible", str(error))], [])
+        return _page(experiment.name, "", [("invalid", str(error))], [])
     try:
         rows, warnings = _properties(scene)
     except PbdkitError as error:
@@ -59,7 +59,7 @@ def _properties(scene: Scene) -> tuple[list[tuple[str, str]], list[str]]:
         ("steps", f"{experiment.steps}, recorded {records} times"),
     ]
     if count > LARGEST:
-        why = f"not looked at for {count} particles; pbdkit.analyse(experiment) does"
+        why = f"not computed for {count} particles; pbdkit.analyse(experiment) computes it"
         return [*rows, ("particles", str(count)), ("stability", why)], list(scene.warnings)
     prediction = forecast(tuned(scene))
     rows += _sizes(prediction)
@@ -70,7 +70,10 @@ def _properties(scene: Scene) -> tuple[list[tuple[str, str]], list[str]]:
 
 def _sizes(prediction: Forecast) -> list[tuple[str, str]]:
     rows = [
-        ("particles", f"{prediction.particles}, of which {prediction.followers} follow in step 1")
+        (
+            "particles",
+            f"{prediction.particles}, of which {prediction.followers} are followers in step 1",
+        )
     ]
     rows.append(("bonds", str(prediction.bonds)))
     if prediction.size_mm:

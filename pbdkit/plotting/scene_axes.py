@@ -90,7 +90,9 @@ def draw_experiment(experiment: Experiment, look: Look, ax: Axes | None) -> Axes
     """Draw the set-up of an experiment on axes, by default in a new figure."""
     scene = build_scene(experiment)
     if scene.axes != 2:
-        raise ExperimentError(f"pictures are of the plane, and this lattice has {scene.axes} axes")
+        raise ExperimentError(
+            f"pictures are two-dimensional, but this lattice has {scene.axes} axes"
+        )
     units = experiment.units
     unit, words = (units.scale(LENGTH), LENGTH.unit) if units else (1.0, LENGTH.lattice)
     low, high = corners(scene)

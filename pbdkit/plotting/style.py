@@ -125,7 +125,7 @@ class Look:
                 f"dpi: {self.dpi} is not between {SMALLEST_DPI} and {LARGEST_DPI}"
             )
         if self.contours and self.filled is False:
-            raise ExperimentError("contours need filled=True, got filled=False")
+            raise ExperimentError("contours require filled=True, got filled=False")
 
     def _check_limits(self) -> None:
         for name, limit in (("vmin", self.vmin), ("vmax", self.vmax)):

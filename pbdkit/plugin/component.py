@@ -68,7 +68,7 @@ def _slip(key: str) -> str:
     if colon and name and value:
         return f"write a space after the colon: `{name}: {value}`"
     if key.strip().isdecimal():
-        return "decimals have a point and no comma, as in 0.3"
+        return "write decimals with a point instead of a comma, as in 0.3"
     return ""
 
 
@@ -136,7 +136,7 @@ def as_vector(answer: Any, what: str, like: Any) -> Any:
     if type(answer) is not type(like):
         names = ", ".join(type(like)._fields)
         raise AnswerError(
-            f"`{what}` returned {_kind(answer)}: return a vector, as "
+            f"`{what}` returned {_kind(answer)}; return a vector, as "
             f"`pbdkit.plugin.{_kind(like)}({names})`"
         )
     return answer
@@ -152,7 +152,9 @@ def as_verdict(answer: Any) -> Any:
     """
     if (dtype := np.asarray(answer).dtype).kind != "b":
         what = "None" if answer is None else dtype
-        raise AnswerError(f"`breaks` returned {what}: compare, as in `... > c.limit`")
+        raise AnswerError(
+            f"`breaks` returned {what}, not booleans; return a comparison, as in `... > c.limit`"
+        )
     return answer
 
 
@@ -165,7 +167,7 @@ def as_values(answer: Any, what: str) -> tuple[Any, ...]:
         If it is a single value, as when the comma of ``(value,)`` is missing.
     """
     if isinstance(answer, Vector) or not isinstance(answer, (tuple, list)):
-        raise AnswerError(f"`{what}` returned {_kind(answer)}, not a tuple: write `(value,)`")
+        raise AnswerError(f"`{what}` returned {_kind(answer)}, not a tuple; write `(value,)`")
     return tuple(answer)
 
 
@@ -213,10 +215,12 @@ class Remembered:
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise ValueError(
-                f"'{self.name}' is not the name of a variable; use letters, digits and _"
+                f"'{self.name}' is not a valid name of a variable; use letters, digits and _"
             )
         if self.dtype not in DTYPES:
-            raise ValueError(f"'{self.name}' has the dtype '{self.dtype}', not {', '.join(DTYPES)}")
+            raise ValueError(
+                f"'{self.name}' has the dtype '{self.dtype}'; expected one of {', '.join(DTYPES)}"
+            )
         if np.ndim(self.initial):
             raise ValueError(
                 f"the initial value of '{self.name}' is {self.initial!r}, not a number; declare "

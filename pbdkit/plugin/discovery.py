@@ -183,7 +183,9 @@ def _check_functions(component: type[Component]) -> None:
         try:
             signature.bind(*parameters)
         except TypeError:
-            raise TypeError(f"{label}.{name}{signature} is called as {call}") from None
+            raise TypeError(
+                f"{label}.{name}{signature} has other arguments; declare {call}"
+            ) from None
 
 
 def _check_defaults(component: type[Component]) -> None:
@@ -229,7 +231,7 @@ class Retired:
     def advice(self) -> str:
         """Warning for experiments with this component."""
         return (
-            f"'{self.type}' is retired and read as '{self.successor}' until version 1.0; "
+            f"'{self.type}' is retired, and is replaced by '{self.successor}' until version 1.0; "
             f"{self.difference}; write {self.field}: {{type: {self.successor}}}"
         )
 
@@ -240,7 +242,7 @@ RETIRED = (
         type="traction-free",
         successor="natural",
         difference="the body then ends at its outermost particles, not half a spacing outside "
-        "them, and no frame points are numbered",
+        "them, and has no frame points",
         renumbers=True,
     ),
 )

@@ -121,7 +121,7 @@ class Gridded(Varying):
         self.values = np.array(values, float)
         for name, places in (("x", self.x), ("y", self.y)):
             if places.ndim != 1 or not len(places) or not (np.diff(places) > 0.0).all():
-                raise ValueError(f"{name} should be numbers that increase")
+                raise ValueError(f"{name} should be increasing numbers")
         if self.values.shape != (shape := (len(self.x), len(self.y))):
             raise ValueError(
                 f"values should be {shape[0]} lists of {shape[1]} numbers, a list for each x with "
@@ -228,7 +228,7 @@ def as_varying(value: Any) -> Varying | None:
         and not random_keys
         and all(isinstance(number, (int, float)) for number in value.values())
     ):
-        raise ValueError("otherwise is missing: the number outside these regions")
+        raise ValueError("`otherwise` is missing; it is the value outside these regions")
     if value.keys() == {"x", "y", "values"}:
         return Gridded(value["x"], value["y"], _unpacked(value))
     raise ValueError(
@@ -630,7 +630,9 @@ def unknown_regions(
         for region, _ in field.values if isinstance(field, ByRegion) else ():
             if region not in regions:
                 names = (
-                    f"known: {', '.join(regions)}" if regions else "there is none: add `regions`"
+                    f"known: {', '.join(regions)}"
+                    if regions
+                    else "the experiment has no `regions`; add them"
                 )
                 hint = did_you_mean(region, regions)
                 yield name, region, f"there is no region '{region}'{hint} ({names})"

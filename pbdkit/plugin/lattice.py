@@ -260,7 +260,7 @@ class Lattice(Component):
     [(-1, 0), (1, 0)]
     """
 
-    origin: Place = Field((0.0, 0.0), description="Where site (0, 0) lies (lattice units).")
+    origin: Place = Field((0.0, 0.0), description="Position of site (0, 0) (lattice units).")
 
     @abstractmethod
     def cell(self) -> Cell:

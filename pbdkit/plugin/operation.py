@@ -63,7 +63,7 @@ class ParticleOperation(Component):
     other operations."""
 
     select: Selection | None = Field(
-        None, description="The particles of the body to which it happens; all where it is left out."
+        None, description="The particles that are changed; by default all of the body."
     )
 
     def parameters(self) -> dict[str, float]:

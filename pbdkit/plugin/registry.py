@@ -77,7 +77,7 @@ class Registry:
         classes = {p.distribution: o.component for p, o in offers if o.component}
         if len(classes) > 1:
             choice = ", ".join(f"'{source}:{kind}'" for source in classes)
-            raise ExperimentError(f"'{label}' is offered by several distributions: write {choice}")
+            raise ExperimentError(f"'{label}' is offered by several distributions; write {choice}")
         if classes:
             return classes.popitem()[1]
         if distribution:

@@ -102,8 +102,8 @@ class Setting:
 
 
 SCALES_FORCES = (
-    "a rule says where particles go, which does not depend on it; it scales forces and stresses, "
-    "and stands under `units`, or in each diagnostic that gives them"
+    "displacements do not depend on it, and rules do not have this parameter; it scales forces and "
+    "stresses: write it under `units`, or in each diagnostic of forces or stresses"
 )
 """Hint for Young's modulus as a key of a rule."""
 

@@ -295,8 +295,8 @@ def magnitude(text: str, unit: str, meaning: str) -> float:
         with suppress(pint.PintError, ArithmeticError, ValueError):
             if registry.parse_units(f"({name}) * s").is_compatible_with(unit):
                 hint = (
-                    "the steps of a run have no duration: write the change in one step, without "
-                    f"the time, as in 0.01 {unit}"
+                    "steps have no duration; write the change in one step, without the unit of "
+                    f"time, as in 0.01 {unit}"
                 )
         raise _fault(f"'{text}' is not a {meaning}; {hint}") from None
 

@@ -92,7 +92,7 @@ def narrow_voids(lattice: Lattice, left_out: LeftOut) -> Iterator[str]:
         x, y = (float(c[0]) + origin for c, origin in zip(at, lattice.origin, strict=True))
         cells = "a cell is" if left_out.count == 1 else f"{left_out.count} cells are"
         yield (
-            f"body: {cells} left out, the first near ({x:.6g}, {y:.6g}), where a void is less than "
+            f"body: {cells} omitted, the first near ({x:.6g}, {y:.6g}), where a void is less than "
             "two cells wide: they would connect its two sides; use a finer lattice, with two cells "
             "across the void, or `cuts` for a crack of zero width"
         )
@@ -189,7 +189,8 @@ def never_near(
         gaps = [low + moves.min(axis=0) - box[1], box[0] - high - moves.max(axis=0)]
         if np.max(gaps) > reach:
             yield (
-                f"obstacles.{n}: stays farther from the body than the size of the body, so that it "
+                f"obstacles.{n}: remains farther from the body than the size of the body, so "
+                "that it "
                 "has no effect"
             )
 

@@ -114,14 +114,14 @@ def check_diagnostics(
     """
     owners = remembered_names(experiment)
     for n, diagnostic in enumerate(experiment.diagnostics):
-        with blaming(diagnostic, "to declare what it measures", "diagnostics", n):
+        with blaming(diagnostic, "to declare its variables", "diagnostics", n):
             diagnostic.check(raster.total, len(experiment.leaders))
             diagnostic.coordinates()
             if "cells" in diagnostic.needs and not raster.communicator.any(
                 patches(raster, neighbourhood.tiling)
             ):
                 raise ExperimentError(
-                    f"'{diagnostic.type}' requires cells, and no cell has all its corners in the "
+                    f"'{diagnostic.type}' requires cells, but no cell has all its corners in the "
                     "body; use a wider body, or remove the diagnostic"
                 )
             if "loads" in diagnostic.needs and not experiment.loads:
@@ -137,7 +137,7 @@ def check_diagnostics(
                         f"'{diagnostic.type}' requires obstacles; the experiment has none"
                     )
                 if variable.name in owners:
-                    other = f"{owners[variable.name]} does too"
+                    other = f"so does {owners[variable.name]}; remove one"
                     raise ExperimentError(f"adds the variable '{variable.name}'; {other}")
                 owners[variable.name] = f"diagnostics.{n}"
     return _frame_warnings(experiment, raster)
@@ -422,7 +422,9 @@ def _named(kind: str, values: Any, **constants: float) -> Any:
     """Return a named tuple of Python floats; with numpy's scalars single precision would be
     promoted to double."""
     if not isinstance(values, dict):
-        raise TypeError(f"it returned {type(values).__name__}, not numbers by name: {{'k': 1.0}}")
+        raise TypeError(
+            f"it returned {type(values).__name__}; return numbers by name: {{'k': 1.0}}"
+        )
     names = (*values, *constants)
     return _kind(kind, names)(*map(float, (*values.values(), *constants.values())))
 

@@ -244,11 +244,14 @@ def refuse_too_large(
     needed = sizes_of(experiment, neighbourhood, math.ceil(particles / communicator.size)).memory
     available = machine_memory(communicator.processes_on_machine())
     if needed > available:
-        each, fewer = "", "make it smaller"
+        each, fewer = "", "reduce it"
         if communicator.size > 1:
-            each, fewer = " in each process", "make it smaller, or start more on other machines"
+            each, fewer = (
+                " in each process",
+                "reduce the body, or start more processes on other machines",
+            )
         raise TooLargeError(
-            f"{particles:.3g} particles need about {needed / 2**30:.3g} GiB{each}, and "
+            f"{particles:.3g} particles need about {needed / 2**30:.3g} GiB{each}, but only "
             f"{available / 2**30:.3g} may be used on this machine; {fewer}",
             ("body",),
         )

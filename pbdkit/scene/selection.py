@@ -122,7 +122,7 @@ class Selecting:
 
     def _region(self, name: str, where: tuple[str | int, ...]) -> Indices:
         if name not in self.regions:
-            names = ", ".join(self.regions) or "there is none: add `regions`"
+            names = ", ".join(self.regions) or "the experiment has no `regions`; add them"
             hint = did_you_mean(name, self.regions)
             raise ExperimentError(f"there is no region '{name}'{hint} (known: {names})", where)
         distance = signed_distance(self.regions[name], self.raster.cell, *self._x.T)

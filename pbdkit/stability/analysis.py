@@ -102,11 +102,14 @@ class Spectra:
         if excess_size and not reason:
             reason = f"{excess_size} for a matrix, and {self.estimate.NEEDS}"
         elif not reason:
-            reason = (
-                "eigenvalues lie too close together, as in long bodies; a shorter one shows more"
+            reason = "eigenvalues lie too close together, as in long bodies; analyse a shorter one"
+        prefix = "as are parts that no leader reaches: " if excess_size else ""
+        return [
+            (
+                "analysis: the spectrum and the distance from equilibrium are omitted, "
+                f"{prefix}{reason}"
             )
-        prefix = "parts that no leader reaches too: " if excess_size else ""
-        return [f"analysis: the spectrum and the lag are left out, {prefix}{reason}"]
+        ]
 
     @property
     def of_rule(self) -> Spectrum | None:
@@ -213,7 +216,7 @@ class Analysis:
             kinds = f", {turning} of them complex" if turning else ", all real"
             rows.append((f"eigenvalues {which}", f"{len(values)}{kinds}"))
         if self.lag is not None:
-            rows.append(("lag", f"{self.lag:.4g} lattice units behind equilibrium"))
+            rows.append(("distance", f"{self.lag:.4g} lattice units from equilibrium"))
         return rows
 
     def _repr_html_(self) -> str:
@@ -258,21 +261,21 @@ class Analysis:
         messages, solver = self.spectra.left_out, self.scene.experiment.stepping
         if types := dict.fromkeys(f"'{part.operation.type}'" for part in self.scene.operations):
             messages.append(
-                f"operations: the analysis leaves out {', '.join(types)}; eigenvalues, steps and "
-                "lag are those of the rule alone"
+                f"operations: the analysis does not include {', '.join(types)}; eigenvalues, steps "
+                "and distance are those of the rule alone"
             )
         if not self.estimated:
             return messages
         if solver.memory > 0.0 and self.swing(solver.relaxation, solver.memory) is None:
             messages.append(
-                "analysis: the period is left out, a body of this size has many modes between "
-                "those that decay without oscillating and those that oscillate"
+                "analysis: the period is omitted, because a body of this size has many modes "
+                "between those that decay without oscillating and those that oscillate"
             )
         moves = self.scene.experiment.solver.makes_steps and fastest(self.scene).speed > 0.0
         if moves and self.stable and self.trailing is None:
             messages.append(
-                "analysis: the lag is left out, the leaders do not constrain the body in their "
-                "fastest steps"
+                "analysis: the distance from equilibrium is omitted, because the leaders do not "
+                "constrain the body in their fastest steps"
             )
         return messages
 
@@ -451,10 +454,10 @@ class Analysis:
         """Return what prevents convergence, with the remedy."""
         anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
         parts = [] if anchored or self.scene.barriers else self.parts_without_leader
-        message = "leaders: none reaches a part of {} particles (with number {}): nothing holds it"
+        message = "leaders: a part of {} particles (with number {}) is not constrained by any"
         warnings = [message.format(len(part), part[0]) for part in parts]
         if len(parts) > 3:
-            warnings = [f"leaders: none reaches {len(parts)} parts of the body; nothing holds them"]
+            warnings = [f"leaders: {len(parts)} parts of the body are not constrained by any"]
         bond = min(min(lengths) for lengths in self.scene.neighbourhood.shells())
         lag_warnings = (
             self.trailing.late(bond, self.scene.experiment.units) if self.trailing else []
@@ -474,7 +477,7 @@ class Analysis:
             ]
         if self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:
             return [
-                "solver.relaxation: a mode that changes its sign in every step never decays; take "
+                "solver.relaxation: a mode that changes its sign in every step never decays; use "
                 "a relaxation below 1"
             ]
         return []
@@ -487,7 +490,7 @@ class Analysis:
         if not (self.estimated and has_free_edges and bound and NEAR * bound < relaxation < bound):
             return []
         message = f"solver.relaxation: {relaxation:g} is near the bound of plane waves, {bound:.4g}"
-        return [f"{message}, and edges without a frame may have one up to 10 % lower"]
+        return [f"{message}, and at edges without a frame the bound can be up to 10 % lower"]
 
 
 ACCURACY = 1e-2
@@ -544,11 +547,11 @@ class StabilityEstimate:
     def obstacle(self) -> str:
         """Return the reason why no estimate is possible, or an empty string."""
         if self._scene.experiment.neighbours.nearness():
-            return "neighbours are searched at every step"
+            return "neighbours are re-evaluated at every step"
         if not find_spec("numba"):
-            return "for a body of this size numba is needed: pip install 'pbdkit[fast]'"
+            return "a body of this size requires numba: pip install 'pbdkit[fast]'"
         if self._scene.raster.count * BYTES_PER_PARTICLE > machine_memory():
-            return "for a body of this size there is too little memory"
+            return "there is too little memory for a body of this size"
         return ""
 
     def slowest(self) -> SlowMode | None:
@@ -592,14 +595,14 @@ class StabilityEstimate:
 def verdict_of(found: Any) -> list[tuple[str, str]]:
     """Return the statements of an Analysis or a Forecast on stability, as names and texts."""
     if found.spectral_radius is None:
-        return [("stability", "not known of this scene")]
+        return [("stability", "not known for this scene")]
     near = "" if found.exact else ", linearised at the start"
     near += ", estimated" if found.estimated else ""
     verdict = "stable" if found.stable else "not stable"
     rows = [("stability", f"{verdict}: spectral radius {found.spectral_radius:.9g}{near}")]
     steps = ", ".join(f"to {t} in {n}" for t, n in found.steps_to.items() if n is not None)
     if steps:
-        rows.append(("settles", f"{steps} steps"))
+        rows.append(("converges", f"{steps} steps"))
     if (bound := found.largest_stable_relaxation) is not None:
         rows.append(("relaxation", f"stable below {bound:.6g}"))
     return rows

@@ -58,8 +58,8 @@ def too_light(scene: Scene) -> list[str]:
         lightest = motion.lightest(forces.stiffness(n, state, NUDGE))
         if motion.mass < lightest:
             warnings.append(
-                f"leaders.{n}.motion.mass: {motion.mass:g} is too small, its oscillation may grow "
-                f"without bound; steps are stable from {lightest:.4g} on"
+                f"leaders.{n}.motion.mass: {motion.mass:g} is too small, so that its oscillation "
+                f"can grow without bound; steps are stable from a mass of {lightest:.4g} on"
             )
     return warnings
 
@@ -231,8 +231,8 @@ def _too_short(analysis: Analysis) -> list[str]:
     if experiment.stepping.settle or steps_needed <= experiment.steps:
         return []
     return [
-        f"steps: under its loads the body converges in about {steps_needed} steps, and the run has "
-        f"{experiment.steps}; take solver: {{type: equilibrium}}, memory: auto, or more steps"
+        f"steps: under its loads the body converges in about {steps_needed} steps, but the run has "
+        f"{experiment.steps}; use solver: {{type: equilibrium}}, memory: auto, or more steps"
     ]
 
 
@@ -253,7 +253,8 @@ def _divergence_in_time(scene: Scene) -> list[str]:
             )
     if len(moments) > MAX_CHANGES:
         warnings.append(
-            f"analysis: of {len(moments)} changes in time the first {MAX_CHANGES} were analysed"
+            f"analysis: only the first {MAX_CHANGES} of {len(moments)} changes in time were "
+            "analysed"
         )
     return warnings
 
@@ -263,7 +264,7 @@ def _scene_warnings(scene: Scene) -> list[str]:
     warnings = list(scene.warnings)
     followers = kinds_of_places(scene.raster, scene.leading, 1) == FOLLOWER
     if not scene.raster.communicator.any(followers.any()):
-        warnings.append("leaders: all particles are leaders in step 1, none is a follower")
+        warnings.append("leaders: all particles are leaders in step 1; there are no followers")
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:
             warnings.append(f"leaders.{n}: starts after the last step of the run")
@@ -275,10 +276,12 @@ def _scene_warnings(scene: Scene) -> list[str]:
         if barrier.group.from_ > scene.experiment.steps:
             warnings.append(f"obstacles.{n}: starts after the last step of the run")
     if not (scene.driven or scene.loads):
-        warnings.append("leaders: there are none, and no loads: nothing will move")
+        warnings.append(
+            "leaders: the experiment has neither leaders nor loads, so that nothing moves"
+        )
     if sizes.output > machine_memory():
         warnings.append(
-            f"record: the output of {sizes.output / 2**30:.3g} GiB exceeds this machine's memory: "
+            f"record: the output of {sizes.output / 2**30:.3g} GiB exceeds this machine's memory; "
             "record fewer steps to open it at once"
         )
     return warnings
@@ -292,7 +295,7 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
     if stable and not scene.experiment.solver.makes_steps:
         return []
     remedy = f"; it is stable below {stable:.4g}" if stable else NO_REMEDY
-    grows = f"can diverge, some waves grow by {bound.radius:.4g} a step"
+    grows = f"can diverge, since some waves grow by {bound.radius:.4g} per step"
     text = f"solver.relaxation: {solver.relaxation:g} {grows}{remedy}"
     return [WarningText(text, StabilityWarning)]
 
@@ -318,8 +321,9 @@ def _missing_supports(scene: Scene) -> list[str]:
         return []
 
     return [
-        f"loads: nothing holds a part of {part.particles} particles (with number {part.first}) "
-        "against them, so that it moves on in every step; constrain it with a leader group"
+        f"loads: a part of {part.particles} particles (with number {part.first}) is loaded, but "
+        "not constrained, so that its displacement grows in every step; constrain it with a "
+        "leader group"
         for part in pushed_parts(scene)
     ]
 

@@ -149,9 +149,9 @@ class Lag:
             )
         )
         return [
-            f"leaders: in steps {self.first} to {self.last} the fastest moves by {speed} a step "
-            f"and leaves the body {distance} behind its equilibrium, more than a bond ({length}): "
-            f"its speed determines the strain of bonds; move by less than {bound} a step, or take "
+            f"leaders: in steps {self.first} to {self.last} the fastest moves by {speed} per step, "
+            f"which brings the body {distance} from equilibrium, more than a bond ({length}): the "
+            f"strain of bonds depends on this speed; move by less than {bound} per step, or use "
             "solver: {type: equilibrium}"
         ]
 

@@ -95,7 +95,9 @@ def best_weights(
     if np.abs(z.imag).max() > STRAIGHT:
         weights = _best_for_complex(eigenvalues, relaxation, memory)
     if not weights.rate(eigenvalues) < 1.0:
-        raise HopelessError(f"no memory lets all modes decay with relaxation {weights[0]:g}")
+        raise HopelessError(
+            f"no value of memory makes all modes decay with relaxation {weights[0]:g}"
+        )
     return weights
 
 
@@ -159,7 +161,7 @@ SOLUTIONS = 10
 """Number of solutions from which the slowest mode is computed."""
 NUDGE = 1e-6
 """Displacement at which nonlinear rules are linearised, as a fraction of the spacing."""
-REMEDY = "give numbers, or leave them out (relaxation 1, memory 0)"
+REMEDY = "give numbers, or omit them (relaxation 1, memory 0)"
 """Remedy in messages about `auto`."""
 
 
@@ -201,16 +203,16 @@ def chosen_weights(scene: Scene) -> StepWeights:
 
 def _refuse(scene: Scene) -> None:
     if scene.experiment.courses:
-        raise _refusal(f"'auto' needs constant parameters, and some depend on time; {REMEDY}")
+        raise _refusal(f"'auto' requires constant parameters, but some depend on time; {REMEDY}")
     if scene.experiment.neighbours.nearness():
         raise _refusal(
-            "'auto' needs a spectrum, and there is none if neighbours are searched at every step; "
+            "'auto' requires a spectrum, which does not exist if neighbours are re-evaluated; "
             f"set neighbours.reevaluate: false, or {REMEDY}"
         )
     if scene.lag:
         raise _refusal(
-            "'auto' is for steps that depend on the last one alone, and a frame with lag reads "
-            f"earlier ones; set frame.lag: 0, or {REMEDY}"
+            "'auto' requires steps that depend on the last one only, but a frame with lag depends "
+            f"on earlier ones; set frame.lag: 0, or {REMEDY}"
         )
 
 

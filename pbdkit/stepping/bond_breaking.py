@@ -165,7 +165,7 @@ class _Renewed(NamedTuple):
     cells: tuple[CellStress, ...]
 
 
-BREAKS_AT_REST = Hindrance("an equilibrium with bonds that break", "fracture")
+BREAKS_AT_REST = Hindrance("an equilibrium with breaking bonds", "fracture")
 """Reason why ranks do not share an equilibrium."""
 
 

@@ -432,8 +432,9 @@ def _uncontracted() -> Iterator[None]:
 def _checked(text: str) -> str:
     if UNROUNDED.search(text):
         raise PbdkitError(
-            "this version of numba-cuda contracts products and sums, whatever it is told: results "
-            "would not be those of the other engines; take numba-cuda 0.30, or `engine: auto`"
+            "this version of numba-cuda contracts products and sums in spite of its settings: "
+            "results would differ from those of the other engines; use numba-cuda 0.30, or "
+            "`engine: auto`"
         )
     return text
 

@@ -26,8 +26,8 @@ def what_is_missing() -> str:
     if cuda.config.ENABLE_CUDASIM:
         return ""
     if not cuda.is_available():
-        return "there is no GPU, or no driver of NVIDIA's for it"
-    return "" if cuda.cudadrv.nvvm.is_available() else f"CUDA's compiler is missing: {install}"
+        return "there is no NVIDIA GPU, or its driver is missing"
+    return "" if cuda.cudadrv.nvvm.is_available() else f"the CUDA compiler is missing: {install}"
 
 
 def what_gpus_lack(scene: Scene) -> str:
@@ -68,22 +68,25 @@ def choose(scene: Scene) -> Choice:
     solver = scene.experiment.stepping
     if solver.engine == "gpu":
         lacks = what_is_missing() or what_gpus_lack(scene) or what_kernels_lack(scene)
-        _refuse(scene, lacks and f"the GPU engine cannot be had: {lacks}; take `engine: auto`")
-        return Choice("gpu", 1, "asked for")
+        _refuse(scene, lacks and f"the GPU engine is not available: {lacks}; use `engine: auto`")
+        return Choice("gpu", 1, "requested")
     hindrance = obstacle() or what_kernels_lack(scene)
     if solver.engine == "compiled":
-        _refuse(scene, hindrance and f"the compiled engine cannot be had: {hindrance}")
+        _refuse(
+            scene,
+            hindrance and f"the compiled engine is not available: {hindrance}; use `engine: auto`",
+        )
     if solver.engine == "numpy":
-        return Choice("numpy", 1, "asked for")
+        return Choice("numpy", 1, "requested")
     seconds = _numpy_seconds(scene)
     if solver.engine == "auto" and seconds < PATIENCE_S:
-        return Choice("numpy", 1, f"{_about(seconds)} in all: compiling would take longer")
+        return Choice("numpy", 1, f"{_about(seconds)} in total; compiling would take longer")
     if hindrance:
-        return Choice("numpy", 1, f"slower than it could be: {hindrance}")
+        return Choice("numpy", 1, f"the compiled engine is not available: {hindrance}")
     threads = solver.threads
     if threads == "auto":
         threads = processors() if scene.raster.total >= TWO_THREADS_PAY else 1
-    reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
+    reason = "requested" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
     return Choice("compiled", threads, reason + _about_passes(scene))
 
 
@@ -115,7 +118,7 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
     except PluginError as error:
         if scene.experiment.stepping.engine == "compiled":
             raise
-        reason = f"slower than it could be: {str(error).splitlines()[0]}"
+        reason = f"the compiled engine is not available: {str(error).splitlines()[0]}"
         return Stepper(scene), Choice("numpy", 1, reason)
 
 
@@ -141,7 +144,7 @@ def _about_passes(scene: Scene) -> str:
     """Return the reason why each step is a pass of its own over the memory, in scenes in which
     passes of several steps would be faster; empty otherwise."""
     why = exceeds_cache(scene) and single_steps(scene)
-    return f"; one step a pass over the memory: {why}" if why else ""
+    return f"; one step per pass over the memory: {why}" if why else ""
 
 
 def _numpy_seconds(scene: Scene) -> float:

@@ -58,7 +58,7 @@ def target(u: Any, move: Any, before: Any, solver: Stepping) -> Any:
     """
     if np.shape(move) not in ((), np.shape(u)):
         raise ValueError(
-            f"it returned the shape {np.shape(move)} for particles of shape {np.shape(u)}: "
+            f"it returned the shape {np.shape(move)} for particles of the shape {np.shape(u)}: "
             "it is not elementwise"
         )
     if not isinstance(move, float) and np.asarray(move).dtype.kind not in REAL:
@@ -313,15 +313,15 @@ class MoveFollowers(Operation):
         """Return a reason if neighbours are re-evaluated, because their lists are computed on the
         host in every step, or if parameters depend on time in a way that kernels do not support."""
         if self.scene.experiment.neighbours.nearness():
-            changing = "numbers change in time, and neighbours are found anew"
+            changing = "parameters are time-dependent, and neighbours are re-evaluated"
             reasons = {
-                Mode.RANKS: "neighbours are found anew in every step",
+                Mode.RANKS: "neighbours that are re-evaluated",
                 Mode.COURSES: changing,
                 Mode.SOLVER_COURSES: changing,
             }
-            return Hindrance(reasons.get(mode, "neighbours are found anew"), "neighbours")
+            return Hindrance(reasons.get(mode, "neighbours are re-evaluated"), "neighbours")
         if mode is Mode.PASSES and self.sweeps() > 2:
-            return Hindrance("the rule moves by the moves of one that moves by another's", "rule")
+            return Hindrance("the rule applies another rule more than twice", "rule")
         if mode is Mode.RANKS_AT_REST and (self.scene.inner or not self._rule.linear):
             reason = "applies twice" if self._rule.linear else "is not linear"
             text = f"the equilibrium of rule '{self._rule.type}', which {reason}"
@@ -337,11 +337,11 @@ class MoveFollowers(Operation):
         if not fields:
             return None
         if scene.constants.by_particle or scene.constants.by_bond or _is_mixed(scene):
-            reason = "numbers differ from place to place and others change in time"
+            reason = "some parameters vary in space and others in time"
             return Hindrance(reason, str(fields[0]))
         for moment in sorted({bend for course in courses.values() for bend in course.bends}):
             if _differ_in_kernels(scene, scene.at(moment)):
-                reason = "numbers change in time that are written into kernels"
+                reason = "constants of kernels are time-dependent"
                 return Hindrance(reason, str(fields[0]))
         return None
 

@@ -93,8 +93,8 @@ class FollowFrame(Operation):
         """Return a reason if the map changes: it is then an array on the host, and of the whole
         lattice."""
         reasons = {
-            Mode.COURSES: "numbers change in time by which the frame follows",
-            Mode.RANKS: "a frame whose map follows numbers of the rule that change in time",
+            Mode.COURSES: "the weights of the frame are time-dependent",
+            Mode.RANKS: "a frame that depends on time-dependent parameters of the rule",
         }
         changes = mode in reasons and self.scene.frame_changes
         return Hindrance(reasons[mode], "frame") if changes else None

@@ -320,7 +320,7 @@ def _refuse_contradiction(scene: Scene, leaders: Leaders, step: int) -> None:
         number = raster.particle_offset + row + 1
         raise ExperimentError(
             f"two groups move particle {number} differently in step {step}; "
-            "select it in one of them only, or let one end before the other begins",
+            "select it in one of them only, or end one before the other begins",
             ("leaders",),
         )
 

@@ -181,18 +181,18 @@ def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Value
         owners, bonds = describe_bonds(scene), scene.bonds
         place = bonds.plane * math.prod(scene.raster.shape[1:]) + bonds.place
     generator = component_generator(scene.experiment.seed, field)
-    with blaming(part, "to draw where its numbers start", field):
+    with blaming(part, "to draw its initial values", field):
         array_of = {number.name: value for number, value in zip(numbers, values, strict=True)}
         for name, value in part.draw(owners, generator).items():
             if name not in array_of:
                 raise PluginError(
-                    f"'{part.type}' draws '{name}', which it does not remember"
+                    f"'{part.type}' draws '{name}', which is not among its state variables"
                     f"{did_you_mean(name, array_of)}"
                 )
             if np.shape(value) != (len(owners),) or not np.isfinite(value).all():
                 raise PluginError(
                     f"'{part.type}' draws '{name}' with the shape {np.shape(value)}, finite: "
-                    f"{bool(np.isfinite(value).all())}; needed are ({len(owners)},) finite numbers"
+                    f"{bool(np.isfinite(value).all())}; expected ({len(owners)},) finite numbers"
                 )
             array_of[name].reshape(-1)[place] = value
 
@@ -222,8 +222,8 @@ def renew(
     old = [value for number, value in zip(numbers, own, strict=True) if number.changes]
     if len(new) != len(old):
         raise ValueError(
-            f"it returned {len(new)} value{'s' * (len(new) != 1)}, and it remembers {len(old)} "
-            "that change: declare `changes=False` for those that stay"
+            f"it returned {len(new)} value{'s' * (len(new) != 1)} for {len(old)} changing state "
+            "variables; declare `changes=False` for constant ones"
         )
     fresh = [
         np.array(value) if where is None else np.where(where, value, plane)

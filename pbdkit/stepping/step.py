@@ -58,7 +58,7 @@ class Mode(Enum):
 
 
 PUSHED_BY_COURSES = (
-    "numbers change in time by which masses, obstacles or leaders along an axis push"
+    "the motion of masses, obstacles or leaders along an axis depends on time-dependent parameters"
 )
 """Reason why kernels do not support some time-dependent parameters."""
 

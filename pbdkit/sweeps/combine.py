@@ -152,8 +152,8 @@ def combine_members(
     for member in complete:
         frame.place(unpacked(report_of(member.job.key).content), member.place, arrays)
     variables: dict[str, Any] = {
-        STATUS: (dims, status.astype(str), {"long_name": "how the member ended"}),
-        MESSAGE: (dims, message.astype(str), {"long_name": "why it failed, or what it warned of"}),
+        STATUS: (dims, status.astype(str), {"long_name": "status of the member"}),
+        MESSAGE: (dims, message.astype(str), {"long_name": "error or warnings of the member"}),
     }
     variables |= {name: (ds, arrays[name], attributes) for name, ds, attributes in frame.described}
     coordinates = {
@@ -195,7 +195,7 @@ class _Layout:
             if variable.dims != first.dims:
                 raise ExperimentError(
                     f"'{name}' has the dimensions {variable.dims} in some members and {first.dims} "
-                    "in others, and cannot be combined; list others in keep.variables"
+                    "in others, and cannot be combined; list other variables in keep.variables"
                 )
             self._dtypes[name] = np.promote_types(dtype, self._dtypes.get(name, dtype))
             for dim, size in zip(variable.dims, variable.values.shape, strict=True):
@@ -237,8 +237,8 @@ class _Layout:
         )
         if size > machine_memory():
             raise ExperimentError(
-                f"the dataset of all members takes {size / 2**30:.3g} GiB, more than this machine "
-                "has; keep fewer variables or times, for which members run again"
+                f"the dataset of all members takes {size / 2**30:.3g} GiB, more than the "
+                "memory of this machine; keep fewer variables or times (members then run again)"
             )
         kinds = self._dtypes
         arrays = {

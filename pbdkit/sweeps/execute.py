@@ -176,8 +176,8 @@ class ClusterExecutor(Executor):
             if self._is_there():
                 raise
             raise StorageError(
-                f"--dask: the scheduler is lost ({type(error).__name__}); what was finished is "
-                "held, and the same command runs the others"
+                f"--dask: the scheduler is lost ({type(error).__name__}); finished members are "
+                "stored, and the same command runs the remaining ones"
             ) from None
         finally:
             if self._is_there():
@@ -278,7 +278,7 @@ class SizeEstimate:
         step to keep."""
         keep, last = self._keep, max(steps for steps, *_ in self._times)
         if isinstance(keep.times, tuple) and min(keep.times) > last:
-            text = f"keep.times: {min(keep.times)} is beyond the last step of all, {last}"
+            text = f"keep.times: {min(keep.times)} exceeds the last step of all members, {last}"
             raise ExperimentError(text, ("keep", "times"))
         sizes = self._sizes | {"time": self._number_of_times()}
         names = self._columns if keep.variables is None else keep.variables
@@ -286,9 +286,9 @@ class SizeEstimate:
         each = sum(math.prod(sizes.get(d, 1) for d in c.dims) * _bytes(c) for c in columns)
         if each * self._count > (limit := int(SHARE * machine_memory())):
             raise ExperimentError(
-                f"{self._count} members come to a dataset of {each * self._count / 2**30:.3g} GiB, "
-                f"and this machine can hold {limit / 2**30:.3g}; keep fewer variables, or "
-                "`times: last`, or vary less",
+                f"the dataset of {self._count} members takes {each * self._count / 2**30:.3g} GiB, "
+                f"more than the {limit / 2**30:.3g} GiB allowed on this machine; keep fewer "
+                "variables, keep `times: last`, or vary fewer values",
                 ("keep",),
             )
 
@@ -541,14 +541,14 @@ class _Worker:
         has_started = not self._begun.exception()
         self._renew()
         if has_started:
-            yield from queue.lost(chunk, "its process was killed, as where memory runs out,")
+            yield from queue.lost(chunk, "its process was killed, possibly for lack of memory,")
             return
         queue.jobs.extendleft(reversed(chunk))
         queue.false_starts += 1
         if queue.false_starts >= MOST_STARTS:
             raise PbdkitError(
                 f"{MOST_STARTS} worker processes ended while they were starting; --workers 1 runs "
-                "the members in this process, and shows why"
+                "the members in this process and shows the error"
             )
 
     def _renew(self) -> None:
@@ -605,8 +605,9 @@ def called(
     classes = given_classes(experiment)
     if classes and folder is not None:
         raise ExperimentError(
-            "folder: members are known by the versions of what they use, and classes from Python "
-            "have none; leave it out, or make a plugin of them (`pbdkit plugins new`)"
+            "folder: stored members are identified by the versions of their components, which "
+            "classes from Python do not have; omit it, or put the classes into a plugin "
+            "(`pbdkit plugins new`)"
         )
     crew = crew_of(workers, client, classes)
     sweep = checked(parts | {"experiment": base.data}, Source())
@@ -619,7 +620,10 @@ def called(
             warn_caller(text, StorageWarning)
         if failures := summary.failures:
             member, status, message = failures[0]
-            text = f"{len(failures)} of {len(summary.members)} members have no values, as {status}"
+            text = (
+                f"{len(failures)} of {len(summary.members)} members have no values; the first "
+                f"is {status}"
+            )
             warn_caller(f"{text}: {member.words}: {message}", SweepWarning)
         assert summary.path is not None  # Only an exception can stop the sweep.
         dataset = open_result(summary.path)
@@ -634,13 +638,13 @@ def crew_of(
 ) -> Executor:
     """Return the executor of a sweep; raise ExperimentError if it is not available."""
     if workers is not None and (type(workers) is not int or workers < 1):
-        raise ExperimentError(f"workers: should be a number from 1, got {workers!r}")
+        raise ExperimentError(f"workers: expected a number from 1, got {workers!r}")
     if client is not None and workers is not None:
-        raise ExperimentError("give workers of this machine, or a cluster, not both")
+        raise ExperimentError("give either workers of this machine or a cluster, not both")
     if components and (client is not None or (workers or 1) > 1):
         raise ExperimentError(
-            "classes from Python are known in this process only: leave workers and client out, or "
-            "make a plugin of them (`pbdkit plugins new`)"
+            "classes from Python exist in this process only; omit workers and client, or put the "
+            "classes into a plugin (`pbdkit plugins new`)"
         )
     if client is not None:
         return ClusterExecutor(client)

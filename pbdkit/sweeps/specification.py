@@ -51,7 +51,7 @@ class Range(Strict):
     @model_validator(mode="after")
     def _has_a_logarithm(self) -> Self:
         if self.scale == "log" and not (self.from_ > 0 and self.to > 0):
-            raise ValueError("`scale: log` needs `from` and `to` above 0")
+            raise ValueError("`scale: log` requires `from` and `to` above 0")
         return self
 
     def values(self) -> list[int | float]:
@@ -136,11 +136,11 @@ class Sweep(Strict):
         for first, second in combinations(sorted(paths), 2):
             if f"{second}.".startswith(f"{first}."):
                 reason = (
-                    "replicates vary it" if first == second == "seed" else f"so does '{second}'"
+                    "also by replicates" if first == second == "seed" else f"also by '{second}'"
                 )
                 raise fault(f"'{first}' is varied twice: {reason}", key="vary")
         if self.count > MAX_MEMBERS:
-            raise fault(f"{self.count} members; at most {MAX_MEMBERS} are allowed", key="vary")
+            raise fault(f"{self.count} members exceed the maximum of {MAX_MEMBERS}", key="vary")
         return self
 
     @property

@@ -191,7 +191,7 @@ class Store:
             query = f"SELECT {COLUMNS} FROM member WHERE key = ?"
             report = self._verified(self._database.execute(query, (key,)).fetchone() or ())
         if not isinstance(report, str) and report.key != key:
-            report = "is of another member"
+            report = "belongs to another member"
         if isinstance(report, str):
             raise StorageError(
                 f"{self._path}: the result of a member {report}; the same command runs it again"
@@ -215,8 +215,8 @@ class Store:
             exists = False
         if not exists:
             self.faults.append(
-                f"{self._path}: was removed or replaced during the sweep; its results are in "
-                "sweep.nc alone, and the next call runs the members again"
+                f"{self._path}: was removed or replaced during the sweep; its results are "
+                "in sweep.nc only, and the next call runs the members again"
             )
 
     def _refuse_moved(self) -> None:
@@ -232,7 +232,7 @@ class Store:
 
     def _verified(self, row: Row) -> MemberReport | str:
         """Return the report in a row, or its fault."""
-        fault = "is not what was written"
+        fault = "has changed since it was written"
         key, status, message, is_large, digest, content = row or (None,) * 6
         if not re.fullmatch("[0-9a-f]{32}", str(key)):
             return fault
@@ -296,8 +296,8 @@ class Store:
             folder = self._set_aside()
             remark = f"; the damaged one is in {folder}" if folder else ""
             self.faults.append(
-                f"{self._path}: {fault}; {intact} members of it are intact and stay stored, in a "
-                f"new one; the others run again{remark}"
+                f"{self._path}: {fault}; its {intact} intact members are now in a new one; the "
+                f"others run again{remark}"
             )
         new.replace(self._path)
         sync_folder(self._folder)
@@ -314,7 +314,9 @@ class Store:
         logs = any(size_of(path) for path in files_of(self._path)[1:3])
         if not is_database(self._path):
             if count or logs:
-                return f"is missing, or no database, and {count or 'some'} members were stored"
+                return (
+                    f"is missing or not a database, although {count or 'some'} members were stored"
+                )
             if size_of(self._path) > ONE_PAGE or not _may_become_database(self._path):
                 raise self._foreign_store()
             return ""
@@ -337,10 +339,13 @@ class Store:
         if fault := fault_of(database):
             return f"is damaged: {fault}"
         if (owner, version) != (APPLICATION, FORMAT) or schema != [(TABLE,), (None,)]:
-            return "is damaged, or of an earlier pbdkit"
+            return "is damaged, or was written by an earlier pbdkit"
         (stored,) = database.execute("SELECT COUNT(*) FROM member").fetchone()
         if stored < count:
-            return f"is damaged: it contains {stored} of {count} members, as if its log was removed"
+            return (
+                f"is damaged: it contains {stored} of {count} members; its log may have been "
+                "removed"
+            )
         return None
 
     def _foreign_store(self) -> StorageError:
@@ -440,6 +445,6 @@ def _locked(path: Path) -> io.FileIO:
         return file
     file.close()
     raise StorageError(
-        f"{path.parent}: another sweep is running in this folder; wait for its end, or name "
+        f"{path.parent}: another sweep is running in this folder; wait until it ends, or name "
         "another folder"
     )

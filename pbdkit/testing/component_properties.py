@@ -91,10 +91,10 @@ def names_itself(subject: Subject) -> None:
     component = type(subject.component)
     field, name = component.model_fields["type"], component.type_name()
     if not re.fullmatch(WORD, name):
-        raise PropertyError(f"the type '{name}' is not in lower case with hyphens, as 'my-rule' is")
+        raise PropertyError(f"the type '{name}' is not in lower case with hyphens, as in 'my-rule'")
     if getattr(field.annotation, "__args__", None) != (name,):
         remedy = f'declare it as `type: Literal["{name}"] = "{name}"`'
-        raise PropertyError(f"any other word passes as its type too: {remedy}")
+        raise PropertyError(f"`type` accepts other words, too: {remedy}")
 
 
 @property_of()
@@ -103,11 +103,11 @@ def is_documented(subject: Subject) -> None:
     and editors show them."""
     component = type(subject.component)
     if not (component.__dict__.get("__doc__") or "").strip():
-        raise PropertyError(f"{component.__name__} has no docstring: say what it computes")
+        raise PropertyError(f"{component.__name__} has no docstring; describe what it computes")
     for name, field in component.model_fields.items():
         if name != "type" and not (field.description or "").strip():
             remedy = f'`{name}: ... = Field(..., description="what it is, with units")`'
-            raise PropertyError(f"the parameter `{name}` has no description: write {remedy}")
+            raise PropertyError(f"the parameter `{name}` has no description; write {remedy}")
 
 
 @property_of()
@@ -118,13 +118,17 @@ def is_frozen(subject: Subject) -> None:
     for name in type(component).model_fields:
         with suppress(ValidationError):
             setattr(component, name, getattr(component, name))
-            raise PropertyError(f"`{name}` can be set: leave `frozen` in `model_config` as it is")
+            raise PropertyError(
+                f"`{name}` can be assigned; do not change `frozen` in `model_config`"
+            )
     try:
         same = hash(component) == hash(component.model_copy())
     except TypeError as error:
-        raise PropertyError(f"{error}: take tuples for lists and named fields for dicts") from None
+        raise PropertyError(
+            f"{error}; use tuples instead of lists, and named fields instead of dicts"
+        ) from None
     if not same or component != component.model_copy():
-        raise PropertyError("a copy of it is not equal to it, or has another hash")
+        raise PropertyError("a copy of the component is not equal to it, or has another hash")
 
 
 @property_of()
@@ -133,7 +137,7 @@ def refuses_unknown_keys(subject: Subject) -> None:
     parameters = subject.component.model_dump(by_alias=True) | {"no_such_parameter": 1}
     with suppress(ValidationError):
         type(subject.component).model_validate(parameters)
-        raise PropertyError('it takes any key: leave `extra` in `model_config` at "forbid"')
+        raise PropertyError('it accepts unknown keys; keep `extra` in `model_config` at "forbid"')
 
 
 @property_of()
@@ -145,7 +149,7 @@ def survives_json(subject: Subject) -> None:
         for name in kind.model_fields:
             original, restored = getattr(component, name), getattr(copy, name)
             if original != restored:
-                raise PropertyError(f"`{name}` is {original!r}, and {restored!r} after JSON")
+                raise PropertyError(f"`{name}` is {original!r}, but {restored!r} after JSON")
 
 
 @property_of()
@@ -159,7 +163,7 @@ def survives_pickling(subject: Subject) -> None:
         remedy = "" if importable else "; define the class at the top of a module"
         raise PropertyError(f"{type(error).__name__}: {error}{remedy}") from None
     if copy != subject.component:
-        raise PropertyError("it is another one after pickling")
+        raise PropertyError("the component is not equal to itself after pickling")
 
 
 @property_of(Lattice, is_needed=True)
@@ -174,8 +178,10 @@ def has_a_sound_cell(subject: Subject) -> None:
     for n, site in enumerate(cell.sites):
         cells = np.array(site.at) @ np.linalg.inv(np.array(cell.vectors))
         if (np.abs(cells - np.divide(site.index, cell.period)) > 1.0 - 1e-9).any():
-            fault = f"basis site {n} lies a cell or more from where its index {site.index} says"
-            raise PropertyError(f"{fault}: take whole cell vectors from its `at`")
+            fault = (
+                f"basis site {n} lies a cell or more from the position of its index {site.index}"
+            )
+            raise PropertyError(f"{fault}; subtract whole cell vectors from its `at`")
     _refuse_miscounted(cell)
 
 
@@ -183,13 +189,13 @@ def _refuse_miscounted(cell: Cell) -> None:
     """Raise PropertyError if `primitive` counts equal steps differently, equal sites twice, or
     steps between which there is no site."""
     if np.linalg.det(cell.primitive) == 0.0:
-        raise PropertyError(f"`primitive` gives the cell vectors {cell.primitive}: in line")
+        raise PropertyError(f"the cell vectors {cell.primitive} of `primitive` are parallel")
     for (m, site), (n, other_site) in combinations(enumerate(cell.sites), 2):
         between = np.subtract(other_site.primitive, site.primitive).astype(float)
         cells = np.linalg.solve(np.transpose(cell.primitive), between)
         if np.abs(cells - np.round(cells)).max() < 1e-9:
             fault = f"basis sites {m} and {n} have the same primitive index {site.primitive}"
-            raise PropertyError(f"{fault}, up to whole cells: they must differ")
+            raise PropertyError(f"{fault}, up to whole cells; they must differ")
     counted: dict[tuple[float, ...], tuple[int, ...]] = {}
     lengths = [math.hypot(*vector) for vector in cell.vectors]
     for offset in chain(*(cell.offsets(s, 1.5 * sum(lengths)) for s in range(len(cell.sites)))):
@@ -202,7 +208,9 @@ def _refuse_miscounted(cell: Cell) -> None:
     steps = [*cell.primitive, *(np.subtract(s.primitive, first.primitive) for s in further)]
     spanned = [np.linalg.det(np.array(basis)) for basis in combinations(steps, len(cell.vectors))]
     if np.gcd.reduce(np.rint(spanned).astype(int)) != 1:
-        raise PropertyError("`primitive` counts steps that no site takes: count whole ones only")
+        raise PropertyError(
+            "`primitive` counts steps that do not occur between sites; count whole ones only"
+        )
 
 
 @property_of(Lattice)
@@ -211,7 +219,7 @@ def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
     position of the body."""
     moved = subject.component.model_copy(update={"origin": (1000.3, -77.1)})
     if moved.cell() != subject.component.cell():
-        raise PropertyError("another origin gives another cell: leave `self.origin` out of `cell`")
+        raise PropertyError("`cell` depends on the origin; remove `self.origin` from it")
 
 
 @property_of(NeighbourMetric, is_needed=True)
@@ -232,8 +240,8 @@ def takes_offsets_of_the_cell(subject: Subject) -> None:
     for where, cell, s, shells in _tried(subject):
         for offset in chain(*shells):
             if offset != cell.offset(s, offset.target, offset.cell):
-                remedy = "take those of `cell.offsets(sublattice, radius)` as they are"
-                fault = f"the offset {offset.rest} is none of the cell's"
+                remedy = "return offsets of `cell.offsets(sublattice, radius)` unchanged"
+                fault = f"the offset {offset.rest} is not an offset of the cell"
                 raise PropertyError(f"{where} {fault}: {remedy}")
 
 
@@ -244,7 +252,7 @@ def takes_sublattices_in_any_order(subject: Subject) -> None:
         backwards = replace(cell, sites=cell.sites[::-1])
         shells_backwards = subject.component.shells_around(backwards, len(cell.sites) - 1 - s)
         if [_sites(shell) for shell in shells] != [_sites(shell) for shell in shells_backwards]:
-            fault = f"basis site {s} has other neighbours where the sites are listed backwards"
+            fault = f"basis site {s} has other neighbours if the order of the sites is reversed"
             raise PropertyError(f"{where} {fault}")
 
 
@@ -254,14 +262,14 @@ def finds_the_same_anew(subject: Subject) -> None:
     neighbours on the lattice: a body at rest keeps its neighbours."""
     near = subject.component.nearness()
     if near is None:
-        raise NotApplicableError("its neighbours stay as they are")
+        raise NotApplicableError("its neighbours do not change")
     scale = np.sqrt(near.weights)
     far, limit = near.radius / scale.min() * (1 + 1e-6), near.radius * (1 + 1e-9)
     for where, cell, s, shells in _tried(subject):
         offsets = (o for o in cell.offsets(s, far) if np.hypot(*(scale * tuple(o.rest))) <= limit)
         if _sites(offsets) != _sites(chain(*shells)):
-            fault = "`nearness` finds other neighbours in the reference configuration"
-            raise PropertyError(f"{where} {fault} than `shells_around` chooses")
+            fault = "`nearness` selects other neighbours in the reference configuration"
+            raise PropertyError(f"{where} {fault} than `shells_around`")
 
 
 def _tried(subject: Subject) -> Iterator[tuple[str, Cell, int, Sequence[Sequence[Offset]]]]:
@@ -295,7 +303,7 @@ def labels_its_variables(subject: Subject) -> None:
     variables = {variable.name: variable for variable in diagnostic.variables()}
     for name in (*diagnostic.coordinates(), diagnostic.own_dimension, *variables):
         if name in reserved_names():
-            raise PropertyError(f"the dataset has '{name}' already: give it another name")
+            raise PropertyError(f"the dataset already has a variable '{name}'; rename it")
     for name, variable in variables.items():
         _refuse_unlabelled(variable, f"the variable '{name}'", "my_quantity")
 
@@ -324,7 +332,7 @@ def declares_what_it_remembers(subject: Subject) -> None:
         remembered_names(scene.experiment)  # Raises an error for names that are declared twice.
         for number in numbers:
             if number.name in reserved_names():
-                raise PropertyError(f"every dataset has a '{number.name}': give it another name")
+                raise PropertyError(f"every dataset has a variable '{number.name}'; rename it")
             _refuse_unlabelled(number, f"'{number.name}'", "my_number")
             _refuse_unheld(number, number.initial, "starts at")
         # Raises an error for rotations that are not state variables.
@@ -342,7 +350,7 @@ def remembered(subject: Subject, scene: Scene) -> tuple[Remembered, ...]:
     if numbers := numbers_of(subject.component, scene):
         return numbers
     owners_name = "particles" if isinstance(subject.component, FollowerRule) else "bonds"
-    raise NotApplicableError(f"it remembers nothing of {owners_name}")
+    raise NotApplicableError(f"it has no state variables of {owners_name}")
 
 
 @property_of(FollowerRule, FractureModel, is_needed=True)
@@ -353,17 +361,17 @@ def draws_what_it_remembers(subject: Subject) -> None:
     for scene in subject.scenes:
         numbers = {number.name: number for number in remembered(subject, scene)}
         if not isinstance(subject.component, Draws):
-            raise NotApplicableError("all that it remembers starts at its `initial`")
+            raise NotApplicableError("its state variables start at their `initial` values")
         rows = owners(part, scene)
         for name, values in part.draw(rows, np.random.default_rng(SEED)).items():
             if name not in numbers:
                 declared = ", ".join(numbers)
-                raise PropertyError(f"`draw` gives '{name}'; what it remembers is {declared}")
+                raise PropertyError(f"`draw` returns '{name}'; expected {declared}")
             if (shape := np.shape(values)) != (len(rows),):
                 needed = f"not ({len(rows)},)"
-                raise PropertyError(f"`draw` gives '{name}' with the shape {shape}, {needed}")
+                raise PropertyError(f"`draw` returns '{name}' with the shape {shape}, {needed}")
             if not np.isfinite(values).all():
-                raise PropertyError(f"`draw` gives '{name}' that is not finite")
+                raise PropertyError(f"`draw` returns values of '{name}' that are not finite")
             _refuse_unheld(numbers[name], values, "is drawn as")
 
 
@@ -373,8 +381,8 @@ def _refuse_unheld(number: Remembered, values: Any, verb: str) -> None:
     with np.errstate(all="ignore"):
         lost = array[array.astype(number.dtype) != array]
     if lost.size:
-        fault = f"'{number.name}' {verb} {lost.flat[0]}, which {number.dtype} does not hold"
-        raise PropertyError(f"{fault}: declare another `dtype`")
+        fault = f"'{number.name}' {verb} {lost.flat[0]}, which {number.dtype} does not represent"
+        raise PropertyError(f"{fault}; declare another `dtype`")
 
 
 UNUSUAL = 918273645
@@ -405,13 +413,13 @@ def changes_no_input(subject: Subject) -> None:
         except ValueError as error:
             if "read-only" not in str(error):
                 raise
-            raise PropertyError(_written(call.function, "what it is given")) from error
+            raise PropertyError(_written(call.function, "its arguments")) from error
         if names := differing(flat(call.inputs), flat(inputs)):
             raise PropertyError(_written(call.function, _listed(names)))
 
 
 def _written(function: str, where: str) -> str:
-    return f"`{function}` writes into {where}: make new arrays, `x = x + 1` and not `x += 1`"
+    return f"`{function}` writes into {where}; make new arrays, `x = x + 1` instead of `x += 1`"
 
 
 @property_of(is_needed=True)
@@ -427,7 +435,7 @@ def remembers_nothing(subject: Subject) -> None:
         names = reachable | reachable_later
         changes = sorted(n for n in names if reachable.get(n) != reachable_later.get(n))
         if differing(second, third) and (changes or not differing(first, second)):
-            what = f", and keeps {_listed(changes)} from call to call" if changes else ""
+            what = f", and changes {_listed(changes)} between calls" if changes else ""
             fault = f"`{call.function}` returns another value after a call with other arguments"
             raise PropertyError(fault + what)
 
@@ -447,7 +455,7 @@ def answers_the_same(subject: Subject) -> None:
         np.random.set_state(saved[1])
         if names:
             fault = f"returns another value in the second of two equal calls ({_listed(names)})"
-            cause = "it draws random numbers from a generator of its own, or reads a clock"
+            cause = "it draws random numbers from its own generator, or reads a clock"
             raise PropertyError(f"`{call.function}` {fault}: {cause}")
         if final != initial:
             fault = "seeds or uses the global generator of random numbers"
@@ -519,13 +527,15 @@ def returns_a_value_a_particle(subject: Subject) -> None:
     for call in _elementwise(subject):
         for name, value in call.answer().items():
             if value.shape not in ((), SHAPE):
-                fault = f"returns the shape {value.shape} for particles of shape {SHAPE} ({name})"
-                raise PropertyError(f"`{call.function}` {fault}: it is not elementwise")
+                fault = (
+                    f"returns the shape {value.shape} for particles of the shape {SHAPE} ({name})"
+                )
+                raise PropertyError(f"`{call.function}` {fault}; it is not elementwise")
     if isinstance(subject.component, FollowerRule):
         scene = subject.scene
         counts = {len(c) for c in gathered(scene, differences(scene, 0))}
         if len(counts) > 1:
-            raise PropertyError(f"`gather` returns now {min(counts)}, now {max(counts)} values")
+            raise PropertyError(f"`gather` returns between {min(counts)} and {max(counts)} values")
 
 
 @property_of()
@@ -537,7 +547,7 @@ def is_finite(subject: Subject) -> None:
             if value.dtype.kind in "fc" and not np.isfinite(value).all():
                 worst = value[~np.isfinite(value)].flat[0]
                 remedy = "guard the division, as in `a / where(b > 0.0, b, 1.0)`"
-                raise PropertyError(f"`{call.function}` answers {worst} ({name}): {remedy}")
+                raise PropertyError(f"`{call.function}` returns {worst} ({name}); {remedy}")
 
 
 @property_of(FollowerRule, FractureModel, is_needed=True)
@@ -547,17 +557,17 @@ def renews_what_it_remembers(subject: Subject) -> None:
     changing = [number for number in remembered(subject, subject.scene) if number.changes]
     renewals = [call for call in subject.calls() if call.function in ("update", "remember")]
     if not renewals:
-        raise NotApplicableError("what it remembers stays as it starts")
+        raise NotApplicableError("its state variables do not change")
     what, answer = renewals[0].function, renewals[0].evaluate()
     for values in answer if what == "update" else [answer]:
         if len(values) != len(changing):
             returned = f"{len(values)} value{'s' * (len(values) != 1)}"
-            fault = f"`{what}` returns {returned}, and {len(changing)} of the numbers change"
-            raise PropertyError(f"{fault}: declare `changes=False` for those that stay")
+            fault = f"`{what}` returns {returned} for {len(changing)} changing state variables"
+            raise PropertyError(f"{fault}; declare `changes=False` for constant ones")
         for number, value in zip(changing, map(np.asarray, values), strict=True):
             if not np.can_cast(value.dtype, number.dtype, "same_kind"):
                 fault = f"`{what}` returns {value.dtype} for '{number.name}', which is declared"
-                raise PropertyError(f"{fault} as {number.dtype}: fractions would be lost")
+                raise PropertyError(f"{fault} as {number.dtype}; fractions would be lost")
 
 
 @property_of(FollowerRule, FractureModel, ParticleOperation)
@@ -568,8 +578,8 @@ def keeps_single_precision(subject: Subject) -> None:
             kind = getattr(value, "dtype", None)
             if kind is not None and kind.kind == "f" and kind != np.float32:
                 raise PropertyError(
-                    f"`{call.function}` returns {kind} for float32 ({name}): leave the dtype to "
-                    "the arithmetic, and make parameters and constants plain numbers, `float(...)`"
+                    f"`{call.function}` returns {kind} for float32 ({name}); set no dtype, and "
+                    "convert parameters and constants to plain numbers by `float(...)`"
                 )
 
 
@@ -620,8 +630,8 @@ def _refuse_an_order_of_rows(subject: Subject) -> None:
     first, second = (part.draw(rows, Alike(np.random.PCG64(SEED))) for rows in (table, mixed))
     for name, values in first.items():
         if not np.array_equal(np.asarray(values)[order], second[name]):
-            remedy = "take it from what a row holds, or from the generator"
-            raise PropertyError(f"`draw` gives '{name}' by the row: {remedy}")
+            remedy = "derive it from the content of a row, or from the generator"
+            raise PropertyError(f"`draw` derives '{name}' from the number of the row; {remedy}")
 
 
 def _refuse_an_order_of_slots(scene: Scene) -> None:
@@ -631,7 +641,7 @@ def _refuse_an_order_of_slots(scene: Scene) -> None:
     for name, value in forwards.items():
         if _apart(value, backwards[name]) is not None:
             fault = f"the move depends on the order in which neighbours are summed ({name})"
-            raise PropertyError(f"{fault}: do not sum large numbers that cancel")
+            raise PropertyError(f"{fault}; do not sum large numbers that cancel")
 
 
 @property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
@@ -644,13 +654,13 @@ def is_local(subject: Subject) -> None:
             try:
                 alone = flat(call.evaluate(methodcaller("item", *place)))
             except Exception as error:
-                fault = f"`{call.function}` fails with plain numbers in the place of arrays"
+                fault = f"`{call.function}` fails with plain numbers instead of arrays"
                 raise PropertyError(f"{fault}: {type(error).__name__}: {error}") from None
             for name, value in alone.items():
                 among = np.broadcast_to(whole[name], SHAPE)[place]
                 if np.shape(value) or _apart(value, among) is not None:
-                    fault = "returns another value for a particle alone than among others"
-                    values = f"({name}: {value} and {among}): it is not elementwise"
+                    fault = "returns different values for a particle alone and among others"
+                    values = f"({name}: {value} and {among}); it is not elementwise"
                     raise PropertyError(f"`{call.function}` {fault} {values}")
 
 
@@ -690,7 +700,7 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
         constants, opposite = model.constants(plane.slot), model.constants(plane.opposite)
         if constants != opposite:
             fault = f"{constants} for the slot {plane.slot.site} and {opposite} for its opposite"
-            raise PropertyError(f"`constants` are {fault}: take lengths and shells, not directions")
+            raise PropertyError(f"`constants` are {fault}; use lengths and shells, not directions")
     evaluator, numbers = Evaluator(scene), remembers(model, scene, 0)
     cells = tuple(CellStress(*cell) for cell in stressed(model, 0))
     sides = _from_the_other_end([number.name for number in bond_numbers(scene.experiment)])
@@ -710,7 +720,7 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
                 answer_opposite = tuple(answer_opposite[n] for n in sides)
             if not np.array_equal(np.asarray(answer), np.asarray(answer_opposite)):
                 along = f"for (-d, -r) than for (d, r) along {slot.site}"
-                raise PropertyError(f"`{name}` answers otherwise {along}")
+                raise PropertyError(f"`{name}` returns other values {along}")
 
 
 def _from_the_other_end(names: list[str]) -> list[int]:
@@ -731,7 +741,7 @@ def breaks_as_declared(subject: Subject) -> None:
     slots, breaks = scene.neighbourhood.slots[0], Evaluator(scene).breaks
     for slot, d in zip(slots, differences(scene, 0, share=1e3), strict=True):
         if np.any(breaks(d, slot.rest, scene.constants.limits[slot], ())):
-            raise PropertyError("it declares `can_break = False`, and `breaks` returns True")
+            raise PropertyError("it declares `can_break = False`, but `breaks` returns True")
 
 
 @property_of(FractureModel)
@@ -740,7 +750,7 @@ def breaks_beyond_its_strain(subject: Subject) -> None:
     model declares and, unless broken before, not slightly below: `pbdkit explain` prints it."""
     model, scene = subject.component, subject.scene
     if not isinstance(subject.component, BreaksAtStrain):
-        raise NotApplicableError("it declares no `breaking_strain`")
+        raise NotApplicableError("it does not declare `breaking_strain`")
     evaluator, numbers, p = Evaluator(scene), remembers(model, scene, 0), scene.constants.fracture
     for slot in scene.neighbourhood.slots[0]:
         r, limits = slot.rest, scene.constants.limits[slot]
@@ -753,7 +763,7 @@ def breaks_beyond_its_strain(subject: Subject) -> None:
             wrong = np.broadcast_to(evaluator.breaks(d, r, limits, renewed), SHAPE) != expected
             if wrong.any():
                 where = f"at strain {stretch[wrong][0]:.6g} along {slot.site} the bond"
-                fault = f"{where} {'stays' if expected else 'breaks'}"
+                fault = f"{where} {'does not break' if expected else 'breaks'}"
                 raise PropertyError(f"`breaking_strain` and `breaks` disagree: {fault}")
 
 
@@ -767,12 +777,12 @@ def rests_as_declared(subject: Subject) -> None:
     u, new = call.inputs["u"], call.inputs["new"]
     if differing(flat(call.compute(u, u)), flat(u)):
         raise PropertyError(
-            "`displacement` moves a particle that rests: write it as `new` plus what vanishes with "
-            "`new - u`, or leave `rests` out"
+            "`displacement` moves a particle at rest; write it as `new` plus terms that vanish "
+            "with `new - u`, or remove `rests`"
         )
     stays = np.all([a == b for a, b in zip(call.compute(u, new), u, strict=True)], axis=0)
     if stays.any():
-        fault = "`displacement` holds a particle that the rule moves: leave `rests` out"
+        fault = "`displacement` holds a particle that the rule moves; remove `rests`"
         raise PropertyError(fault)
 
 
@@ -794,7 +804,7 @@ def takes_every_point_alone(subject: Subject) -> None:
                 subset = frame_showing(frame, frame.site[points], indices, body[is_in_points])
                 part = policy.follow(subset)
             except ExperimentError as refusal:
-                reason = reason and f"it takes whole frames only: {refusal}"
+                reason = reason and f"it accepts complete frames only: {refusal}"
                 continue
             reason = ""
             for n, number in enumerate(points):
@@ -808,7 +818,7 @@ def takes_every_point_alone(subject: Subject) -> None:
 
 
 @property_of(FramePolicy)
-def follows_who_is_near(subject: Subject) -> None:
+def follows_nearby_particles(subject: Subject) -> None:
     """Points of a `local` frame follow the particles nearest to them, or particles at most twice
     the layers away in site index."""
     policy = subject.component
@@ -826,8 +836,8 @@ def follows_who_is_near(subject: Subject) -> None:
             point, body = int(follow.point[entry]), int(follow.body[entry])
             if (point, body) not in nearest:
                 raise PropertyError(
-                    f"frame point {point} follows a particle {way[entry]} sites away, beside "
-                    f"{layers} layers ({place_of(scene.experiment)}): leave out `local`"
+                    f"frame point {point} follows a particle {way[entry]} sites away, in a frame "
+                    f"of {layers} layers ({place_of(scene.experiment)}); remove `local`"
                 )
 
 
@@ -852,7 +862,7 @@ def measures_what_it_declares(subject: Subject) -> None:
     if len(variables) != len(measured):
         raise PropertyError(f"{len(measured)} arrays for {len(variables)} variables")
     if own_dimension and not diagnostic.at_end:
-        remedy = "has a length only where it declares `at_end` too"
+        remedy = "requires `at_end`"
         raise PropertyError(f"its `own_dimension` '{own_dimension}' {remedy}")
     for variable, value in zip(variables, measured, strict=True):
         if own_dimension in variable.dims and value.ndim == len(variable.dims):
@@ -861,14 +871,14 @@ def measures_what_it_declares(subject: Subject) -> None:
     for variable, value in zip(variables, measured, strict=True):
         for dim in variable.dims:
             if dim not in sizes:
-                what = f"the dimension '{dim}', which `coordinates` does not give"
+                what = f"the dimension '{dim}', which is not in `coordinates`"
                 raise PropertyError(f"'{variable.name}' has {what}")
         shape = tuple(sizes[dim] for dim in variable.dims)
         if value.shape != shape:
             raise PropertyError(f"'{variable.name}' has the shape {value.shape}, not {shape}")
         if not np.can_cast(value.dtype, variable.dtype, "same_kind"):
-            fault = f"is declared as {variable.dtype} and measured as {value.dtype}"
-            raise PropertyError(f"'{variable.name}' {fault}: digits would be lost without a word")
+            fault = f"is declared as {variable.dtype}, but measured as {value.dtype}"
+            raise PropertyError(f"'{variable.name}' {fault}; digits would be lost")
 
 
 @property_of(Diagnostic)
@@ -886,5 +896,5 @@ def takes_rows_in_any_order(subject: Subject) -> None:
         size = float(np.nanmax(np.abs(expected), initial=1e-300))
         atol = ROUNDING * size
         if not np.allclose(permuted_value, expected, rtol=0.0, atol=atol, equal_nan=True):
-            remedy = "take rows from `now.rows(numbers)`"
-            raise PropertyError(f"'{variable.name}' depends on the order of the rows: {remedy}")
+            remedy = "use the rows of `now.rows(numbers)`"
+            raise PropertyError(f"'{variable.name}' depends on the order of the rows; {remedy}")

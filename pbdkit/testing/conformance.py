@@ -127,7 +127,7 @@ def _outcomes(component: Component, parts: Mapping[str, Any]) -> Iterator[Outcom
     subject, failed = Subject(component, parts), ""
     for tested in properties_of(type(component)):
         if failed:
-            yield Outcome(tested.name, "skipped", f"not judged while {failed} fails")
+            yield Outcome(tested.name, "skipped", f"not tested, since {failed} fails")
             continue
         outcome = _judged(tested, subject)
         yield outcome
@@ -271,7 +271,7 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
     import pytest
 
     if not components:
-        raise ValueError("conformance() is given no component")
+        raise ValueError("conformance() requires at least one component")
     instances: list[Component] = []
     for component in components:
         instances += examples_of(component) if isinstance(component, type) else [component]

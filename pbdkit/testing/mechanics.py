@@ -247,7 +247,7 @@ def solids_of(component: Component, around: Mapping[str, Any]) -> list[Solid]:
                 if not (_is_tied(solid.scene) or pulls_at_rest(solid.scene, solid._softened)):
                     solids[name] = solid
     if not solids:
-        raise NoSolidError("no scene has known forces, free edges, and no forces at rest")
+        raise NoSolidError("there is no scene with known forces, free edges, and no forces at rest")
     return list(solids.values())
 
 
@@ -266,13 +266,13 @@ def _parts(component: Component) -> list[dict[str, Any]]:
     """Return rule, frame and fracture for the tests of a component, those with fracture first."""
     if isinstance(component, FollowerRule):
         if material_of(component) is None:
-            raise NoSolidError("it knows no forces")
+            raise NoSolidError("it defines no forces")
         frame = {"type": "natural" if component.uses_cells else "none"}
         plain = {"rule": component, "frame": frame}
         return [plain | {"fracture": TEARS}, plain]
     if isinstance(component, FramePolicy):
         if not component.edges_are_free:
-            raise NoSolidError("its points pull at the edges, which are not free")
+            raise NoSolidError("its points exert forces on the edges, which are not free")
         return [{"rule": SPRINGS, "frame": component, "fracture": TEARS}]
     return [{"rule": SPRINGS, "frame": {"type": "natural"}, "fracture": component}]
 

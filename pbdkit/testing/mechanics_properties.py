@@ -46,14 +46,14 @@ ROUNDING = 1e-11
 LARGER = 2.0**20
 """Factor of lengths, a power of two, so that rounding errors do not change."""
 AXES: dict[str, Floats] = {
-    "mirrored in x": np.diag([-1.0, 1.0]),
-    "mirrored in y": np.diag([1.0, -1.0]),
-    "turned by a right angle": np.array([[0.0, -1.0], [1.0, 0.0]]),
+    "reflected in x": np.diag([-1.0, 1.0]),
+    "reflected in y": np.diag([1.0, -1.0]),
+    "rotated by a right angle": np.array([[0.0, -1.0], [1.0, 0.0]]),
 }
 """Matrices of the reflections and the rotation."""
 REMEDY = (
-    "compare lengths with those of the neighbours at rest, and annotate parameters that are "
-    "lengths with `pbdkit.plugin.LENGTH`, powers of lengths with a `pbdkit.plugin.Quantity`"
+    "compare lengths with those of the neighbours at rest; annotate parameters that are lengths "
+    "with `pbdkit.plugin.LENGTH`, and powers of lengths with a `pbdkit.plugin.Quantity`"
 )
 """Remedy for results that depend on the unit of length."""
 EVEN = {"type": "grid", "columns": 5, "rows": 5}
@@ -65,7 +65,7 @@ def goes_alike_in_all_units(subject: Subject) -> None:
     """If all lengths are multiplied by a number, so are the displacements of a step: lengths matter
     relative to the spacing only, and parameters that are lengths are annotated as such."""
     if isinstance(subject.component, Lattice) and not _lengths(subject.component):
-        raise NotApplicableError("it has no length among its parameters: it is of one size")
+        raise NotApplicableError("none of its parameters is a length")
     for scene in subject.scenes[:2]:
         u = displacements(scene, 8)
         if np.abs(advanced(scene, 0.0 * u, 1)).max() > 0.0:
@@ -74,7 +74,7 @@ def goes_alike_in_all_units(subject: Subject) -> None:
         original, scaled = advanced(scene, u, STEPS)[-1], advanced(larger, LARGER * u, STEPS)[-1]
         deviation = np.abs(scaled / LARGER - original).max() / max(1e-300, np.abs(original).max())
         if not deviation <= ROUNDING:
-            fault = f"with all lengths {LARGER:g} times as large a body moves otherwise"
+            fault = f"a body with all lengths {LARGER:g} times as large moves differently"
             extent = f"by {deviation:.3g} of its displacement, {place_of(scene.experiment)}"
             raise PropertyError(f"{fault}, {extent}: {REMEDY}")
 
@@ -135,11 +135,11 @@ def goes_alike_mirrored_and_turned(subject: Subject) -> None:
     """A body on the square lattice that is reflected, or rotated by a right angle, moves as the
     original, reflected or rotated, up to rounding; components with `has_axes` are exempt."""
     if subject.component.has_axes:
-        raise NotApplicableError("it declares `has_axes`: directions count")
+        raise NotApplicableError("it declares `has_axes`, and depends on directions")
     scenes = [scene for each in subject.scenes if (scene := _even_scene(each.experiment))][:2]
     if not scenes:
         raise NotApplicableError(
-            "every scene draws or remembers numbers, or has preferred directions"
+            "every scene has random numbers, state variables, or preferred directions"
         )
     for scene in scenes:
         u = displacements(scene, 9, share=0.5)
@@ -156,8 +156,10 @@ def goes_alike_mirrored_and_turned(subject: Subject) -> None:
             deviation = distance / max(1e-300, np.abs(original).max())
             if not deviation <= ROUNDING:
                 extent = f"by {deviation:.3g} of its displacement"
-                fault = f"a body that is {name} moves otherwise, {extent}"
-                remedy = "take lengths and products, not single components, or declare `has_axes`"
+                fault = f"a body that is {name} moves differently, {extent}"
+                remedy = (
+                    "use lengths and products instead of single components, or declare `has_axes`"
+                )
                 raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
 
 
@@ -201,9 +203,11 @@ def moves_rigidly_for_nothing(subject: Subject) -> None:
     _check_stiffness(
         subject,
         resistance_to_rigid_motions,
-        "a rigid motion of a {body} body meets {measure:.3g} of its stiffness",
-        "let forces act along the line between two particles, or sum to those of cells that feel "
-        "strains alone",
+        "forces under a rigid motion of a {body} body are {measure:.3g} of its stiffness",
+        (
+            "use forces along the line between two particles, or forces of cells that depend on "
+            "strain only"
+        ),
     )
 
 
@@ -215,7 +219,7 @@ def acts_both_ways_alike(subject: Subject) -> None:
         subject,
         lambda _, K: asymmetry(K),
         "the stiffness of a {body} body is not symmetric, by {measure:.3g} of the largest",
-        "give both ends of a bond one weight, the transpose where it is a matrix",
+        "use the same weight at both ends of a bond, the transpose if it is a matrix",
     )
 
 
@@ -225,9 +229,11 @@ def gives_no_energy_back(subject: Subject) -> None:
     _check_stiffness(
         subject,
         lambda _, K: energy_given_back(K),
-        "some displacement of a {body} body gives energy back, {measure:.3g} of the largest "
-        "stiffness",
-        "let `force` pull towards where neighbours are",
+        (
+            "the energy of some displacement of a {body} body is negative, {measure:.3g} of the "
+            "largest stiffness"
+        ),
+        "let `force` act towards the neighbours",
     )
 
 
@@ -250,9 +256,11 @@ def does_not_stiffen_by_breaking(subject: Subject) -> None:
             if (increase := stiffening(K, K_damaged)) > _rounding(solid.scene):
                 _fail(
                     solid.scene,
-                    f"some displacement of a {what} body meets more force than before, by "
-                    f"{increase:.3g} of the largest stiffness",
-                    "let what is seen of a bond be a share of its difference, falling from 1 to 0",
+                    (
+                        f"some displacement of a {what} body has more stiffness than before, by "
+                        f"{increase:.3g} of the largest"
+                    ),
+                    "scale the difference of a bond by a factor that decreases from 1 to 0",
                 )
 
 

@@ -64,20 +64,28 @@ def bears_loads_as_forces(subject: Subject) -> None:
     of neighbours, and a load of zero changes nothing."""
     rule, scene = subject.component, subject.scene
     if not isinstance(rule, Loadable):
-        raise NotApplicableError("it takes no loads")
+        raise NotApplicableError("it does not support loads")
     if material_of(subject.component) is None:
-        raise NotApplicableError("its parameters leave it without a material")
+        raise NotApplicableError("it has no material with these parameters")
     evaluator, p = Evaluator(scene), scene.constants.rule
     load, added = here(scene, 1)["u"], []
     for seed in (0, 1):
         total = summed((c, None) for c in gathered(scene, differences(scene, seed)))
         at, under = standing(scene, **here(scene, seed)), rule.loaded(total, load, p)
-        _compare(evaluator.force(under, at), evaluator.force(total, at) + load, "the force is not")
+        _compare(
+            evaluator.force(under, at),
+            evaluator.force(total, at) + load,
+            ("`force` with a load is not"),
+        )
         still = flat(rule.loaded(total, 0.0 * load, p))
         if any(np.any(still[name] != value) for name, value in flat(total).items()):
             raise PropertyError("`loaded` changes the sums where the load is 0")
         added.append(evaluator.move(total, at, load) - evaluator.move(total, at))
-    _compare(added[0], added[1], "what it adds to the move is not, wherever neighbours stand,")
+    _compare(
+        added[0],
+        added[1],
+        ("its contribution to the move is not, for all positions of neighbours,"),
+    )
 
 
 def _compare(value: object, reference: object, subject: str) -> None:
@@ -85,7 +93,9 @@ def _compare(value: object, reference: object, subject: str) -> None:
     size = max(float(np.abs(number).max()) for number in expected.values())
     for name, number in flat(value).items():
         if not (np.abs(number - expected[name]) <= LOAD_ROUNDING * size).all():
-            raise PropertyError(f"`loaded`: {subject} the same as without, and the load ({name})")
+            raise PropertyError(
+                f"`loaded`: {subject} the value without load plus the load ({name})"
+            )
 
 
 STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
@@ -103,7 +113,7 @@ def rests(subject: Subject) -> None:
     fracture = [(scene, scene.experiment.fracture) for scene in subject.scenes]
     quiet = [scene for scene, model in fracture if not model.check(scene.neighbourhood.shells())]
     if not quiet:
-        raise NotApplicableError("it warns that bonds break at rest in every scene that was tried")
+        raise NotApplicableError("in every tested scene it warns that bonds break at rest")
     for scene in quiet:
         engine, state = Stepper(scene), initial_state(scene)
         if scene.frame is None:
@@ -131,7 +141,7 @@ def _refuse_to_leave_rest(scene: Scene) -> None:
 
 def _restless(largest: float, where: str) -> str:
     wanted = "zero differences must give a move of exactly zero"
-    remedy = "let terms of opposite neighbours cancel one by one"
+    remedy = "make the terms of opposite neighbours cancel one by one"
     return f"a body at rest moves by {largest:.3g} {where}: {wanted}; {remedy}"
 
 
@@ -148,15 +158,16 @@ def follows_translations(subject: Subject) -> None:
         if largest > STEP_ROUNDING and not anchors:
             remedy = ""
             if isinstance(component, FollowerRule):
-                remedy = ": use differences `d`, not `here.u`, or declare `uses_reference`"
+                remedy = "; use differences `d` instead of `here.u`, or declare `uses_reference`"
             elif isinstance(component, FramePolicy):
                 remedy = (
-                    ": let the weights of each point sum to 1, or take on `pbdkit.plugin.Anchors`"
+                    "; make the weights of each point sum to 1, or inherit from "
+                    "`pbdkit.plugin.Anchors`"
                 )
-            fault = f"a translated body moves otherwise, by {largest:.3g} of its displacement"
+            fault = f"a translated body moves differently, by {largest:.3g} of its displacement"
             raise PropertyError(f"{fault}, {place_of(scene.experiment)}{remedy}")
     if anchors and largest <= STEP_ROUNDING:
-        raise PropertyError("it says that it `anchors` the body, and follows every translation")
+        raise PropertyError("it inherits from `Anchors`, but follows every translation")
 
 
 def _free(subject: Subject) -> list[Scene]:
@@ -175,7 +186,7 @@ def _free(subject: Subject) -> list[Scene]:
             free.append(scene)
     if not free:
         reason = f"{_rule_name(subject)} declares `uses_reference`, or a frame anchors"
-        raise NotApplicableError(f"{reason}: where a body lies may count")
+        raise NotApplicableError(f"{reason}, so that the position of the body can matter")
     return free
 
 
@@ -213,11 +224,11 @@ def continues_where_it_stopped(subject: Subject) -> None:
     component, kind = subject.component, type(subject.component)
     copy = kind.model_validate_json(component.model_dump_json(by_alias=True))
     if any(getattr(copy, name) != getattr(component, name) for name in kind.model_fields):
-        raise NotApplicableError("it is another one after JSON")
+        raise NotApplicableError("the component is not equal to itself after JSON")
     scenes = zip(subject.scenes, Subject(copy, subject.parts).scenes, strict=True)
     for n, (scene, rebuilt) in enumerate(scenes):
         start = displacements(scene, n, share=0.4)
-        _refuse_difference(initial_state(rebuilt), initial_state(scene), "a run made anew", scene)
+        _refuse_difference(initial_state(rebuilt), initial_state(scene), "a repeated run", scene)
         whole = Stepper(scene).advance(state_with(scene, start), 2 * STEPS)
         half = Stepper(scene).advance(state_with(scene, start), STEPS)
         saved, duplicate = pickle.dumps(half), half.copy()
@@ -230,7 +241,7 @@ def continues_where_it_stopped(subject: Subject) -> None:
             measured = measured_by(copy, StateMoment(continued, Tables(rebuilt)))
             expected = measured_by(component, StateMoment(whole, Tables(scene)))
             for name in differing(expected, measured):
-                raise PropertyError(f"`{name}` of a run continued at step {STEPS} is another one")
+                raise PropertyError(f"`{name}` of a run continued at step {STEPS} differs")
     with suppress(PluginError):  # Other properties report the error.
         _refuse_other_records(subject.scene, Subject(copy, subject.parts).scene)
 
@@ -244,7 +255,7 @@ def _refuse_other_records(scene: Scene, rebuilt: Scene) -> None:
     datasets = resumed(scene, rebuilt, STEPS - 1, start), whole.dataset()
     records, expected = ({str(n): v for n, v in ds.variables.items()} for ds in datasets)
     for name in differing(expected, records):
-        raise PropertyError(f"`{name}` of a run gone on with after step {STEPS - 1} is another one")
+        raise PropertyError(f"`{name}` of a run resumed after step {STEPS - 1} differs")
 
 
 @property_of(*STEPPED, ParticleOperation)
@@ -260,7 +271,9 @@ def is_the_same_compiled(subject: Subject) -> None:
         compiled = CompiledStepper(scene)
     except PluginError as error:
         text = str(error).splitlines()[0]
-        raise NotApplicableError(f"numpy alone steps it, more slowly: {text}") from None
+        raise NotApplicableError(
+            f"only the numpy engine supports it, which is slower: {text}"
+        ) from None
     start = displacements(scene, 4, share=0.6)
     state, expected = state_with(scene, start), state_with(scene, start)
     for steps in (1, 2, STEPS):
@@ -274,9 +287,9 @@ def _refuse_difference(state: State, expected: State, origin: str, scene: Scene)
         difference = ""
         array, reference = np.asarray(arrays.get(name)), np.asarray(references.get(name))
         if array.shape == reference.shape:
-            difference = f", by {np.abs(array.astype(float) - reference).max():.3g} at most,"
+            difference = f", by at most {np.abs(array.astype(float) - reference).max():.3g},"
         where = f"at step {expected.step}, {place_of(scene.experiment)}"
-        raise PropertyError(f"{origin} gives another `{name}`{difference} {where}")
+        raise PropertyError(f"{origin} computes another `{name}`{difference} {where}")
 
 
 ROUNDING = 1e-11
@@ -294,15 +307,17 @@ def follows_rotations(subject: Subject) -> None:
         raise NotApplicableError("its particles have no directions")
     scenes = [scene for scene in subject.scenes if anywhere and scene.frame is None]
     if not scenes:
-        raise NotApplicableError("a frame, or where a particle stands, may tell directions apart")
+        raise NotApplicableError(
+            "the frame or the position of a particle can distinguish directions"
+        )
     for scene in scenes:
         start = Stepper(scene).advance(state_with(scene, displacements(scene, 6)), 2)
         turned = _turned(scene, start.copy())
         expected = _positions(scene, _turned(scene, Stepper(scene).advance(start, STEPS)))
         positions = _positions(scene, Stepper(scene).advance(turned, STEPS))
         if (deviation := np.abs(positions - expected).max() / spacing(scene)) > ROUNDING:
-            fault = f"a turned body moves otherwise, by {deviation:.3g} of the spacing"
-            remedy = "count its neighbours' places from its own direction"
+            fault = f"a rotated body moves differently, by {deviation:.3g} of the spacing"
+            remedy = "measure the positions of its neighbours from its own direction"
             raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
 
 

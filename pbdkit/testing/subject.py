@@ -132,7 +132,7 @@ class FunctionCall:
 @singledispatch
 def calls_of(component: Component, scene: Scene, seed: int) -> list[FunctionCall]:
     """Return the calls of the functions of a component that its interface permits."""
-    raise TypeError(f"{type(component).__name__} is of no interface")
+    raise TypeError(f"{type(component).__name__} does not implement an interface")
 
 
 @calls_of.register
@@ -168,7 +168,7 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[FunctionCall]:
         )
     slots = zip(d, scene.neighbourhood.slots[0], strict=True)
     meeting = {"d": [v.each(lambda x, r: np.full_like(x, -r), slot.rest) for v, slot in slots]}
-    name = "apply, where all neighbours meet in the particle,"
+    name = "apply with all neighbours at the position of the particle"
 
     def coincident_move(d: Any, **to: Any) -> Any:
         return applied(scene, gathered(scene, d), **to)
@@ -424,8 +424,9 @@ class Subject:
                 refusals.append(error)
         if not scenes:
             raise PropertyError(
-                f"no scene that was tried takes it; the first: {refusals[0]}; name the parts that "
-                "go with it, `conformance(..., lattice=..., neighbours=...)`"
+                "the component is incompatible with every tested scene; the first error: "
+                f"{refusals[0]}; give compatible components, `conformance(..., lattice=..., "
+                "neighbours=...)`"
             )
         return scenes
 
@@ -525,7 +526,7 @@ def examples_of(component: type[Component]) -> list[Component]:
         key, examples = field.alias or name, list(field.examples or [])
         if is_needed(field):
             if not examples:
-                fault = f"{component.__name__}.{name} has neither default nor example"
+                fault = f"{component.__name__}.{name} has neither a default nor an example"
                 remedy = f"write `{name}: ... = Field(description=..., examples=[...])`"
                 raise PluginError(f"{fault}: {remedy}")
             base[key] = examples.pop(0)
@@ -537,11 +538,11 @@ def _made(component: type[Component], parameters: dict[str, Any]) -> Component:
     try:
         return component.model_validate(parameters)
     except TypeError as error:  # An abstract method is missing.
-        raise PluginError(f"{component.__name__} cannot be made: {error}") from None
+        raise PluginError(f"{component.__name__} cannot be created: {error}") from None
     except ValidationError as error:
         fault = error.errors()[0]
         detail = f"{'.'.join(map(str, fault['loc'])) or 'the whole'}: {fault['msg']}"
-        text = f"{component.__name__} refuses its examples {parameters}: {detail}"
+        text = f"{component.__name__} rejects its examples {parameters}: {detail}"
         raise PluginError(text) from None
 
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 def pbdkit_commands() -> list[Command]:
     """Return the commands `live` and `report`."""
     module = "pbdkit.web.command_line"
-    steps = "Steps an experiment in the browser, led by the mouse."
-    page = "Makes one page to share: its motion, curves, all else."
+    steps = "Step an experiment in the browser and move it by the mouse."
+    page = "Write a result as one HTML page: motion, curves, fracture."
     return [
         Command("live", f"{module}:live", steps, "Run"),
         Command("report", f"{module}:report", page, "Look"),
@@ -56,7 +56,7 @@ def live(
     ExperimentError, PluginError
         If the experiment is invalid, or anywidget is missing.
     """
-    refuse_without("anywidget", "live", "live needs anywidget")
+    refuse_without("anywidget", "live", "live requires anywidget")
     from pbdkit.model.loading import as_experiment
     from pbdkit.web.session import Session
     from pbdkit.web.widget import LiveWidget

@@ -23,13 +23,18 @@ from pbdkit.errors import refuse_without
 
 @click.command()
 @experiment_argument
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="The port; 0: any free one.")
-@click.option("--no-browser", is_flag=True, help="Print the address, and open no browser.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    help="Port of the page; 0 selects a free one.",
+)
+@click.option("--no-browser", is_flag=True, help="Print the address without opening a browser.")
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    help="Where 'Save as experiment' writes; else NAME-live.yaml.",
+    help="File of 'Save as experiment'; default NAME-live.yaml.",
 )
 @set_option
 def live(
@@ -40,7 +45,7 @@ def live(
 
     The page is served to this machine only, under a secret address. Ctrl-C ends it.
     """
-    refuse_without("websockets", "live", "live needs websockets")
+    refuse_without("websockets", "live", "live requires websockets")
     from pbdkit.web.server import Conductor, SessionServer
     from pbdkit.web.session import Session
 
@@ -49,7 +54,7 @@ def live(
     server = SessionServer(conductor, loaded.name, port)
 
     def ready(address: str) -> None:
-        click.echo(f"{loaded.name} is at {address}")
+        click.echo(f"{loaded.name} is served at {address}")
         click.echo("Ctrl-C ends it.")
         if not no_browser:
             click.launch(address)
@@ -71,15 +76,17 @@ def live(
 
 @click.command()
 @result_argument("file")
-@click.option("-o", "--output", type=PATH, help="The page; OUT.html if left out.")
-@click.option("--bench", type=PATH, help="What `pbdkit bench --json` wrote, shown in the page.")
+@click.option("-o", "--output", type=PATH, help="The page; default OUT.html.")
+@click.option(
+    "--bench", type=PATH, help="Figures written by `pbdkit bench --json`, to be shown in the page."
+)
 @at_option
 @click.option("--force", is_flag=True, help="Replace an existing page.")
 def report(
     file: Path, output: Path | None, bench: Path | None, at: dict[str, str], force: bool
 ) -> None:
-    """Write one page to share: the moving lattice, histories, curves, predictions, broken bonds,
-    and how to run it again; for a sweep its map and its members. It needs no network."""
+    """Write a result as one HTML page: the moving lattice, histories, curves, predictions, broken
+    bonds, and the experiment to run it again; for a sweep its map and its members."""
     from pbdkit.io.open import reading
     from pbdkit.io.other_files import refuse_other_file
     from pbdkit.web.report import BUDGET, report as write
@@ -93,4 +100,6 @@ def report(
     size = path.stat().st_size
     click.echo(f"{path} written, {size / 1e6:.2g} MB; open it in a browser")
     if size > BUDGET:
-        click.echo(f"it is larger than {BUDGET / 1e6:.2g} MB: what it holds cannot be thinned more")
+        click.echo(
+            f"the page is larger than {BUDGET / 1e6:.2g} MB: its content cannot be thinned further"
+        )

@@ -1,4 +1,4 @@
-/** A body that answers to the mouse: the view of the lattice, and beside it all that can be turned. */
+/** Interactive simulation: the view of the lattice, and beside it the controls and parameters. */
 
 import { KINDS, KIND_NAMES, gradient } from "./colours.js";
 import { choice, labelled, make } from "./dom.js";
@@ -8,21 +8,21 @@ import { handle } from "./live_tools.js";
 import { LatticeView } from "./view.js";
 
 const FASTEST = 1000; // steps a picture
-const SAID_MS = 8000; // so long a message stays
-const WRITTEN_MS = 100; // between two steps that the panel tells
-const SMOOTH = 2000; // particles up to which edges are drawn smoothly
-const MOST_BONDS = 10000, CLOSE = 10; // more bonds are drawn once their ends are so many pixels apart
+const SAID_MS = 8000; // time for which a message is shown
+const WRITTEN_MS = 100; // time between two updates of the panel
+const SMOOTH = 2000; // number of particles up to which edges are drawn smoothly
+const MOST_BONDS = 10000, CLOSE = 10; // more bonds are drawn if their ends are this many pixels apart
 const HIDDEN = 2;
 const ROOM = 0.1; // around the body, of its size
 const WORDS = { stable: "stable", slow: "slow", diverging: "diverging", unknown: "not known" };
 const HINTS = {
-  lead: "Drag a particle to lead it.",
+  lead: "Drag a particle to move it.",
   cut: "Draw a line across bonds, or click one.",
 };
 
 /**
- * Fills `root`. `send` takes commands to the session; what comes back goes to `hear` and `see` of
- * what is returned: messages, and pictures as ArrayBuffers. `close` takes it off again.
+ * Fill `root`. `send` sends commands to the session. Its messages and pictures (ArrayBuffers) are
+ * passed to `hear` and `see` of the returned object; `close` removes the view.
  */
 export function mountLive(root, send) {
   const live = { send, root, running: false, step: 0, end: 0, received: 0, drawn: 0, wrote: 0, first: null };
@@ -71,7 +71,7 @@ const HEARD = {
     live.colour.replaceChildren(
       ...Object.entries(scene.colours).map(([value, words]) => make("option", { value }, words)),
     );
-    const thinned = `${scene.every ** 2} particles stand behind each point: all are stepped.`;
+    const thinned = `Each point represents ${scene.every ** 2} particles; all are stepped.`;
     live.thinned.textContent = scene.every > 1 ? thinned : "";
   },
   standing(live, now) {
@@ -79,7 +79,7 @@ const HEARD = {
     live.play.textContent = now.running ? "Pause" : "Play";
     live.play.setAttribute("aria-pressed", now.running);
     live.speed.value = Math.log(now.speed) / Math.log(FASTEST);
-    live.speedText.textContent = `${now.speed} step${now.speed > 1 ? "s" : ""} a picture`;
+    live.speedText.textContent = `${now.speed} step${now.speed > 1 ? "s" : ""} per picture`;
     live.colour.value = now.colour;
     for (const row of live.rows ?? []) row.show(now.numbers[row.name]);
     if (live.view) live.view.setColours(now.colour === "kind" ? "kind" : "values");
@@ -107,7 +107,7 @@ const HEARD = {
   },
 };
 
-/** Takes a picture, and draws the newest before the screen is next shown. */
+/** Store a picture; the newest is drawn before the next frame of the screen. */
 function see(live, buffer) {
   live.send({ do: "seen" }); // the next can be on its way while this one is drawn
   live.picture = pictureIn(buffer);
@@ -140,7 +140,7 @@ function show(live) {
   live.marks?.();
 }
 
-/** What the panel says of a picture: less often than there are pictures, as it costs as much. */
+/** Update the panel: less often than there are pictures, because it takes as long. */
 function tellStep(live) {
   const { picture } = live;
   live.wrote = performance.now();
@@ -151,7 +151,7 @@ function tellStep(live) {
   live.legend.dataset.by = picture.values ? "values" : "kind";
 }
 
-/** Where bonds are many and close they are left out, but for the broken ones. */
+/** Draw only broken bonds if there are many at a small distance. */
 function maskBonds(live) {
   const { view, scene, broken } = live;
   const many = view.bonds.length / 2 > MOST_BONDS && scene.spacing * view.scale < CLOSE;
@@ -160,7 +160,7 @@ function maskBonds(live) {
   view.setBroken(many ? broken.map((bit) => (bit ? 1 : HIDDEN)) : broken);
 }
 
-/** All of the body, with room to move. */
+/** Fit the view to the body, with a margin. */
 function fit({ view }) {
   const box = [Infinity, Infinity, -Infinity, -Infinity];
   view.positions.forEach((value, n) => {
@@ -172,7 +172,7 @@ function fit({ view }) {
   view.fit([box[0] - room, box[1] - room, box[2] + room, box[3] + room]);
 }
 
-/** The range of colours, that stays as long as it fits. */
+/** Set the range of colours, which changes only if values exceed it or are much smaller. */
 function setRange(live, high) {
   if (!(live.high >= high && live.high < 4 * high)) {
     live.high = 1.25 * high;
@@ -234,7 +234,7 @@ function controls(live) {
     labelled("Speed", live.speedText), live.speed,
     row(live.tools.lead, live.tools.cut), live.hint,
     labelled("Colour", live.colour), live.legend,
-    make("h2", {}, "Numbers"), live.numbers);
+    make("h2", {}, "Parameters"), live.numbers);
 }
 
 function legendOf(live) {
@@ -251,10 +251,10 @@ function legendOf(live) {
     make("div", { className: "by-value" }, "0", ramp, live.most));
 }
 
-/** What the mouse is from now on: "lead" or "cut". */
+/** Select the tool of the mouse: "lead" or "cut". */
 function take(live, tool) {
   live.tool = live.root.dataset.tool = tool;
-  live.hint.textContent = `${HINTS[tool]} The wheel zooms, f shows all.`;
+  live.hint.textContent = `${HINTS[tool]} The wheel zooms; the key f shows the whole body.`;
   for (const [name, made] of Object.entries(live.tools)) {
     made.setAttribute("aria-pressed", name === tool);
   }
@@ -271,7 +271,7 @@ function listenToKeys(live, signal) {
   };
   const target = live.root === document.body ? document : live.root;
   target.addEventListener("keydown", (event) => {
-    // Who types or moves a slider keeps all keys, who is on a button that which presses it.
+    // Text fields and sliders receive all keys; buttons receive the space bar.
     const own = event.target.closest?.(event.key === " " ? "input, select, button" : "input, select");
     if (own || event.ctrlKey || event.metaKey || event.altKey || !KEYS[event.key]) return;
     event.preventDefault();
@@ -279,7 +279,7 @@ function listenToKeys(live, signal) {
   }, { signal });
 }
 
-/** Pictures drawn a second, and how many of those there could have been were not. */
+/** Show the number of pictures per second, and the number that was skipped. */
 function tellRate(live) {
   const { picture, drawn, told, now: standing } = live;
   const now = performance.now();
@@ -288,9 +288,9 @@ function tellRate(live) {
   live.perSecond = (1000 * (drawn - told.drawn)) / (now - told.now);
   const all = picture.made - live.first;
   live.lostPictures = Math.max(0, all - drawn);
-  const step = picture.stepNs ? `${(picture.stepNs / 1e6).toPrecision(2)} ms a step, ` : "";
-  live.rate.textContent = `${live.perSecond.toFixed(0)} pictures a second, ${live.lostPictures} of ` +
-    `${all} left out; ${step}${standing?.engine ?? ""}`;
+  const step = picture.stepNs ? `${(picture.stepNs / 1e6).toPrecision(2)} ms per step, ` : "";
+  live.rate.textContent = `${live.perSecond.toFixed(0)} pictures per second, ${live.lostPictures} of ` +
+    `${all} skipped; ${step}${standing?.engine ?? ""}`;
 }
 
 function say(live, text, wrong = false) {

@@ -25,7 +25,7 @@ export function numberRow({ name, span: [low, high] }, send) {
   const show = (value) => {
     if (value === undefined || value === null) return;
     current = value;
-    if (performance.now() - touched < 3 * APART_MS) return; // somebody is at it
+    if (performance.now() - touched < 3 * APART_MS) return; // the user is changing it
     range.value = value;
     if (document.activeElement !== field) field.value = shortened(value);
   };
@@ -37,7 +37,7 @@ function shortened(value) {
   return String(Number(value.toPrecision(5)));
 }
 
-/** A slider that hands on where it is moved to; `meaning` is for those who do not see it. */
+/** Slider that passes its value to `act`; `meaning` is its label for screen readers. */
 export function slider(meaning, min, max, step, act) {
   const made = make("input", { type: "range", min, max, step, "aria-label": meaning });
   made.addEventListener("input", () => act(made.valueAsNumber));

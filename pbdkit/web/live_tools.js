@@ -98,5 +98,5 @@ function cut(live, { begin, now }) {
   }
   const row = view.pickBond(...begin);
   if (row >= 0) send({ do: "cut-bond", row });
-  else live.say("Draw a line across bonds, or come closer and click one.");
+  else live.say("Draw a line across bonds, or zoom in and click one.");
 }

@@ -8,10 +8,10 @@ import { Tears } from "./tears.js";
 import { LatticeView } from "./view.js";
 
 const STEPS_A_SECOND = 25;
-const HINT = "Click a particle or a bond. Wheel or fingers zoom, dragging moves the picture.";
+const HINT = "Click a particle or a bond. The wheel or two fingers zoom; dragging moves the picture.";
 
 export class LatticePanel {
-  /** `onstep(t)` is called with the place along the run's times that is shown. */
+  /** `onstep(t)` is called with the index of the time that is shown. */
   constructor(place, run, { onstep = () => {} } = {}) {
     Object.assign(this, { run, onstep, t: 0, colour: null, range: "all", factor: 1 });
     this.canvas = make("canvas", { role: "img", "aria-label": "the lattice" });
@@ -50,7 +50,7 @@ export class LatticePanel {
     this.onstep(t);
   }
 
-  /** Colours by "kind", or by the name of one of the run's colours. */
+  /** Set colours by "kind" or by the name of a variable. */
   setColour(name) {
     this.colour = this.run.colours.find((colour) => colour.name === name) ?? null;
     this.colours.value = name;
@@ -105,7 +105,7 @@ export class LatticePanel {
     const { run } = this, last = run.times.length - 1;
     const names = run.colours.map(({ name, meaning }) => [name, meaning]);
     this.colours = choice([["kind", "kind"], ...names], (name) => this.setColour(name));
-    const ranges = [["all", "all steps"], ["now", "this step"], ["typed", "typed"]];
+    const ranges = [["all", "all steps"], ["now", "this step"], ["typed", "custom"]];
     this.ranges = choice(ranges, (range) => { this.range = range; this.#paint(); });
     this.bounds = ["from", "to"].map((end) => make("input", {
       type: "number", step: "any", "aria-label": `${end} value`, hidden: true,
@@ -121,10 +121,10 @@ export class LatticePanel {
       this.#showAll();
     } });
     const whole = make("button", { type: "button", onclick: () => this.#showAll() }, "Show all");
-    this.find = make("input", { type: "text", placeholder: "number, or two: 12 13", onchange: () => this.#search() });
+    this.find = make("input", { type: "text", placeholder: "particle 12 or bond 12 13", onchange: () => this.#search() });
     this.choices = make("div", { className: "choices" },
       labelled("Colour", this.colours), this.rangeChoice, this.fill,
-      labelled("Displacements drawn ×", drawn), labelled("Find", this.find), whole);
+      labelled("Displacement factor", drawn), labelled("Find", this.find), whole);
     const act = () => this.play();
     this.button = make("button", { type: "button", onclick: act, disabled: !last }, "Play");
     this.slider = make("input", {
@@ -135,13 +135,13 @@ export class LatticePanel {
     this.time = make("div", { className: "time" }, this.button, this.slider, this.read);
   }
 
-  /** All that is shown at any step; of displacements that are drawn larger, all at this step. */
+  /** Fit the view to all steps, or to this step if displacements are magnified. */
   #showAll() {
     this.view.fit(this.factor === 1 ? this.run.lattice.box : undefined);
     this.view.draw();
   }
 
-  /** A particle by its number, or a bond by two. */
+  /** Select a particle by its number, or a bond by the numbers of its particles. */
   #search() {
     const rows = (this.find.value.match(/\d+/g) ?? []).map((n) =>
       this.run.lattice.labels.number.indexOf(Number(n)));

@@ -36,24 +36,24 @@ function origin({ facts, experiment, file, what, left_out: leftOut }) {
       setTimeout(() => URL.revokeObjectURL(link), 1000);
     } }, `Save as ${file}.yaml`);
     const commands = what === "run"
-      ? [`pbdkit run ${file}.yaml -o ${file}.nc`, `# or, in Python, from the result itself:`,
+      ? [`pbdkit run ${file}.yaml -o ${file}.nc`, `# or in Python, from the result:`,
         `pbdkit.rerun(pbdkit.open("${file}.nc"))`]
       : [`pbdkit sweep ${file}.yaml`];
-    const name = what === "run" ? "The experiment, as the result carries it" : "The sweep";
+    const name = what === "run" ? "Experiment of this result" : "Sweep";
     parts.push(
       make("details", {}, make("summary", {}, name), make("pre", { tabIndex: 0 }, experiment)),
-      make("h3", {}, "How to repeat it"), make("p", {}, save),
+      make("h3", {}, "Run it again"), make("p", {}, save),
       make("pre", { tabIndex: 0 }, commands.join("\n")),
     );
   }
   if (leftOut.length) {
-    parts.push(make("h3", {}, "What is left out here"));
+    parts.push(make("h3", {}, "Omitted from this page"));
     parts.push(make("ul", { id: "left-out" }, ...leftOut.map((line) => make("li", {}, line))));
   }
-  return section("What was run", ...parts);
+  return section("Origin", ...parts);
 }
 
-/** Charts of curves and of means over the particles; they follow the step of the lattice. */
+/** Charts of curves and of means over the particles; they mark the step of the lattice. */
 class Curves {
   constructor(place, { curves, run, pick }) {
     this.charts = [];
@@ -83,10 +83,10 @@ function nearest(steps, wanted) {
   return best;
 }
 
-/** Of all particles: the mean, the largest and, where there are values below zero, the least. */
+/** Mean and largest value over the particles, and the smallest if there are negative values. */
 function series({ mean, largest, least }) {
   const shown = [{ name: "mean", values: mean }, { name: "largest", values: largest }];
-  return least.some((value) => value < 0) ? [...shown, { name: "least", values: least }] : shown;
+  return least.some((value) => value < 0) ? [...shown, { name: "smallest", values: least }] : shown;
 }
 
 /** The lattice and the curves of a run, into two places. */
@@ -100,20 +100,20 @@ async function show(lattice, charts, { run: content }) {
   return panel;
 }
 
-/** Appends its section: a chart is as wide as the place where it stands. */
+/** Append the section first: the width of a chart is that of its parent. */
 function settling({ rows, notes, moves, certificate }) {
   const parts = notes.map((line) => make("p", { className: "note" }, line));
   const words = (value) => (typeof value === "number" ? short(value, 6) : value ?? "not known");
   const happened = (value) => (value === null ? "" : words(value));
   if (rows) {
     const told = rows.map(([what, before, after]) => [what, words(before), happened(after)]);
-    parts.unshift(table(["", "predicted", "what happened"], told));
+    parts.unshift(table(["", "predicted", "observed"], told));
   }
   if (certificate) {
     parts.push(table([], certificate.map(([name, value]) => [name, words(value)])));
   }
   const place = make("div", { className: "charts" });
-  page.append(section("What was predicted, and what happened", ...parts, place));
+  page.append(section("Prediction and observation", ...parts, place));
   if (moves) new Chart(place, { ...moves, xLabel: moves.x_label, yLabel: moves.y_label });
 }
 
@@ -127,8 +127,8 @@ function ledger({ model, bonds, counts, all, step, ends, shell, strain, limit, n
   const listed = rows.length ? table(["order", "step", "bond", "shell", "strain", "breaks above"], rows) : "";
   if (listed) listed.classList.add("long");
   const near = nearest ? [`Nearest to breaking at the end: bond ${nearest.bond.join("-")}, strain ${number(nearest.strain)}; it breaks above ${number(nearest.breaks_above)}.`] : [];
-  const cut = all > rows.length ? [`The first ${rows.length} of ${all} are listed; \`pbdkit explain\` has all.`] : [];
-  return section("What broke",
+  const cut = all > rows.length ? [`The first ${rows.length} of ${all} are listed; \`pbdkit explain\` lists all.`] : [];
+  return section("Fracture",
     make("p", {}, `Fracture model ${model}: ${words.join(", ")}.`), listed,
     ...[...cut, ...near].map((line) => make("p", { className: "note" }, line)));
 }
@@ -141,7 +141,7 @@ function speed({ of, on, columns, rows, left_out: leftOut }) {
 }
 
 async function runPage(content) {
-  const lattice = section("The lattice"), charts = make("div", { className: "charts" });
+  const lattice = section("Lattice"), charts = make("div", { className: "charts" });
   const whole = await unpacked(content);
   page.append(origin(content), lattice, section("Curves", charts));
   const panel = await show(lattice, charts, whole);
@@ -151,7 +151,7 @@ async function runPage(content) {
 }
 
 async function sweepPage(content) {
-  const map = section("The map"), below = make("div");
+  const map = section("Map"), below = make("div");
   const shared = await unpacked(content.shared);
   let panel = null;
   listenToKeys(() => panel);

@@ -96,7 +96,7 @@ def fewer_points(dataset: xarray.Dataset) -> list[str]:
     """Return a note where curves show fewer points than were recorded."""
     longest = max((dataset.sizes.get(dim, 0) for dim in ("time", "step")), default=0)
     every = _every(longest, MOST_POINTS)
-    return [] if every == 1 else [f"Curves show one point in {every} of up to {longest}."]
+    return [] if every == 1 else [f"Curves show one of {every} points, of up to {longest}."]
 
 
 def _names(dataset: xarray.Dataset) -> list[str]:
@@ -195,14 +195,14 @@ class Thinning:
         if len(self.steps) < self.recorded:
             every = int(self.steps[1] - self.steps[0]) if len(self.steps) > 1 else self.recorded
             sentences.append(
-                f"{len(self.steps)} of the {self.recorded} recorded steps are shown: one in "
-                f"{every}, and the last one."
+                f"{len(self.steps)} of the {self.recorded} recorded steps are shown: one of "
+                f"{every}, and the last."
             )
         if len(self.particles) < self.count:
             sentences.append(
-                f"{len(self.particles)} of the {self.count} particles are shown: one in "
+                f"{len(self.particles)} of the {self.count} particles are shown: one of "
                 f"{self.stride} along i and along j"
-                f"{', and all that lead' if self.with_leaders else ''}. "
+                f"{', and all leaders' if self.with_leaders else ''}. "
                 "Bonds are shown where both of their particles are."
             )
         return sentences
@@ -348,7 +348,7 @@ def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> BondArray
     if not len(table):
         return None
     if scene.raster.count != dataset.sizes["particle"]:
-        raise ExperimentError("its particles are not those of the experiment that it carries")
+        raise ExperimentError("its particles are not those of its experiment")
     return _whole(table.ends, table.rest, table.shell)
 
 
@@ -749,14 +749,18 @@ def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
     """Return the predicted and measured values, notes, and the curve of the moves; or the reason
     why there is none."""
     if scene is None:
-        return {"notes": ["Nothing is predicted: the experiment cannot be built here."]}
+        return {
+            "notes": [("There is no prediction: the experiment cannot be built on this machine.")]
+        }
     if not scene.experiment.solver.makes_steps:
         return _certificate(dataset)
     if scene.raster.count > LARGEST:
         return {
             "notes": [
-                f"Nothing is predicted here of more than {LARGEST} particles; `pbdkit check` does, "
-                "and takes longer."
+                (
+                    f"There is no prediction for more than {LARGEST} particles on this page; "
+                    "`pbdkit check` computes one."
+                )
             ]
         }
     analysis, moves = Analysis(tuned(scene)), moves_of(dataset)
@@ -767,11 +771,11 @@ def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
     }
     if decaying is None:
         reason = (
-            "too few steps are recorded, or they are not equally far apart"
+            "too few steps are recorded, or at unequal distances"
             if moves is None
-            else "leaders move or bonds break until the end, or nearly"
+            else "leaders move or bonds break until the end of the run or shortly before"
         )
-        content["notes"].append(f"How the body came to rest is not measured: {reason}.")
+        content["notes"].append(f"The rate of convergence is not measured: {reason}.")
     return content | ({"moves": _curve(analysis, moves)} if moves else {})
 
 
@@ -779,9 +783,7 @@ def _certificate(dataset: xarray.Dataset) -> dict[str, Any]:
     """Return the error bound of an equilibrium."""
     certificate = json_attribute(dataset, "certificate")
     entries = [[name.replace("_", " "), value] for name, value in certificate.items()]
-    note = (
-        "The solver makes no steps: it finds the equilibrium, with a bound on the distance to it."
-    )
+    note = "The solver makes no steps: it computes the equilibrium, with a bound on the error."
     return {"certificate": entries, "notes": [note]}
 
 
@@ -791,12 +793,13 @@ def _rows(
     to = analysis.steps_to["1e-3"]
     measured: Any = moves.steps_to(1e-3) if moves else None
     if moves and measured is None:
-        measured = "not by the end"
+        measured = "not within the run"
     decay = moves.decay if moves else None
     rows: list[list[Any]] = [
         ["stable", _yes(analysis.stable), _ended(dataset, moves)],
-        ["factor a step: spectral radius; of moves, in the end", analysis.spectral_radius, decay],
-        ["steps until it has shrunk to 1/1000; moves, since the last event", to, measured],
+        [("factor per step: spectral radius; ratio of the last "
+         "moves"), analysis.spectral_radius, decay],
+        ["steps of decay to 1/1000; of moves, since the last event", to, measured],
         ["smallest eigenvalue of the rule", analysis.smallest_eigenvalue, None],
         ["largest stable relaxation", analysis.largest_stable_relaxation, None],
     ]  # fmt: skip
@@ -812,15 +815,15 @@ def _ended(dataset: xarray.Dataset, moves: SettlingMoves | None) -> str:
     if status not in ("complete", "settled") or moves is None:
         return status
     last = moves.move[-1] / (moves.move.max() or 1.0)
-    return f"{status}, the last move was {last:.2g} of the largest"
+    return f"{status}; the last move is {last:.2g} of the largest"
 
 
 def _notes(analysis: Analysis) -> list[str]:
     notes = []
     if not analysis.exact:
         notes.append(
-            "The prediction is of the start, made linear: the rule is not linear, or bonds, "
-            "neighbours, contacts or numbers change on the way."
+            "The prediction is linearised at the start: the rule is not linear, or bonds, "
+            "neighbours, contacts or parameters change during the run."
         )
     if analysis.estimated:
         notes.append("The spectrum is estimated: 1 - radius is within 1 %.")
@@ -833,7 +836,7 @@ def _curve(analysis: Analysis, moves: SettlingMoves) -> dict[str, Any]:
     with np.errstate(divide="ignore"):
         logs = np.log10(moves.move)
     logs[~np.isfinite(logs)] = np.nan
-    series = [{"name": "what happened", "values": packed(logs, "f8")}]
+    series = [{"name": "observed", "values": packed(logs, "f8")}]
     radius, rows = analysis.spectral_radius, moves.fitted
     if radius and len(rows) >= FEWEST:
         middle = rows[len(rows) // 2]
@@ -842,7 +845,7 @@ def _curve(analysis: Analysis, moves: SettlingMoves) -> dict[str, Any]:
         line[(line < np.nanmin(logs) - 1) | (line > np.nanmax(logs) + 0.5)] = np.nan
         series.append({"name": "predicted slope", "values": packed(line, "f8")})
     return {
-        "title": "largest move of a follower, a step",
+        "title": "largest move of a follower per step",
         "x": packed(moves.steps, "f8"),
         "x_label": "step",
         "y_label": "log10 of the move",
@@ -906,25 +909,28 @@ class RunContent:
 def _refuse_no_motion(dataset: xarray.Dataset) -> None:
     """Raise ExperimentError unless there are positions of one run in the plane."""
     if "position" not in dataset:
-        raise ExperimentError("has no positions: keep `position` to have them in a page")
+        raise ExperimentError("has no positions; keep `position`, which a page requires")
     position = dataset["position"]
     if {*position.dims} != {"time", "particle", "axis"} or position.sizes["axis"] != 2:
         raise ExperimentError(
-            f"position has the dimensions {dict(position.sizes)}: a page needs time, particle and "
-            "two axes; isel picks one of several runs"
+            f"position has the dimensions {dict(position.sizes)}; a page requires time, particle "
+            "and two axes; select one of several runs with isel"
         )
     if not position.size:
-        raise ExperimentError("has no step or no particle: a page needs one of each")
+        raise ExperimentError("has no step or no particle; a page requires at least one of each")
 
 
 def _bonds(dataset: xarray.Dataset, origin: Origin) -> tuple[BondArrays | None, list[str]]:
     """Return the known bonds, and notes on what is unknown."""
     notes = []
     if origin.fault:
-        notes.append(f"The experiment cannot be built here: {origin.fault}")
+        notes.append(f"The experiment cannot be built on this machine: {origin.fault}")
     count = dataset.sizes["particle"]
     if "number" in dataset and not np.array_equal(dataset["number"], np.arange(1, count + 1)):
-        return None, [*notes, "Bonds are not shown: some particles of the run are missing."]
+        return None, [
+            *notes,
+            ("Bonds are not shown: the dataset does not contain all particles of the run."),
+        ]
     try:
         return bonds_of(dataset, origin.scene), notes
     except PbdkitError as error:
@@ -1053,7 +1059,7 @@ class SweepContent:
         points = max(FEWEST_POINTS, POINTS // len(each))
         successful = [str(member[STATUS].item()) in KEPT for member in each]
         if "position" not in each[0] or not any(successful):
-            note = "No lattices are shown: no member ended well, or `position` was not kept."
+            note = "No lattices are shown: no member is complete, or `position` was not kept."
             plain = [{"curves": curves(member, points)} for member in each]
             return self._whole | {
                 "shared": {}, "members": plain, "left_out": [note], "thinned": False,
@@ -1195,7 +1201,7 @@ def speed(path: Path) -> dict[str, Any]:
         raise StorageError(f"{path}: {error.strerror}") from None
     except (ValueError, TypeError, KeyError, RecursionError):
         raise ExperimentError(
-            f"{path}: holds no measurement; `pbdkit bench EXPERIMENT --json {path}` writes one"
+            f"{path}: contains no measurement; `pbdkit bench EXPERIMENT --json {path}` writes one"
         ) from None
     names = [name for name in COLUMNS if any(row.get(name) is not None for row in rows)]
     return {

@@ -71,7 +71,7 @@ class Release(Strict):
 
 
 class Turn(Strict):
-    """Change a number, by its name."""
+    """Change a parameter, by its name."""
 
     do: Literal["turn"]
     name: Annotated[str, Field(max_length=200)]
@@ -125,15 +125,17 @@ def command_of(message: str | bytes | dict[str, Any]) -> Command:
     try:
         if not isinstance(message, dict):
             if len(message) > LONGEST:
-                raise ExperimentError(f"a command takes at most {LONGEST} bytes")
+                raise ExperimentError(f"a command has at most {LONGEST} bytes")
             message = json.loads(message)
         return _COMMANDS.validate_python(message)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         where = ".".join(map(str, fault["loc"]))
-        raise ExperimentError(f"no command: {where}: {printable(fault['msg'])}"[:300]) from None
+        raise ExperimentError(
+            (f"invalid command: {where}: {printable(fault['msg'])}")[:300]
+        ) from None
     except (ValueError, RecursionError) as error:
-        raise ExperimentError(f"no command: {printable(str(error))}"[:300]) from None
+        raise ExperimentError(f"invalid command: {printable(str(error))}"[:300]) from None
 
 
 def execute(session: Session, command: Command) -> None:

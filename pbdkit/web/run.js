@@ -86,6 +86,6 @@ export class Run {
       }
     });
     const at = (row, t) => (first[row] <= this.times[t] ? first[row] : NaN);
-    return { name: "broken_step", meaning: "when its first bond broke", units: "step", at };
+    return { name: "broken_step", meaning: "step in which its first bond broke", units: "step", at };
   }
 }

@@ -341,7 +341,7 @@ class Script:
         """Change a number after a step. Raises ExperimentError for an invalid one."""
         number = self.numbers.get(name)
         if number is None:
-            raise ExperimentError(f"there is no number '{name}' that can be turned")
+            raise ExperimentError(f"there is no parameter '{name}' that can be changed")
         self.experiment.of_parts(with_number(self.playing(step), number, number.turned(value)))
         number.turn(step, value)
 
@@ -447,7 +447,7 @@ def _with_key(parts: Parts, key: str, values: list[Any]) -> Parts:
 
 INLINE = 500
 """Maximum number of knots of a path in the experiment; longer ones are written to a table."""
-COMMENT = "# Made by hand with pbdkit live: `pbdkit run` repeats it bit for bit.\n"
+COMMENT = "# Written by pbdkit live: `pbdkit run` repeats the session bit for bit.\n"
 """First line of a saved session."""
 
 
@@ -468,7 +468,7 @@ def save_script(script: Script, step: int, output: FilePath | None) -> Saved:
     cannot be written.
     """
     if step < 1:
-        raise ExperimentError("nothing has been stepped yet: an experiment has a step at least")
+        raise ExperimentError("no step has been made yet, but an experiment has at least one")
     parts = script.written(step)
     name = parts["name"].replace("/", "-")
     path = _free(output or FilePath(f"{name}.yaml"), len(parts["leaders"]))
@@ -476,7 +476,7 @@ def save_script(script: Script, step: int, output: FilePath | None) -> Saved:
     text = COMMENT + yaml_text(parts)
     script.experiment.of_parts(script.written(step))
     if len(text) > MAX_BYTES or _nodes(parts) > MAX_NODES:
-        text = "what was done is more than an experiment file may hold"
+        text = "the session exceeds the size of an experiment file"
         raise ExperimentError(f"{text}; go back, and save a part of it")
     write_together({**tables, path: text})
     return Saved(path, None if tables else text)

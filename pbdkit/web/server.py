@@ -67,7 +67,7 @@ class Access:
         if len(hosts) != 1 or hosts[0] not in self._hosts:
             return "the Host header does not name this server"
         if len(origins) > 1 or any(origin != f"http://{hosts[0]}" for origin in origins):
-            return "the page is of another server"
+            return "the page was served by another server"
         if is_socket and not origins:
             return "the Origin header is missing"
         tokens = parse_qs(urlsplit(target).query).get("token", [])

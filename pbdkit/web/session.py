@@ -72,20 +72,28 @@ def _worded(analysis: Analysis) -> Judgement:
     radius, stable = analysis.spectral_radius, analysis.stable
     if radius is None:
         reasons = analysis.left_out
-        return Judgement("unknown", reasons[0] if reasons else "these steps have no spectrum")
+        return Judgement(
+            "unknown", reasons[0] if reasons else ("the spectrum of these steps is not known")
+        )
     if not stable:
         bound = analysis.largest_stable_relaxation
         remedy = f"; relaxation below {bound:.4g} is stable" if bound else ""
-        return Judgement("diverging", f"the fastest mode grows {radius:.4g} times a step{remedy}")
+        return Judgement(
+            "diverging", (f"the fastest mode grows by a factor of {radius:.4g} per step{remedy}")
+        )
     steps = analysis.steps_to["1e-3"]
     if steps is None:
-        return Judgement("slow", "a mode neither grows nor shrinks: nothing holds it")
-    decay = f"the slowest mode shrinks to a thousandth in {steps} steps"
+        return Judgement("slow", "a mode neither grows nor decays: it is not constrained")
+    decay = f"the slowest mode decays to 1/1000 in {steps} steps"
     if steps <= SLOW:
         return Judgement("stable", decay)
     best = analysis.best_memory
     memory = analysis.scene.experiment.stepping.memory
-    remedy = f"; memory {best:.4g} is fastest" if best and not math.isclose(best, memory) else ""
+    remedy = (
+        (f"; convergence is fastest with memory {best:.4g}")
+        if best and not math.isclose(best, memory)
+        else ""
+    )
     return Judgement("slow", decay + remedy)
 
 
@@ -404,7 +412,7 @@ class Session:
             self.history.keep(self.state)
         except FloatingPointError as error:
             self.running, self.owed = False, 0
-            text = f"{error} left all bounds; go back, and take other numbers"
+            text = f"{error} diverged; go back, and choose other parameters"
             self.notify({"is": "error", "text": text})
 
     @property
@@ -431,7 +439,7 @@ class Session:
         self.release()
         row_in_table = int(self.camera.rows[row])
         if self.stage.scene.raster.table_kind[row_in_table] == FRAME:
-            raise ExperimentError("points of the frame follow others, and cannot be led")
+            raise ExperimentError("frame points follow the body, and cannot be moved")
         self.grabbed = GrabbedParticle(row_in_table)
 
     def drag(self, by: Way) -> None:
@@ -465,7 +473,7 @@ class Session:
         positions = camera.positions(self.state)
         segments = at_rest(line, positions, camera.reference, camera.spacing)
         if not segments:
-            raise ExperimentError("the cut lies beside the body; draw it across some bonds")
+            raise ExperimentError("the cut crosses no bond; draw it across some bonds")
         self._cut(segments)
 
     def cut_bond(self, row: int) -> None:
@@ -493,7 +501,9 @@ class Session:
 
     def _cut(self, segments: list[Segment]) -> None:
         if self.stage.choice.engine == "compiled" and not self.stage.scene.has_fracture:
-            self.notify({"is": "note", "text": "A kernel is made for cuts: some seconds."})
+            self.notify(
+                {"is": "note", "text": ("A kernel for cuts is compiled; this takes some seconds.")}
+            )
         with self._editing():
             self.script.cut(segments, self.step)
 

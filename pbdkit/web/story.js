@@ -1,9 +1,9 @@
-/** What is told of one particle or one bond beside the lattice. */
+/** Details of the selected particle or bond. */
 
 import { Chart, short } from "./chart.js";
 import { make, table } from "./dom.js";
 
-/** What is told of a particle: numbers that follow the step, and its history. */
+/** Details of a particle: values at the current step, and histories. */
 export class ParticleStory {
   constructor(place, run, row, colour, pick) {
     Object.assign(this, { run, row, colour });
@@ -34,7 +34,7 @@ export class ParticleStory {
   }
 }
 
-/** What is told of a bond, as `pbdkit explain --bond` does: how it stands and what broke around. */
+/** Details of a bond, as in `pbdkit explain --bond`: its state, and adjacent broken bonds. */
 export class BondStory {
   constructor(place, run, bond, pick) {
     const values = run.history((t) => run.strain(bond, t)), limit = run.bonds.limit[bond];
@@ -55,21 +55,21 @@ function* told(run, bond, strains, limit) {
   yield `Shell ${bonds.shell[bond]}, rest length ${short(length, 6)}.`;
   if (state === "broken") {
     const strain = Number.isFinite(bonds.strain[bond]) ? short(bonds.strain[bond], 6) : "an unknown strain";
-    yield `It broke in step ${step} at strain ${strain}, number ${bonds.order[bond]} of the ${bonds.broken} broken.`;
+    yield `It broke in step ${step} at strain ${strain}, bond ${bonds.order[bond]} of ${bonds.broken} in the order of breaking.`;
   } else if (state === "cut") yield `It was cut at the beginning of step ${step}.`;
   else if (state === "broken from the start") yield "It is broken from the start.";
   else yield state === "intact" ? "It is intact at the end." : "It cannot break.";
-  if (Number.isFinite(limit)) yield `The fracture model (${bonds.model}) breaks it above ${short(limit, 6)}.`;
+  if (Number.isFinite(limit)) yield `Fracture model ${bonds.model}: it breaks above the strain ${short(limit, 6)}.`;
   let most = 0;
   strains.forEach((strain, t) => { if (strain > strains[most]) most = t; });
-  yield `Of the steps shown it is the longest in step ${times[most]}: strain ${short(strains[most], 6)}.`;
+  yield `Largest strain in the steps shown: ${short(strains[most], 6)}, in step ${times[most]}.`;
   for (const [name, values] of Object.entries(bonds.remembered)) {
     yield `${name} at the end: ${short(values[bond], 6)}.`;
   }
   if (bonds.broken) yield* around(run, bond, step);
 }
 
-/** The other bonds at its ends: what broke before it, with it and after it. */
+/** Adjacent bonds: those that broke before it, in the same step and after it. */
 function* around(run, bond, step) {
   const { ends, step: steps } = run.bonds, mine = ends.subarray(2 * bond, 2 * bond + 2);
   const others = [...steps.keys()].filter(
@@ -77,11 +77,11 @@ function* around(run, bond, step) {
   );
   const gone = others.filter((n) => steps[n] >= 0).sort((a, b) => steps[a] - steps[b]);
   const list = (some) => some.map((n) => `${run.bondName(n)} (step ${steps[n]})`).join(", ") || "none";
-  if (step < 0) yield `Broken around it: ${list(gone)}.`;
+  if (step < 0) yield `Adjacent bonds broken: ${list(gone)}.`;
   else {
-    yield `Broken around it before: ${list(gone.filter((n) => steps[n] < step))}.`;
-    yield `In the same step: ${list(gone.filter((n) => steps[n] === step))}.`;
-    yield `After: ${list(gone.filter((n) => steps[n] > step))}.`;
+    yield `Adjacent bonds broken before: ${list(gone.filter((n) => steps[n] < step))}.`;
+    yield `Adjacent bonds broken in the same step: ${list(gone.filter((n) => steps[n] === step))}.`;
+    yield `Adjacent bonds broken after: ${list(gone.filter((n) => steps[n] > step))}.`;
   }
-  yield `Not broken around it: ${others.length - gone.length}.`;
+  yield `Adjacent bonds not broken: ${others.length - gone.length}.`;
 }

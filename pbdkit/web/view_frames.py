@@ -24,7 +24,7 @@ MOST_LEADERS = 2000
 """Maximum number of leaders of a group that are shown."""
 MOST_BONDS = 500_000
 """Maximum number of bonds that are shown."""
-COLOURS = {"kind": "kind", "displacement": "displacement", "last-step": "way of the last step"}
+COLOURS = {"kind": "kind", "displacement": "displacement", "last-step": "move in the last step"}
 """Variables that can colour particles, with their names."""
 HEAD = struct.Struct("<IIIIIIIIdd")
 """Layout of the head of a frame."""

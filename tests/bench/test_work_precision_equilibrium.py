@@ -122,7 +122,7 @@ def test_steps_that_take_too_long_are_counted_ahead(tmp_path, quick, monkeypatch
     file = tmp_path / "s.json"
     file.write_text(json.dumps(sheet(AFFINE)))
     _, none, *steps = measure(str(file), (), 12, lambda _: None)
-    assert "left out above 10 particles" in none.reason
+    assert "omitted above 10 particles" in none.reason
     assert [row.is_predicted for row in steps] == [True, True]
     loose, tight = steps
     assert (loose.error, tight.error) == TOLERANCES
@@ -144,7 +144,7 @@ def test_a_method_that_took_too_long_is_left_out_where_it_would_take_longer():
     found = list(measurement._rows_of_method(work, base, tolerances, exact))
     assert [bool(row.reason) for row in found] == [False] + 4 * [True]
     assert (
-        "left out: conjugate-gradients at size as it is, 1e-04: 99 s for the tolerance before"
+        "omitted: conjugate-gradients at size unchanged, 1e-04: 99 s for the previous tolerance"
     ) in lines(found)
 
 
@@ -153,7 +153,7 @@ def test_bonds_that_can_break_are_refused(call):
     Path("s.json").write_text(json.dumps(sheet(AFFINE, fracture=fracture)))
     result = call("bench", "s.json")
     assert result.code == 2
-    assert "where no bond can break; set fracture={type: none}" in result.err
+    assert "without fracture; set fracture={type: none}" in result.err
     assert len(result.err.strip().splitlines()) == 1
 
 

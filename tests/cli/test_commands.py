@@ -87,7 +87,7 @@ def test_a_disabled_plugin_adds_none(
 def test_a_command_of_pbdkit_has_precedence(add: Install, call: Call) -> None:
     add("pbdkit-thief", source("run"))
     assert call("run", "e.json").code == 0
-    told = "run Left out of pbdkit-thief 1.0: pbdkit has a command of this name."
+    told = "run Unavailable from pbdkit-thief 1.0: pbdkit has a command of this name."
     assert told in " ".join(call("--help").out.split())
     rows = json.loads(call("plugins", "list", "--json").out)
     (row,) = [row for row in rows if row["interface"] == "command"]
@@ -105,7 +105,9 @@ def test_of_two_plugins_with_one_command_the_user_chooses(
         "pbdkit: the command 'shear' is offered by pbdkit-one 1.0 and pbdkit-two 1.0; "
         f"name one of them in {DISABLE} to use the other\n",
     )
-    assert "Left out of pbdkit-one 1.0 and pbdkit-two 1.0" in " ".join(call("--help").out.split())
+    assert "Unavailable: offered by pbdkit-one 1.0 and pbdkit-two 1.0" in " ".join(
+        call("--help").out.split()
+    )
     monkeypatch.setenv(DISABLE, "pbdkit-two")
     assert call("shear").out == "sheared by 1\n"
 
@@ -145,7 +147,7 @@ def test_a_broken_plugin_stops_no_command(add: Install, call: Call, text: str, r
     [
         ("no_such_module:shear", "failed: ModuleNotFoundError: No module named 'no_such_module'"),
         ("pbdkit_target:bend", "failed: AttributeError: module 'pbdkit_target' has no attribute"),
-        ("json:dumps", "cannot be used: json:dumps is no click command"),
+        ("json:dumps", "cannot be used: json:dumps is not a click command"),
     ],
 )
 def test_a_target_that_cannot_be_used_is_named(

@@ -102,7 +102,7 @@ def test_a_run_that_fails_leaves_a_good_result_as_it_is(
     for name in ("tensile-partial.nc", "tensile-partial-2.nc"):
         result = call("run", "e.json", "--force", *settings)
         assert (result.code, OUT.read_bytes() == good) == (code, True)
-        ending = f"the records until then are in {name}; tensile.nc is unchanged\n"
+        ending = f"the records up to this step are in {name}; tensile.nc is unchanged\n"
         assert result.err.endswith(ending)
         assert pbdkit.open(name).attrs["status"] == status
     assert left() == ["tensile-partial-2.nc", "tensile-partial.nc", "tensile.nc"]
@@ -114,7 +114,7 @@ def test_a_run_that_fails_takes_its_name_where_nobody_has_it(call: Call) -> None
     code, settings = FAILING["diverged"]
     result = call("run", "e.json", "--force", *settings)
     assert (result.code, left()) == (code, ["tensile.nc"])
-    assert result.err.endswith("the records until then are in tensile.nc\n")
+    assert result.err.endswith("the records up to this step are in tensile.nc\n")
 
 
 def test_a_result_beside_is_kept_where_there_are_no_hard_links(

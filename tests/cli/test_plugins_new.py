@@ -59,7 +59,7 @@ def test_the_project_runs_as_it_stands(new: New, call: Call, interface: str) -> 
     result = call("run", str(folder / "example.yaml"), "--json")
     assert (result.code, result.err, json.loads(result.out)["status"]) == (0, "", "complete")
     warnings = json.loads(call("check", str(folder / "example.yaml"), "--json").out)["warnings"]
-    left_out = ["the analysis leaves out 'brand-new'"] * (interface == "ParticleOperation")
+    left_out = ["the analysis does not include 'brand-new'"] * (interface == "ParticleOperation")
     assert [part in warning for part, warning in zip(left_out, warnings, strict=True)] == [
         True
     ] * len(left_out)
@@ -171,9 +171,9 @@ REFUSED = {
     "json": "there is already a module json; try pbdkit-my-json",
     "numpy": "there is already a module numpy; try pbdkit-my-numpy",
     "if": "there is already a module if; try pbdkit-my-if",
-    "pbdkit-2d": "'pbdkit-2d' gives no valid name for a class; try pbdkit-my-2d",
-    "literal": "'literal' gives no valid name for a class; try pbdkit-my-literal",
-    "pbdkit-none": "'pbdkit-none' gives no valid name for a class; try pbdkit-my-none",
+    "pbdkit-2d": "'pbdkit-2d' cannot be converted to the name of a class; try pbdkit-my-2d",
+    "literal": "'literal' cannot be converted to the name of a class; try pbdkit-my-literal",
+    "pbdkit-none": "'pbdkit-none' cannot be converted to the name of a class; try pbdkit-my-none",
     "pbdkit-barycentre": "'barycentre' is a built-in FollowerRule; try pbdkit-my-barycentre",
 }
 
@@ -193,7 +193,7 @@ def test_one_spelling_of_the_name_counts(call: Call) -> None:
 def test_what_is_there_is_left_as_it_is(call: Call) -> None:
     Path("pbdkit-mine").mkdir()
     result = call("plugins", "new", "pbdkit-mine")
-    message = "pbdkit: pbdkit-mine: exists and is not changed; choose another name or --dir\n"
+    message = "pbdkit: pbdkit-mine: exists and is not replaced; choose another name or --dir\n"
     assert (result.code, result.err) == (2, message)
     assert list(Path("pbdkit-mine").iterdir()) == []
 

@@ -26,7 +26,7 @@ from tests.components.test_elasticity import (
 
 # Fields are given by the start of a run: no leaders are needed.
 pytestmark = [
-    pytest.mark.filterwarnings("ignore:leaders. there are none"),
+    pytest.mark.filterwarnings("ignore:leaders. the experiment has neither"),
     pytest.mark.filterwarnings("ignore:neighbours. all lie along one line"),
 ]
 

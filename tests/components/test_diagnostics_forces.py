@@ -30,7 +30,7 @@ from tests.components.test_elasticity import (
 
 # Forces are those of given starts, and of any frame.
 pytestmark = [
-    pytest.mark.filterwarnings("ignore:leaders. there are none"),
+    pytest.mark.filterwarnings("ignore:leaders. the experiment has neither"),
     pytest.mark.filterwarnings("ignore:diagnostics.. .* includes forces of frame points"),
     pytest.mark.filterwarnings("ignore:frame. under 'none' edges"),
 ]

@@ -131,16 +131,16 @@ def test_springs_have_youngs_modulus_at_first_and_then_bend_off_in_proportion():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"group": 2}, "diagnostics.0.group: there is no leader group 2; they are numbered from 0, "
-         "and there are 2"),
-        ({"against": 5}, "diagnostics.0.against: there is no leader group 5; they are numbered "
-         "from 0, and there are 2"),
+        ({"group": 2}, "diagnostics.0.group: there is no leader group 2; "
+         "there are 2, counted from 0"),
+        ({"against": 5}, "diagnostics.0.against: there is no leader group 5; "
+         "there are 2, counted from 0"),
         ({"numbers": [1, 99]}, "diagnostics.0.numbers.1: there is no particle 99; they are "
          "numbered 1 to 54"),
         ({"numbers": [1, 2], "points": [[0, 0], [1, 0]]},
-         "diagnostics.0: the gauge has both points and numbers; give one of them"),
+         "diagnostics.0: the gauge has both points and numbers; give only one of them"),
         ({"points": [[0, 0], [0, 1]]}, "diagnostics.0: the gauge has no length along x: both ends "
-         "lie at 0; choose two points at a distance"),
+         "are at 0; choose points that differ along this axis"),
     ],
 )  # fmt: skip
 def test_what_makes_no_curve_is_refused(wrong, message):

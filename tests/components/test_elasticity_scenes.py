@@ -105,7 +105,7 @@ IMPOSSIBLE = {
     ),
     "no positive energy": (
         ORTHOTROPIC | {"poisson_ratio": 2.0},
-        "poisson_ratio² · modulus_ratio must be below 1, and is 2",
+        "poisson_ratio² · modulus_ratio must be below 1, got 2",
     ),
     "Poisson's ratio above a half": (ELASTIC | {"poisson_ratio": 0.6}, "0.5"),
 }

@@ -31,7 +31,7 @@ SHEET = {
     "steps": 4,
 }
 OLD = SHEET | {"frame": {"type": "traction-free"}}
-ADVICE = "frame.type: 'traction-free' is retired and read as 'natural' until version 1.0"
+ADVICE = "frame.type: 'traction-free' is retired, and is replaced by 'natural' until version 1.0"
 
 
 @pytest.mark.parametrize("name", ["traction-free", "pbdkit:traction-free"])

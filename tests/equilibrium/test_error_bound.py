@@ -256,7 +256,7 @@ def test_it_does_not_end_while_a_bond_may_break_farther_than_the_equilibrium():
         assert (ds.broken_step == -1).all()
         assert (steps_of(ds) > steps_of(whole)) == waits
     early = torn(neck + 1.9 * distance, steps=steps_of(whole))
-    assert "a bond may break on the last" in early.attrs["stop_reason"]
+    assert "a bond may break within the remaining distance" in early.attrs["stop_reason"]
 
 
 @pytest.mark.parametrize(("memory", "lag"), [(0.8, 0), (-0.4, 0), (0.0, 1)])
@@ -308,18 +308,18 @@ def test_a_bound_to_first_order_is_not_given_where_the_rule_has_a_kink():
     assert ds.attrs["status"] == "settled"
     assert error_of(ds, rest) <= certificate(ds)["distance"]
     early = run(given_ | {"steps": 320})
-    assert "not settled: at step" in early.attrs["stop_reason"]
+    assert "not converged: at step" in early.attrs["stop_reason"]
     assert "the rule is too nonlinear" in early.attrs["stop_reason"]
 
 
-@pytest.mark.filterwarnings("ignore:leaders. there are none")
+@pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
 def test_a_nonlinear_body_that_nothing_holds_goes_on_and_says_why():
     noise = {"type": "noise", "amplitude": 0.1}
     given_ = sheet(4, 3, rule="distance-weighted", solver={"relaxation": 0.5}, leaders=[],
                    initial=noise, steps=100)  # fmt: skip
     ds = run(given_)
     assert ds.attrs["status"] == "complete"
-    reason = r"not settled: at step \d+ there is no unique .*a part of 12 particles.*hold it"
+    reason = r"not converged: at step \d+ there is no unique .*a part of 12 particles.*constrain it"
     assert re.search(reason, ds.attrs["stop_reason"])
 
 
@@ -377,7 +377,7 @@ def test_single_precision_settles_as_far_as_it_goes():
     assert error_of(ds, rest) <= certificate(ds)["distance"]
     fine = run(sheet(solver={"precision": "float32"}, tolerance=1e-12, steps=3000))
     assert fine.attrs["status"] == "complete"
-    assert "not settled: at step" in fine.attrs["stop_reason"]
+    assert "not converged: at step" in fine.attrs["stop_reason"]
 
 
 def test_neighbours_found_anew_cannot_settle():
@@ -392,7 +392,7 @@ def test_motions_without_end_never_settle_and_the_run_says_so():
     leaders = [HOLD_LEFT, {"select": {"edge": "right"}, "motion": swinging}]
     ds = run(sheet(leaders=leaders, steps=100))
     assert ds.attrs["status"] == "complete"
-    reason = "all steps done, not settled: leaders do not come to rest before its end"
+    reason = "completed all steps, not converged: leaders do not come to rest before its end"
     assert ds.attrs["stop_reason"] == reason
 
 
@@ -414,7 +414,7 @@ def test_the_command_says_how_far_from_equilibrium_the_run_ended(tmp_path, monke
     assert json.loads(figures.stdout)["status"] == "settled"
     short = CliRunner().invoke(program, [*call[:4], "--force", "--set", "steps=40"])
     assert short.exit_code == 0
-    assert "all steps done, not settled: in step " in short.output
+    assert "completed all steps, not converged: in step " in short.output
 
 
 def test_runs_without_it_import_nothing_of_it():
@@ -450,7 +450,7 @@ def test_what_swings_for_ever_never_settles():
     parts = {"rule": "mixed-coordinate", "leaders": leaders, "frame": "lag", "steps": 4000}
     ds = run(sheet(25, 24, **parts, solver={"engine": "numpy"}))
     assert ds.attrs["status"] == "complete"
-    reason = r"not settled: in step \d+ particles still moved by up to 0.0018$"
+    reason = r"not converged: in step \d+ particles still moved by up to 0.0018$"
     assert re.search(reason, ds.attrs["stop_reason"])
 
 

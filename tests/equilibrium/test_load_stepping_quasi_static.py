@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from itertools import count
 from pathlib import Path
 
@@ -222,7 +223,7 @@ def test_a_refusal_on_the_way_is_no_run_to_resume(call, tmp_path, monkeypatch):
     path.write_text(json.dumps(BAR | parts | {"diagnostics": diagnostics}))
     ended = call("run", str(path), "-o", str(out))
     assert ended.code == 2
-    assert "nothing holds a part of" in ended.err
+    assert "is loaded, but not constrained" in ended.err
     assert "would fail in the same way" in ended.err
     assert "continues it" not in ended.err
 
@@ -343,4 +344,4 @@ def test_equilibria_within_a_step_are_drawn_and_explained(call, tmp_path):
     assert "step 0.33 was not recorded; the nearest recorded: 0." in refused.err
     assert call("curve", "dogbone.nc", "load-displacement", "-o", "curve.png").code == 0
     explained = call("explain", "dogbone.nc", "--bond", a, b).out
-    assert "largest strain of the recorded steps in step 0." in explained
+    assert re.search(r"largest strain in a recorded step: .*, in step 0\.", explained)

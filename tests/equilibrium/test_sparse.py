@@ -154,7 +154,7 @@ def test_an_interrupted_search_keeps_the_start(call, monkeypatch, what):
     result = call("run", "s.json")
     assert result.code == 130
     assert result.err == (
-        "pbdkit: interrupted: stopped on the way to equilibrium, after step 0; `pbdkit resume "
+        "pbdkit: interrupted: stopped before equilibrium was reached, after step 0; `pbdkit resume "
         "sheet.nc` continues it\n"
     )
     ds = pbdkit.open("sheet.nc")

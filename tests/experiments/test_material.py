@@ -96,7 +96,8 @@ def test_the_gradient_layer_is_the_exact_one():
 
 def test_a_fine_gradient_layer_is_known_as_well_as_rounding_allows():
     known = (
-        r"rounding alone limits the relative distance to .*; take solver.tolerance: (\S+): within"
+        r"rounding errors limit the relative distance to .*; set solver.tolerance: (\S+); the "
+        r"state is within"
     )
     with pytest.raises(DivergedError, match=known) as caught:
         run("gradient-layer", "lattice.a=0.00625", "solver.tolerance=1.0e-12")

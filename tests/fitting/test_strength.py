@@ -346,7 +346,7 @@ def test_kinds_of_fits_are_told_apart():
     assert is_strength_fit({"kind": "strength"})
     assert not is_strength_fit("plate-with-hole")
     assert not is_strength_fit("nowhere")
-    with pytest.raises(pbdkit.ExperimentError, match="a fit of strength is to peaks"):
+    with pytest.raises(pbdkit.ExperimentError, match="a strength fit uses peak loads"):
         pbdkit.fit("fibres", measured=xarray.Dataset())
 
 
@@ -359,21 +359,21 @@ def test_a_sample_of_the_long_trial():
 
 
 WRONG = {
-    "no peaks": ({"measured": {"peaks": [], "of": "force"}}, "either a file, or the peaks"),
+    "no peaks": ({"measured": {"peaks": [], "of": "force"}}, "either a file or a list of peaks"),
     "too few": ({"measured": {"peaks": [1.0, 2.0], "of": "force"}}, "at least 3"),
     "below 0": ({"measured": {"peaks": [1.0, 2.0, -1.0], "of": "force"}}, "specimen 3 is -1"),
     "numbers of breaks": (
         {"measured": {"peaks": [1.0, 2.0, 3.0], "broke": [1, 1], "of": "force"}},
-        "2 numbers for 3 peaks",
+        "expected one number for each of 3 peaks, got 2",
     ),
     "no such file": ({"measured": {"file": "no.csv", "of": "force"}}, r"\.csv: does not exist"),
     "no quantity": ({"measured": {"peaks": [1.0, 2.0, 3.0]}}, "of"),
-    "bounds at 0": ({"unknown": {"fracture.scale": [0.0, 1.0]}}, "above 0; got 0"),
+    "bounds at 0": ({"unknown": {"fracture.scale": [0.0, 1.0]}}, "above 0, got 0"),
     "one parameter": (
         {"unknown": {"fracture.scale": [0.01, 1.0]}}, "both fracture.scale and fracture.modulus",
     ),
     "no law": ({"law": None}, "give law: weibull or uniform"),
-    "another law": ({"experiment": sheet(STRAIN)}, "are uniform, not weibull"),
+    "another law": ({"experiment": sheet(STRAIN)}, "are distributed as uniform, not as weibull"),
     "bounds elsewhere": (
         {"law": "uniform", "unknown": {"fracture.failure": [1.0, 2.0],
                                        "fracture.scatter": [0.1, 0.2]}},
@@ -425,7 +425,7 @@ def test_bounds_that_cut_are_named():
     found = pbdkit.fit_strength(fit_of(16 * drawn(16, 40, 1), unknown=narrow))
     assert found.values["fracture.modulus"].cut
     assert not found.values["fracture.scale"].cut
-    assert "cut off by its bounds" in str(found.values["fracture.modulus"])
+    assert "truncated by its bounds" in str(found.values["fracture.modulus"])
 
 
 def test_an_experiment_may_be_given_besides():

@@ -48,7 +48,7 @@ def test_case_10_a_hexagonal_threshold_written_as_the_spacing_breaks_nothing_at_
 
 
 @pytest.mark.parametrize("below", [1e-16, 2e-13, 5e-13, 8e-13, 2e-12, 1e-9])
-@pytest.mark.filterwarnings("ignore:leaders. there are none")
+@pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
 def test_case_10_a_threshold_that_is_accepted_does_not_break_a_body_at_rest(below):
     fracture = {"type": "threshold", "thresholds": [1.0 - below]}
     try:

@@ -57,7 +57,7 @@ def test_case_4_the_current_y_in_mixed_coordinates_diverges_and_is_known_to_befo
     assert known.spectral_radius == pytest.approx(-least, abs=1e-12)
     (warning,) = known.warnings()
     assert f"it is stable below {2 / (1 - least):.4g}" in warning
-    with pytest.warns(pbdkit.PbdkitWarning, match="inside out"):
+    with pytest.warns(pbdkit.PbdkitWarning, match="inverted cells"):
         assert pbdkit.run(ours, progress=False).status == "complete"
     with pytest.raises(pbdkit.DivergedError, match="'current-y'"):
         pbdkit.run(naive, components=[CurrentY], progress=False)
@@ -91,14 +91,14 @@ class Even(Periodic):
 
 
 @pytest.mark.parametrize("frame", ["periodic", "even"])
-@pytest.mark.filterwarnings("ignore:leaders. there are none")
+@pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
 def test_case_13_the_mode_that_never_decays_is_found_and_decays_below_relaxation_1(frame):
     parts = {"frame": {"type": frame}, "initial": {"type": "noise", "amplitude": 0.1}}
     given = experiment(6, 4, **parts, steps=600)
     known = pbdkit.analyse(given, components=[Periodic, Even])
     assert known.smallest_eigenvalue == pytest.approx(-1.0, abs=1e-12)
     assert (
-        "changes its sign in every step never decays; take a relaxation below 1"
+        "changes its sign in every step never decays; use a relaxation below 1"
         in (known.warnings()[-1])
     )
     ds = pbdkit.run(given, components=[Periodic, Even], progress=False)
@@ -148,7 +148,7 @@ def test_case_15_the_distance_weighted_rule_runs_as_printed_with_the_warning():
         broken_up, said = departure(1.0)
     texts = [str(warning.message) for warning in warned]
     assert sum("can diverge" in text for text in texts) == 2
-    assert any("inside out" in text for text in texts)
+    assert any("inverted cells" in text for text in texts)
     assert broken_up[1] < 2e-6
     assert broken_up[50] > 1.0
     assert said == {
@@ -209,7 +209,7 @@ def test_case_16_memory_1_swings_for_ever_and_does_not_grow():
     assert swings[2500:].max() == pytest.approx(swings[10:510].max(), rel=0.2)
 
 
-@pytest.mark.filterwarnings("ignore:leaders. there are none")
+@pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
 def test_case_17_in_1e5_steps_without_a_leader_the_frame_does_not_drift():
     parts = {"lattice": "hexagonal", "frame": "first", "neighbours": "chebyshev-1"}
     start = {"initial": {"type": "noise", "amplitude": 0.3}, "record": {"at": [0, 1000, 100000]}}

@@ -119,7 +119,9 @@ def test_distance_weighting_has_the_poisson_ratio_of_springs_without_rest_length
     expected = [[c11, c12, 0], [c12, c11, 0], [0, 0, c66]]
     np.testing.assert_allclose(found.body.stiffness, expected, atol=1e-9)
     assert found.poisson_ratio == pytest.approx(-3 / 7, abs=1e-8)
-    assert "away from free edges it is elastic; at them it pulls inwards" in found.notes
+    assert (
+        "away from free edges the rule is elastic; at free edges it exerts an inward force"
+    ) in found.notes
 
 
 @pytest.mark.parametrize("lattice", [SQUARE, RECTANGULAR], ids=["square", "rectangular"])
@@ -208,9 +210,9 @@ def test_the_parameter_of_mixed_coordinates_is_no_poisson_ratio(axis):
     assert (found.kind, found.poisson_ratio, found.body) == ("neither", None, None)
     across = "yx"["xy".index(axis)]
     assert found.reasons == (
-        f"it depends on the place: when everything moves by 1 along {axis}, the particle at (0, 0) "
-        f"of the body moves 0.004 more along {across} a step than the one in the middle; no "
-        "material constant does that: K is not a Poisson ratio",
+        f"the rule depends on the position: under a translation by 1 along {axis}, the particle at "
+        f"(0, 0) of the body moves 0.004 more along {across} per step than the one in the middle; "
+        "a material constant has no such effect: K is not a Poisson ratio",
     )
 
 
@@ -233,7 +235,7 @@ def test_positive_further_shells_are_no_gradient_elasticity(lattice, neighbours,
         x = found.stencil.rest @ [np.cos(angle), np.sin(angle)]
         assert gradient.total == pytest.approx((-(x**4).sum() / (x**2).sum() / 12,) * 2)
     assert max(l2 for g in found.long.gradients for l2 in g.material) < 1e-12
-    assert any("the wrong sign for gradient elasticity" in note for note in found.notes)
+    assert any("which is not the sign of gradient elasticity" in note for note in found.notes)
 
 
 def test_nearest_rows_alone_have_the_lattice_s_own_fourth_order():
@@ -256,7 +258,7 @@ def test_the_operator_twice_is_gradient_elasticity(c):
         assert gradient.material == pytest.approx((c / 4, c / 4), abs=1e-13)
     assert found.spectrum.largest_stable_relaxation == pytest.approx(2 / (2 + 4 * c))
     length = math.sqrt(c / 4)
-    assert f"it is gradient elasticity, with a length of {length:.6g} h" in found.notes
+    assert f"the rule is gradient elasticity with a length of {length:.6g} h" in found.notes
 
 
 @pytest.mark.parametrize(
@@ -331,6 +333,5 @@ def test_neighbours_found_anew_are_those_at_rest():
     found = identity(SQUARE, neighbours, BARYCENTRE)
     assert found.diffusivity == pytest.approx(0.25)
     assert (
-        "neighbours are searched at every step: the figures hold while they are those at rest"
-        in found.notes
+        "neighbours are re-evaluated: the values hold while they are those at rest" in found.notes
     )

@@ -92,7 +92,7 @@ def test_a_result_that_the_disk_gives_back_otherwise_gets_no_name(
     monkeypatch.setattr(os, "fsync", spoil)
     found = call("run", "e.json", "-o", "out.nc")
     assert (found.code, Path("out.nc").exists(), left()) == (6, False, [])
-    assert "returns other bytes than were written" in found.err
+    assert "that the disk returns differ from those written" in found.err
 
 
 WRITING = {

@@ -59,13 +59,13 @@ def test_a_broken_bond(explain):
     across = np.hypot(1.0, 17 * RATE / 2) - 1
     assert answer.out.splitlines() == [
         "bond 1-3: shell 1, rest length 1",
-        "broke in step 17 at strain 0.53125, number 1 of the 1 broken",
-        "fracture strain breaks it above 0.5",
-        "broken around it before: none",
-        "in the same step: none",
-        "after: none",
-        f"not broken around it: 2, the most strained 3-4: intact, strain {across:.6g} in step 17, "
-        f"breaks above 0.5 ({across / 0.5:.3g} of the way)",
+        "broke in step 17 at strain 0.53125, bond 1 of 1 in the order of breaking",
+        "fracture strain: it breaks above the strain 0.5",
+        "adjacent bonds broken before: none",
+        "adjacent bonds broken in the same step: none",
+        "adjacent bonds broken after: none",
+        "adjacent bonds not broken: 2; the largest strain is that of 3-4: intact, strain "
+        f"{across:.6g} in step 17, breaks above 0.5 ({across / 0.5:.3g} of this limit)",
     ]
 
 
@@ -74,11 +74,11 @@ def test_an_intact_bond(explain):
     across = np.hypot(1.0, 40 * RATE - 20 * RATE / 2) - 1
     assert answer.out.splitlines() == [
         "bond 2-4: shell 1, rest length 1",
-        "intact, strain 0.3125 in step 40, breaks above 0.5 (0.625 of the way)",
-        "largest strain of the recorded steps in step 20: 0.3125",
-        "broken around it: none",
-        f"not broken around it: 2, the most strained 3-4: intact, strain {across:.6g} in step 40, "
-        f"breaks above 0.5 ({across / 0.5:.3g} of the way)",
+        "intact, strain 0.3125 in step 40, breaks above 0.5 (0.625 of this limit)",
+        "largest strain in a recorded step: 0.3125, in step 20",
+        "adjacent bonds broken: none",
+        "adjacent bonds not broken: 2; the largest strain is that of 3-4: intact, strain "
+        f"{across:.6g} in step 40, breaks above 0.5 ({across / 0.5:.3g} of this limit)",
     ]
 
 
@@ -86,9 +86,9 @@ def test_what_happened_around_a_bond(explain):
     """3-4 breaks in the end: after 1-3."""
     answer = explain("--bond", "3", "4", fracture={"type": "strain", "failure": 0.3})
     lines = answer.out.splitlines()
-    assert lines[1].endswith("number 3 of the 3 broken")
-    assert lines[3] == "broken around it before: 1-3 (step 10), 2-4 (step 20)"
-    assert lines[6] == "not broken around it: 0"
+    assert lines[1].endswith("bond 3 of 3 in the order of breaking")
+    assert lines[3] == "adjacent bonds broken before: 1-3 (step 10), 2-4 (step 20)"
+    assert lines[6] == "adjacent bonds not broken: 0"
 
 
 def test_the_whole_run(explain):
@@ -108,7 +108,8 @@ def test_a_run_of_a_model_that_does_not_say_when_it_breaks(explain, monkeypatch)
     lines = explain(fracture={"type": "threshold", "thresholds": [1.3]}).out.splitlines()
     assert lines[3].endswith("not known")
     assert lines[6] == (
-        "threshold has no strain above which a bond breaks: models declare it by `breaking_strain`"
+        "threshold declares no strain above which a bond breaks: a fracture model declares it by "
+        "`breaking_strain`"
     )
 
 
@@ -146,7 +147,7 @@ def test_a_bond_that_is_not_there(explain, arguments, message):
 def test_a_run_without_bonds(explain):
     answer = explain(fracture={"type": "none"})
     assert answer.code == 2
-    assert "bar.nc: has no table of bonds: nothing could break in this run" in answer.err
+    assert "bar.nc: has no table of bonds, since no bond can break in this run" in answer.err
     answer = explain("--bond", "1", "3", fracture={"type": "none"}, diagnostics=[{"type": "pe1"}])
     assert answer.out.splitlines()[1] == "cannot break, strain 1.25 in step 40"
 
@@ -205,5 +206,5 @@ def test_a_file_that_was_changed_is_refused():
     given = BAR | SHEET
     ds = pbdkit.run(given, progress=False)
     other = build_scene(pbdkit.Experiment(**given | {"neighbours": {"type": "chebyshev"}}))
-    with pytest.raises(pbdkit.ExperimentError, match="its bonds are not those of the experiment"):
+    with pytest.raises(pbdkit.ExperimentError, match="its bonds are not those of its experiment"):
         BondRecords(ds, other)

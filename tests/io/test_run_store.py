@@ -239,7 +239,7 @@ def test_a_newer_store_is_refused_with_its_version(
     put("about", json.dumps(about | {"format": "4"}).encode())
     for command in ("resume", "status", "plot"):
         found = call(command, str(OUT))
-        assert (found.code, "is of format 4" in found.err) == (6, True), found
+        assert (found.code, "has the format 4" in found.err) == (6, True), found
 
 
 def test_a_store_that_a_killed_process_was_making_is_none(call: Any) -> None:
@@ -300,7 +300,7 @@ def test_damage_to_the_log_of_a_store_is_named_and_the_rest_is_kept(
             found = call(*command.split(), str(OUT))
             assert found.code == (2 if command.startswith("run") else 6), (command, found)
             assert kept() == damaged, command
-        assert "--anyway goes on from the last commit" in call("status", str(OUT)).err
+        assert "--anyway continues from the last commit" in call("status", str(OUT)).err
         assert call("resume", str(OUT), "--anyway").code == 0
         assert is_whole(right)
     lay(files)

@@ -114,7 +114,10 @@ def test_verify_says_a_line_a_file(sound, call, tmp_path):
     assert result.code == 6
     assert result.out.splitlines() == [
         f"{good}: unchanged since it was written",
-        f"{bad}: bytes {begin} to {end} of {table['stop'][-1]} are not what was written",
+        (
+            f"{bad}: bytes {begin} to {end} of {table['stop'][-1]} have changed since they were "
+            "written"
+        ),
         f"{bare}: has no seal: changes since it was written cannot be detected",
         f"{tmp_path / 'none.nc'}: there is no such file",
     ]
@@ -128,7 +131,7 @@ def test_a_damaged_seal_is_named(sound, call, tmp_path):
     result = call("plot", str(changed))
     assert (result.code, result.err) == (
         6,
-        f"pbdkit: {changed}: its seal is not what was written\n",
+        f"pbdkit: {changed}: its seal has changed since it was written\n",
     )
 
 

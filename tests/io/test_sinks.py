@@ -146,7 +146,7 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
         path.write_text("somebody else's")
         return False
 
-    with pytest.raises(pbdkit.StorageError, match="appeared while this was going on"):
+    with pytest.raises(pbdkit.StorageError, match="was created by another program meanwhile"):
         record(Simulation.of_scene(scene, watch=Watch(appear)), sink)
     assert path.read_text() == "somebody else's"
     (kept,) = (p for p in tmp_path.iterdir() if p != path)

@@ -94,8 +94,8 @@ def test_a_corner_folded_over_its_diagonal_makes_a_square_concave_and_not_inside
     np.testing.assert_allclose(measured(scene, u), [0.4], rtol=0, atol=1e-15)
     warning = StateMoment(state_with(scene, u), Tables(scene)).cells.inside_out()
     assert warning.startswith(
-        "the last state is folded: 1 of 1 cells have a corner that has turned over, the worst, at "
-        "particle 6, to -0.2 of its area at rest; "
+        "the last state is folded: 1 of 1 cells have an inverted corner; the worst, at "
+        "particle 6, has -0.2 times its area at rest; "
     )
 
 
@@ -124,9 +124,9 @@ def test_parts_of_a_broken_body_may_pass_each_other():
     whole = scene_of(6, 5)
     warning = StateMoment(state_with(whole, u), Tables(whole)).cells.inside_out()
     assert warning == (
-        "the last state is inside out: 4 of 20 cells have turned over, the worst, at particle "
-        "23, to -3 of its area at rest; let the leaders go less far, or weaken the rule where it "
-        "couples x and y"
+        "the last state has inverted cells: 4 of 20 cells are inverted; the worst, at particle 23, "
+        "has -3 times its area at rest; reduce the displacement of the leaders, or the coupling of "
+        "x and y in the rule"
     )
 
 
@@ -134,7 +134,7 @@ def test_the_warning_is_printed_by_run_and_silenced_by_quiet(call, tmp_path):
     (tmp_path / "e.json").write_text(json.dumps(experiment(leaders=[displace([9], 4.0, 0.0)])))
     said = call("run", str(tmp_path / "e.json"), "-o", "a.nc")
     assert said.code == 0
-    assert said.err.startswith("warning: the last state is inside out: ")
+    assert said.err.startswith("warning: the last state has inverted cells: ")
     quiet = call("run", str(tmp_path / "e.json"), "-o", "b.nc", "--quiet")
     assert quiet.err == ""
 
@@ -144,7 +144,7 @@ def test_the_warning_is_printed_by_run_and_silenced_by_quiet(call, tmp_path):
 def test_a_body_without_a_cell_is_refused_by_the_diagnostic_and_never_inside_out(columns, rows):
     given = experiment(columns, rows, leaders=BOTH_ENDS_HELD[:1])
     asked = given | {"diagnostics": [{"type": "smallest-cell-area"}]}
-    message = "diagnostics.0.*requires cells, and no cell has all its corners in the body"
+    message = "diagnostics.0.*requires cells, but no cell has all its corners in the body"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         pbdkit.run(asked, progress=False)
     assert pbdkit.run(given, progress=False).status == "complete"
@@ -166,7 +166,7 @@ class Areas(pbdkit.Diagnostic):
         return (now.cells.over(area).sum(),)
 
 
-@pytest.mark.filterwarnings("ignore:leaders. there are none")
+@pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
 def test_a_diagnostic_of_ones_own_gets_the_cells():
     given = experiment(6, 5, initial={"type": "affine", "gradient": [[0.5, 0.0], [0.0, 0.0]]})
     ds = pbdkit.run(given | {"diagnostics": [Areas()]}, components=[Areas], progress=False)

@@ -69,7 +69,7 @@ def pieces(scene):
 
 
 def left_out(scene):
-    return [warning for warning in scene.warnings if "left out" in warning]
+    return [warning for warning in scene.warnings if "omitted" in warning]
 
 
 @pytest.mark.parametrize("name", LATTICES)
@@ -142,7 +142,7 @@ def test_a_thin_strip_stays_connected():
 def test_the_warning_names_cells_place_and_remedy():
     vertical = {"type": "rectangle", "width": 0.4, "height": 5.0, "origin": [4.3, -1.0]}
     assert left_out(scene_of(LATTICES["square"], less(vertical))) == [
-        "body: 4 cells are left out, the first near (4, 0), where a void is less than two cells "
+        "body: 4 cells are omitted, the first near (4, 0), where a void is less than two cells "
         "wide: they would connect its two sides; use a finer lattice, with two cells across the "
         "void, or `cuts` for a crack of zero width"
     ]

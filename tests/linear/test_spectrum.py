@@ -199,7 +199,7 @@ def test_check_says_the_period(call):
     assert figures["period"] == pytest.approx(84.4, abs=0.01)
     assert figures["decay"] == pytest.approx(math.sqrt(0.98))
     said = call("check", "stability/oscillation").out
-    assert "oscillates slowest period 84.4 steps, shrinking by a factor of 0.9899 a step" in said
+    assert "oscillates slowest period 84.4 steps, decaying by a factor of 0.9899 per step" in said
 
 
 @pytest.mark.parametrize("memory", [0.0, -0.5, 0.01])

@@ -142,11 +142,11 @@ REFUSED = {
     ),
     "mirror of a disc": (
         {"frame": {"type": "mirror"}, "body": {"type": "disc", "radius": 3.0, "centre": [0, 0]}},
-        "fills a rectangle of sites",
+        "requires a rectangular body",
     ),
     "mirror wider than the body": (
         {"frame": {"type": "mirror", "layers": 5}},
-        "wider than the frame",
+        "of more rows and columns than the frame",
     ),
     "lattice neighbours re-evaluated": (
         {"neighbours": {"type": "chebyshev", "reevaluate": True}},

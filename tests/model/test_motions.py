@@ -133,7 +133,7 @@ TABLE, MEASURED = "{type: table, file: data.csv}", "{type: measured, file: data.
     ("motion", "content", "text"),
     [
         (TABLE, "step,ux\n1,0\n", r"yaml:9:27: leaders\.0\.motion\.file: .*data\.csv:1: "
-                                  "requires columns step, ux, uy, .* no 'uy'"),
+                                  "requires the columns step, ux, uy, .* has no 'uy'"),
         (TABLE, "step;ux;uy\n1;0,1;0\n", "separated by ';'; save it with commas between columns"),
         (TABLE, "step\tux\tuy\n1\t0\t0\n", "separated by tabs; save it with commas"),
         (TABLE, "step,ux,uy\n", "has no row"),
@@ -141,12 +141,13 @@ TABLE, MEASURED = "{type: table, file: data.csv}", "{type: measured, file: data.
         (TABLE, "step,ux,uy\n1,0\n", "column 'uy' requires a finite number, got nothing"),
         (TABLE, "step,ux,uy\n1,inf,0\n", "got 'inf'"),
         (TABLE, "step,ux,uy\n1,0,0\n1,1,0\n", "steps must increase"),
-        (TABLE, "step,ux,uy\n1.5,0,0\n", "steps are whole numbers from 1, got 1.5"),
+        (TABLE, "step,ux,uy\n1.5,0,0\n", "expected whole numbers from 1 as steps, got 1.5"),
         (TABLE, "step,ux,uy\n0,1,0\n", "the displacement at step 0 is zero"),
         (TABLE.replace("data", "other"), "", r"other\.csv: does not exist; paths are relative to"),
         (TABLE.replace("data.csv", "."), "", "is not a regular file"),
         (TABLE.replace("}", ", steps: [1]}"), STEPS, "give either a file, or steps"),
-        (MEASURED, "x,y,ux,uy\n0,0,1,1\n0,0,1,2\n", r"\(0, 0\) is measured twice"),
+        (MEASURED, "x,y,ux,uy\n0,0,1,1\n0,0,1,2\n", (r"\(0, 0\) occurs twice among the measured "
+                                                    r"points")),
         (MEASURED, measured([(0, 0), (4, 0), (0, 3)]), "3 of 4 particles lie outside the measured "
                                                       r"points, the first is number \d+ at"),
         (MEASURED, measured([(0, 0), (1, 0)]), "4 of 4 particles lie outside"),

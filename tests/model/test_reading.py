@@ -59,10 +59,10 @@ NO_SWEEP = {
 NO_RESULT = {
     "experiment.nc": "experiment.nc: is an experiment; `pbdkit run experiment.nc` computes its result and prints the path",
     "e.json": "e.json: is an experiment; `pbdkit run e.json` computes its result and prints the path",
-    "sweep.nc": "sweep.nc: is a sweep, no result; `pbdkit sweep sweep.nc` runs it",
-    "fit.nc": "fit.nc: is a fit, no result; `pbdkit fit fit.nc` runs it",
-    "other.yaml": "other.yaml: is no result: those end in .nc",
-    "picture.yaml": "picture.yaml: is no result, by its name an experiment",
+    "sweep.nc": "sweep.nc: is a sweep, not a result; `pbdkit sweep sweep.nc` runs it",
+    "fit.nc": "fit.nc: is a fit, not a result; `pbdkit fit fit.nc` runs it",
+    "other.yaml": "other.yaml: is not a result; the names of results end in .nc",
+    "picture.yaml": "picture.yaml: is not a result; by its name it is an experiment",
 }  # fmt: skip
 
 
@@ -87,16 +87,16 @@ def test_plot_takes_an_experiment_by_any_name_and_refuses_what_is_neither(told: 
     for file in ("sweep.nc", "fit.nc", "other.yaml"):
         assert told("plot", file).startswith(NO_RESULT[file])
     assert told("plot", "picture.yaml").startswith(NO_EXPERIMENT["picture.yaml"])
-    refused = "--color: applies to results; e.json is an experiment, whose set-up is drawn; `pbdkit run e.json` computes a result"
+    refused = "--color: applies to results, but e.json is an experiment; `pbdkit run e.json` computes a result"
     assert told("plot", "e.json", "--color", "u") == refused
     assert told("plot", "experiment.nc", "--time", "3").startswith("--time: applies to results")
-    refused = "--set: changes an experiment, and result.yaml is a result"
+    refused = "--set: changes an experiment, but result.yaml is a result"
     assert told("plot", "result.yaml", "--set", "steps=3") == refused
 
 
 @pytest.mark.parametrize("command", ["plot", "animate", "curve", "export", "report", "explain"])
 def test_a_folder_is_no_result(call: Any, command: str) -> None:
-    assert call(command, ".").err == "pbdkit: .: is a folder, no result of pbdkit\n"
+    assert call(command, ".").err == "pbdkit: .: is a folder, not a result of pbdkit\n"
 
 
 def test_a_result_is_one_under_any_name(call: Any) -> None:
@@ -107,7 +107,7 @@ def test_a_result_is_one_under_any_name(call: Any) -> None:
 
 @pytest.mark.parametrize("command", ["status", "resume"])
 def test_the_store_of_a_run_names_its_output(told: Any, command: str) -> None:
-    message = "left.nc.run: is what was kept of an unfinished run; name left.nc"
+    message = "left.nc.run: is the store of an unfinished run; give its output, left.nc"
     assert told(command, "left.nc.run") == message
 
 
@@ -121,7 +121,7 @@ def test_the_folder_of_a_sweep_names_its_dataset(call: Any) -> None:
 
 
 def test_a_shipped_experiment_is_no_result(call: Any) -> None:
-    told = "paper/a: is a shipped experiment; `pbdkit run paper/a` makes a result of it"
+    told = "paper/a: is a shipped experiment; `pbdkit run paper/a` computes its result"
     for command in ("explain", "animate", "status", "resume"):
         assert told in call(command, "paper/a").err
 

@@ -69,7 +69,7 @@ def test_an_unknown_type_is_shortened_and_escaped(field: str, name: str) -> None
     ids=["key", "value", "in"],
 )
 def test_half_a_character_is_refused_in_files(text: str) -> None:
-    with pytest.raises(pbdkit.ExperimentError, match=r"^e:1:\d+: half a character"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"^e:1:\d+: an unpaired surrogate"):
         read_text(text, "e")
 
 
@@ -160,19 +160,19 @@ BODIES = {
     ),
     "a long strip, 24 neighbours": (
         {"body": grid(3000, 10), "neighbours": {"type": "chebyshev", "shells": 2}},
-        "42056 particles with 24 neighbours each, 33333 at most",
+        "42056 particles with 24 neighbours each exceed the maximum of 33333",
     ),
     "many neighbours": (
         {"neighbours": {"type": "chebyshev", "shells": 16}},
-        "1764 particles with 1088 neighbours each, 168 at most",
+        "1764 particles with 1088 neighbours each exceed the maximum of 168",
     ),
     "a large body, a frame that lags": (
         {"body": grid(225, 225), "frame": {"type": "mean", "lag": 1}},
-        "51529 particles, 50000 at most",
+        "51529 particles exceed the maximum of 50000",
     ),
     "a large body that nothing holds": (
         {"body": grid(225, 225), "leaders": []},
-        "51529 particles, 50000 at most",
+        "51529 particles exceed the maximum of 50000",
     ),
 }
 
@@ -182,8 +182,10 @@ def test_what_would_take_long_is_left_out_with_a_word(parts: Any, said: str) -> 
     found, took = checked(diagnostics=[], **parts)
     assert took < 2 * SOON_S
     assert found.spectral_radius is found.lag is None
-    (warning,) = [w for w in found.warnings if "left out" in w]
-    assert warning.startswith("analysis: the spectrum and the lag are left out, ")
+    (warning,) = [w for w in found.warnings if "omitted" in w]
+    assert warning.startswith(
+        "analysis: the spectrum and the distance from equilibrium are omitted, "
+    )
     assert said in warning
 
 

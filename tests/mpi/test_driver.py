@@ -179,7 +179,7 @@ def test_what_the_certificate_says_is_true(tmp_path):
 
 BREAKING = {"type": "threshold", "thresholds": [1.9]}
 REFUSED = {
-    "an equilibrium with bonds that break": {"fracture": BREAKING},
+    "an equilibrium with breaking bonds": {"fracture": BREAKING},
     "an equilibrium before obstacles": {
         "obstacles": [{"shape": DISC | {"centre": [99.0, 17.0]}, "motion": {"type": "hold"}}]
     },
@@ -187,16 +187,16 @@ REFUSED = {
     "the equilibrium of rule 'strain-gradient', which applies twice": {
         "rule": {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 0.5}
     },
-    "the equilibrium of a lattice with several sites a cell": {
+    "an equilibrium on a lattice with several sites per cell": {
         "lattice": {"type": "hexagonal", "a": 1.0},
         "neighbours": FOUR,
     },
-    "an equilibrium whose neighbours lie farther": BARYCENTRE
+    "an equilibrium with neighbours beyond": BARYCENTRE
     | {"neighbours": {"type": "chebyshev", "shells": 2}, "frame": {"type": "none"}},
     "an equilibrium by method 'lu'": {"solver": MULTIGRID | {"method": "lu"}},
-    "leaders must hold all of the body": {"leaders": []},
-    "its frame show particles nearby": {"frame": Turning()},
-    "each axis move the other or neither": {
+    "leaders must constrain the whole body": {"leaders": []},
+    "frame points must follow nearby particles": {"frame": Turning()},
+    "axes must be mutual or absent": {
         "rule": {"type": "mixed-coordinate", "K": -0.004},
         "frame": {"type": "mean"},
     },
@@ -220,7 +220,7 @@ def test_where_the_iteration_gets_nowhere_one_process_is_asked_for(tmp_path, mon
     monkeypatch.setattr(LatticeSystem, "solve", stuck)
     refused = on_ranks(2, lambda ranks: ended(strip(), tmp_path / "out.nc", ranks))
     assert refused[0] == refused[1]
-    assert refused[0].startswith("solver: the iteration that several processes share gets nowhere")
+    assert refused[0].startswith("solver: the distributed iteration does not converge")
 
 
 one_of = st.sampled_from
@@ -366,7 +366,7 @@ def test_what_cannot_be_shared_the_first_process_runs_alone(name, settings, tmp_
     how = [word for setting in settings for word in ("--set", setting)]
     done = pbdkit_on(2, "run", name, *how, "-o", "two.nc", folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("; the first of them runs it alone") == 1
+    assert done.stderr.count("; the first process runs it alone") == 1
     assert done.stdout.count("complete: ") == 1
     given_ = pbdkit.load(name, settings=settings).model_dump(mode="json", by_alias=True)
     written(given_, tmp_path / "one.nc")

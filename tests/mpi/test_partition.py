@@ -216,7 +216,9 @@ def test_what_is_wrong_is_said_where_the_whole_cannot_be_built(tmp_path, monkeyp
     with pytest.raises(pbdkit.ExperimentError, match="selects no particle"):
         on_ranks(3, lambda ranks: written(sheet(**LARGE | nobody), tmp_path / "out.nc", ranks))
     bounded(monkeypatch, 6)
-    with pytest.raises(pbdkit.ExperimentError, match=r"in each process.*start more on other"):
+    with pytest.raises(
+        pbdkit.ExperimentError, match=r"in each process.*start more processes on other"
+    ):
         on_ranks(3, lambda ranks: written(sheet(**LARGE), tmp_path / "out.nc", ranks))
 
 

@@ -266,7 +266,7 @@ def test_numbers_are_thinned_where_they_would_overprint(bodies, monkeypatch):
 
 REFUSED = {
     "not recorded": ({"time": 7000}, "step 7000 was not recorded; the nearest recorded: 400"),
-    "no time": ({"time": []}, "a figure needs at least one time"),
+    "no time": ({"time": []}, "a figure requires at least one time"),
     "misspelt": (
         {"color": "pe1_intat"},
         "'pe1_intat' cannot be drawn; did you mean 'pe1_intact'? drawable: position, ",
@@ -274,21 +274,27 @@ REFUSED = {
     "component": ({"color": "position_z"}, "did you mean 'position_"),
     "not measured": ({"color": "u_x"}, "add {type: displacement} to `diagnostics`"),
     "of nothing": ({"color": "track"}, "'track' cannot be drawn"),
-    "field of names": ({"contours": True}, "contours need numbers at particles as color"),
-    "field of bonds": ({"color": "broken_step", "filled": True}, "contours need numbers at"),
-    "dots and contours": ({"color": "pe1", "filled": False, "contours": True}, "need filled=True"),
+    "field of names": ({"contours": True}, "contours require values at particles"),
+    "field of bonds": ({"color": "broken_step", "filled": True}, "contours require values at"),
+    "dots and contours": (
+        {"color": "pe1", "filled": False, "contours": True},
+        ("require filled=True"),
+    ),
     "limits": (
         {"color": "pe1", "vmin": 2.0, "vmax": 1.0},
         "2 (vmin), is not below the upper one, 1",
     ),
-    "map": ({"color": "pe1", "cmap": "virids"}, "'virids' is not a colour map; did you mean"),
+    "map": (
+        {"color": "pe1", "cmap": "virids"},
+        "'virids' is not a colour map of matplotlib; did you mean",
+    ),
     "size": (
         {"figsize": (0.0, 3.0)},
         "a height in inches, each above 0 and at most 100; got (0.0, 3",
     ),
-    "no room": ({"figsize": (0.4, 0.4)}, "figsize: 0.4 by 0.4 inches leave no room for 1 panels"),
+    "no room": ({"figsize": (0.4, 0.4)}, "figsize: 0.4 by 0.4 inches are too small for 1 panels"),
     "dpi": ({"dpi": 5}, "dpi: 5 is not between 10 and 2400"),
-    "axes": ({"time": [0, 1], "ax": []}, "2 steps need as many axes; 0 are given"),
+    "axes": ({"time": [0, 1], "ax": []}, "expected one axes for each of 2 steps, got 0"),
 }
 
 
@@ -303,14 +309,14 @@ def test_what_makes_no_picture_is_refused(torn, name):
 def test_bonds_that_are_not_there_are_refused(tensile):
     ds = pbdkit.run(tensile | {"fracture": {"type": "none"}, "diagnostics": []}, progress=False)
     for look in ({"bonds": True}, {"broken": True}):
-        with pytest.raises(ExperimentError, match="there are no bonds to draw"):
+        with pytest.raises(ExperimentError, match="the dataset has no bonds to draw"):
             plot(ds, **look)
 
 
 def test_what_has_no_places_is_refused(torn):
     with pytest.raises(ExperimentError, match="keep the variable `position`"):
         torn.drop_vars(["position", "reference"]).pbd.plot()
-    with pytest.raises(ExperimentError, match="no particle has a place in what is to be drawn"):
+    with pytest.raises(ExperimentError, match="there are no positions to draw: all are NaN"):
         torn.assign(position=torn.position * np.nan).pbd.plot()
 
 
@@ -484,9 +490,9 @@ def test_a_difference_is_of_particles_of_one_number(bodies):
     np.testing.assert_allclose(body, dots.get_offsets()[~dots.get_array().mask][:, 0], atol=1e-9)
     moved = compare(ds.isel(time=[0]), ds, difference=True)  # of positions, about the rest
     assert moved.get_title() == "a/plate less a/plate, step 12"
-    with pytest.raises(ExperimentError, match="no particle in common: no number is in both"):
+    with pytest.raises(ExperimentError, match="have no particle in common"):
         compare(ds.isel(particle=[0]), ds.isel(particle=[1]), color="pe1", difference=True)
-    with pytest.raises(ExperimentError, match="of particles, and 'broken_step' is one of bonds"):
+    with pytest.raises(ExperimentError, match="of particles, but 'broken_step' is one of bonds"):
         compare(ds, ds, color="broken_step", difference=True)
 
 

@@ -171,22 +171,25 @@ def test_the_crack_of_a_part_of_a_body_is_that_between_its_particles(torn):
     assert 0 < (there & of_body).sum() < of_body.sum()
     (line,) = drawn(part.pbd.crack("bonds"))
     assert line[1].max() == (there & of_body).sum()
-    with pytest.raises(pbdkit.ExperimentError, match="no broken bond is between particles"):
+    with pytest.raises(pbdkit.ExperimentError, match="the dataset does not contain both particles"):
         torn.isel(particle=[0, 1]).pbd.crack()
 
 
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ({}, "no particle is given; write history('u', particle=67), or i=4, j=5"),
-        ({"particle": 999}, "there is no particle 999; there are 56"),
-        ({"particle": 3, "i": 1}, "by number or by i and j, not by both"),
+        ({}, "expected a particle; write history('u', particle=67), or i=4, j=5"),
+        ({"particle": 999}, "there is no particle 999; the dataset has 56 particles"),
+        ({"particle": 3, "i": 1}, "either by number or by i and j, not by both"),
         ({"i": 77, "j": 1}, "there is no particle at i=77, j=1"),
         ({"name": "broken_bonds", "particle": 3}, "no values at particles; `curve` draws it"),
         ({"name": "stress_xx", "particle": 3}, "add {type: stress, youngs_modulus: ...} to"),
         ({"name": "pe11", "particle": 3}, "did you mean 'pe1'?"),
-        ({"bond": (1, 2, 3)}, "named by two numbers of particles, not by [1, 2, 3]"),
-        ({"name": "pe1", "bond": (19, 20)}, "bonds have no history of 'pe1'; they have ['strain']"),
+        ({"bond": (1, 2, 3)}, "given by two numbers of particles, got [1, 2, 3]"),
+        (
+            {"name": "pe1", "bond": (19, 20)},
+            ("bonds have no history of 'pe1'; available: ['strain']"),
+        ),
         ({"name": "track"}, "add {type: track, numbers: ...} to `diagnostics`"),
     ],
 )
@@ -302,10 +305,10 @@ def test_maps_of_cracks_keep_their_legend_within_given_axes(torn):
         ({"kind": "load-displacement"}, "{type: load-displacement, youngs_modulus: ...} for loads"),
         (
             {"kind": "speed"},
-            "there is no curve 'speed'; there are stress-strain, load-displacement",
+            "there is no curve 'speed'; use one of stress-strain, load-displacement",
         ),
-        ({"y": "pe1", "kind": "energies"}, "give y or the kind 'energies', not both"),
-        ({"y": "position"}, "'position' is a vector; take one of 'position_x', 'position_y'"),
+        ({"y": "pe1", "kind": "energies"}, "give either y or the kind 'energies', not both"),
+        ({"y": "position"}, "'position' is a vector; use one of 'position_x', 'position_y'"),
         ({"y": "strain_energy"}, "add {type: strain-energy, youngs_modulus: ...} to `diagnostics`"),
         ({"y": "reaction_x"}, "add {type: reaction, youngs_modulus: ...} to `diagnostics`"),
     ],
@@ -419,8 +422,8 @@ def test_far_cracks_are_not_added_up():
 @pytest.mark.parametrize(
     ("of", "kind", "said"),
     [
-        ("pulled", "map", "no bond could break: give the experiment `fracture` or `cuts`"),
-        ("torn", "paths", "no picture 'paths' of a crack; take map, length, bonds"),
+        ("pulled", "map", "no bond can break in this run; add `fracture` or `cuts`"),
+        ("torn", "paths", "'paths' is not a picture of a crack; use one of map, length, bonds"),
     ],
 )
 def test_what_has_no_crack_is_said(of, kind, said, request):
@@ -431,7 +434,7 @@ def test_what_has_no_crack_is_said(of, kind, said, request):
 
 def test_where_nothing_broke_nothing_is_drawn():
     whole = run(steps=1, fracture={"type": "threshold", "thresholds": [9.0]})
-    with pytest.raises(pbdkit.ExperimentError, match="no bond broke, nothing is to be drawn"):
+    with pytest.raises(pbdkit.ExperimentError, match="there is no crack to draw: no bond broke"):
         whole.pbd.crack()
 
 
@@ -498,7 +501,7 @@ def test_one_command_draws_them_all(call, tmp_path, monkeypatch):
     assert "exists; --force replaces it" in call("curve", "d.nc", "crack").err
     refused = call("curve", "d.nc", "stress-strain")
     assert refused.code == 2
-    assert "d.nc: stress over strain needs the diagnostic stress-strain" in refused.err
+    assert "d.nc: a stress-strain curve requires the diagnostic stress-strain" in refused.err
 
 
 def test_the_command_draws_sweeps(call, tmp_path, monkeypatch):

@@ -80,7 +80,7 @@ def test_some_steps_only_and_the_last_in_any_case(torn, tmp_path):
 @pytest.mark.parametrize(
     ("name", "look", "message"),
     [
-        ("torn.avi", {}, "torn.avi: a movie ends in .mp4 or .gif"),
+        ("torn.avi", {}, "torn.avi: the name of a movie must end in .mp4 or .gif"),
         ("torn.gif", {"fps": 100.0}, "fps: 100 is not between 0.1 and 50"),
         ("torn.gif", {"every": 0}, "every: 0 is below 1; 1 shows all recorded steps"),
         ("torn.mp4", {"color": "pe3"}, "'pe3' cannot be drawn; did you mean"),
@@ -131,7 +131,7 @@ def test_the_command_makes_movies_and_replaces_none(call, tmp_path, monkeypatch)
     assert (again.code, "f2.mp4: exists; --force replaces it" in again.err) == (2, True)
     assert call("animate", "f2.nc", "-o", "f2.gif", "--force", *look).code == 0
     wrong = call("animate", "f2.nc", "-o", "f2.png")
-    assert (wrong.code, "a movie ends in .mp4 or .gif" in wrong.err) == (2, True)
+    assert (wrong.code, "the name of a movie must end in .mp4 or .gif" in wrong.err) == (2, True)
 
 
 def test_notebooks_have_an_animation_of_no_more_than_sixty_steps(torn):

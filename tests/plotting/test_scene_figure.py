@@ -180,7 +180,7 @@ def test_large_bodies_are_small_pages():
 
 def test_what_takes_long_is_said_to_be_left_out(monkeypatch):
     monkeypatch.setattr(notebook, "LARGEST", 10)
-    assert "not looked at for" in pbdkit.load("paper/a")._repr_html_()
+    assert "not computed for" in pbdkit.load("paper/a")._repr_html_()
 
 
 def test_pages_say_what_check_says(call):
@@ -236,8 +236,8 @@ def test_a_colour_stands_once_in_the_legend():
 def test_at_an_equilibrium_no_steps_are_told():
     page = pbdkit.load("material/bar")._repr_html_()
     text = "".join(ElementTree.fromstring(page).itertext())
-    assert "goes straight to the equilibrium" in text
-    assert "settles" not in text
+    assert "computes the equilibrium directly" in text
+    assert "converges" not in text
 
 
 @pytest.mark.parametrize("of", [pbdkit.analyse, pbdkit.identify])

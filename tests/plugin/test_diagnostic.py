@@ -109,7 +109,9 @@ def test_a_dimension_with_a_name_of_ours_is_refused(name):
         def coordinates(self):
             return {}
 
-    message = f"declares the dimension '{name}', and that name is taken in the dataset"
+    message = (
+        f"declares the dimension '{name}', but the dataset already has a variable or dimension"
+    )
     for kind in (Named, OwnLength):
         with pytest.raises(pbdkit.PluginError, match=message):
             pbdkit.run(experiment(diagnostics=[kind(dimension=name)], steps=1), progress=False)
@@ -119,10 +121,10 @@ def test_a_dimension_and_a_variable_of_others_have_names_of_their_own_too():
     for other in (Named(dimension="mine"), Named(dimension="named", variable="mine")):
         given = experiment(diagnostics=[Named(dimension="named", variable="other"), other], steps=1)
         if other.dimension == "named":
-            with pytest.raises(pbdkit.PluginError, match="the dimension 'named', and that name is"):
+            with pytest.raises(pbdkit.PluginError, match="the dimension 'named', but the dataset"):
                 pbdkit.run(given, progress=False)
         else:
-            with pytest.raises(pbdkit.PluginError, match="the variable 'named', and that name is"):
+            with pytest.raises(pbdkit.PluginError, match="the variable 'named', but the dataset"):
                 pbdkit.run(given, progress=False)
 
 
@@ -194,6 +196,6 @@ def test_smallest_cell_area_is_the_area_of_a_concave_cell():
               for p in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])]  # fmt: skip
     asked = [{"type": "smallest-cell-area"}]
     given = experiment(2, 2, leaders=leaders + others, diagnostics=asked, steps=1)
-    with pytest.warns(pbdkit.PbdkitWarning, match="folded: 1 of 1 cells have a corner"):
+    with pytest.warns(pbdkit.PbdkitWarning, match="folded: 1 of 1 cells have an inverted corner"):
         ds = pbdkit.run(given, progress=False)
     assert ds.smallest_cell_area.values == pytest.approx([1.0, 0.4])

@@ -68,8 +68,8 @@ def test_order_does_not_choose_a_distribution(install: Install, tensile: Any) ->
     with pytest.raises(pbdkit.ExperimentError) as caught:
         pbdkit.Experiment(**tensile | {"rule": {"type": "twin"}})
     assert str(caught.value) == (
-        "rule.type: 'twin' is offered by several distributions: "
-        "write 'pbdkit-one:twin', 'pbdkit-two:twin'"
+        "rule.type: 'twin' is offered by several distributions; write 'pbdkit-one:twin', "
+        "'pbdkit-two:twin'"
     )
     chosen = pbdkit.Experiment(**tensile | {"rule": {"type": "pbdkit-two:twin"}})
     assert type(chosen.rule).__module__ == "pbdkit_two"

@@ -468,7 +468,7 @@ def test_a_frame_that_reads_no_number_is_made_once(monkeypatch):
 
 def test_kernels_leave_frames_that_follow_a_course_to_numpy():
     scene = build_scene(leaning(engine="auto", **FOLLOWING["parameter"]))
-    assert "numbers change in time by which the frame follows" in what_kernels_lack(scene)
+    assert "the weights of the frame are time-dependent" in what_kernels_lack(scene)
 
 
 class Behind(StrainGradient):
@@ -483,7 +483,7 @@ class Behind(StrainGradient):
 def test_kernels_leave_inner_rules_whose_weights_change_to_numpy():
     rule = Behind(poisson_ratio=0.2, length=course([2, 15], [0.1, 0.4]))
     scene = build_scene(pbdkit.Experiment(**sheet(rule=rule)))
-    assert what_kernels_lack(scene) == "numbers change in time that are written into kernels"
+    assert what_kernels_lack(scene) == "constants of kernels are time-dependent"
 
 
 def test_the_spectrum_on_the_way_is_that_of_the_frame_on_the_way():
@@ -523,7 +523,7 @@ def test_turns_of_a_live_session_move_the_frame_too(tmp_path):
 def test_several_processes_leave_frames_that_follow_a_course_to_one():
     def begun(ranks):
         scene = ranks.scene(leaning(**FOLLOWING["parameter"]))
-        with pytest.raises(NotSharedError, match=r"^frame: a frame whose map follows numbers"):
+        with pytest.raises(NotSharedError, match=r"^frame: a frame that depends on time-dependent"):
             ranks.run(scene, Watch())
         return True
 

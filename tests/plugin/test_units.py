@@ -245,7 +245,7 @@ STRESS_OF = [{"type": "stress", "youngs_modulus": 70e3}]
         ({"lattice": {"type": "square", "a": "2 s"}}, "lattice.a: '2 s' is not a length"),
         ({"lattice": {"type": "square", "a": "2"}}, "lattice.a: should be a valid number, got '2'"),
         ({"lattice": {"type": "square", "a": "-1 mm"}}, "lattice.a: should be greater than"),
-        ({"initial": SHIFTED}, "got '1 mm'; this takes a plain number, and no unit"),
+        ({"initial": SHIFTED}, "got '1 mm'; expected a plain number without a unit"),
         (
             {"units": {"length": "1 mm"}},
             "diagnostics.1.youngs_modulus: is missing; give it here, or",
@@ -314,9 +314,9 @@ def test_check_says_forces_as_the_file_does(call: Any) -> None:
 def test_the_lag_behind_leaders_is_told_in_mm(call: Any) -> None:
     given = ["paper/a", "--set", "units={length: 2 mm}"]
     told = call("check", *given, "--verbose").out
-    assert "moves by 0.7 mm a step and leaves the body 4.09 mm behind" in told
+    assert "moves by 0.7 mm per step, which brings the body 4.09 mm from equilibrium" in told
     assert "more than a bond (2 mm)" in told
-    assert "mm behind equilibrium if the leaders' fastest steps went on" in told
+    assert "mm from equilibrium if the leaders continue at their fastest" in told
 
 
 def test_units_that_are_those_wanted_are_read_without_pint(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -252,7 +252,7 @@ class Trial:
             if code == 0 or files() != before:
                 what = f"changed {changed(before, files())}"
                 self.found.append(f"run ended with {code}, {what}: {told}")
-        if "--anyway goes on from the last commit" in said:
+        if "--anyway continues from the last commit" in said:
             self.outcome = "named, gone on with on request"
             code, told = self.call("anyway", ["resume", OUTPUT, "--anyway"])
             if code == 0 and (wrong := result_is_other(self.whole)):

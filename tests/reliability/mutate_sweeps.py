@@ -203,7 +203,7 @@ def tried(kind: str, right: dict[str, Any], base: Path, others: list[Path], seed
     if aside.exists() and files(aside) != {n: b for n, b in damaged.items() if ".new" not in n}:
         found.append(f"what was set aside is not what was there: {said}")
     code, said = done(*COMMAND, log=Path("log"), before=begin)
-    if code or "warning" in said or "0 run now, 8 before" not in said:
+    if code or "warning" in said or "0 run now, 8 stored before" not in said:
         found.append(f"the next call: {code}, {said[-1500:]}")
     elif content(Path("s/sweep.nc")) != right:
         found.append("the next call: other values")

@@ -24,7 +24,7 @@ from scene_laws import LAWS, Faults, Tree
 
 import pbdkit
 
-REFUSED = "nothing holds a part"
+REFUSED = "is loaded, but not constrained"
 """A part that comes off a torn body cannot rest: the one refusal in which a scene may end."""
 
 

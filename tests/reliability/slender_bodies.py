@@ -201,7 +201,7 @@ def trial(experiment: dict[str, Any], known: dict[str, Any]) -> str:
     except pbdkit.DivergedError:
         return f"{supports}, {method}: unconverged"
     except pbdkit.ExperimentError as error:
-        drifts = "pushed on for ever" in str(error)
+        drifts = "is loaded, but not constrained" in str(error)
         if supports == "clamped":
             return f"{supports}: too soft" if not drifts else f"differs: refused, {error}"
         return f"{supports}: pushed on for ever" if drifts else f"{supports}: refused"

@@ -272,10 +272,10 @@ def test_check_refuses_what_has_no_equilibrium_as_run_does(
     checked, run = call("check", "bar.json"), call("run", "bar.json")
     assert (checked.code, run.code) == (0, 0) if is_held else (2, 2)
     if not is_held:
-        assert "nothing holds a part of 5" in checked.err
+        assert "a part of 5" in checked.err
         assert checked.err == run.err
     steps = call("check", "bar.json", "--set", "solver={type: stepping}", "--set", "steps=90000")
-    assert ("loads: nothing holds a part of" in steps.out) == (not is_held)
+    assert ("loads: a part of" in steps.out) == (not is_held)
 
 
 def test_of_two_bodies_the_one_that_is_not_held_is_named() -> None:
@@ -290,7 +290,7 @@ def test_run_warns_of_leaders_that_are_too_fast_as_check_does(call: Any) -> None
     fast = {"type": "velocity", "velocity": [0.3, 0.0], "steps": 10}
     leaders = [*bar()["leaders"], {"select": {"edge": "right"}, "motion": fast}]
     Path("bar.json").write_text(json.dumps(bar(leaders=leaders, loads=[])))
-    told = "leaders: in steps 1 to 10 the fastest moves by 0.3 a step and leaves the body"
+    told = "leaders: in steps 1 to 10 the fastest moves by 0.3 per step, which brings the body"
     lines = [line for line in call("check", "bar.json").out.splitlines() if "warning" in line]
     run = call("run", "bar.json")
     assert run.err.splitlines() == lines

@@ -159,24 +159,39 @@ class Writing(pbdkit.plugin.RenewsBonds, Keeping):
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (Shortened, r"'plain' draws 'age' with the shape \(3,\), finite: True; needed are"),
-        (Infinite, r"'plain' draws 'age' with the shape \(\d+,\), finite: False; needed are"),
-        (Misspelt, "'plain' draws 'agee', which it does not remember; did you mean 'age'?"),
+        (Shortened, r"'plain' draws 'age' with the shape \(3,\), finite: True; expected"),
+        (Infinite, r"'plain' draws 'age' with the shape \(\d+,\), finite: False; expected"),
+        (
+            Misspelt,
+            "'plain' draws 'agee', which is not among its state variables; did you mean 'age'?",
+        ),
         (Twice, "the number 'age' is declared 2 times, by FractureModel 'plain' and FollowerRule"),
-        (Taken, "a part remembers 'shell' of each bond, and that name is taken in the dataset"),
-        (Worded, "'the age' is not the name of a variable; use letters, digits and _"),
-        (Typed, "'age' has the dtype 'f4', not f8, i1, i2, i4, i8"),
-        (Generous, "it returned 2 values, and it remembers 1 that change: declare `changes=False`"),
-        (Bare, "step 1: `update` returned ndarray, not a tuple: write `\\(value,\\)`"),
+        (Taken, "declares the state variable 'shell' of each bond, but the dataset already has"),
+        (Worded, "'the age' is not a valid name of a variable; use letters, digits and _"),
+        (Typed, "'age' has the dtype 'f4'; expected one of f8, i1, i2, i4, i8"),
+        (Generous, "it returned 2 values for 1 changing state variables; declare `changes=False`"),
+        (Bare, "step 1: `update` returned ndarray, not a tuple; write `\\(value,\\)`"),
         (Loose, "to declare its remembered numbers: `remembered` returned Remembered, not a tuple"),
         (
             Tangled,
-            "'tangled' failed to place .*: `fictitious` returned tuple: return a vector, as",
+            "'tangled' failed to place .*: `fictitious` returned tuple; return a vector, as",
         ),
-        (Measured, "'plain' failed at step 1: `breaks` returned float64: compare, as in"),
-        (Silent, "'plain' failed at step 1: `breaks` returned None: compare, as in"),
+        (
+            Measured,
+            (
+                "'plain' failed at step 1: `breaks` returned float64, not booleans; return a "
+                "comparison, as in"
+            ),
+        ),
+        (
+            Silent,
+            (
+                "'plain' failed at step 1: `breaks` returned None, not booleans; return a "
+                "comparison, as in"
+            ),
+        ),
         (Misshapen, "'plain' failed at step 1: ValueError: operands could not be broadcast"),
-        (Constant, "to return its constants: TypeError: it returned float, not numbers by name"),
+        (Constant, "to return its constants: TypeError: it returned float; return numbers by name"),
         (Fractional, "failed at step 1.*same_kind"),
         (Writing, "failed at step 1.*read-only"),
     ],
@@ -203,9 +218,11 @@ class Aged(pbdkit.Diagnostic):
 
 
 def test_a_diagnostic_measures_what_is_remembered_under_a_name_of_its_own():
-    with pytest.raises(pbdkit.ExperimentError, match="adds the variable 'age'; fracture does too"):
+    with pytest.raises(
+        pbdkit.ExperimentError, match=("adds the variable 'age'; so does fracture; remove one")
+    ):
         pbdkit.run(SHEET | {"fracture": Keeping(), "diagnostics": [Aged()]}, progress=False)
-    with pytest.raises(pbdkit.PluginError, match="no part remembers 'age'"):
+    with pytest.raises(pbdkit.PluginError, match="no component has a state variable 'age'"):
         pbdkit.run(SHEET | {"diagnostics": [Aged()]}, progress=False)
 
 
@@ -223,13 +240,13 @@ class Odd(pbdkit.Diagnostic):
 
 
 def test_a_dimension_of_its_own_has_one_length():
-    with pytest.raises(pbdkit.PluginError, match=r"'other' has the shape \(4,\), not \(3,\)"):
+    with pytest.raises(pbdkit.PluginError, match=r"'other' has the shape \(4,\), expected \(3,\)"):
         pbdkit.run(SHEET | {"diagnostics": [Odd()]}, progress=False)
 
 
 def test_a_rule_that_remembers_has_no_equilibrium():
     given = SHEET | {"rule": Tiring(), "solver": {"type": "equilibrium"}}
-    message = "the rule 'tiring' depends on the history, so that the limit of the steps depends"
+    message = "the rule 'tiring' depends on the history, so that there is no equilibrium that is"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         pbdkit.run(given, components=[Tiring], progress=False)
 

@@ -190,7 +190,10 @@ def test_a_released_body_is_where_its_steps_are():
 
 @pytest.mark.parametrize("rule", [ELASTIC, SPRINGS], ids=["elastic", "springs"])
 def test_what_nothing_holds_has_no_equilibrium(rule):
-    with pytest.raises(pbdkit.ExperimentError, match="nothing holds a part of 24 particles"):
+    with pytest.raises(
+        pbdkit.ExperimentError,
+        match=r"a part of 24 particles \(with number .* is loaded, but not constrained",
+    ):
         ran(loaded(TIP, rule=rule, **FREE))
 
 

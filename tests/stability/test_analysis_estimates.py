@@ -83,10 +83,13 @@ def test_stability_follows_from_the_estimate(monkeypatch):
 
 
 LEFT_OUT = {
-    "period": ({"solver": {"type": "stepping", "memory": 0.3}}, "the period is left out, a body"),
+    "period": (
+        {"solver": {"type": "stepping", "memory": 0.3}},
+        "the period is omitted, because a body",
+    ),
     "edges": (
         {"frame": {"type": "none"}, "solver": {"type": "stepping", "relaxation": 0.95}},
-        "0.95 is near the bound of plane waves, 1.006, and edges without a frame",
+        "0.95 is near the bound of plane waves, 1.006, and at edges without a frame",
     ),
 }
 
@@ -107,14 +110,15 @@ def test_a_lag_without_a_hold_is_left_out_with_a_word(monkeypatch):
     assert analysis.spectrum
     assert analysis.trailing is None
     assert any(
-        "the lag is left out, the leaders do not constrain" in w for w in analysis.warnings()
+        "the distance from equilibrium is omitted, because the leaders do not " in w
+        for w in analysis.warnings()
     )
 
 
 def test_neighbours_found_anew_are_not_analysed_and_check_says_so():
     anew = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
-    (said,) = [w for w in pbdkit.analyse(experiment(neighbours=anew)).warnings() if "left out" in w]
-    assert said.endswith("are left out, neighbours are searched at every step")
+    (said,) = [w for w in pbdkit.analyse(experiment(neighbours=anew)).warnings() if "omitted" in w]
+    assert said.endswith("are omitted, neighbours are re-evaluated at every step")
 
 
 def test_check_answers_for_a_body_that_is_too_large_for_a_matrix(call):
@@ -124,4 +128,4 @@ def test_check_answers_for_a_body_that_is_too_large_for_a_matrix(call):
     assert figures["estimated"]
     assert figures["stable"]
     assert figures["lag"] == pytest.approx(4 * 0.01 * 230**2 / (9 * math.sqrt(3)), rel=0.02)
-    assert not any("left out" in w for w in figures["warnings"])
+    assert not any("omitted" in w for w in figures["warnings"])

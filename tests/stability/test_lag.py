@@ -173,13 +173,13 @@ def test_check_says_the_lag_and_warns_of_a_large_one(call, speed, warned):
     assert figures["lag_reached"] == pytest.approx(reached, rel=1e-4)
     said = call(*arguments, "--verbose").out
     assert (
-        f"lag        {steady:.4g} lattice units behind equilibrium if the leaders' fastest steps "
-        f"went on, {reached:.4g} when they end"
+        f"distance   {steady:.4g} lattice units from equilibrium if the leaders continue at their "
+        f"fastest, and {reached:.4g} at the end of these steps"
     ) in said
     expected = (
-        "leaders: in steps 1 to 10 the fastest moves by 0.35 a step and leaves the body 2.04 "
-        "behind its equilibrium, more than a bond (1): its speed determines the strain of bonds; "
-        "move by less than 0.05 a step, or take solver: {type: equilibrium}"
+        "leaders: in steps 1 to 10 the fastest moves by 0.35 per step, which brings the body 2.04 "
+        "from equilibrium, more than a bond (1): the strain of bonds depends on this speed; "
+        "move by less than 0.05 per step, or use solver: {type: equilibrium}"
     )
     assert (expected in figures["warnings"]) == warned
     assert (expected in said) == warned

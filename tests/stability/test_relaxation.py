@@ -118,13 +118,14 @@ def test_a_result_holds_the_numbers_and_is_made_again_from_them():
 @pytest.mark.parametrize(
     ("parts", "text"),
     [
-        ({"frame": {"type": "mean", "lag": 1}}, "a frame with lag reads earlier ones; set "
+        ({"frame": {"type": "mean", "lag": 1}}, "a frame with lag depends on earlier ones; set "
          "frame.lag: 0, or give numbers"),
         ({"neighbours": {"type": "euclidean", "radius": 1.1, "reevaluate": True}},
-         "there is none if neighbours are searched at every step; set "
+         "which does not exist if neighbours are re-evaluated; set "
          "neighbours.reevaluate: false"),
-        ({"solver": AUTO | {"relaxation": 4.0}}, "no memory lets all modes decay with relaxation "
-         "4; give numbers, or leave them out (relaxation 1, memory 0)"),
+        ({"solver": AUTO | {"relaxation": 4.0}}, "no value of memory makes all modes decay with "
+                                                 "relaxation "
+         "4; give numbers, or omit them (relaxation 1, memory 0)"),
     ],
 )  # fmt: skip
 def test_where_there_is_no_choice_the_remedy_is_named(parts, text):
@@ -139,7 +140,7 @@ def test_check_says_what_is_chosen_and_of_what(call):
     linear = call("check", "paper/a", *auto).out
     assert "  chosen     relaxation 1.83, memory 0.789057\n" in linear
     torn = call("check", "paper/d1", *auto).out
-    assert ", of the step linearised at rest: the rule is not linear or bonds can break" in torn
+    assert ", for the step linearised at rest: the rule is not linear or bonds can break" in torn
     found = json.loads(call("check", "paper/a", "--json", *auto[:2]).out)
     assert (found["relaxation"], found["memory"]) == (1.0, pytest.approx(0.841661, abs=1e-6))
 

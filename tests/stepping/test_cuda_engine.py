@@ -127,7 +127,7 @@ def test_without_the_option_products_and_sums_are_contracted_and_that_is_refused
     from pbdkit.stepping import cuda_engine as kernel
 
     monkeypatch.setattr(kernel, "_uncontracted", nullcontext)
-    with pytest.raises(pbdkit.PbdkitError, match="contracts products and sums, whatever it is"):
+    with pytest.raises(pbdkit.PbdkitError, match="contracts products and sums in spite of"):
         text_of(gpu_cases.scene_of(sheet()), device)
 
 
@@ -135,7 +135,7 @@ NEWTON = [{"select": {"edge": "right"}, "motion": {"type": "newton", "mass": 1.0
 WALL = {"shape": {"type": "disc", "radius": 1.0, "centre": [20.0, 20.0]}}
 SPRINGS = {"type": "springs"}
 REFUSED = {
-    "neighbours are found anew": sheet(neighbours=ANEW),
+    "neighbours are re-evaluated": sheet(neighbours=ANEW),
     "leaders are clamped": vanes(**CASES["clamped"]),
     "leaders move by Newton's law": sheet(
         **gpu_cases.WHOLE, rule={"type": "springs"}, leaders=NEWTON
@@ -152,7 +152,7 @@ def test_what_it_cannot_do_is_refused_with_a_reason(why, monkeypatch):
     assert what_gpus_lack(scene) == why
     with pytest.raises(pbdkit.ExperimentError) as refused:
         choose(scene)
-    remedy = f"solver.engine: the GPU engine cannot be had: {why}; take `engine: auto`"
+    remedy = f"solver.engine: the GPU engine is not available: {why}; use `engine: auto`"
     assert str(refused.value) == remedy
     assert refused.value.where == ("solver", "engine")
 

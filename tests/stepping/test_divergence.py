@@ -78,7 +78,7 @@ def test_not_a_number_is_found(every):
     assert np.isfinite(caught.value.dataset.position).all()
 
 
-@pytest.mark.filterwarnings("ignore:leaders. there are none")
+@pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
 def test_a_far_start_and_a_released_leader_are_no_divergence():
     start = {"type": "affine", "gradient": [[0.0, 0.0], [0.0, 0.0]], "shift": [1e9, 0.0]}
     far = {"type": "displace", "displacement": [1e9, 0.0]}

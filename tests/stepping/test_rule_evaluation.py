@@ -129,9 +129,9 @@ class Infinite(Measured):
         return (np.full(len(now.reference()), np.inf),)
 
 
-DECLARE = "are given to rules that declare `uses_reference: ClassVar[bool] = True`"
+DECLARE = "exist only in rules that declare `uses_reference: ClassVar[bool] = True`"
 NO_NUMBER = "is not a number: convert it in `parameters` or `weights`"
-TUPLE = ", not a tuple: write `(value,)`"
+TUPLE = ", not a tuple; write `(value,)`"
 MISTAKES = {
     DividesByZero: ("particle 25, found at step 1", "a displacement is NaN", "in divide (test_ru",
                     "guard divisions and roots with `pbdkit.plugin.where`"),

@@ -99,7 +99,7 @@ def test_maps_are_drawn_at_rest_where_positions_were_not_kept(swept):
         ({"steel": 9}, "steel=9: no member has this value; there are 0.1, 0.2, 0.3"),
         (
             {"stel": 1},
-            "stel: is no parameter of this sweep; did you mean 'steel'? (",
+            "stel: is not a parameter of this sweep; did you mean 'steel'? (",
         ),
     ],
 )

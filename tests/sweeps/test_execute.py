@@ -164,22 +164,24 @@ def test_failures_stop_nobody_and_are_told(call, small):
     assert "1 members have no values" in told
     assert "relaxation=5.0" in told
     assert "diverged" in told
-    assert "left all bounds" in told
+    assert " diverged under rule " in told
     with pbdkit.open("s/sweep.nc") as found:
         assert found.status.values.tolist() == ["complete", "diverged", "complete"]
         assert found.position.isnull().all(["time", "particle", "axis"]).values[1]
-        assert "left all bounds" in str(found.message.values[1])
+        assert " diverged under rule " in str(found.message.values[1])
     again = call("sweep", "s.json", "--workers", "1")
     assert again.code == 5
-    assert "0 run now, 3 before" in again.out
+    assert "0 run now, 3 stored before" in again.out
     assert call("verify", "s/sweep.nc").code == 0
-    assert "holds all members of a sweep" in call("plot", "s/sweep.nc").err
+    assert "contains all members of a sweep" in call("plot", "s/sweep.nc").err
 
 
 def test_what_a_member_raises_is_its_own_fault(small, probing):
     probing("raise ValueError('no luck')")
     small["diagnostics"] = [{"type": "probe"}]
-    with pytest.warns(pbdkit.PbdkitWarning, match="1 of 2 members have no values, as failed"):
+    with pytest.warns(
+        pbdkit.PbdkitWarning, match="1 of 2 members have no values; the first is failed"
+    ):
         found = swept(small, vary={"steps": [2, 5]})
     assert found.status.values.tolist() == ["complete", "failed"]
     assert "no luck" in str(found.message.values[1])
@@ -206,7 +208,7 @@ def test_a_flipped_bit_is_named_and_that_member_runs_again(small, tmp_path, run_
     for column in ("content", "message", "status", "key", "digest"):
         flip(tmp_path / stores.DATABASE, column)
         run_only.clear()
-        with pytest.warns(pbdkit.PbdkitWarning, match=r"sweep\.sqlite: row \d+ is not what was"):
+        with pytest.warns(pbdkit.PbdkitWarning, match=r"sweep\.sqlite: row \d+ has changed since"):
             same(first, swept(small, **asked))
         assert len(run_only) == 1
 
@@ -234,7 +236,9 @@ def test_large_members_are_files_and_a_flipped_bit_in_one_is_named(
     content = bytearray(one.read_bytes())
     content[-1] ^= 1
     one.write_bytes(content)
-    with pytest.warns(pbdkit.PbdkitWarning, match="is not what was written; it runs again"):
+    with pytest.warns(
+        pbdkit.PbdkitWarning, match="has changed since it was written; it runs again"
+    ):
         same(first, swept(small, **asked))
     other.unlink()
     with pytest.warns(pbdkit.PbdkitWarning, match="cannot be read"):
@@ -284,7 +288,7 @@ def test_of_a_damaged_database_what_is_sound_stays_held(small, tmp_path, run_onl
     data[8192:8704] = bytes(512)  # the index of the keys
     path.write_bytes(data)
     run_only.clear()
-    with pytest.warns(pbdkit.PbdkitWarning, match="3 members of it are intact and stay stored"):
+    with pytest.warns(pbdkit.PbdkitWarning, match="its 3 intact members are now in a new one"):
         same(first, swept(small, **asked))
     assert run_only == []
 
@@ -388,7 +392,9 @@ def test_a_database_that_is_removed_while_a_sweep_runs_is_said_to_be(small, tmp_
     meanwhile(monkeypatch, lambda: (tmp_path / stores.DATABASE).unlink())
     with pytest.warns(pbdkit.PbdkitWarning, match="was removed or replaced during the sweep"):
         first = swept(small, **asked)
-    with pytest.warns(pbdkit.PbdkitWarning, match="is missing, or no database, and 2 members"):
+    with pytest.warns(
+        pbdkit.PbdkitWarning, match="is missing or not a database, although 2 members"
+    ):
         same(first, swept(small, **asked))
 
 
@@ -415,14 +421,14 @@ WRONG = [
     ({"vary": {"steps": {"from": 1, "til": 2, "count": 2}}}, "did you mean 'to'|unknown key"),
     ({"vary": {"solver.relaxation": {"from": 0, "to": 2, "count": 2, "scale": "log"}}}, "above 0"),
     ({"vary": {"rule": [{"type": "barycentre"}], "rule.K": [1]}}, "'rule' is varied twice"),
-    ({"vary": {"seed": [1]}, "replicates": 2}, "'seed' is varied twice: replicates vary it"),
+    ({"vary": {"seed": [1]}, "replicates": 2}, "'seed' is varied twice: also by replicates"),
     ({"together": {"steps": [1, 2], "seed": [1]}}, "equal length.*steps has 2, seed has 1"),
     ({"vary": {"leaders.7.until": [1]}}, "member leaders.7.until=1: .*'7' is not an index"),
     ({"vary": {"steps": {"from": 1, "to": 10**6, "count": 10**5}}, "replicates": 9},
-     "900000 members; at most 100000"),
-    ({"vary": {"steps": [10**9]}}, "come to a dataset of .* GiB"),
+     "900000 members exceed the maximum of 100000"),
+    ({"vary": {"steps": [10**9]}}, "the dataset of .* members takes .* GiB"),
     ({"keep": {"variables": ["pe3"]}}, "no variable 'pe3'; did you mean 'pe1'"),
-    ({"keep": {"times": [50]}}, "keep.times: 50 is beyond the last step of all, 10"),
+    ({"keep": {"times": [50]}}, "keep.times: 50 exceeds the last step of all members, 10"),
     ({"keep": {"times": "lost"}}, "keep.times"),
     ({"vary": {"body.columns": [10**5], "body.rows": [10**6]}}, "member body.columns=1.*GiB"),
     ({"experiment": "paper/x"}, "experiment: 'paper/x' is neither; did you mean 'paper/"),
@@ -468,7 +474,7 @@ def test_a_stopped_sweep_goes_on_where_it_was(small, tmp_path):
     os.killpg(running.pid, signal.SIGINT)
     _, told = running.communicate(timeout=60)
     assert running.returncode == 130
-    assert "the same command runs the others" in told
+    assert "the same command runs the remaining ones" in told
     assert "Traceback" not in told
     held = rows(tmp_path / "out")
     assert 0 < held < 30
@@ -586,7 +592,7 @@ def test_a_class_from_python_is_swept_in_this_process(small, tmp_path):
     found = pbdkit.sweep(given, vary={"rule.share": [0.3, 0.6]}, progress=False)
     assert found.status.values.tolist() == ["complete"] * 2
     for wrong in ({"workers": 2}, {"folder": tmp_path}):
-        with pytest.raises(pbdkit.ExperimentError, match="make a plugin of them"):
+        with pytest.raises(pbdkit.ExperimentError, match="into a plugin"):
             pbdkit.sweep(given, vary={"rule.share": [0.3]}, progress=False, **wrong)
 
 

@@ -65,104 +65,136 @@ FAULTS = [
     (rules.CountsPlaces, "takes-particles-in-any-order", "if the particles are in another order"),
     (rules.SumsInOrder, "takes-particles-in-any-order", "order in which neighbours are summed"),
     (rules.Doubles, "keeps-single-precision", "`apply` returns float64 for float32"),
-    (rules.LooksAround, "is-local", "alone than among others"),
-    (rules.NeedsArrays, "is-local", "fails with plain numbers in the place of arrays"),
-    (rules.Remembers, "remembers-nothing", "keeps `SEEN` from call to call"),
-    (rules.Counts, "remembers-nothing", "keeps `Counts.calls` from call to call"),
+    (rules.LooksAround, "is-local", "alone and among others"),
+    (rules.NeedsArrays, "is-local", "fails with plain numbers instead of arrays"),
+    (rules.Remembers, "remembers-nothing", "changes `SEEN` between calls"),
+    (rules.Counts, "remembers-nothing", "changes `Counts.calls` between calls"),
     (rules.Throws, "answers-the-same", "in the second of two equal calls"),
     (rules.Seeds, "answers-the-same", "seeds or uses the global generator of random numbers"),
     (rules.Drifts, "rests", "a body at rest moves by 1e-09 in step 1 on the square lattice"),
     (rules.DriftsByRounding, "rests", "a body at rest moves by"),
-    (rules.Divides, "is-finite", "where all neighbours meet in the particle"),
+    (rules.Divides, "is-finite", "with all neighbours at the position of the particle"),
     (rules.Square, "returns-a-value-a-particle", "returns the shape (2, 4, 3)"),
-    (rules.Varies, "returns-a-value-a-particle", "`gather` returns now 2, now 3 values"),
+    (rules.Varies, "returns-a-value-a-particle", "`gather` returns between 2 and 3 values"),
     (rules.ClaimsLinear, "superposes", "do not declare `linear`"),
-    (rules.HoldsOn, "follows-translations", "use differences `d`, not `here.u`"),
-    (rules.BearsTwice, "bears-loads-as-forces", "the force is not the same as without, and the"),
+    (rules.HoldsOn, "follows-translations", "use differences `d` instead of `here.u`"),
+    (
+        rules.BearsTwice,
+        "bears-loads-as-forces",
+        ("`force` with a load is not the value without load plus the"),
+    ),
     (rules.HasAScale, "goes-alike-in-all-units", "annotate parameters that are lengths"),
     (rules.LeansRight, "goes-alike-mirrored-and-turned", "or declare `has_axes`"),
-    (rules.ResistsTurning, "moves-rigidly-for-nothing", "a rigid motion of a whole body meets"),
-    (rules.PullsOneWay, "acts-both-ways-alike", "give both ends of a bond one weight"),
-    (rules.Gives, "gives-no-energy-back", "let `force` pull towards where neighbours are"),
-    (remembering.Hardens, "does-not-stiffen-by-breaking", "a share of its difference, falling"),
-    (rules.Unlike, "is-the-same-compiled", "the compiled engine gives another `u`"),
+    (
+        rules.ResistsTurning,
+        "moves-rigidly-for-nothing",
+        ("forces under a rigid motion of a whole body"),
+    ),
+    (rules.PullsOneWay, "acts-both-ways-alike", "use the same weight at both ends of a bond"),
+    (rules.Gives, "gives-no-energy-back", "let `force` act towards the neighbours"),
+    (remembering.Hardens, "does-not-stiffen-by-breaking", "scale the difference of a bond"),
+    (rules.Unlike, "is-the-same-compiled", "the compiled engine computes another `u`"),
     (rules.Restarts, "continues-where-it-stopped", "a run continued at step"),
     (rules.Raises, "changes-no-input", "has no attribute 'strength'"),
     (rules.Undescribed, "is-documented", "the parameter `strength` has no description"),
     (rules.Undocumented, "is-documented", "Undocumented has no docstring"),
     (rules.AnyName, "names-itself", 'declare it as `type: Literal["any-name"] = "any-name"`'),
     (rules.CapitalName, "names-itself", "the type 'CapitalName' is not in lower case"),
-    (rules.Thawed, "is-frozen", "`type` can be set"),
-    (rules.Unhashable, "is-frozen", "take tuples for lists and named fields for dicts"),
-    (rules.Lenient, "refuses-unknown-keys", "it takes any key"),
-    (rules.Forgets, "survives-json", "`strength` is 2.0, and 1.0 after JSON"),
+    (rules.Thawed, "is-frozen", "`type` can be assigned"),
+    (
+        rules.Unhashable,
+        "is-frozen",
+        ("use tuples instead of lists, and named fields instead of dicts"),
+    ),
+    (rules.Lenient, "refuses-unknown-keys", "it accepts unknown keys"),
+    (rules.Forgets, "survives-json", "`strength` is 2.0, but 1.0 after JSON"),
     (rules.homeless, "survives-pickling", "define the class at the top of a module"),
-    (rules.Chooses, "takes-part", "name the parts that go with it"),
+    (rules.Chooses, "takes-part", "give compatible components"),
     (others.Twins, "has-a-sound-cell", "(0, 0) and (0, 1) lie at one place, (0.0, 0.0)"),
     (others.Flat, "has-a-sound-cell", "span no area"),
-    (others.Astray, "has-a-sound-cell", "basis site 1 lies a cell or more from where its index"),
+    (
+        others.Astray,
+        "has-a-sound-cell",
+        ("basis site 1 lies a cell or more from the position of its index"),
+    ),
     (others.Miscounts, "has-a-sound-cell", "`primitive` counts the step"),
-    (others.Skips, "has-a-sound-cell", "`primitive` counts steps that no site takes"),
-    (others.Rooted, "keeps-its-cell-wherever-it-lies", "leave `self.origin` out of `cell`"),
+    (others.Skips, "has-a-sound-cell", "`primitive` counts steps that do not occur"),
+    (others.Rooted, "keeps-its-cell-wherever-it-lies", "remove `self.origin` from it"),
     (others.OneSided, "is-mutual", "'one-sided' is not mutual"),
-    (others.Approximate, "takes-offsets-of-the-cell", "is none of the cell's"),
-    (others.Favours, "takes-sublattices-in-any-order", "where the sites are listed backwards"),
-    (others.Contradicts, "finds-the-same-anew", "`nearness` finds other neighbours"),
-    (operations.Kicks, "rests-as-declared", "moves a particle that rests"),
+    (others.Approximate, "takes-offsets-of-the-cell", "is not an offset of the cell"),
+    (others.Favours, "takes-sublattices-in-any-order", "if the order of the sites is reversed"),
+    (others.Contradicts, "finds-the-same-anew", "`nearness` selects other neighbours"),
+    (operations.Kicks, "rests-as-declared", "moves a particle at rest"),
     (operations.Pins, "rests-as-declared", "holds a particle that the rule moves"),
     (others.Alternates, "takes-every-point-alone", "follows another particle if there are fewer"),
-    (others.SaysItIsLocal, "follows-who-is-near", "leave out `local`"),
-    (others.Shrinks, "follows-translations", "let the weights of each point sum to 1"),
-    (others.SaysItAnchors, "follows-translations", "and follows every translation"),
+    (others.SaysItIsLocal, "follows-nearby-particles", "remove `local`"),
+    (others.Shrinks, "follows-translations", "make the weights of each point sum to 1"),
+    (others.SaysItAnchors, "follows-translations", "but follows every translation"),
     (others.WritesSites, "changes-no-input", "`follow` writes into `site`"),
-    (others.Lopsided, "is-seen-alike-from-both-ends", "otherwise for (-d, -r) than for (d, r)"),
-    (others.Directed, "is-seen-alike-from-both-ends", "take lengths and shells, not directions"),
-    (others.DeniesBreaking, "breaks-as-declared", "and `breaks` returns True"),
+    (others.Lopsided, "is-seen-alike-from-both-ends", "other values for (-d, -r) than for (d, r)"),
+    (others.Directed, "is-seen-alike-from-both-ends", "use lengths and shells, not directions"),
+    (others.DeniesBreaking, "breaks-as-declared", "but `breaks` returns True"),
     (others.BreaksAtRest, "rests", "bonds of a body at rest break in step"),
-    (others.Measures, "changes-no-input", "`breaks` returned float64: compare, as in"),
-    (others.Tupled, "changes-no-input", "`fictitious` returned tuple: return a vector, as"),
-    (others.TakesOurName, "labels-its-variables", "the dataset has 'site' already"),
+    (others.Measures, "changes-no-input", "`breaks` returned float64, not booleans; return"),
+    (others.Tupled, "changes-no-input", "`fictitious` returned tuple; return a vector, as"),
+    (others.TakesOurName, "labels-its-variables", "the dataset already has a variable 'site'"),
     (others.NoUnits, "labels-its-variables", "the variable 'extent' has no units"),
     (others.OneShort, "measures-what-it-declares", "'extent' has the shape (55,), not (56,)"),
-    (others.Truncates, "measures-what-it-declares", "declared as i4 and measured as float64"),
-    (others.FromFirstRow, "takes-rows-in-any-order", "take rows from `now.rows(numbers)`"),
-    (others.KeepsLargest, "remembers-nothing", "keeps `KeepsLargest.largest` from call to call"),
-    (remembering.TakesAName, "declares-what-it-remembers", "every dataset has a 'shell'"),
+    (others.Truncates, "measures-what-it-declares", "declared as i4, but measured as float64"),
+    (others.FromFirstRow, "takes-rows-in-any-order", "use the rows of `now.rows(numbers)`"),
+    (others.KeepsLargest, "remembers-nothing", "changes `KeepsLargest.largest` between calls"),
+    (remembering.TakesAName, "declares-what-it-remembers", "every dataset has a variable 'shell'"),
     (remembering.Shouts, "declares-what-it-remembers", "'WEAR' is not named as `my_number` is"),
     (remembering.OfNoUnit, "declares-what-it-remembers", "'wear' has no units"),
     (remembering.StartsHalfway, "declares-what-it-remembers", "starts at 0.5, which i4 does not"),
-    (remembering.Misnames, "draws-what-it-remembers", "gives 'strengths'; what it remembers is"),
+    (remembering.Misnames, "draws-what-it-remembers", "returns 'strengths'; expected"),
     (remembering.DrawsOne, "draws-what-it-remembers", "with the shape (), not ("),
-    (remembering.DrawsNothingFinite, "draws-what-it-remembers", "'strength' that is not finite"),
-    (remembering.Overflows, "draws-what-it-remembers", "which i1 does not hold"),
+    (
+        remembering.DrawsNothingFinite,
+        "draws-what-it-remembers",
+        ("values of 'strength' that are not finite"),
+    ),
+    (remembering.Overflows, "draws-what-it-remembers", "which i1 does not represent"),
     (remembering.DrawsElsewhere, "answers-the-same", "`draw` returns another value in the second"),
-    (remembering.DrawsByRow, "takes-particles-in-any-order", "`draw` gives 'strength' by the row"),
-    (remembering.DrawsAgain, "answers-the-same", "random numbers from a generator of its own"),
-    (remembering.DrawsOnItsOwn, "continues-where-it-stopped", "a run made anew gives another"),
+    (
+        remembering.DrawsByRow,
+        "takes-particles-in-any-order",
+        ("`draw` derives 'strength' from the number of the row"),
+    ),
+    (remembering.DrawsAgain, "answers-the-same", "random numbers from its own generator"),
+    (remembering.DrawsOnItsOwn, "continues-where-it-stopped", "a repeated run computes another"),
     (remembering.WritesBonds, "changes-no-input", "`draw` writes into `shell`"),
-    (remembering.WritesWear, "changes-no-input", "`update` writes into what it is given: make"),
+    (remembering.WritesWear, "changes-no-input", "`update` writes into its arguments; make"),
     (remembering.WritesTheWay, "changes-no-input", "`remember` writes into `own0`"),
-    (remembering.OneTooMany, "renews-what-it-remembers", "returns 3 values, and 2 of the numbers"),
-    (remembering.ForgetsTheWay, "renews-what-it-remembers", "`remember` returns 0 values, and 1"),
-    (remembering.WayAndMove, "renews-what-it-remembers", "`remember` returns 2 values, and 1 of"),
-    (remembering.CountsHalves, "renews-what-it-remembers", "declared as i4: fractions would be"),
-    (remembering.WearsTogether, "is-local", "`update` returns another value for a particle alone"),
-    (remembering.SharesTheWay, "is-local", "`remember` returns another value for a particle alone"),
+    (remembering.OneTooMany, "renews-what-it-remembers", "returns 3 values for 2 changing"),
+    (remembering.ForgetsTheWay, "renews-what-it-remembers", "`remember` returns 0 values for 1"),
+    (remembering.WayAndMove, "renews-what-it-remembers", "`remember` returns 2 values for 1"),
+    (remembering.CountsHalves, "renews-what-it-remembers", "declared as i4; fractions would be"),
+    (
+        remembering.WearsTogether,
+        "is-local",
+        ("`update` returns different values for a particle alone"),
+    ),
+    (
+        remembering.SharesTheWay,
+        "is-local",
+        ("`remember` returns different values for a particle alone"),
+    ),
     (
         remembering.WearsInOrder,
         "takes-particles-in-any-order",
         "`update` returns another value for a",
     ),
     (remembering.WearsInDoubles, "keeps-single-precision", "`update` returns float64 for float32"),
-    (remembering.WearsOneWay, "is-seen-alike-from-both-ends", "`update` answers otherwise for"),
+    (remembering.WearsOneWay, "is-seen-alike-from-both-ends", "`update` returns other values for"),
     (remembering.Misstates, "breaks-beyond-its-strain", "`breaking_strain` and `breaks` disagree"),
     (remembering.Sags, "rests", "a body at rest moves by"),
-    (directions.Compass, "follows-rotations", "count its neighbours' places from its own"),
+    (directions.Compass, "follows-rotations", "measure the positions of its neighbours"),
     (directions.PointsNowhere, "declares-what-it-remembers", "has 'vane_tan' in `rotations`"),
     (directions.WritesThere, "changes-no-input", "`gather` writes into `shared"),
     (directions.Creeps, "rests", "a body at rest moves by 1e-09"),
     (remembering.Ragged, "measures-what-it-declares", "'last_square' has the shape"),
-    (remembering.Untimely, "measures-what-it-declares", "a length only where it declares `at_end`"),
+    (remembering.Untimely, "measures-what-it-declares", "requires `at_end`"),
 ]
 
 
@@ -216,8 +248,8 @@ def test_a_report_tells_what_ran_and_why_not():
 def test_after_a_fault_nothing_is_judged_that_means_nothing():
     report = examine(rules.WritesInput())
     assert {o.reason for o in report.skipped} == {
-        "not judged while changes-no-input fails",
-        "it remembers nothing of particles",
+        "not tested, since changes-no-input fails",
+        "it has no state variables of particles",
     }
 
 
@@ -229,8 +261,11 @@ def test_examples_come_from_defaults_and_from_fields():
 @pytest.mark.parametrize(
     ("field", "words"),
     [
-        (Field(description="k"), "Needy.k has neither default nor example: write `k: ... = Field("),
-        (Field(1.0, examples=["a"]), "Needy refuses its examples {'k': 'a'}: k: Input should be"),
+        (
+            Field(description="k"),
+            ("Needy.k has neither a default nor an example: write `k: ... = Field("),
+        ),
+        (Field(1.0, examples=["a"]), "Needy rejects its examples {'k': 'a'}: k: Input should be"),
     ],
 )
 def test_a_class_without_usable_examples_is_told(field, words):
@@ -258,9 +293,9 @@ class Unfinished(pbdkit.FollowerRule):
 def test_a_class_that_lacks_a_method_is_told():
     for report in (examine(Unfinished), *examine_all([Unfinished])):
         assert [outcome.property for outcome in report.failed] == ["has-examples"]
-        assert "Unfinished cannot be made: " in report.failed[0].reason
+        assert "Unfinished cannot be created: " in report.failed[0].reason
         assert "apply" in report.failed[0].reason
-    with pytest.raises(pbdkit.PluginError, match="Unfinished cannot be made"):
+    with pytest.raises(pbdkit.PluginError, match="Unfinished cannot be created"):
         conformance(Unfinished)
 
 
@@ -331,7 +366,7 @@ def test_plugins_check_tries_a_distribution(install, call):
     good = call("plugins", "check", "pbdkit_good")
     assert good.code == 0
     assert "FollowerRule mine: 21 properties ran, 0 failed; 3 skipped: it remembers" in good.out
-    assert "all properties hold for 1 example of its components" in good.out
+    assert "1 example of its components passed all properties" in good.out
     both = call("plugins", "check")
     assert both.code == 3
     assert "failed  rests: a body at rest moves by 1e-09" in both.out

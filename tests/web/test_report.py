@@ -183,14 +183,14 @@ def test_a_click_on_a_bond_tells_its_story(page, torn):
     (standing,) = known.statuses(known.order[:1])
     assert (
         f"It broke in step {standing.step} at strain {standing.strain_at_break:.6g}, "
-        f"number 1 of the {len(known.order)} broken." in story
+        f"bond 1 of {len(known.order)} in the order of breaking." in story
     )
-    assert f"breaks it above {standing.breaks_above:.6g}" in story
+    assert f"it breaks above the strain {standing.breaks_above:.6g}" in story
     around = known.statuses(known.around(first))
     together = [s for s in around if s.step == standing.step]
     assert all("-".join(map(str, s.bond)) in story for s in together)
     step, strain = known.most_strained(first)
-    assert f"the longest in step {step}: strain {strain:.6g}" in story
+    assert f"in the steps shown: {strain:.6g}, in step {step}." in story
     a, b = known.bonds.ends[known.steps.argmin()]
     page.get_by_label("Find").fill(f"{b} {a}")
     page.get_by_label("Find").press("Enter")
@@ -205,7 +205,7 @@ def test_the_ledger_has_what_broke_in_its_order(page, torn, monkeypatch, tmp_pat
     monkeypatch.setattr(bonds, "LISTED", 3)
     dataset, _ = torn
     opened(page, written(dataset, tmp_path))
-    section = page.locator("section").filter(has_text="What broke")
+    section = page.locator("section").filter(has_text="Fracture model")
     rows = [row.split("\t") for row in section.locator("tbody").inner_text().splitlines()]
     broken = dataset.broken_step.values
     assert [int(row[1]) for row in rows] == sorted(broken[broken >= 0])[:3]
@@ -258,9 +258,7 @@ def test_a_large_body_is_thinned_and_the_page_says_so(page, tmp_path, monkeypatc
     dataset = pbdkit.run(pbdkit.load("paper/a", settings=settings), progress=False)
     opened(page, written(dataset, tmp_path))
     steps, particles = page.locator("#left-out li").all_inner_texts()
-    assert re.fullmatch(
-        r"\d+ of the 81 recorded steps are shown: one in 2, and the last one.", steps
-    )
+    assert re.fullmatch(r"\d+ of the 81 recorded steps are shown: one of 2, and the last.", steps)
     count = int(re.match(rf"(\d+) of the {62 * 62} particles are shown", particles)[1])
     content = RunContent(dataset).within(200_000)
     assert content["run"]["lattice"]["reference"]["shape"] == [count, 2]
@@ -343,8 +341,8 @@ def test_an_equilibrium_and_its_certificate(page, tmp_path):
     page.get_by_label("Colour").select_option("stress_xx")
     assert page.get_by_label("Fill").is_checked()
     before = page.locator("canvas").screenshot()
-    page.get_by_label("Displacements drawn").fill("20")
-    page.get_by_label("Displacements drawn").press("Enter")
+    page.get_by_label("Displacement factor").fill("20")
+    page.get_by_label("Displacement factor").press("Enter")
     assert page.locator("canvas").screenshot() != before
     distance = json_attribute(dataset, "certificate")["distance"]
     assert f"{distance:.6g}" in page.locator("main").inner_text()
@@ -365,7 +363,7 @@ def test_what_was_benched_and_what_cannot_be_built_here(page, sheet, tmp_path):
     opened(page, written(dataset, tmp_path, bench=bench))
     assert "2.0e-09" in page.locator("section").last.inner_text()
     assert "unknown type 'of-nobody'" in page.locator("#left-out").inner_text()
-    assert "Nothing is predicted" in page.locator("main").inner_text()
+    assert "There is no prediction" in page.locator("main").inner_text()
 
 
 @pytest.mark.parametrize("name", ["paper/f2", "modelling/composite-plate", "stability/oscillation"])
@@ -409,7 +407,7 @@ def test_files_that_are_no_result(call):
     assert (none.code, none.err) == (6, "pbdkit: nothing.nc: there is no such file\n")
     bench = call("report", "tensile.nc", "-o", "a.html", "--bench", "e.json")
     assert bench.code == 2
-    assert "e.json: holds no measurement; `pbdkit bench EXPERIMENT --json e.json`" in bench.err
+    assert "e.json: contains no measurement; `pbdkit bench EXPERIMENT --json e.json`" in bench.err
     folder = call("report", "tensile.nc", "-o", "none/a.html")
     assert (folder.code, folder.err) == (6, "pbdkit: none/a.html: there is no folder none\n")
 
@@ -417,7 +415,7 @@ def test_files_that_are_no_result(call):
 def test_a_dataset_without_positions(sheet, tmp_path):
     with pytest.raises(pbdkit.ExperimentError, match="has no positions"):
         written(sheet[0].drop_vars("position"), tmp_path)
-    with pytest.raises(pbdkit.ExperimentError, match="isel picks one of several runs"):
+    with pytest.raises(pbdkit.ExperimentError, match="select one of several runs with isel"):
         written(pbdkit.concat([sheet[0], sheet[0]]), tmp_path)
     for none in ("time", "particle"):
         with pytest.raises(pbdkit.ExperimentError, match="has no step or no particle"):
@@ -441,7 +439,9 @@ def test_a_body_of_one_particle_has_no_bonds(page, tmp_path):
 def test_a_dataset_that_is_cut(page, torn, tmp_path):
     some = torn[0].isel(particle=slice(20, 60), time=slice(0, 9))
     opened(page, written(some, tmp_path))
-    assert "some particles of the run are missing" in page.locator("#left-out").inner_text()
+    assert ("the dataset does not contain all particles of the run") in page.locator(
+        "#left-out"
+    ).inner_text()
     page.get_by_label("Find").fill("30")
     page.get_by_label("Find").press("Enter")
     assert page.locator("aside h3").inner_text() == "Particle 30"

@@ -267,7 +267,7 @@ def test_long_ways_of_the_mouse_stand_in_a_table(tmp_path, monkeypatch):
 
 def test_nothing_is_overwritten(tmp_path):
     session, said = session_of("paper/a", tmp_path)
-    with pytest.raises(pbdkit.ExperimentError, match="nothing has been stepped yet"):
+    with pytest.raises(pbdkit.ExperimentError, match="no step has been made yet"):
         do(session, do="save")
     session.advance(1)
     do(session, do="save")
@@ -299,18 +299,18 @@ def test_leaders_that_cannot_go_there_stay_and_it_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("command", "told"),
     [
-        ({"do": "turn", "name": "rule.K", "value": 1.0}, "no number 'rule.K'"),
+        ({"do": "turn", "name": "rule.K", "value": 1.0}, "no parameter 'rule.K'"),
         ({"do": "turn", "name": "solver.relaxation", "value": -1.0}, "greater than 0"),
         ({"do": "grab", "row": 5000}, "no particle 5000"),
-        ({"do": "grab", "row": 0}, "points of the frame"),
+        ({"do": "grab", "row": 0}, "frame points follow the body"),
         ({"do": "cut-bond", "row": 9999}, "no bond 9999"),
-        ({"do": "cut", "from": [90.0, 0.0], "to": [91.0, 0.0]}, "beside the body"),
-        ({"do": "sing"}, "no command"),
-        ({"do": "play"}, "no command: play.on"),
+        ({"do": "cut", "from": [90.0, 0.0], "to": [91.0, 0.0]}, "crosses no bond"),
+        ({"do": "sing"}, "invalid command"),
+        ({"do": "play"}, "invalid command: play.on"),
         ({"do": "speed", "steps": 0}, "greater than or equal to 1"),
         ({"do": "drag", "by": [float("nan"), 0.0]}, "finite"),
         ({"do": "step", "count": 1, "more": 2}, "unknown key"),
-        ([], "no command"),
+        ([], "invalid command"),
     ],
 )
 def test_what_cannot_be_is_refused_with_nothing_done(command, told, tmp_path):
@@ -375,7 +375,7 @@ def test_what_is_refused_undoes_nothing_else(command, back, tmp_path, monkeypatc
 def test_numbers_from_which_others_are_drawn_are_not_turned(tmp_path):
     session, _ = session_of("modelling/ageing", tmp_path)
     assert "fracture.failure" in session.script.numbers
-    with pytest.raises(pbdkit.ExperimentError, match=r"no number 'fracture\.scatter'"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"no parameter 'fracture\.scatter'"):
         do(session, do="turn", name="fracture.scatter", value=0.1)
 
 
@@ -406,11 +406,11 @@ def test_states_that_are_kept_take_no_more_room_than_they_may(tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("settings", "word", "told"),
     [
-        ([], "stable", "shrinks to a thousandth in"),
+        ([], "stable", "decays to 1/1000 in"),
         (["solver.relaxation=1.3"], "diverging", "relaxation below 1"),
         (["body.columns=60", "body.rows=60"], "slow", "memory"),
         (["body.columns=90", "body.rows=90"], "unknown", "more than 4000 particles"),
-        (["leaders=[]", "frame.type=none"], "slow", "nothing holds it"),
+        (["leaders=[]", "frame.type=none"], "slow", "it is not constrained"),
         (["neighbours={type: euclidean, radius: 1.1, reevaluate: true}"], "unknown", "spectrum"),
     ],
 )
@@ -641,7 +641,7 @@ FAR = [
 
 @pytest.mark.parametrize("command", FAR)
 def test_places_that_no_body_reaches_are_no_commands(command):
-    with pytest.raises(pbdkit.ExperimentError, match=r"no command: .* 1000000000000"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"invalid command: .* 1000000000000"):
         command_of(json.dumps(command))
 
 
@@ -668,7 +668,7 @@ def test_pages_that_say_nonsense_are_told_so_and_the_session_goes_on(address):
             b"\xff",
         ):
             page.socket.send(nonsense)
-            assert "no command" in page.hear("error")["text"]
+            assert "invalid command" in page.hear("error")["text"]
         other.socket.send("x" * (LONGEST + 1))
         with pytest.raises(ConnectionClosed, match="1009"):
             other.hear("nothing")
@@ -712,7 +712,7 @@ def test_a_notebook_sends_and_hears_what_a_page_does(monkeypatch, tmp_path):
     hear({"do": "save"}, [])
     wait("saved")
     hear({"do": "nonsense"}, [])
-    assert "no command" in wait("error")[0]["text"]
+    assert "invalid command" in wait("error")[0]["text"]
     widget.close()
     assert widget.session.step == 3
 

@@ -105,9 +105,9 @@ def main():
         ]
         angles = ", ".join(f"{angle:.2f}" for angle in expected.values())
         print(
-            f"| {pull:g} | {' | '.join(means)} | {angles} "
-            f"| {on_axis(found):.4f} | {(1 + pull) / np.sqrt(2.0):.4f} "
-            f"| {100 * found.strain.min():.2f} to {100 * found.strain.max():.2f} % |",
+            f"| {pull:g} | {' | '.join(means)} | {angles} | {on_axis(found):.4f} | "
+            f"{(1 + pull) / np.sqrt(2.0):.4f} | {100 * found.strain.min():.2f} to "
+            f"{100 * found.strain.max():.2f} % |",
             flush=True,
         )
 

@@ -113,7 +113,7 @@ def test_every_pivot_moves_along_the_force_at_the_ends_of_fibres_too():
         assert 1.0 < share < 4 + 16 * BENDING + 4 * SHEAR + 1e-6
 
 
-@pytest.mark.filterwarnings("ignore:the last state is inside out")
+@pytest.mark.filterwarnings("ignore:the last state has inverted cells")
 @pytest.mark.parametrize("bending", [0.0, BENDING, 20.0])
 def test_the_energy_never_rises(bending):
     for seed in range(5):

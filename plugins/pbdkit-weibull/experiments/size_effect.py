@@ -98,9 +98,9 @@ def main():
         for size in (4, 8, 16):
             first, load = np.transpose([sheet(size, modulus, seed) for seed in range(10)])
             print(
-                f"| {size} × {size} | {modulus:g} | {first.mean():.4f} "
-                f"| {weakest_link(size * size, modulus):.4f} "
-                f"| {load.mean():.4f} ± {load.std() / np.sqrt(10):.4f} |"
+                f"| {size} × {size} | {modulus:g} | {first.mean():.4f} | "
+                f"{weakest_link(size * size, modulus):.4f} | {load.mean():.4f} ± "
+                f"{load.std() / np.sqrt(10):.4f} |"
             )
 
 

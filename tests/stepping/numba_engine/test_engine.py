@@ -351,7 +351,7 @@ def test_a_rule_that_does_not_compile_runs_slower_and_says_so(monkeypatch):
     scene = build_scene(pbdkit.Experiment(**sheet(rule=Uncompilable(type="uncompilable"))))
     engine, made = make_engine(scene, choose(scene))
     assert engine.name == made.engine == "numpy"
-    assert "slower than it could be: FollowerRule 'uncompilable' failed" in made.reason
+    assert "the compiled engine is not available: FollowerRule 'uncompilable' failed" in made.reason
 
 
 def test_small_scenes_are_not_compiled():

@@ -227,7 +227,7 @@ def test_compiled_in_the_sizes_that_were_measured(monkeypatch):
 
 
 ONE_STEP = {
-    "found anew": ({"neighbours": ANEW}, "neighbours are found anew"),
+    "found anew": ({"neighbours": ANEW}, "neighbours are re-evaluated"),
     "many": ({"neighbours": MANY}, "there are many neighbours"),
 }
 
@@ -240,7 +240,7 @@ def test_what_goes_one_step_a_pass_says_why(parts, why, monkeypatch):
     assert single_steps(scene) == why
     assert "a pass" not in choose(scene).reason  # it stays in the cache anyway
     monkeypatch.setattr(passes, "CACHE", 0)
-    assert choose(scene).reason.endswith(f"; one step a pass over the memory: {why}")
+    assert choose(scene).reason.endswith(f"; one step per pass over the memory: {why}")
 
 
 @pytest.mark.parametrize("threads", [1, 2])
