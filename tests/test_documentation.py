@@ -192,6 +192,14 @@ def test_sources_that_are_named_in_text_exist(page):
     assert [name for name in names if not any((f / name).exists() for f in folders)] == []
 
 
+def test_pages_for_users_show_a_picture_or_an_example():
+    """Reports and decisions aside; the gallery is generated with pictures."""
+    apart = {"validation", "decisions", "gallery"}
+    pages = [p for p in (ROOT / "docs").rglob("*.md") if apart.isdisjoint(p.parts)]
+    shown = re.compile(r"!\[|^ *```(?!\{toctree\}|$)|^\n {4}\S", re.M)
+    assert [page.name for page in pages if not shown.search(page.read_text())] == []
+
+
 def test_readme_lists_the_two_commands_that_ci_runs():
     text = (ROOT / "README.md").read_text()
     commands = re.findall(r"^python3 -m venv .*$", text, re.M)
