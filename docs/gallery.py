@@ -53,6 +53,8 @@ COLORS = {
     "broken": "broken_step",
 }
 """Variables for the colours of a picture, by the diagnostic that computes them, best first."""
+FIELDS = ("stress", "strain", "u")
+"""First letters of variables that are drawn as fields."""
 END_OF_PULL = 10
 """Last step in which the leaders of the paper's cases move."""
 GROUPS = {
@@ -180,6 +182,8 @@ class Entry:
         options = options[1:] if options and options[0].endswith(".nc") else options
         if "--color" not in options and (color := default_color(source)):
             options += ["--color", color]
+        if options[options.index("--color") + 1].startswith(FIELDS) and "--contours" not in options:
+            options += ["--field"]
         if "--time" not in options and name.startswith("paper/") and "record:" not in source:
             options += ["--time", str(END_OF_PULL)]
         return cls(name, source, text, tuple(options))
@@ -206,6 +210,7 @@ class Entry:
         times = [int(value) for key, value in pairs if key == "--time"]
         arguments: dict[str, Any] = {key[2:]: value for key, value in pairs if key == "--color"}
         arguments |= {"contours": True} if "--contours" in self.options else {}
+        arguments |= {"filled": True} if "--field" in self.options else {}
         return arguments | ({"time": times if len(times) > 1 else times[0]} if times else {})
 
     def page(self, *, drawn: bool) -> str:
