@@ -228,6 +228,7 @@ ELSEWHERE = {
     "pytest": "this is a test; sessions of nox run those of plugins",
     "ruff": "the session `lint` of nox",
     "mypy": "the session `lint` of nox",
+    "python tests/prose.py": "the session `lint` of nox",
     "nox": "`.ci/run` calls its sessions",
     "pre-commit": "writes into the repository's own hooks",
     "pip install": "`cli/test_plugins_new` and the session `plugins` of nox install so",
