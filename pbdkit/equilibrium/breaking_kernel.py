@@ -547,7 +547,7 @@ class Settler:
         self._take_roles(math.ceil(moment), state)
         changes, became = 0, GOES_ON
         while became == GOES_ON and changes < most:
-            self._watch.begin("settling and breaking")
+            self._watch.begin("equilibria and broken bonds")
             a_call = max(1, min(most - changes, OPERATIONS_A_CALL // self._work))
             with blaming(self._scene.experiment.rule, f"at step {moment:.6g}"):
                 breaks, became = self._run(*self._given(state, moment, a_call))

@@ -144,7 +144,7 @@ def _event_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
          "independent of the steps; use solver: {type: stepping}"),
         *(("solver", (jumps or settles) and not operation.rests,
            f"'{operation.type}' can move particles at rest, so that the equilibrium is not "
-           "determined; use solver: {type: stepping} without settle")
+           "determined; use solver: {type: stepping} without `settle`")
           for operation in experiment.operations),
     ]  # fmt: skip
 
@@ -157,7 +157,7 @@ def _force_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
     return [
         ("solver", masses and rests,
          "leaders that move by Newton's law have no final position that is known before the run; "
-         "use solver: {type: stepping} without settle, or a load on followers"),
+         "use solver: {type: stepping} without `settle`, or a load on followers"),
         ("rule", masses and not has_forces,
          f"leaders that move by Newton's law require forces, which '{rule.type}' with these "
          "parameters does not define; use a calibrated rule: elastic with poisson_ratio above -1, "

@@ -147,7 +147,7 @@ def particle_5(data):
     ("parts", "text"),
     [
         ({"solver": {"type": "equilibrium"}}, "solver: leaders that move by Newton's law have no"),
-        ({"solver": {"type": "stepping", "settle": {}}}, "without settle"),
+        ({"solver": {"type": "stepping", "settle": {}}}, "without `settle`"),
         (
             {"rule": {"type": "barycentre"}, "frame": {"type": "none"}},
             "rule: leaders that move by Newton's law require forces, which 'barycentre' with",
