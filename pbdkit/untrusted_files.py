@@ -40,7 +40,7 @@ EMPTY = 2**20
 """Number of bytes that a variable may declare for any size of the file."""
 LARGEST_CHUNK = 2**26
 """Number of bytes that a chunk may declare for any size of the file."""
-MOST_OBJECTS = 10_000
+MAX_OBJECTS = 10_000
 """Maximum number of objects and of links in a file, and of attributes of each."""
 LARGEST_TEXTS = 2**28
 """Maximum number of bytes of a block of texts that is checked."""
@@ -68,22 +68,22 @@ def check_declared(content: h5py.File, size: int) -> None:
     # h5py ends a visit if the function returns a value; it does not support exceptions in it.
     def note_link(name: bytes, info: Any) -> bool | None:
         links.append((name, info.type == h5l.TYPE_HARD))
-        return len(links) > MOST_OBJECTS or None
+        return len(links) > MAX_OBJECTS or None
 
     def note_object(name: bytes, info: Any) -> bool | None:
         objects.append(name)
-        return len(objects) > MOST_OBJECTS or None
+        return len(objects) > MAX_OBJECTS or None
 
     if content.id.links.visit(note_link, info=True) or h5o.visit(
         content.id, note_object, info=True
     ):
-        raise StorageError(f"it contains more than {MOST_OBJECTS} objects")
+        raise StorageError(f"it contains more than {MAX_OBJECTS} objects")
     for name, is_hard in links:
         if not is_hard:
             raise StorageError(f"its link '{_text(name)}' is not a hard link; {_REMEDY}")
     for name in objects:
         item = h5o.open(content.id, name)
-        if (count := h5a.get_num_attrs(item)) > MOST_OBJECTS:
+        if (count := h5a.get_num_attrs(item)) > MAX_OBJECTS:
             raise StorageError(f"'{_text(name)}' has {count} attributes")
         for n in range(count):
             _check_attribute(h5a.open(item, index=n), size)

@@ -18,7 +18,7 @@ from pbdkit.array_types import Floats, Indices, Mask
 
 COARSEST = 400
 """Number of unknowns up to which a grid is solved by its inverse."""
-MOST_GRIDS = 20
+MAX_GRIDS = 20
 """Maximum number of grids."""
 STRONG = 0.01
 """Ratio of an off-diagonal entry to the geometric mean of both diagonal entries, above which two
@@ -70,7 +70,7 @@ class SparseGrids:
         self._levels: list[_Level] = []
         A, spacing = matrix.astype(np.float32).tocsr(), _spacing(np.concatenate([places, led]))
         origin = places.min(axis=0, initial=np.inf)
-        while A.shape[0] > COARSEST and len(self._levels) < MOST_GRIDS:
+        while A.shape[0] > COARSEST and len(self._levels) < MAX_GRIDS:
             spacing = np.where(spacing <= 1.5 * spacing.min(), 2.0 * spacing, spacing)
             hats, points = _hats(A, axes, (places - origin) / spacing, (led - origin) / spacing)
             if hats.shape[1] > 0.8 * hats.shape[0]:

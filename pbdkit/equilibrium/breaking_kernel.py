@@ -188,9 +188,9 @@ SETTLING_S = 6e-3
 """Estimated time of one equilibrium by numpy, in seconds."""
 PARTICLE_S = 1e-5
 """Estimated additional time for each particle, in seconds."""
-LITTLE_BY_LITTLE = 20
+EQUILIBRIA_IF_SOFTENING = 20
 """Estimated number of equilibria in an increment if bonds soften gradually."""
-AT_ONCE = 2
+EQUILIBRIA_IF_BREAKING = 2
 """Estimated number of equilibria in an increment if bonds only break."""
 
 
@@ -239,7 +239,7 @@ def _seconds(scene: Scene) -> float:
     """Estimate the time by numpy in seconds."""
     renews = isinstance(scene.experiment.fracture, RenewsBonds)
     settlings = scene.experiment.solver.equilibrium.increments * (
-        LITTLE_BY_LITTLE if renews else AT_ONCE
+        EQUILIBRIA_IF_SOFTENING if renews else EQUILIBRIA_IF_BREAKING
     )
     return settlings * (SETTLING_S + PARTICLE_S * scene.raster.count)
 
@@ -334,7 +334,7 @@ def _followed(scene: Scene, places: Indices) -> Iterator[tuple[Indices, Indices,
         yield numbers[has], frame.body_place[entry], matrices[entry]
 
 
-GOES_ON = 0
+UNFINISHED = 0
 """Result of a call: bonds may change further."""
 SETTLED = 1
 """Result of a call: no bond changes any more."""
@@ -367,7 +367,7 @@ def write_settling(plan: Plan) -> tuple[str, list[str]]:
     run.add(2, f"return n, {FAILED}")
     run.add(1, judge.call(*ROWS, "0", "kind.shape[2]"), f"if not {changed.call('slack')}:")
     run.add(2, f"return n, {SETTLED}")
-    run.add(0, f"return most, {GOES_ON}")
+    run.add(0, f"return most, {UNFINISHED}")
     functions = [general, moves, derive, judge, mark, changed, update, settle]
     return write_module(plan, [follow, *functions] if follow.lines else functions, run)
 
@@ -545,8 +545,8 @@ class Settler:
         placed, state.starts = prescribe(self._scene, state, moment)
         place(state.u, placed)
         self._take_roles(math.ceil(moment), state)
-        changes, became = 0, GOES_ON
-        while became == GOES_ON and changes < most:
+        changes, became = 0, UNFINISHED
+        while became == UNFINISHED and changes < most:
             self._watch.begin("equilibria and broken bonds")
             a_call = max(1, min(most - changes, OPERATIONS_A_CALL // self._work))
             with blaming(self._scene.experiment.rule, f"at step {moment:.6g}"):

@@ -130,10 +130,10 @@ def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
     bond."""
     ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
     prescribed = rows.communicator.largest(max([rows.max_norm(start.u), *ways]))
-    return prescribed or _way_under_loads(scene, start, rows) or spacing_of(scene)
+    return prescribed or _displacement_under_loads(scene, start, rows) or spacing_of(scene)
 
 
-def _way_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
+def _displacement_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
     """Return the largest displacement that changes of the loads cause, linearised at rest; 0 if
     nothing holds the body against them. If obstacles prevent every displacement, return the largest
     move of the loads without obstacles."""
@@ -173,7 +173,7 @@ ACCURACY = 1e-8
 CONTRACTION = 0.1
 """Largest ratio of moves after and before a correction for which the linearisation is valid.
 Further corrections, each smaller by this ratio, then add up to at most a ninth of the first."""
-BENT = "the rule is too nonlinear between the state and equilibrium for a bound"
+TOO_NONLINEAR = "the rule is too nonlinear between the state and equilibrium for a bound"
 """Reason for an infinite distance under a rule that is too nonlinear."""
 
 
@@ -221,8 +221,8 @@ class ErrorBound:
         if not self._scene.barriers:
             at_rest = self._system_at_rest(start)
             if self._is_linear(start, at_rest):
-                return self._outlook(start, at_rest)
-        return self._outlook(start, self._linearised(start, u), anew=True)
+                return self._predict(start, at_rest)
+        return self._predict(start, self._linearised(start, u), anew=True)
 
     def _system_at_rest(self, state: State) -> System:
         system, broken = self._at_rest, broken_bonds(state)
@@ -235,7 +235,7 @@ class ErrorBound:
         at, steps = replace(state, u=u), self._scene.experiment.steps
         return linearised(self._scene, at, steps, "auto", self._watch)
 
-    def _outlook(self, state: State, system: System, *, anew: bool = False) -> PredictedEquilibrium:
+    def _predict(self, state: State, system: System, *, anew: bool = False) -> PredictedEquilibrium:
         """Predict by the system at rest or, with `anew`, by a system that is linearised at the
         state."""
         moves = self._moves.at(state, self._scene.experiment.steps)
@@ -252,7 +252,7 @@ class ErrorBound:
                 ahead
             )
             if anew and not np.abs(remainder).max(initial=0.0) <= limit:
-                distance, obstacle = math.inf, BENT
+                distance, obstacle = math.inf, TOO_NONLINEAR
         distance = math.inf if math.isnan(distance) else distance
         certificate = Certificate(
             method=system.methods,

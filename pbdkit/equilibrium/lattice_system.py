@@ -108,7 +108,7 @@ def planes_of(matrix: StencilMatrix, field: Floats, shape: tuple[int, ...]) -> F
     return planes
 
 
-MOST_TURNS = 32
+MAX_TURNS = 32
 """Maximum number of inverse iterations on a coarser grid."""
 TURN = 3
 """Maximum number of inner iterations in each inverse iteration."""
@@ -134,7 +134,7 @@ def softest(grids: Multigrid, krylov: type[LatticeKrylov]) -> tuple[Floats, floa
     mode, softness = grids.softest_field(), 1.0
     for depth in range(len(grids) - 1, 0, -1):
         solver, finer = krylov(grids, depth), grids.grid().unknowns / grids.grid(depth).unknowns
-        for _ in range(min(4 ** (depth - 1) // 2, MOST_TURNS)):
+        for _ in range(min(4 ** (depth - 1) // 2, MAX_TURNS)):
             force = mode.astype(float) / np.abs(mode).max()
             mode = solver.solve(force.copy(), lambda d: len(d.jumps) >= TURN).x
             softness = finer * float((mode * mode).sum() / (mode * force).sum())

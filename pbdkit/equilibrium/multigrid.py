@@ -35,9 +35,9 @@ PRECISION = np.float32
 """Floating-point type of cycles."""
 WEIGHT = 0.8
 """Relaxation factor. It is below 1 because all places of a row are relaxed simultaneously."""
-STIFFER = 3.0
+STIFFNESS_RATIO = 3.0
 """Ratio of stiffness above which only the stiffer direction is coarsened."""
-NARROW = 5
+MIN_PLACES = 5
 """Number of places along an axis, including the ring of empty places, from which a grid is not
 coarsened along that axis."""
 EVERY = slice(None)
@@ -88,9 +88,9 @@ class StencilGrid:
         rows."""
         along = [np.abs(_stiffness(self.stencils[0], axis)) for axis in range(2)]
         columns = self.code.shape[1]
-        if rows <= NARROW or columns <= NARROW:
+        if rows <= MIN_PLACES or columns <= MIN_PLACES:
             return int(rows > columns), int(columns >= rows)
-        if max(along) <= STIFFER * min(along):
+        if max(along) <= STIFFNESS_RATIO * min(along):
             return 1, 1
         return int(along[0] > along[1]), int(along[1] > along[0])
 

@@ -43,14 +43,14 @@ from pbdkit.stepping.state import State
 
 MOST_CORRECTIONS = 12
 """Maximum number of corrections."""
-LOOSEST = 0.1
+MAX_PROPOSED_TOLERANCE = 0.1
 """Largest tolerance that messages propose."""
 CONTRACTION = 0.5
 """Largest ratio of a correction to the last one. Below it Newton's iteration converges to the only
 equilibrium nearby (Deuflhard, Newton Methods for Nonlinear Problems, 2004)."""
-SERVES = 0.02
+MAX_REUSE_RATIO = 0.02
 """Largest ratio of errors after and before a correction for which a linearisation is used again."""
-NEAR = 1e-3
+MAX_CORRECTION_RTOL = 1e-3
 """Largest relative error of corrections."""
 NOT_LINEAR = "the rule declares itself linear, but its moves differ from the linearisation"
 """Message for a rule that is wrongly declared linear."""
@@ -62,24 +62,24 @@ UNSTABLE = "the equilibrium is not stable"
 """Message for an unstable equilibrium."""
 ROUNDING = "rounding errors limit the relative distance"
 """Message for a tolerance that rounding prevents."""
-FIRM = 1e5
+MAX_ROUNDING_RATIO = 1e5
 """Largest ratio of distance to rounding error of a body that is not near a limit point. Beyond it a
 smaller increment could converge."""
-MOST_IMPLICIT_STEPS = 200
+MAX_IMPLICIT_STEPS = 200
 """Maximum number of implicit steps."""
-LEAP = 0.2
+MAX_MOVE = 0.2
 """Longest move of an implicit step, in lattice spacings."""
-LEAST_DAMPING = 1e-10
+MIN_DAMPING = 1e-10
 """Smallest damping, relative to the stiffness of a particle in the interior at rest."""
-FASTEST = 0.05
+MIN_DAMPING_RATIO = 0.05
 """Smallest ratio of a damping to the one before."""
-FALL = 0.5
+DAMPING_FACTOR = 0.5
 """Factor of the ratio of the moves, if it is below 1, that gives the ratio of two dampings."""
-SLOWEST = 2.0
+MAX_DAMPING_RATIO = 2.0
 """Largest ratio of a damping to the one before."""
-NEXT_TO_NOTHING = 1e-6
+NEGLIGIBLE_STIFFNESS = 1e-6
 """Stiffness, as a damping, below which motions are excluded from an error bound."""
-MUCH = 100.0
+MAX_SOFT_RATIO = 100.0
 """Largest ratio of the moves to those of soft motions within the tolerance, for which a bound
 without soft motions is computed."""
 
@@ -205,7 +205,7 @@ class Search(ABC):
         certificate = self._certificate(self._distance())
         if not certificate.distance <= self._finder.tolerance:
             best = self._floor() / self._finder.scale
-            is_near = certificate.distance <= FIRM * self._rounding()
+            is_near = certificate.distance <= MAX_ROUNDING_RATIO * self._rounding()
             kind = RoundingError if is_near and self._is_rounding(best) else UnconvergedError
             raise kind(self._why(best), certificate)
         return certificate
@@ -297,7 +297,7 @@ def _reachable(share: float) -> str:
     """Return a remedy: a tolerance that can be reached with such a bound, empty if there is
     none."""
     tolerance = 10.0 ** math.ceil(math.log10(share / SHARE)) if 0.0 < share < math.inf else 1.0
-    if tolerance < LOOSEST:
+    if tolerance < MAX_PROPOSED_TOLERANCE:
         return f"; set solver.tolerance: {tolerance:.0e}"
     return ": the body is too slender or soft for double precision"
 
@@ -378,7 +378,7 @@ class _Newton(Search):
         moves_before = moves.at(self._before, self._moment)
         nudged = replace(self._before, u=self._before.u + part * self._leader_change)
         pull = moves_before + (moves.at(nudged, self._moment) - moves_before) / part
-        wanted = max(self._wanted, NEAR * self._load_change)
+        wanted = max(self._wanted, MAX_CORRECTION_RTOL * self._load_change)
         correction = self._system.solve(pull, wanted, None, self._rounding() / part)
         if self._finder.scene.loads:
             self._load_change = max(self._load_change, float(np.abs(correction).max(initial=0.0)))
@@ -387,14 +387,18 @@ class _Newton(Search):
     def _correct(self) -> None:
         distance, size, previous_distance = math.inf, math.inf, self._load_change
         for _ in range(MOST_CORRECTIONS):
-            if distance > SERVES * previous_distance:
+            if distance > MAX_REUSE_RATIO * previous_distance:
                 self._system = self._linearised(self._state, "following the load")
                 self._system.refuse_moving_floats(self._residual, self._rounding())
                 distance = self._distance()
             if distance <= self._finder.tolerance or not math.isfinite(distance):
                 return
             # Each solution is as accurate as the moves are linear (Eisenstat and Walker, 1996).
-            share = min(NEAR, (distance / previous_distance) ** 2) if previous_distance else NEAR
+            share = (
+                min(MAX_CORRECTION_RTOL, (distance / previous_distance) ** 2)
+                if previous_distance
+                else MAX_CORRECTION_RTOL
+            )
             wanted = max(self._wanted, share * distance)
             correction = self._system.solve(self._residual, wanted, None, self._rounding())
             previous, size = size, float(np.abs(correction).max(initial=0.0))
@@ -431,8 +435,9 @@ class _Relaxing(Search):
 
         Raises UnconvergedError if moves do not decay or the result is not stable.
         """
-        leap, size = LEAP * spacing_of(self._finder.scene), self._finder.rows.norm(self._residual)
-        for _ in range(MOST_IMPLICIT_STEPS):
+        leap = MAX_MOVE * spacing_of(self._finder.scene)
+        size = self._finder.rows.norm(self._residual)
+        for _ in range(MAX_IMPLICIT_STEPS):
             if self._is_near():
                 break
             correction = self._system.solve(self._residual, self._wanted, None, self._rounding())
@@ -442,8 +447,11 @@ class _Relaxing(Search):
             self._shift(correction * min(1.0, leap / longest if longest else 1.0))
             previous, size = size, self._finder.rows.norm(self._residual)
             share = size / previous if previous and longest <= leap else 1.0
-            share = max(FASTEST, FALL * share) if share < 1.0 else min(SLOWEST, share)
-            self._damping = min(1.0, max(LEAST_DAMPING, self._damping * share))
+            if share < 1.0:
+                share = max(MIN_DAMPING_RATIO, DAMPING_FACTOR * share)
+            else:
+                share = min(MAX_DAMPING_RATIO, share)
+            self._damping = min(1.0, max(MIN_DAMPING, self._damping * share))
             self._system = self._linearised(self._state, "relaxing after bonds broke")
         certificate = self._certified()
         if not self._system.is_stable():
@@ -453,16 +461,16 @@ class _Relaxing(Search):
     def _is_near(self) -> bool:
         """Return whether the tolerance is reached except for motions of almost no stiffness."""
         longest, tolerance = self._finder.rows.max_norm(self._residual), self._finder.tolerance
-        if longest > MUCH * NEXT_TO_NOTHING * tolerance:
+        if longest > MAX_SOFT_RATIO * NEGLIGIBLE_STIFFNESS * tolerance:
             return False
-        self._damping = NEXT_TO_NOTHING
+        self._damping = NEGLIGIBLE_STIFFNESS
         self._system = self._linearised(self._state, "relaxing after bonds broke")
         return self._distance() <= tolerance
 
 
-MOST_SETS = 60
+MAX_SETS = 60
 """Maximum number of changes of the active set."""
-LEAST_PART = 2.0**-6
+MIN_PART = 2.0**-6
 """Smallest fraction of a correction, tried if the whole correction removes particles from obstacles
 that hold them."""
 
@@ -493,7 +501,7 @@ class _ContactSearch(Search):
         """
         contacts, size, went_loose = None, math.inf, False
         system = self._newest()
-        for _ in range(MOST_SETS):
+        for _ in range(MAX_SETS):
             loose = system.is_loose(self._residual, self._rounding())
             if not loose and not self._finder.tolerance < self._distance() < math.inf:
                 break
@@ -510,9 +518,7 @@ class _ContactSearch(Search):
             self._go(correction)
             part, system = 1.0, self._newest()
             while (
-                not loose
-                and part > LEAST_PART
-                and system.is_loose(self._residual, self._rounding())
+                not loose and part > MIN_PART and system.is_loose(self._residual, self._rounding())
             ):
                 part /= 2.0  # A larger part would remove particles from obstacles that hold them.
                 self._go(-part * correction)

@@ -57,7 +57,7 @@ SHIFT = 1e-13
 """Shift of a large singular matrix, relative to its largest entry."""
 MODES = 6
 """Number of modes among which the kernel of a matrix is searched first."""
-MOST_MODES = 96
+MAX_MODES = 96
 """Maximum number of modes among which the kernel is searched."""
 LARGEST_FALLBACK = 400_000
 """Number of unknowns up to which an LU factorisation replaces an iteration that makes no
@@ -324,9 +324,9 @@ def _left_kernel(matrix: Any) -> Floats:
             basis = np.linalg.qr(shifted.solve_transposed(basis, 0.0))[0]
         _, values, turned = np.linalg.svd(matrix.T @ basis, full_matrices=False)
         is_kernel = values <= nothing
-        if not is_kernel.all() or count >= min(MOST_MODES, size):
+        if not is_kernel.all() or count >= min(MAX_MODES, size):
             return np.asarray(basis @ turned[is_kernel].T)
-        count = min(4 * count, MOST_MODES, size)
+        count = min(4 * count, MAX_MODES, size)
 
 
 @dataclass

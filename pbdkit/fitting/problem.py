@@ -315,7 +315,7 @@ Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 TELLS = 0.25
 """Ratio of the standard error along a direction to the interval between bounds below which the
 direction is identifiable."""
-PART = 0.3
+MIN_COMPONENT = 0.3
 """Component of a direction above which a parameter belongs to it."""
 AT_BOUND = 1e-6
 """Distance from a bound, relative to the interval, up to which a value is at the bound."""
@@ -347,7 +347,7 @@ MODULUS = "Young's modulus"
 """Name of Young's modulus."""
 CONVERGED = 1e-2
 """Largest step, in standard errors, of a converged fit."""
-SWING = 0.25
+MAX_REVERSAL = 0.25
 """Fraction of the last change that a step may revert; otherwise the next step is halved."""
 FROZEN = 1e-3
 """Change of all residuals between the bounds, in units of their noise, below which an unknown is
@@ -394,7 +394,9 @@ class Directions:
         is_large = components * np.sqrt(self.variance)[:, None] > TELLS
         is_uncertain = (self.variance > TELLS**2)[:, None]
         return np.where(
-            self.is_null[:, None], components > 0.0, is_uncertain & (is_large | (components > PART))
+            self.is_null[:, None],
+            components > 0.0,
+            is_uncertain & (is_large | (components > MIN_COMPONENT)),
         )
 
     def errors(self, step: Floats) -> Floats:
@@ -481,7 +483,7 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
         if (np.abs(directions.errors(step)) <= CONVERGED).all():
             break
         change = at.jacobian @ step
-        is_reversed = change @ last_change < -SWING * (last_change @ last_change)
+        is_reversed = change @ last_change < -MAX_REVERSAL * (last_change @ last_change)
         length = length / 2.0 if is_reversed else min(1.0, 2.0 * length)
         length, at, trials = _line_search(problem, at, z, step, length, loss)
         z, last_change, count = z + length * step, length * change, count + trials

@@ -458,7 +458,7 @@ NEGLIGIBLE = 18.0
 """Difference to the largest logarithm above which the likelihood is negligible (2e-8)."""
 DRAWS = 20_000
 """Number of draws for the likelihood."""
-DEPTH = 1e-8
+NEGLIGIBLE_DEPTH = 1e-8
 """Fraction of the strain of the weakest specimen that is negligible."""
 LawBounds = tuple[tuple[float, float], tuple[float, float]]
 """Bounds of both parameters of a law."""
@@ -604,7 +604,7 @@ class UniformLaw(StrengthLaw):
             inside &= (s >= bounds[1][0]) & (s <= bounds[1][1])
             return np.where(inside, log_likelihood + depth[:, None], -np.inf)
 
-        depth = np.log(lowest) + np.linspace(np.log(DEPTH), -1e-9, COARSE)
+        depth = np.log(lowest) + np.linspace(np.log(NEGLIGIBLE_DEPTH), -1e-9, COARSE)
         widths = 2 * bounds[0][0] * bounds[1][0], 2 * bounds[0][1] * bounds[1][1]
         log_w = _nodes(widths)
         depth, log_w = _refine_nodes(logarithm(depth, log_w), depth, log_w)

@@ -106,7 +106,7 @@ LARGE_BYTES = 2**20
 time."""
 MOST_WAITING = 2
 """Maximum number of pending large values; beyond it the run waits."""
-MOST_CALLS = 100
+MAX_CALLS = 100
 """Maximum number of pending calls; beyond it the run waits."""
 
 
@@ -167,7 +167,7 @@ class OverlappingSink(KeepingSink):
         self._inner.abandon()
 
     def _hand_over(self, large: bool, call: Callable[[Any], None], what: Any) -> Future[None]:
-        while len(self._waiting) >= MOST_CALLS or (large and self._large_ones() >= MOST_WAITING):
+        while len(self._waiting) >= MAX_CALLS or (large and self._large_ones() >= MOST_WAITING):
             self._waiting.popleft()[1].result()
         handed = self._thread.submit(call, what)
         self._waiting.append((large, handed))

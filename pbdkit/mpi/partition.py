@@ -98,10 +98,10 @@ def _blocks(part: Array, axis: int) -> Iterator[Bytes]:
 MOST_STEPS = 16
 """Maximum number of steps between two exchanges, after which the halo of a part of 1500 rows is a
 hundredth of the part."""
-MADE_TWICE = 0.05
+MAX_OVERLAP = 0.05
 """Maximum number of rows that two adjacent parts both compute, relative to the number of rows of a
 part."""
-LOOKED_AT = 3
+MIN_MEASURED_ROWS = 3
 """Minimum number of moving rows beyond the own rows of a part if diagnostics are evaluated on
 it."""
 
@@ -169,7 +169,7 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     steps = _steps(each, int(np.diff(bounds).min()))
     # After the last of these steps all own rows are valid, and all particles that their frame
     # points follow.
-    looked_at = edge + LOOKED_AT * any(d.local for d in experiment.diagnostics)
+    looked_at = edge + MIN_MEASURED_ROWS * any(d.local for d in experiment.diagnostics)
     # Bonds from own frame points lead to moving particles.
     halo = max(steps * each, looked_at, 2 * edge * experiment.shows_bonds) + edge
     if scene.has_fracture and not experiment.fracture.breaks_frame_bonds():
@@ -185,7 +185,7 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
 def widest_halo(each: int, edge: int, least: int, parts: int) -> int:
     """Return an upper bound of the halos of `subdomains`, if a step reaches at most `each` rows and
     neighbours `edge` rows, for parts of at least `least` rows."""
-    return _steps(each, least) * each + 3 * edge + LOOKED_AT + int(MADE_TWICE * least)
+    return _steps(each, least) * each + 3 * edge + MIN_MEASURED_ROWS + int(MAX_OVERLAP * least)
 
 
 def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
@@ -209,7 +209,7 @@ def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
 def _steps(each: int, least: int) -> int:
     """Return the number of steps between two exchanges, for the rows that a step reaches and the
     minimum number of rows of a part."""
-    return min(MOST_STEPS, 1 + int(MADE_TWICE * least / each)) if each else MOST_STEPS
+    return min(MOST_STEPS, 1 + int(MAX_OVERLAP * least / each)) if each else MOST_STEPS
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ NEW = "#D55E00"
 """Colour of broken bonds if all broke in the same step."""
 WIDE_IN = 5.0
 """Maximum width of a map in inches."""
-LEAST_IN = 1.8
+MIN_IN = 1.8
 """Minimum width and height of a map in inches."""
 TALLEST_IN = 6.0
 """Maximum height of a map in inches."""
@@ -202,8 +202,8 @@ def _axes_around(body: Array) -> Axes:
     """Return the axes of a new figure with the aspect ratio of the body, limited by the room for
     text."""
     wide, tall = np.maximum(np.ptp(body, axis=0), 1e-9)
-    height = min(max(WIDE_IN * tall / wide, LEAST_IN), TALLEST_IN)
-    width = min(max(height * wide / tall, LEAST_IN), WIDE_IN)
+    height = min(max(WIDE_IN * tall / wide, MIN_IN), TALLEST_IN)
+    width = min(max(height * wide / tall, MIN_IN), WIDE_IN)
     below = SCALE_IN if _is_long(body) else 0.0
     return new_axes(width + BESIDE_IN, height + BESIDE_IN + below)
 

@@ -397,7 +397,7 @@ def _draw(dataset: xarray.Dataset, x: Any, drawn: list[Any], ax: Axes | None) ->
     return ax
 
 
-MOST_LINES = 200
+MAX_LINES = 200
 """Maximum number of lines."""
 Numbers = int | Iterable[int]
 
@@ -423,9 +423,9 @@ def draw_history(
         drawn = _of_particles(dataset, name or "u", numbers)
     alone = len(drawn) == 1
     lines = [line for n, series in enumerate(drawn) for line in _lines(dataset, series, n, alone)]
-    if not 0 < len(lines) <= MOST_LINES:
+    if not 0 < len(lines) <= MAX_LINES:
         what = f"{len(lines)} lines are too many" if lines else "there is no value to draw"
-        raise ExperimentError(f"{what}; select other particles, for at most {MOST_LINES} lines")
+        raise ExperimentError(f"{what}; select other particles, for at most {MAX_LINES} lines")
     values, title = drawn[0].values, str(dataset.attrs.get("title", ""))
     hues = "bond" if bond is not None else "number of the particle"
     if len(drawn) == 1 and (members := hues_of(values)):

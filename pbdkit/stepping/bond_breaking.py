@@ -26,9 +26,9 @@ Home = tuple[Any, ...]
 """Type of the index of bonds in planes: plane and cells."""
 DIRECTIONS = 8
 """Number of directions in which the ends of a bond are displaced to test whether it may break."""
-TIE = 1e-6
+TIE_RTOL = 1e-6
 """Relative difference of loads up to which cells begin to soften together."""
-CALM = 1e-3
+MAX_DAMAGE_CHANGE = 1e-3
 """Change of damage up to which further cells may begin to soften."""
 
 
@@ -140,7 +140,7 @@ class Fracturing:
                     load = self._load(part, n)
                     largest = max(largest, float(load[begins].max()))
                     waiting.append((begins, load, old, new))
-        threshold = largest * (1.0 - TIE) if change <= CALM else math.inf
+        threshold = largest * (1.0 - TIE_RTOL) if change <= MAX_DAMAGE_CHANGE else math.inf
         for begins, load, old, new in waiting:
             for a, b in zip(old, new, strict=True):
                 np.copyto(b, a, where=begins & (load < threshold))

@@ -466,7 +466,7 @@ def _lowered(
 
 THREADS = 256
 """Number of threads of a block if there are several blocks."""
-MOST_THREADS = 1024
+MAX_THREADS = 1024
 """Number of threads of a single block."""
 SIMULATED_THREADS = 8
 """Number of threads in numba's simulator."""
@@ -492,7 +492,7 @@ class GpuStepper(Engine):
         self._device: Arrays = {}
         self._send(kernel.arrays)
         with blamed(self._plan.levels):
-            threads = MOST_THREADS if kernel.alone else THREADS
+            threads = MAX_THREADS if kernel.alone else THREADS
             functions = functions_of(self._plan.levels)
             self._run = make_kernel(kernel.source, functions, threads)
             # A call without steps compiles the kernel, so that errors of the compiler occur here.
@@ -520,7 +520,7 @@ class GpuStepper(Engine):
         if is_simulated():
             return 1, SIMULATED_THREADS
         if alone:
-            return 1, min(MOST_THREADS, -(-size // 32) * 32)
+            return 1, min(MAX_THREADS, -(-size // 32) * 32)
         return min(most_blocks(self._run, THREADS), -(-size // THREADS)), THREADS
 
     def _begin(self, state: State) -> None:

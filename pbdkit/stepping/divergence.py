@@ -18,7 +18,7 @@ EVERY = 100
 KEPT_EVERY = 5000
 """Minimum number of steps between two copies of the state. Steps after a copy are repeated to find
 the last good state."""
-BEYOND = 1e6
+MAX_RELATIVE_SIZE = 1e6
 """Factor by which a displacement exceeds the sum of the sizes of body, initial displacements and
 leaders' motions in a diverging run."""
 SAMPLES = 64
@@ -53,7 +53,7 @@ class Guard:
         if note:
             self.next_look = next_multiple(state.step)
             self._note(state, largest)
-        if largest <= BEYOND * self.size:
+        if largest <= MAX_RELATIVE_SIZE * self.size:
             return
         worst = self.worst(scene, state)
         raise FloatingPointError(f"particle {worst}, found at step {state.step},")

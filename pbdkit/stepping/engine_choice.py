@@ -45,7 +45,7 @@ VALUE_S = 2.5e-9
 KERNEL_S = 2e-9
 """Time of kernels for each step and particle, in seconds (measured: 1 to 2 ns, with 4 or 8
 neighbours in motion)."""
-TWO_THREADS_PAY = 100_000
+MIN_PARTICLES_OF_TWO_THREADS = 100_000
 """Number of particles from which two threads are faster than one (measured: 40 000), with a
 margin."""
 
@@ -85,7 +85,7 @@ def choose(scene: Scene) -> Choice:
         return Choice("numpy", 1, f"the compiled engine is not available: {hindrance}")
     threads = solver.threads
     if threads == "auto":
-        threads = processors() if scene.raster.total >= TWO_THREADS_PAY else 1
+        threads = processors() if scene.raster.total >= MIN_PARTICLES_OF_TWO_THREADS else 1
     reason = "requested" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
     return Choice("compiled", threads, reason + _about_passes(scene))
 

@@ -71,12 +71,12 @@ if TYPE_CHECKING:
 
 HANDED_OUT_S = 0.25
 """Duration of a chunk of members in seconds."""
-MOST_AT_ONCE = 16
+MAX_AT_ONCE = 16
 """Maximum number of members in a chunk. A chunk must fit into the pipe to a worker that has been
 killed."""
 HEARTBEAT_S = 0.2
 """Maximum time in seconds between two looks at the progress of workers."""
-MOST_LOSSES = 3
+MAX_LOSSES = 3
 """Maximum number of times that a member may be lost with its process, while it was run alone,
 before it counts as failed."""
 AHEAD = 2
@@ -116,7 +116,7 @@ class Queue:
         if not self._count or self.jobs[0].key in self._losses:
             return [self.jobs.popleft()]
         size = int(HANDED_OUT_S * self._count / max(self._seconds, 1e-9))
-        size = min(size, MOST_AT_ONCE, len(self.jobs) // (2 * self.workers))
+        size = min(size, MAX_AT_ONCE, len(self.jobs) // (2 * self.workers))
         chunk = [self.jobs.popleft()]
         while len(chunk) < size and self.jobs and self.jobs[0].key not in self._losses:
             chunk.append(self.jobs.popleft())
@@ -135,7 +135,7 @@ class Queue:
         for job in chunk:
             losses = self._losses.get(job.key, 0) + (len(chunk) == 1)
             self._losses[job.key] = losses
-            if losses >= MOST_LOSSES:
+            if losses >= MAX_LOSSES:
                 text = f"{reason} {losses} times while it ran; it runs again with the next call"
                 yield report_of(job.key, LOST, text, lasting=False)
             else:
@@ -443,7 +443,7 @@ def _attributes(plan: SweepPlan, versions: dict[str, str]) -> dict[str, str]:
 
 GRACE_S = 1.0
 """Time in seconds for members to end after the sweep is stopped."""
-MOST_STARTS = 10
+MAX_STARTS = 10
 """Maximum number of workers in succession that end while they start."""
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
@@ -545,9 +545,9 @@ class _Worker:
             return
         queue.jobs.extendleft(reversed(chunk))
         queue.false_starts += 1
-        if queue.false_starts >= MOST_STARTS:
+        if queue.false_starts >= MAX_STARTS:
             raise PbdkitError(
-                f"{MOST_STARTS} worker processes ended while they were starting; --workers 1 runs "
+                f"{MAX_STARTS} worker processes ended while they were starting; --workers 1 runs "
                 "the members in this process and shows the error"
             )
 

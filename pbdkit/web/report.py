@@ -65,7 +65,7 @@ def factor_of(variable: xarray.DataArray) -> float:
 
 MOST_POINTS = 1200
 """Maximum number of points of a curve."""
-MOST_SERIES = 12
+MAX_SERIES = 12
 """Maximum number of curves of a variable."""
 AGAINST = {"nominal_stress": "nominal_strain", "load_resultant": "load_displacement"}
 """Variables that are drawn over another variable as well as over time."""
@@ -108,7 +108,7 @@ def _names(dataset: xarray.Dataset) -> list[str]:
         and variable.dtype.kind in "biuf"
         and TWIN_OF not in variable.attrs
         and math.prod(n for d, n in variable.sizes.items() if d not in ("time", "step"))
-        <= MOST_SERIES
+        <= MAX_SERIES
         and variable.size
     ]
 
@@ -163,9 +163,9 @@ def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
 
 
 Rows = NDArray[np.intp]
-FEWEST_STEPS = 60
+MIN_STEPS = 60
 """Minimum number of steps of a run, as far as recorded."""
-MOST_PARTICLES = 50_000
+MAX_PARTICLES = 50_000
 """Maximum number of particles that a browser moves smoothly, with their bonds."""
 FEW_LEADERS = 200
 """Number of leaders up to which all are shown, since they drive the motion."""
@@ -213,7 +213,7 @@ def thinned(
     leaders: NDArray[np.bool_],
     size: int,
     budget: int,
-    fewest: int = FEWEST_STEPS,
+    fewest: int = MIN_STEPS,
 ) -> Thinning:
     """Select as many steps and particles as fit into `budget` bytes, with `size` bytes for each
     particle and step. Steps are omitted first, down to the number `fewest`, then particles.
@@ -224,7 +224,7 @@ def thinned(
     steps = np.unique(np.append(np.arange(0, recorded, every), recorded - 1))
     stride = 1
     selection = np.ones(count, np.bool_)
-    limit = min(budget // (size * len(steps)), MOST_PARTICLES)
+    limit = min(budget // (size * len(steps)), MAX_PARTICLES)
     while selection.sum() > limit and stride < 1000:
         stride += 1
         selection = _on_sublattice(dataset, stride)
@@ -579,7 +579,7 @@ def _triangles(reference: Array, sites: list[Array], body: NDArray[np.bool_]) ->
 
 
 KeyPath = tuple[str | int, ...]
-MOST_TRIED = 150
+MAX_TRIED = 150
 """Maximum number of keys for which omission is tried."""
 PARTS = ("lattice", "body", "neighbours", "rule", "frame", "fracture", "solver")
 """Parts of an experiment that the summary describes."""
@@ -629,7 +629,7 @@ def experiment_text(parts: dict[str, Any]) -> str:
 def _brief(parts: dict[str, Any]) -> dict[str, Any]:
     """Omit every key without which the same experiment is built."""
     omitted: list[KeyPath] = []
-    for path in list(_paths(parts))[:MOST_TRIED]:
+    for path in list(_paths(parts))[:MAX_TRIED]:
         inside = any(path[: len(prefix)] == prefix for prefix in omitted)
         if not inside and _same(_without(parts, [*omitted, path]), parts):
             omitted.append(path)
@@ -682,7 +682,7 @@ FEWEST = 8
 """Minimum number of moves from which a decay is measured."""
 MOST = 800
 """Maximum number of moves from which a decay is measured."""
-FADED = 1e-11
+ROUNDING_RTOL = 1e-11
 """Ratio to the largest move below which moves are rounding errors."""
 
 
@@ -700,7 +700,7 @@ class SettlingMoves:
         """Return the rows from which the decay is measured: the second half of those after the last
         event and above rounding errors."""
         rows = np.arange(self.free, len(self.move))
-        rows = rows[self.move[rows] > FADED * self.move.max(initial=0.0)]
+        rows = rows[self.move[rows] > ROUNDING_RTOL * self.move.max(initial=0.0)]
         return np.asarray(rows[len(rows) // 2 :])
 
     @property
@@ -736,7 +736,7 @@ def moves_of(dataset: xarray.Dataset) -> SettlingMoves | None:
     for n, ((previous, previous_kinds), (current, kinds)) in enumerate(pairwise(records), 1):
         lengths, leads = np.linalg.norm(current - previous, axis=1), kinds == LEADER
         move.append(float(lengths[~leads].max(initial=0.0)) / intervals[0])
-        leader_move = lengths[leads].max(initial=0.0) > FADED * max(move)
+        leader_move = lengths[leads].max(initial=0.0) > ROUNDING_RTOL * max(move)
         if leader_move or not np.array_equal(kinds, previous_kinds):
             event = n
     if "broken_step" in dataset and dataset["broken_step"].size:
@@ -1022,9 +1022,9 @@ def _last(values: Array) -> Array:
     return np.asarray(values[np.arange(len(values)), last])
 
 
-FEWEST_STEPS_OF_MEMBER = 6
+MIN_STEPS_OF_MEMBER = 6
 """Minimum number of steps shown of each member, if recorded."""
-FEWEST_POINTS = 50
+MIN_POINTS = 50
 """Minimum number of points of the curves of each member, if recorded."""
 POINTS = 100_000
 """Maximum number of points in the curves of all members together."""
@@ -1056,7 +1056,7 @@ class SweepContent:
         """Return the content, with moving lattices of all members of about `budget` bytes before
         packing."""
         each = self._members
-        points = max(FEWEST_POINTS, POINTS // len(each))
+        points = max(MIN_POINTS, POINTS // len(each))
         successful = [str(member[STATUS].item()) in KEPT for member in each]
         if "position" not in each[0] or not any(successful):
             note = "No lattices are shown: no member is complete, or `position` was not kept."
@@ -1066,7 +1066,7 @@ class SweepContent:
             }  # fmt: skip
         first = each[successful.index(True)]
         size = bytes_a_particle(first) * len(each)
-        thinning = thinned(first, leaders_of(first), size, budget, FEWEST_STEPS_OF_MEMBER)
+        thinning = thinned(first, leaders_of(first), size, budget, MIN_STEPS_OF_MEMBER)
         bodies = [
             _Body.of(member, self._scene) if g else None
             for member, g in zip(each, successful, strict=True)

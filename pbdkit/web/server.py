@@ -242,7 +242,7 @@ class Conductor:
 
 MOST_WAITING = 1000
 """Maximum number of messages that wait for a page; if it does not read them, it is disconnected."""
-MOST_PAGES = 8
+MAX_PAGES = 8
 """Maximum number of connected pages."""
 SERVER_CLOSE_S = 0.5
 """Time in seconds for pages to answer at the end; then they are disconnected."""
@@ -352,7 +352,7 @@ class SessionServer:
         )
         if refusal:
             return connection.respond(HTTPStatus.FORBIDDEN, f"refused: {refusal}\n")
-        if path == "/socket" and is_socket and self._pages < MOST_PAGES:
+        if path == "/socket" and is_socket and self._pages < MAX_PAGES:
             return None
         if path != "/" or is_socket:
             return connection.respond(HTTPStatus.NOT_FOUND, "there is no such page\n")

@@ -20,7 +20,7 @@ from pbdkit.stepping.state import State
 
 MOST_POINTS = 50_000
 """Maximum number of particles that are shown."""
-MOST_LEADERS = 2000
+MAX_LEADERS = 2000
 """Maximum number of leaders of a group that are shown."""
 MOST_BONDS = 500_000
 """Maximum number of bonds that are shown."""
@@ -151,7 +151,7 @@ def _thinned(scene: Scene, every: int) -> NDArray[np.intp]:
     site = raster.site_table()
     selection = ((site % every == 0) | (site == site.max(axis=0))).all(axis=1)
     for leading in scene.leading:
-        selection[leading.rows[:: max(1, len(leading.rows) // MOST_LEADERS)]] = True
+        selection[leading.rows[:: max(1, len(leading.rows) // MAX_LEADERS)]] = True
     return np.flatnonzero(selection)
 
 

@@ -90,7 +90,7 @@ class Level:
         return [f"t{n}" for n in range(sum(self.parts))]
 
 
-MOST_BITS = 32
+MAX_BITS = 32
 """Number of neighbours of a sublattice up to which code is written slot by slot and broken bonds
 are bits."""
 
@@ -134,7 +134,7 @@ class Plan:
     @property
     def long(self) -> bool:
         """True if there are too many neighbours to write them out."""
-        return max(map(len, self.scene.neighbourhood.slots)) > MOST_BITS
+        return max(map(len, self.scene.neighbourhood.slots)) > MAX_BITS
 
     def is_loaded(self, level: Level) -> bool:
         """Return whether loads act on the particles moved by the rule of that level, which is the

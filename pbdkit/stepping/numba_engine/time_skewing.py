@@ -24,7 +24,7 @@ CACHE = 2**24
 FARTHEST = 8
 """Maximum distance in cells between steps of a pass; the distance of frame points from their
 particles increases it."""
-MOST_SLOTS = 32
+MAX_SLOTS = 32
 """Number of neighbours up to which steps are limited by memory bandwidth rather than
 computation."""
 
@@ -45,7 +45,7 @@ def single_steps(scene: Scene) -> str:
     one."""
     if reason := reason_against(scene, Mode.PASSES):
         return reason
-    if max(map(len, scene.neighbourhood.slots)) > MOST_SLOTS:
+    if max(map(len, scene.neighbourhood.slots)) > MAX_SLOTS:
         return "there are many neighbours"
     if max(Skew(scene).along) > FARTHEST:
         return "frame points follow particles far away"
