@@ -293,5 +293,7 @@ def table(entries: list[Entry]) -> Iterator[str]:
     """Yield a table of all names with their first sentences."""
     yield ".. list-table::\n   :class: summary\n   :widths: 30 70\n"
     for entry in entries:
-        yield f"   * - :py:obj:`{entry.name}`\n     - {linked(entry.summary)}"
+        short = entry.name.startswith(ACCESSOR) or entry.name.count(".") == 1
+        title = entry.name if short else entry.name.rpartition(".")[2]
+        yield f"   * - :py:obj:`{title} <{entry.name}>`\n     - {linked(entry.summary)}"
     yield ""

@@ -44,13 +44,14 @@ else:  # named tuples, which numba compiles
 class Vector(_Plane[T]):
     """A vector by components: numbers, or arrays of one shape.
 
-    Vectors add, subtract and are scaled as vectors are; with `+` no tuple is made longer.
+    The operators + - * / are those of vectors and scalars: `+` adds components and does not
+    concatenate.
 
     Parameters
     ----------
-    x, y : T
-        The components along the axes. ``Vector[float]`` has numbers, and ``Vector`` alone, as
-        elementwise functions take it, numbers or arrays (`Number`).
+    x, y : float or array
+        Components along the axes: numbers in a ``Vector[float]``, and numbers or arrays (`Number`)
+        in the arguments of elementwise functions.
 
     Examples
     --------
@@ -110,8 +111,8 @@ class SpaceVector(_Space[T], Vector[T]):
 
     Parameters
     ----------
-    x, y, z : T
-        The components along the axes.
+    x, y, z : float or array
+        Components along the axes.
     """
 
     __slots__ = ()
