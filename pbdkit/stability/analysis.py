@@ -351,7 +351,7 @@ class Analysis:
 
         Returns
         -------
-        Swing or None
+        `Swing` or None
             Period 2π / arg μ in steps and decay |μ| a step, which is √memory for real eigenvalues;
             None if no mode oscillates, or if the eigenvalues of the rule are unknown.
         """
