@@ -189,7 +189,7 @@ ENGINE = "NetCDF4BackendEntrypoint"
 """Class by which xarray uses this module. With its name instead of the class, xarray would search
 all distributions, and stop at one with damaged metadata."""
 BEGINNINGS = (b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"CDF\x02", b"CDF\x05")
-"""First bytes of netCDF files of any kind."""
+"""First bytes of netCDF files: HDF5 and the classic formats."""
 PATIENCE_S = 10.0
 """Time limit in seconds for reading one piece."""
 PIECE = 2**26

@@ -133,8 +133,7 @@ class Look:
                 raise ExperimentError(f"{name}: expected a finite number, got {limit!r}")
         if self.vmin is not None and self.vmax is not None and not self.vmin < self.vmax:
             raise ExperimentError(
-                f"the lower limit of the colours, {self.vmin:g} (vmin), is not below the upper "
-                f"one, {self.vmax:g} (vmax); exchange them"
+                f"colour limits: vmin {self.vmin:g} is not below vmax {self.vmax:g}; exchange them"
             )
 
 

@@ -65,7 +65,7 @@ def check_directions(experiment: Experiment, *, has_frame: bool) -> None:
         ):
             if clash:
                 raise ExperimentError(
-                    f"'{rule.type}' uses the remembered numbers of neighbours, which {points} do "
+                    f"'{rule.type}' uses the state variables of neighbours, which {points} do "
                     f"not have; use {part}: {{type: none}}",
                     (part,),
                 )

@@ -282,7 +282,7 @@ REFUSED = {
     ),
     "limits": (
         {"color": "pe1", "vmin": 2.0, "vmax": 1.0},
-        "2 (vmin), is not below the upper one, 1",
+        "vmin 2 is not below vmax 1; exchange them",
     ),
     "map": (
         {"color": "pe1", "cmap": "virids"},
