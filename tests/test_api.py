@@ -190,7 +190,7 @@ def test_a_dataset_is_saved_as_a_sealed_result(ds, call, tmp_path, monkeypatch):
         some.pbd.save("some.nc")
     pbdkit.open(path).isel(time=[0]).pbd.save("some.nc", force=True)
     assert pbdkit.open(path).sizes["time"] == 1
-    with pytest.raises(pbdkit.ExperimentError, match=r"'axis', which .* by `to_netcdf`"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"'axis', which .* use `to_netcdf`"):
         ds[["pe1"]].pbd.save("part.nc")
     with pytest.raises(pbdkit.StorageError):
         ds.pbd.save(tmp_path / "nowhere" / "a.nc")
@@ -230,7 +230,7 @@ def test_sweeps_take_keywords_alone(tensile):
 def test_analyses_and_identities_read_well(tensile):
     known = str(pbdkit.analyse(tensile))
     assert known.startswith("analysis of tensile\n  stability ")
-    assert re.search(r"^  settles +to 1e-3 in \d+, .* steps$", known, re.M)
+    assert re.search(r"^  converges +to 1e-3 in \d+, .* steps$", known, re.M)
     identity = str(pbdkit.identify("material/bar"))
     assert identity.startswith("material/bar: elastic, ")
     assert re.search(r"^  Poisson", identity, re.M | re.I)

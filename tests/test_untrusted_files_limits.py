@@ -345,7 +345,7 @@ def test_names_that_are_none_are_refused_in_a_line(tensile: dict[str, Any], name
 
 TABLES = [
     ("," * 3_000_000 + "\n", r"has a line of more than 65536 characters; remove the columns"),
-    (",".join(f"ux{n}" for n in range(9000)) + "\n", "there are no 'step'"),
+    (",".join(f"ux{n}" for n in range(9000)) + "\n", "has no 'step'"),
     ("step,ux,uy\n1,1_0,0\n", "d.csv:2: column 'ux' requires a finite number, got '1_0'"),
 ]
 

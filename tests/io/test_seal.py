@@ -80,7 +80,9 @@ def test_only_what_is_read_is_checked(sound, tmp_path):
     changed.write_bytes(content)
     with pbdkit.open(changed) as dataset:
         assert np.isfinite(dataset["position"][0].values).all()
-        with pytest.raises(BrokenSealError, match=f"of {SealedFile(changed).seal.size} are not"):
+        with pytest.raises(
+            BrokenSealError, match=f"of {SealedFile(changed).seal.size} have changed"
+        ):
             dataset["position"][-1].load()
 
 
