@@ -49,7 +49,7 @@ def __getattr__(name: str) -> object:
 
 
 def _hint(name: str) -> str:
-    """Return a hint to the module of a name for authors of components; empty for any other name."""
+    """Return a hint to import a name from pbdkit.plugin; empty if the name is not public there."""
     if name.startswith("_"):
         return ""
     present_name = _RENAMED.get(name, name)

@@ -450,7 +450,7 @@ def fit(
     description : mapping, str or path
         Fit file, name of a shipped fit, or dict with the same keys.
     experiment : Experiment, mapping, str or path, optional
-        Experiment in place of that of the description.
+        Experiment that replaces the one in the description.
     measured : xarray.Dataset, optional
         Measurement in place of the file of the description: a variable for each of its
         ``columns``, all of one shape, for instance x, y, ux and uy of a displacement field.
@@ -512,14 +512,14 @@ def fit_strength(
 ) -> FittedStrength:
     """Fit the strength of bonds and its scatter to peaks of repeated tests.
 
-    The function is `fit` for descriptions with ``kind: strength``.
+    For descriptions with ``kind: strength``, `fit` calls this function.
 
     Parameters
     ----------
     description : mapping, str or path
         Fit file with ``kind: strength``, name of a shipped one, or dict with the same keys.
     experiment : Experiment, mapping, str or path, optional
-        Experiment in place of that of the description.
+        Experiment that replaces the one in the description.
     components : iterable of classes
         Component classes that the experiment uses in addition to the installed ones.
 
@@ -550,7 +550,7 @@ def fit_strength(
 def _experiment_of_fit(
     experiment: ExperimentLike | None, source: Source, components: ComponentClasses
 ) -> Experiment:
-    """Return the experiment of a fit, the caller's or that of its source."""
+    """Return the experiment that the caller passed, or otherwise that of the fit file."""
     if experiment is None:
         return Experiment.build(source, components)
     return as_experiment(experiment, components)

@@ -92,7 +92,7 @@ class Driver(ABC):
 
     @abstractmethod
     def states(self) -> States:
-        """Generate the states of the run, the first included, and return its outcome.
+        """Generate the states of the run, including the first, and return its outcome.
 
         Each state is valid until the next is generated.
 
@@ -153,8 +153,8 @@ class SteppingDriver(Driver):
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """Restore the result of `state_dict`.
 
-        Data that follow from the scene are not restored: the size of the body, and the first step
-        at which convergence is tested, unless it was tested before.
+        Two data are not restored, because they follow from the scene: the size of the body and, if
+        convergence has not been tested yet, the first step at which it is tested.
         """
         self.state, self.recorded_step = parts["state"], parts["kept"]
         is_good = parts["guard"]["good_step"] == self.state.step
@@ -487,9 +487,9 @@ class Simulation:
     def __iter__(self) -> Iterator[State]:
         """Yield the states to the end of the run; possible once.
 
-        The states are those of every recorded step, the first and the last included, and of some
-        steps between. Each is valid, and may be modified, until the next; ``state.copy()`` keeps
-        it.
+        The states are those of every recorded step, including the first and the last, and of some
+        steps between. Each is valid, and may be modified, until the next is generated;
+        ``state.copy()`` keeps it.
         """
         with _located(self.scene):
             self.outcome = yield from self.driver.states()
@@ -680,7 +680,7 @@ class Simulation:
 
     @property
     def particles(self) -> int:
-        """Number of particles, frame included."""
+        """Number of particles, including those of the frame."""
         return self.scene.raster.count
 
     def recorder(self, sink: Sink) -> Recorder:
@@ -746,7 +746,7 @@ class RunReport:
     outcome
         Outcome of the run.
     particles
-        Number of particles, frame included.
+        Number of particles, including those of the frame.
     wall_s
         Wall time of stepping and recording in seconds.
     choice

@@ -165,8 +165,8 @@ The case `rectangular` has all eight neighbours on a rectangular lattice:
 {point_text("rectangular")}```
 
 Only the diffusivity is anisotropic: the body relaxes faster along the axis in which the
-neighbourhood reaches farther. With weighted neighbours a displacement along x causes none along
-y (at most {signs["cross"]:.1g}), and a displacement along y spreads like one along x (within
+neighbourhood reaches farther. With weighted neighbours a displacement along x causes a displacement
+along y of at most {signs["cross"]:.1g}, and a displacement along y spreads like one along x (within
 {signs["turned"]:.0e}). In an elastic body one would cause shear and the other extension.
 """
 

@@ -63,7 +63,8 @@ def _fields() -> list[Claim]:
     return [
         Claim(
             "leaders motion implies a displacement of the first layer that propagates",
-            f"The columns 1 to 8 layers from the leaders first move at steps {which(first)}.",
+            "The columns at distances of 1 to 8 layers from the leaders first move at steps "
+            f"{which(first)}, in this order.",
             first == list(range(1, 9)),
         ),
         Claim(
@@ -139,7 +140,7 @@ def _energy() -> list[Claim]:
         Claim(
             "PE1 [of 67] increases notably when points are pulled but decrease … when they become "
             "followers",
-            "The leaders are released after step 10. PE1 of 67 increases until step "
+            "The leaders are released after step 10. PE1 of particle 67 increases until step "
             f"{peak}, to {fall[0] / pe1[10, LEFT_OF_MIDDLE, ABOVE]:.0f} times its value at step "
             f"10; it has one maximum. In the column left of the leaders the maximum is at step "
             f"{peaks[9]}.",
@@ -202,8 +203,9 @@ def _history() -> list[Claim]:
         ),
         Claim(
             "no oscillation can be observed with this kind of rule",
-            f"x of 67 changes direction {turns} time after it starts to move and never crosses "
-            f"its rest position; in `paper/a-memory` it crosses it {crossings} times by step 200.",
+            f"x of particle 67 changes direction {turns} time after it starts to move and never "
+            f"crosses its rest position; in `paper/a-memory` it crosses it {crossings} times by "
+            "step 200.",
             turns == 1 and bool((x >= 0).all()),
         ),
     ]

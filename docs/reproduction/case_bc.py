@@ -22,7 +22,7 @@ def edge_excess(column: Floats) -> float:
 
 
 def half_time(sheet: Sheet) -> int:
-    """Return the first step with half the contraction of 67 at step 100."""
+    """Return the first step with half the contraction of particle 67 at step 100."""
     y = sheet.u[:, COLUMN, ROW, 1]
     return int(np.flatnonzero(y <= y[100] / 2)[0])
 
@@ -97,7 +97,7 @@ def _claims_b() -> list[Claim]:
         ),
         Claim(
             "the point is above the central line so their y coordinate decrease",
-            f"u_y of 67 decreases to {y[100]:.4f} at step 100 and never increases.",
+            f"u_y of particle 67 decreases to {y[100]:.4f} at step 100 and never increases.",
             bool(y[100] < 0 and (np.diff(y) <= 1e-15).all()),
         ),
     ]
@@ -122,7 +122,8 @@ def section_c() -> Section:
 
 
 def _less(name: str) -> tuple[Floats, list[int]]:
-    """Return the contraction of 67 at steps 9, 19, 99, and the steps at which that of b is less."""
+    """Return the contraction of particle 67 at steps 9, 19, 99, and the steps at which that of b is
+    less."""
     y, first = -run(name).u[:, COLUMN, ROW, 1], -run("paper/b").u[:, COLUMN, ROW, 1]
     return y[[9, 19, 99]], [int(s) for s in np.flatnonzero(y > first + 1e-15)]
 
@@ -149,8 +150,8 @@ def _claims_c() -> list[Claim]:
         ),
         Claim(
             "a lower lateral contraction [of 67], with respect the first gradient case",
-            f"−u_y of 67 in b and c is {values} at steps 9, 19 and 99: the contraction in c is "
-            f"larger at steps {above[0]} to {above[-1]} and smaller afterwards. With 24 "
+            f"−u_y of particle 67 in b and c is {values} at steps 9, 19 and 99: the contraction "
+            f"in c is larger at steps {above[0]} to {above[-1]} and smaller afterwards. With 24 "
             f"neighbours −u_y is {', '.join(f'{v:.4f}' for v in third)}, larger than in b at "
             f"steps {above_24[0]} to {above_24[-1]}.",
             not above,
@@ -159,8 +160,8 @@ def _claims_c() -> list[Claim]:
         ),
         Claim(
             "with a larger number of neighbours the effect is amortized",
-            f"−u_y of 67 at step 99 is {first[2]:.4f} with 4 neighbours, {second[2]:.4f} with 8 "
-            f"and {third[2]:.4f} with 24.",
+            f"−u_y of particle 67 at step 99 is {first[2]:.4f} with 4 neighbours, "
+            f"{second[2]:.4f} with 8 and {third[2]:.4f} with 24.",
             bool(first[2] > second[2] > third[2]),
         ),
         Claim(

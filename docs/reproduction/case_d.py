@@ -84,8 +84,8 @@ def _line() -> list[Claim]:
             "points close to the frame are detached before the others [first gradient]",
             f"The rows separate at steps {rows['1']} in `paper/d1` and {rows['lag']} in "
             f"`paper/d1-lag`. Thresholds from {THRESHOLDS[0]:g} to {THRESHOLDS[-1]:g} were tried; "
-            "the number with edges first, of those at which all rows separate, is: "
-            f"{found}.",
+            "of those at which all rows separate, the following numbers separate at the edges "
+            f"first: {found}.",
             len(first["one shell"]) == len(sheets_of["one shell"]),
             f"`paper/d1-lag`, at {share['one shell and lag 1']}",
             edges_first(parted(lag)),

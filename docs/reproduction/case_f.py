@@ -109,7 +109,7 @@ def _one_shell() -> list[Claim]:
         ),
         Claim(
             "a rebound mechanism [of 133] can be outlined",
-            f"x of 133 decreases to {back[1]:.3f} at step {back[0]} and increases to "
+            f"x of particle 133 decreases to {back[1]:.3f} at step {back[0]} and increases to "
             f"{back[2]:.3f}. Of the thresholds {which(list(family))} there is a rebound at "
             f"{which(turning)}.",
             back[0] > 10,
@@ -186,9 +186,10 @@ def _two_shells() -> list[Claim]:
             "There is no cusp in `paper/f2`, and none in `paper/f2-second-fracture`: the second "
             f"difference of x is at most {kink:.1g} near step {second}, because the broken bond "
             "does not belong to the piece. In `paper/f2-cusp` (thresholds 5.1) a bond between the "
-            f"piece and the frame breaks at step {cusp}, and twenty steps later x of 133 "
-            f"decreases {bend:.1f} times as fast as before. Of {searched} thresholds from 4.9 to "
-            f"5.3 a bond of the piece breaks between steps 60 and 150 at {which(felt)}.",
+            f"piece and the frame breaks at step {cusp}, and twenty steps later x of particle 133 "
+            f"decreases {bend:.1f} times as fast as before. {searched} thresholds from 4.9 to 5.3 "
+            "were tried; a bond of the piece breaks between steps 60 and 150 at the thresholds "
+            f"{which(felt)}.",
             False,
             "`paper/f2-cusp`",
             80 <= cusp <= 130 and bend > 1.5,

@@ -45,8 +45,8 @@ def _claims_g() -> list[Claim]:
         ),
         Claim(
             "the behaviour is … more similar to the square lattice",
-            "The mean difference between x of 133 and x of 103 in `paper/d2` over steps 20 to 400 "
-            f"is {far[1]:.3f}; with the `mean` frame it is {far[0]:.3f}.",
+            "The mean difference between x of particle 133 and x of particle 103 in `paper/d2` "
+            f"over steps 20 to 400 is {far[1]:.3f}; with the `mean` frame it is {far[0]:.3f}.",
             far[1] < far[0],
         ),
         Claim(

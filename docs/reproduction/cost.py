@@ -23,7 +23,7 @@ def cost() -> list[Claim]:
             f"after {', '.join(map(str, steps))} steps, {growth:.1f} times as many for twice the "
             "size. A sparse direct solver solves the same equations once.",
             growth < 1.5,
-            "sheets of some ten particles a side",
+            "sheets of about ten particles a side",
             steps[0] < 400,
         ),
         _shared(),

@@ -122,7 +122,7 @@ def _cauchy() -> list[Claim]:
         Claim(
             "deformable bodies … according to the standard Cauchy model",
             f"`pbdkit identify` computes the continuum limit inside the body: {found}. Diffusion "
-            "does not couple x and y, which equals elasticity with ν = −1. The rule of mixed "
+            "does not couple x and y; it equals elasticity with ν = −1. The rule of mixed "
             "coordinates depends on the position, which no material law does. Among the paper's "
             f"rules {of_weights}. `elastic` is {calibrated.symmetry} elasticity with the given "
             f"ν ({calibrated.poisson_ratio:.3f}).",

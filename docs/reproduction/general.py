@@ -112,7 +112,8 @@ def _rules() -> list[Claim]:
             "With a relaxation of 1.1 and noise of 1e-6 the rows differ by "
             f"{_rows_differ(past, 100):.1g} after 100 steps and {_rows_differ(past, 200):.1g} "
             "after 200: the steps diverge instead of oscillating. Momentum causes oscillation: "
-            f"x of 67 in `paper/a-memory` crosses its rest position {swings} times by step 200.",
+            f"x of particle 67 in `paper/a-memory` crosses its rest position {swings} times by "
+            "step 200.",
             False,
             "`paper/a-memory`",
             swings >= 2,
@@ -138,9 +139,9 @@ def _rules() -> list[Claim]:
         Claim(
             "anisotropic elastic behaviour",
             "Only the spreading is anisotropic. With the same neighbours a displacement along x "
-            f"causes none along y (at most {signs['cross']:.1g}), and a displacement along y "
-            f"spreads like one along x (within {signs['turned']:.0e}): extension and shear are "
-            "alike and not coupled, as in diffusion.",
+            f"causes a displacement along y of at most {signs['cross']:.1g}, and a displacement "
+            f"along y spreads like one along x (within {signs['turned']:.0e}): extension and shear "
+            "are alike and not coupled, as in diffusion.",
             max(signs.values()) > 1e-6,
         ),
     ]

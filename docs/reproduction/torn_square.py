@@ -64,7 +64,7 @@ def both() -> str:
         "thresholds:\n\n"
         "| | independent, 6.0 | 5.2 | 6.0 |\n| --- | --- | --- | --- |\n"
         f"{rows}\n\n"
-        "The number of thresholds at which x of 103 has a rebound is "
+        "The number of thresholds at which x of particle 103 has a rebound is "
         f"{kinds(swept('two shells, unbreakable frame bonds'))} with two shells and unbreakable "
         f"bonds to the frame, and {kinds(swept('24 neighbours'))} with 24 neighbours."
     )

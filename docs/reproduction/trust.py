@@ -88,7 +88,7 @@ def _meaning() -> list[str]:
         "expansion of a lattice may have l² < 0.",
         "**The model is diffusion.** Each coordinate diffuses independently. A particle k layers "
         "away does not move before step k, and the number of steps to equilibrium grows with the "
-        "square of the size. PE1 of 67 is largest at step "
+        "square of the size. PE1 of particle 67 is largest at step "
         f"{int(run('paper/a').of('pe1')[:, 4, 5].argmax())}, long after the release at step 10, "
         "and decreases exponentially rather than like a parabola.",
         "**Case e does not verify Saint-Venant's principle.** At the paper's time 9 the "

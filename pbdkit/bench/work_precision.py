@@ -736,8 +736,9 @@ def _of_followers(scene: Scene, state: State) -> Floats:
 def decay_of(scene: Scene, exact: Floats) -> Decay:
     """Return the decay of the slowest mode that the start excites.
 
-    It is computed by inverse iteration from the distance to `exact`, (axis, follower): v ← A⁻¹ v
-    with A = 1 - (step operator). Its share is the projection of that distance onto the mode.
+    The mode is computed by inverse iteration, v ← A⁻¹ v with A = 1 - (step operator), from the
+    distance of the start from `exact`, (axis, follower). The share of the mode is the projection of
+    this distance onto it.
     """
     start = initial_state(scene)
     steps, resting = scene.experiment.steps, initial_state(scene)

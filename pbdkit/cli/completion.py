@@ -1,4 +1,4 @@
-"""Completion by the tabulator key: names of experiments and results, and contents of results.
+"""Completion with the Tab key: names of experiments and results, and contents of results.
 
 Click completes files and choices. `setting_completion` completes the settings of experiments.
 """

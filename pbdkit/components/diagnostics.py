@@ -24,8 +24,8 @@ from pbdkit.plugin.units import AREA, ENERGY, FORCE, LENGTH, STRESS, FromUnits, 
 class PE1(Diagnostic):
     """Pseudo-energy PE1_j = Σ_k (|x_j - x_k| - |X_j - X_k|)² over all reference neighbours.
 
-    The sum includes broken bonds and frame points. Evaluated at every particle of the body, leaders
-    included.
+    The sum includes broken bonds and frame points. Evaluated at every particle of the body,
+    including leaders.
     """
 
     type: Literal["pe1"] = "pe1"

@@ -174,8 +174,8 @@ def rectangle_springs(c: Stiffness, a: float, b: float) -> tuple[float, float, f
 
 
 def springs_in(stiffness: Floats, c: Stiffness, cells: Tiling) -> Floats:
-    """Compute the largest multiple of the springs of a material that the stiffness of cells
-    exceeds.
+    """Compute the largest factor by which the springs of a material can be multiplied without
+    exceeding the stiffness of cells.
 
     Uniform strains and hourglass modes are considered.
 
@@ -254,8 +254,8 @@ def mean_move(total: Sums) -> Vector:
 
 
 def _on_both_sides(slot: Slot, c: Stiffness, cells: Tiling) -> list[Floats]:
-    """Return -K_jk of the cells to the left and right of a slot, half of it each if they are one
-    cell.
+    """Return -K_jk of the cell to the left and of the cell to the right of a slot. If both sides
+    belong to one cell, each entry is half of its -K_jk.
     """
     if not cells.rectangle:
         return [_in_triangle(slot, c, turn) for turn in (1, -1)]
@@ -297,7 +297,7 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
 
     @abstractmethod
     def material(self) -> tuple[float, Stiffness]:
-        """Return a modulus over Young's modulus, and the stiffness over that modulus.
+        """Return a modulus divided by Young's modulus, and the stiffness divided by that modulus.
 
         The ratios in the stiffness are finite for every admissible material.
         """
@@ -355,13 +355,14 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
         return dict.fromkeys(weights, 0.0) | {"spring": weights["spring"]}
 
     def spring_share(self, c: Floats, setting: Setting) -> Floats:
-        """Return the largest multiple of the springs that the stiffnesses exceed."""
+        """Return the largest factor by which the springs can be multiplied without exceeding the
+        stiffnesses."""
         modulus, material = self.material()
         return springs_in(c / (self.stiffness * modulus), material, setting.cells)
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> Sums:
-        """Return W d, and the entries xx, xy, yy of W; the sum of W is symmetric."""
+        """Return W d and the entries xx, xy, yy of W; the sum of W over all slots is symmetric."""
         return pulled(d, w)
 
     @staticmethod
@@ -386,7 +387,7 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
 
     @staticmethod
     def loaded(total: Sums, load: Vector, p: Parameters) -> Sums:
-        """Add the load over the modulus to Σ W d."""
+        """Add the load, divided by the modulus, to Σ W d."""
         pull, xx, xy, yy = total
         return pull + load / p.modulus, xx, xy, yy
 
@@ -543,8 +544,8 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
 
     @staticmethod
     def loaded(total: Sums, load: Vector, p: Parameters) -> Sums:
-        """Subtract the load over the modulus from c Σ W d, which enters the move with the opposite
-        sign.
+        """Subtract the load, divided by the modulus, from c Σ W d, which enters the move
+        with the opposite sign.
         """
         pull, xx, xy, yy = total
         return pull - load / p.modulus, xx, xy, yy

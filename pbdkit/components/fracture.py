@@ -553,7 +553,7 @@ def _projection(r: Any, cos: Any, sin: Any) -> Any:
 
 
 def _along(cos: Number, sin: Number, along_y: Number, across: Number) -> Number:
-    """Return a compliance or stiffness along a direction, over that along x."""
+    """Return the ratio of a compliance or stiffness along a direction to that along x."""
     x, y = 0.5 * (1.0 + cos), 0.5 * (1.0 - cos)
     return x * x + along_y * y * y + across * 0.25 * sin * sin
 

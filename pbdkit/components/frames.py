@@ -57,7 +57,7 @@ class CopyingFrame(LayeredFrame):
 
 
 class MeanFrame(CopyingFrame):
-    """Frame points move by the mean displacement of the nearest body particles, ties included."""
+    """Frame points move by the mean displacement of the nearest body particles, including ties."""
 
     type: Literal["mean"] = "mean"
 

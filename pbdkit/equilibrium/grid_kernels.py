@@ -1,4 +1,4 @@
-"""Compiled loops over the rows of grids: coarsening, fields of iterations, relaxation.
+"""Compiled loops over the rows of grids: coarsening, updates of fields in iterations, relaxation.
 
 A grid has two arrays (row, place): `code` is the index of the stencil in `own`, -1 where no
 particle is free; `kind` is 0 outside, 1 at free particles, 2 at leaders. `halved` are the axes
@@ -8,9 +8,9 @@ is never free.
 
 A row consists of runs of places, from `begin` to `end`, that share the stencil `same`, and of lone
 places with stencils `own[which]`. A stencil is 3 × 3 places, row by row, of 4 numbers: xx, xy, yx,
-yy. Rows are relaxed in two colours, even and odd, and all places of a row from the same state. Sums
-are computed row by row, so that the result does not depend on the number of rows processed at a
-time.
+yy. Even rows and odd rows are relaxed alternately; all places of a row are relaxed from the same
+state. Sums are computed row by row, so that the result does not depend on the number of rows
+processed at a time.
 """
 
 from __future__ import annotations
@@ -72,8 +72,9 @@ def coarse_kinds(kind, halved, out):
 
 @njit(cache=KEPT)
 def coarse_codes(code, kind, halved, out):
-    """Compute the codes of the next grid, and return the last number: -1 where no particle is free,
-    0 where all stencils around are the most frequent one; others are numbered from 1."""
+    """Compute the codes of the next grid, and return the largest. The code is -1 where no particle
+    is free, and 0 where all stencils around are the most frequent one; all other places are
+    numbered from 1."""
     count = 0
     a1, b1 = halved
     for n in range(out.shape[0]):

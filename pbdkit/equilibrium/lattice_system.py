@@ -332,7 +332,7 @@ class LatticeSystem(System):
         return iteration
 
     def _farthest(self, energy: float) -> float:
-        """Return a bound on the displacement of any place, for a residual with this rᵀ B r."""
+        """Return a bound on all displacements, given rᵀ B r of the residual r."""
         if min(energy, self._compliance) < 0.0:
             raise IndefiniteError
         return math.sqrt(SAFETY / self._smallest * self._compliance * energy)

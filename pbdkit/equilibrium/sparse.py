@@ -151,8 +151,11 @@ class Subsystem(ABC):
         return self.spread_of(np.ones(self._size, bool))
 
     def spread_of(self, some: Mask) -> float:
-        """Return the maximum norm of A⁻¹ for right sides in some unknowns: from the inverse if
-        available, otherwise an estimate from random signs, which resemble rounding errors."""
+        """Return the maximum norm of A⁻¹ for right-hand sides that are zero outside some unknowns.
+
+        It is computed from the inverse if available. Otherwise it is estimated with random signs,
+        which resemble rounding errors.
+        """
         if self._solver is None:
             return math.inf if some.any() else 0.0
         if isinstance(self._solver, Dense):

@@ -256,7 +256,10 @@ ALL: Final = Rows()
 
 @cache
 def _libraries(with_scipy: bool) -> ThreadpoolController:
-    """Return a controller of the libraries loaded so far; scipy loads one of its own."""
+    """Return a controller of the libraries loaded so far.
+
+    The argument distinguishes the time after scipy has loaded a library of its own.
+    """
     return ThreadpoolController()
 
 

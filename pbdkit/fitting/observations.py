@@ -499,7 +499,7 @@ class Observation(ABC):
 
     @property
     def weighted_noise(self) -> float:
-        """Return the noise over the root of the weight, the unit of residuals."""
+        """Return the unit of residuals: the noise divided by the square root of the weight."""
         return float(self.noise / np.sqrt(self.weight))
 
     @property
@@ -549,9 +549,10 @@ class Observation(ABC):
         """
 
     def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:
-        """Return Σ measured · p and Σ p² over the square of the weighted noise.
+        """Return Σ measured · p and Σ p², both divided by the square of the weighted noise.
 
-        The ratio of both, with the predictions p for a modulus of 1, is the initial modulus.
+        The ratio of the two sums, with the predictions p for a modulus of 1, is the initial
+        modulus.
         """
         return 0.0, 0.0
 
@@ -675,7 +676,7 @@ class RunObservation(Observation):
 
 
 def _with_steps(experiment: Experiment, steps: int) -> Experiment:
-    """Return the experiment with a number of steps, all of which are made."""
+    """Return the experiment with this number of steps, which convergence does not shorten."""
     changed: dict[str, Any] = {"steps": steps}
     if experiment.solver.makes_steps:
         changed["solver"] = experiment.stepping.model_copy(update={"settle": None})

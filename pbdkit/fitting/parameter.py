@@ -167,7 +167,8 @@ class Parameter:
     def _ends(
         self, experiment: Experiment, value: float, fraction: float, pairs: int
     ) -> tuple[float, list[tuple[Experiment, Experiment]]]:
-        """Return the step, and the experiments displaced by 1, 2, … steps in both directions."""
+        """Return the step of the differences, and pairs of experiments in which the parameter is
+        larger and smaller by 1, 2, … steps."""
         step = fraction * max(abs(value), 0.1)
         while True:
             try:

@@ -562,7 +562,7 @@ def _weight(residuals: Floats, loss: Loss) -> Floats:
 
 
 def cost_of(residuals: Floats, loss: Loss) -> float:
-    """Return -2 log L of residuals over their noise: Σ r², or its equivalent for a loss."""
+    """Return -2 log L of residuals divided by their noise: Σ r², or its equivalent for a loss."""
     z = np.square(residuals / OUTLIERS)
     if loss == "huber":
         z = np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0)
@@ -574,8 +574,8 @@ def cost_of(residuals: Floats, loss: Loss) -> float:
 
 
 def spread_of(residuals: Floats, unknowns: int, loss: Loss) -> float:
-    """Return the standard deviation of residuals over their noise; with a loss, from their
-    median."""
+    """Return the standard deviation of residuals divided by their noise. With a loss, it is
+    estimated from the median of their magnitudes."""
     if loss == "linear":
         return float(np.sqrt(residuals @ residuals / max(1, len(residuals) - unknowns)))
     return float(1.4826 * np.median(np.abs(residuals)))

@@ -575,7 +575,8 @@ class UniformLaw(StrengthLaw):
 
     @staticmethod
     def whole(path: str) -> float:
-        """Return a strain that is never reached, or zero scatter."""
+        """Return the value with which a parameter has no effect: a strain that is never reached, or
+        zero scatter."""
         return 1e60 if path == "fracture.failure" else 0.0
 
     @staticmethod
@@ -1161,7 +1162,7 @@ def _check_first_break(
 
 
 def _excess(specimen: Specimen, quantity: str) -> float:
-    """Return ln of the peak over that of the first break."""
+    """Return the logarithm of the ratio of the peak to the value at the first break."""
     assert specimen.first is not None
     return float(np.log(specimen.peak_of(quantity) / specimen.first_of(quantity)))
 

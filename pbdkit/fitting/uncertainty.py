@@ -3,8 +3,8 @@ the posterior, and comparison of models by cross-validation.
 
 Profile likelihood: all other parameters are fitted again for each value of one. The 95 % interval
 contains the values at which -2 log L exceeds its minimum by less than 3.84 (Wilks), also for
-strongly nonlinear predictions. With a loss the increase is that of M-estimators: it is divided by
-mean ψ² / mean ψ'.
+strongly nonlinear predictions. With a loss, the increase is divided by mean ψ² / mean ψ', as
+for M-estimators.
 
 Posterior: unknowns that enter linearly (boundaries of a linear rule, distortions, Young's modulus)
 are integrated out exactly, and boundaries of other rules by linearisation at the fit. With their
@@ -108,8 +108,8 @@ def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) ->
 
 
 def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
-    """Divide the force over the thickness by the group's force over Young's modulus, along the
-    force."""
+    """Return the ratio of the measured force per thickness to the group's force divided by
+    Young's modulus, both along the measured force."""
     direction = np.array(force.value) / np.hypot(*force.value)
     count, prediction = len(problem.unknowns), solution.at.predictions[0]
     assert isinstance(prediction, FieldPrediction)
@@ -366,8 +366,8 @@ def profile_likelihood(problem: Problem, solution: Solution, n: int, loss: Loss)
 def _walk(
     problem: Problem, solution: Solution, n: int, direction: float, loss: Loss
 ) -> Iterator[tuple[float, float]]:
-    """Yield values in one direction, with the rise at each, while all other parameters can be
-    fitted."""
+    """Yield values of one parameter in one direction, with the increase of -2 log L at each. The
+    first value for which the other parameters cannot be fitted ends the iteration."""
     low, high = _ends(problem.unknowns[n])
     value, z = float(solution.z[n]), solution.z
     step = min(STEP * float(solution.errors[n]), MAX_FIRST_STEP * (high - low))
@@ -638,8 +638,8 @@ def combinations(problem: Problem, solution: Solution) -> tuple[Combination, ...
 def _is_product(
     problem: Problem, solution: Solution, rows: NDArray[np.intp], direction: Floats
 ) -> bool:
-    """Return whether residuals change less along a direction of logarithms than along one of
-    parameters."""
+    """Return whether residuals change less if the logarithms of the parameters are moved along a
+    direction than if the parameters themselves are."""
     low, high = (bound[rows] for bound in problem.bounds())
     z, direction = solution.z[rows], direction / np.abs(direction).max()
     with np.errstate(divide="ignore", invalid="ignore"):

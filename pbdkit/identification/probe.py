@@ -193,7 +193,11 @@ def _is_symmetric(stencil: Stencil) -> bool:
 
 
 def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> Iterator[str]:
-    """Yield how the rule at the corner that differs most differs from the body's middle."""
+    """Yield a description of how the rule depends on the position.
+
+    The weights in the middle of the body are compared with those at the corner where they differ
+    most.
+    """
     places, slots = list(stencils), scene.neighbourhood.slots
     weights = np.array(
         [[*stencil.neighbours.values(), *stencil.centre] for stencil in stencils.values()]

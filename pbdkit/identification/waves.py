@@ -277,8 +277,8 @@ class DirectionalRange:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Fourth-order lengths along the normal of a family of lattice rows, of the fast and the slow
-    wave.
+    """Fourth-order lengths of the fast and of the slow wave along the normal of a family of lattice
+    rows.
 
     Parameters
     ----------

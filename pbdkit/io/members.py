@@ -85,7 +85,8 @@ def choices(dataset: xarray.Dataset) -> str:
 
 
 def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
-    """Return the values along a dimension, or of a parameter along it."""
+    """Return the labels along a dimension: its coordinate, as text if the dataset has that, or
+    otherwise the indices."""
     for label in (f"{name}{TEXT}", name):
         if label in dataset.coords:
             return np.asarray(dataset[label].values)

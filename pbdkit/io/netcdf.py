@@ -376,7 +376,8 @@ class NetcdfSink(KeepingSink):
             file.disk.close()
 
     def abandon(self) -> None:
-        """Remove the file; of an unfinished run, only the part after the last commit."""
+        """Remove the file. If it belongs to an unfinished run, remove only the part after the last
+        commit."""
         if self._file is None:
             return
         self._file.give_up()

@@ -575,7 +575,8 @@ class UnfinishedRun:
         waiting: Mapping[str, list[NDArray[Any]]],
         written: Mapping[str, int],
     ) -> None:
-        """Commit a checkpoint and the file, with all but the buffered entries in its pages."""
+        """Commit a checkpoint together with the file. Buffered entries are stored with the
+        checkpoint, all other entries in the pages of the file."""
         batches = {f"waiting.{n}": np.stack(v) for n, v in waiting.items() if v}
         arrays = batches | checkpoint.arrays
         types = {n: [a.dtype.str, list(a.shape)] for n, a in arrays.items()}

@@ -127,7 +127,7 @@ class SealedFile(io.RawIOBase):
             self._unchecked[n] = False
 
     def close(self) -> None:
-        """Close the file, on the disk too."""
+        """Close this object and the file on the disk that it reads."""
         self._file.close()
         super().close()
 

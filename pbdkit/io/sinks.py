@@ -83,7 +83,7 @@ class MemorySink(Sink):
         self._entries = {}
 
     def dataset(self) -> xarray.Dataset:
-        """Return the dataset, as in a file."""
+        """Return the dataset as it would be read from a file."""
         import xarray
 
         variables = {c.name: (c.dims, self.values(c), c.attributes) for c in self.columns}

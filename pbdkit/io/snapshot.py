@@ -91,8 +91,7 @@ def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, 
 
 
 def _places(scene: Scene, patch: Patch, corner: int, cells: NDArray[np.intp]) -> Places:
-    """Return the places of a corner of some cells of a patch, given by their indices in the
-    patch."""
+    """Return the places of one corner of the cells with these indices in a patch."""
     block, shape = patch.corners[corner], scene.raster.shape
     at = np.unravel_index(cells, patch.whole.shape)
     index = [n + start for n, start in zip(at, block.start, strict=True)]
@@ -437,8 +436,8 @@ class StateCells(CellValues):
         return None
 
     def _turned(self, share: Callable[..., Any], what: str) -> str | None:
-        """Return the number of inverted cells and the place of the most inverted, relative to its
-        area at rest; None if there is none."""
+        """Describe the inverted cells: their number, and the place of the most inverted cell with
+        the ratio of its area to that at rest. None if no cell is inverted."""
         turned = total = number = 0
         worst = 0.0
         for patch in self._scene.patches:
@@ -474,8 +473,8 @@ class StateCells(CellValues):
 class StateMoment(Moment):
     """A state as a table; bonds that broke after `no_later_than` count as intact.
 
-    An equilibrium within a step, at an increment of load, has a `time` of its own: the roles are
-    those of that step, constants and loads those of that time.
+    An equilibrium within a step, at an increment of load, has a `time` of its own. Particles then
+    have their roles in that step, and constants and loads are evaluated at that time.
     """
 
     def __init__(
@@ -601,7 +600,7 @@ class StateMoment(Moment):
         return tuple(TouchingRows(read_only(rows), read_only(n)) for rows, n in contacts)
 
     def broken_bonds(self) -> int:
-        """Return the number of broken bonds, each of which is marked on one plane."""
+        """Return the number of broken bonds."""
         broken = self._state.broken_step
         return 0 if broken is None else int((broken >= 0).sum())
 

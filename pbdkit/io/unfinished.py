@@ -28,18 +28,18 @@ class Overlay(Sink):
         self._file = file
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Do nothing: the file has its columns."""
+        """Do nothing, because the file already has all columns."""
 
     def put(self, values: Values) -> None:
-        """Write values over the file."""
+        """Overwrite values in the file."""
         self._file.put(values)
 
     def finish(self, attributes: dict[str, str]) -> None:
-        """Write the attributes over the file."""
+        """Overwrite the attributes in the file."""
         self._file.finish(attributes)
 
     def abandon(self) -> None:
-        """Do nothing: nothing was written to the disk."""
+        """Do nothing, because nothing was written to the disk."""
 
 
 def unfinished_dataset(output: Path) -> Any:

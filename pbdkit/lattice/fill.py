@@ -178,7 +178,8 @@ def dilated(mask: Mask, layers: int) -> Mask:
 
 
 def window(body: Body, lattice: Lattice, lines: Lines | None = None) -> tuple[Index, Index]:
-    """Return the smallest and the largest site index that may belong to the body, on the lines."""
+    """Return the smallest and the largest site index that may belong to the body; with `lines`,
+    those within this range of the first index."""
     low, high = hull(_indices(box, lattice) for box in body.boxes())
     if lines:
         first = max(low[0], lines[0])

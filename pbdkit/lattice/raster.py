@@ -53,7 +53,7 @@ class LeftOut:
         return cls(len(sites), min(map(tuple, sites.tolist()), default=None))
 
     def __add__(self, other: LeftOut) -> LeftOut:
-        """Return the union of both."""
+        """Add the numbers of cells, and keep the smaller of the first sites."""
         sites = [cells.first for cells in (self, other) if cells.first]
         return LeftOut(self.count + other.count, min(sites, default=None))
 
@@ -274,7 +274,7 @@ class Raster:
     communicator
         Processes that hold the other parts.
     row_range
-        Part of the lattice that this process builds; None for the whole.
+        Part of the lattice that this process builds; None for the whole lattice.
     """
 
     lattice: Lattice
@@ -514,10 +514,10 @@ class Restriction:
     part
         The raster of the rows.
     low
-        First row, in the whole.
+        First row, in the whole raster.
     present, moving
         Rows with particles, and rows in which all particles have all their neighbours, as (first,
-        last + 1) in the whole.
+        last + 1) in the whole raster.
     """
 
     whole: Raster
@@ -527,25 +527,26 @@ class Restriction:
     moving: tuple[int, int]
 
     def is_between(self, place: Indices, rows: tuple[int, int]) -> Mask:
-        """Return a mask of the flat places of the whole that lie in rows."""
+        """Return a mask of flat places of the whole raster, True for those in these rows."""
         row = np.unravel_index(place, self.whole.shape)[1]
         return np.asarray((row >= rows[0]) & (row < rows[1]))
 
     def is_present(self, place: Indices) -> Mask:
-        """Return a mask of the flat places of the whole that are places of the part."""
+        """Return a mask of flat places of the whole raster, True for those in the part."""
         return self.is_between(place, self.present)
 
     def is_moving(self, place: Indices) -> Mask:
-        """Return a mask of the flat places of the whole that have all neighbours in the part."""
+        """Return a mask of flat places of the whole raster, True for those with all neighbours in
+        the part."""
         return self.is_between(place, self.moving)
 
     def places(self, place: Indices) -> Indices:
-        """Return the flat places of the part for those of the whole."""
+        """Convert flat places of the whole raster to those of the part."""
         s, row, *rest = np.unravel_index(place, self.whole.shape)
         return np.ravel_multi_index((s, row - self.low, *rest), self.part.shape)
 
     def rows(self, rows: Indices) -> Indices:
-        """Return the rows of the table of the part for those of the whole."""
+        """Convert rows of the table of the whole raster to those of the part."""
         return rows - self.part.particle_offset + self.whole.particle_offset
 
     def cut(self, planes: Array) -> Array:

@@ -76,7 +76,8 @@ class Guiding:
         self, free: BlockMatrix, leader: BlockMatrix, rows: Indices, places: Indices,
         numbers: tuple[Indices, Indices], blocks: Floats,
     ) -> None:  # fmt: skip
-        """Add the blocks of followers to `free`, and split those of guided particles between both.
+        """Add the blocks of followers to `free`, and split those of guided particles between
+        `free` and `leader`.
 
         Parameters
         ----------

@@ -200,7 +200,7 @@ class Bound:
     smallest, largest
         min Re λ and max Re λ of the rule's step without relaxation and momentum.
     imaginary
-        max |Im λ| of the same.
+        max |Im λ| of the same step.
     radius
         max |μ| of the step with the relaxation and momentum of the solver.
     """

@@ -132,7 +132,7 @@ class Noise(Initial):
 
 
 class Affine(Initial):
-    """The body starts with the deformation u = gradient · X + shift, leaders included."""
+    """The body, including leaders, starts with the deformation u = gradient · X + shift."""
 
     type: Literal["affine"] = "affine"
     gradient: Gradient

@@ -104,7 +104,7 @@ class FileResolver:
         return path
 
     def holds(self, path: Path) -> bool:
-        """Return whether a path, links followed, lies in the folder or is allowed outside.
+        """Return whether a path lies in the folder after links are resolved, or may lie outside.
 
         Raises
         ------

@@ -262,11 +262,11 @@ class PartSink(KeepingSink):
         self._parts = {c.name: part for c in columns if (part := self._parted(c))}
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Begin with the sizes of the whole."""
+        """Begin with the sizes of the whole lattice."""
         self._first(lambda inner: inner.begin(columns, sizes | self._sizes, planned))
 
     def take(self, history: Iterable[Values]) -> None:
-        """Write entries of the whole, in the first process."""
+        """Write entries of the whole lattice, in the first process."""
 
         def put(inner: Sink) -> None:
             for values in history:
@@ -296,19 +296,19 @@ class PartSink(KeepingSink):
         self._first(lambda inner: inner.put(whole), whole)
 
     def due(self) -> bool:
-        """Return whether the sink of the first process is due."""
+        """Return whether a checkpoint is due, according to the sink of the first process."""
         return bool(self._ranks.bcast(self._inner is not None and self._inner.due()))
 
     def keep(self, checkpoint: Checkpoint) -> None:
-        """Write one checkpoint with the state of the whole."""
+        """Write one checkpoint with the state of the whole lattice."""
         self._first(lambda inner: inner.keep(checkpoint), checkpoint.arrays)
 
     def suspend(self, checkpoint: Checkpoint) -> None:
-        """Write one checkpoint with the state of the whole."""
+        """Write one checkpoint with the state of the whole lattice."""
         self._first(lambda inner: inner.suspend(checkpoint), checkpoint.arrays)
 
     def keep_final(self, checkpoint: Checkpoint) -> None:
-        """Write one checkpoint with the state of the whole."""
+        """Write one checkpoint with the state of the whole lattice."""
         self._first(lambda inner: inner.keep_final(checkpoint), checkpoint.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
@@ -372,12 +372,12 @@ class DistributedSimulation(Simulation):
             return quick_warnings(whole, bound) if whole else ()
 
     def outlook(self) -> list[str]:
-        """Return no warnings: `check` evaluates the whole."""
+        """Return no warnings, because `check` evaluates the whole scene."""
         return []
 
     @property
     def particles(self) -> int:
-        """Number of particles of the whole."""
+        """Number of particles of the whole lattice."""
         return self.division.count
 
     def recorder(self, sink: Sink) -> Recorder:
@@ -392,7 +392,7 @@ class DistributedSimulation(Simulation):
 
 def _tuned(ranks: MPICommunicator, scene: Scene) -> Scene:
     """Return the scene with values in place of `auto`, which the first process computes for the
-    whole."""
+    whole scene."""
     if not scene.experiment.stepping.is_open:
         return scene
     solver = None
@@ -415,7 +415,7 @@ class DistributedExecution(Execution):
         return built(self.communicator, experiment)
 
     def tuned(self, scene: Scene) -> Scene:
-        """Return the part with the values that are computed for the whole."""
+        """Return the part with the values in place of `auto`, computed for the whole scene."""
         return _tuned(self.communicator, scene)
 
     def by_root(self, work: Callable[[], int]) -> int:

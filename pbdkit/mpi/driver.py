@@ -96,7 +96,8 @@ class Division:
 
     def begun(self, scene: Scene) -> tuple[State, bool]:
         """Return the part of the state at time 0, and whether it can be computed again from the
-        part alone. Random numbers are drawn by the first process for the whole."""
+        part alone. Random numbers are drawn by the first process for the whole
+        lattice."""
         experiment, whole = scene.experiment, None
         draws = any(isinstance(part, Draws) for part in (experiment.rule, experiment.fracture))
         if not (experiment.initial.is_drawn or draws):
@@ -129,12 +130,13 @@ class Division:
         return self.halo.gathered(state)
 
     def state_dict(self, own: dict[str, Any]) -> dict[str, Any]:
-        """Return the state of a driver of the part, in which the state is that of the whole, joined
-        on access."""
+        """Return the state of a driver of the part, in which the state is that of the whole
+        lattice, joined on access."""
         return own | {"state": self.halo.joined(own["state"])}
 
     def scattered(self, parts: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the state of a driver of the part from that of the whole, in the first process."""
+        """Return the state of a driver of the part from that of the whole lattice, which the first
+        process has."""
         rest = self.ranks.bcast({key: part for key, part in parts.items() if key != "state"})
         state = self.dealt(parts.get("state") if self.ranks.is_root else None)
         return {**rest, "state": state}
@@ -227,12 +229,12 @@ class DistributedSteppingDriver(SteppingDriver):
         return int(self._division.ranks.bcast(super()._steps_in(seconds_a_step)))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the driver, in which the state is that of the whole, joined on
-        access."""
+        """Return the state of the driver, in which the state is that of the whole
+        lattice, joined on access."""
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """Restore the driver from the state of the whole, in the first process."""
+        """Restore the driver from the state of the whole lattice, which the first process has."""
         super().load_state_dict(self._division.scattered(parts))
 
 
@@ -346,11 +348,11 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         self._rows = DistributedRows(ranks, division.halo, strip)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the driver with the state of the whole, as it is joined."""
+        """Return the state of the driver with the state of the whole lattice, joined on access."""
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """Restore the driver from the state of the whole, in the first process."""
+        """Restore the driver from the state of the whole lattice, which the first process has."""
         super().load_state_dict(self._division.scattered(parts))
 
     def _way(self, state: State) -> Way:

@@ -214,7 +214,7 @@ def _steps(each: int, least: int) -> int:
 
 @dataclass(frozen=True)
 class SubdomainScene:
-    """Scene of a subdomain and its place in the whole.
+    """Scene of a subdomain and its place in the whole lattice.
 
     `ours` are the particles of each leader group in its own rows, `early` the numbers of those in
     rows before, and `rows` the rows of the table that are its own particles.
@@ -315,7 +315,7 @@ class Halo:
         self._pushed = [n for n, each in enumerate(part.scene.leading) if each.share is not None]
 
     def _rows(self, rows: tuple[int, int]) -> slice:
-        """Return rows of the whole as rows of the part."""
+        """Convert a range of rows of the whole lattice to a slice of rows of the part."""
         low, count = self._part.subdomain.low, self._part.scene.raster.shape[1]
         first, last = (min(max(row - low, 0), count) for row in rows)
         return slice(first, max(first, last))
@@ -347,7 +347,7 @@ class Halo:
         self._exchange([field], {}, {})
 
     def look_back(self, state: State) -> None:
-        """Update the halo of the displacements of the step before, in place."""
+        """Update the halo of the displacements of the previous step, in place."""
         if not self._looks_back:
             self.meet(state.previous)
 

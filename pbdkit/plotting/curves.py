@@ -42,7 +42,7 @@ NEEDED_FORCES = (
 
 @dataclass(frozen=True)
 class LoadCurve:
-    """`force` over `displacement`, DataArrays along time with the axis in their names."""
+    """Force as a function of displacement: two DataArrays along time, named with their axis."""
 
     displacement: Any
     force: Any

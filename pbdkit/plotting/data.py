@@ -449,7 +449,8 @@ class ReferenceBody:
 
     @cached_property
     def spacing(self) -> float:
-        """Distance of particles at rest: the median of some distances to the nearest one."""
+        """Approximate distance between neighbouring particles at rest: for small bodies, the median
+        distance of some particles from their nearest neighbour."""
         x = self.reference
         if 1 < len(x) <= MEASURED:
             few = np.linspace(0, len(x) - 1, 50).astype(int)
@@ -724,7 +725,7 @@ def _range(values: Array) -> tuple[float, float]:
 
 
 def _joined(ranges: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Combine several ranges; 0 to 1 where there are none."""
+    """Return the smallest range that contains several ranges; (0, 1) if none of them is finite."""
     finite = [r for r in ranges if np.isfinite(r[0])]
     return (min(r[0] for r in finite), max(r[1] for r in finite)) if finite else (0.0, 1.0)
 

@@ -149,9 +149,13 @@ class Layer(ABC):
 
 
 class PixelField(Layer):
-    """A quantity of particles over whole cells up to the outline, as pixels; particles outside all
-    cells are dots of a size in points, or a pixel if a dot would be invisible. A corner outside the
-    outline without a value has the mean of the cells that meet there."""
+    """A quantity of particles, drawn as pixels over the cells without a broken bond, up to the
+    outline.
+
+    Particles outside these cells are drawn as dots of a size in points, or as single pixels if dots
+    would be invisible. A corner outside the outline that has no value receives the mean of the
+    cells that meet there.
+    """
 
     def __init__(
         self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale, size: float

@@ -223,7 +223,7 @@ class ForceValues(ABC):
 
     @abstractmethod
     def on_particles(self) -> Floats:
-        """Return the forces of the neighbours on every particle, leaders included.
+        """Return the forces of the neighbours on every particle, including leaders.
 
         The forces of broken bonds are those of the rule.
 
@@ -456,8 +456,8 @@ class Diagnostic(Component):
     local: ClassVar[bool] = False
     """True if the value at a particle depends only on the particle and its neighbours.
 
-    With several processes each then evaluates its part of the lattice; otherwise one process
-    evaluates the whole.
+    Each of several processes then evaluates its part of the lattice; otherwise one process
+    evaluates the whole lattice.
     """
     own_dimension: ClassVar[str] = ""
     """With `at_end`: name of a dimension that has the length of the values."""
@@ -491,7 +491,7 @@ class Diagnostic(Component):
         Parameters
         ----------
         particles : int
-            Number of particles, frame included.
+            Number of particles, including those of the frame.
         leader_groups : int
             Number of leader groups.
 

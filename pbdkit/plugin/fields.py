@@ -480,8 +480,9 @@ class Field(RootModel[Any]):
 class TakesFields(Component):
     """Component with numbers that can vary in space or time.
 
-    Fields contain the value that is used where a single number is required, for time-dependent
-    numbers the last one. `varying` and `courses` contain the variation.
+    The attribute of a parameter contains the value that is used where a single number is required;
+    for a time-dependent parameter this is the last value. `varying` and `courses` contain the
+    variation.
     """
 
     _varying: dict[str, Varying] = PrivateAttr(default_factory=dict)

@@ -233,7 +233,7 @@ class Softens(ABC):
 
 
 class CellStress(NamedTuple):
-    """Stress of a cell without damage, over its own Young's modulus.
+    """Stress of a cell without damage, divided by its own Young's modulus.
 
     Parameters
     ----------

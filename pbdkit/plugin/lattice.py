@@ -222,8 +222,8 @@ class Cell:
     def _cells_within(self, radius: float) -> Iterator[Index]:
         """Yield the repeat cells within a radius, and few others.
 
-        Axis by axis, the range is what the previous axes leave (Fincke and Pohst); for nearly
-        collinear vectors all combinations would be too many.
+        The indices along the previous axes limit the range along each axis (Fincke and Pohst). For
+        nearly collinear vectors there would be too many combinations to test all of them.
         """
         # Columns in reverse, so that the first axis is the outermost.
         R = np.linalg.qr(np.array(self.vectors[::-1]).T, mode="r")

@@ -40,7 +40,7 @@ class Here(NamedTuple):
 
 
 class Stiffness(NamedTuple):
-    """Plane elasticity over Young's modulus and thickness.
+    """Stiffness of plane elasticity, divided by Young's modulus and thickness.
 
     σ_x = xx ε_x + xy ε_y + x_shear γ, σ_y = xy ε_x + yy ε_y + y_shear γ and
     τ = x_shear ε_x + y_shear ε_y + shear γ.
@@ -48,9 +48,9 @@ class Stiffness(NamedTuple):
     Parameters
     ----------
     xx, yy, xy : float or array
-        Normal stiffnesses: σ_x over ε_x, σ_y over ε_y, and σ_x over ε_y.
+        Normal stiffnesses: σ_x / ε_x, σ_y / ε_y, and σ_x / ε_y.
     shear : float or array
-        Shear stiffness, τ over γ.
+        Shear stiffness, τ / γ.
     x_shear, y_shear : float or array
         Coupling of shear with ε_x and ε_y; 0 if the axes are axes of symmetry.
     """
@@ -63,12 +63,12 @@ class Stiffness(NamedTuple):
     y_shear: Any = 0.0
 
     def own_modulus(self, through_thickness: Any) -> Any:
-        """Return Young's modulus along x over that of the reference material.
+        """Return the ratio of Young's modulus along x to that of the reference material.
 
         Parameters
         ----------
         through_thickness : float or array
-            σ_zz over σ_xx + σ_yy.
+            Ratio σ_zz / (σ_xx + σ_yy).
 
         Returns
         -------

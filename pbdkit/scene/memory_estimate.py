@@ -140,7 +140,8 @@ class TooLargeError(ExperimentError):
 
 @dataclass(frozen=True)
 class Sizes:
-    """Estimates of the size of a scene: number of particles (frame included), bytes of memory
+    """Estimates of the size of a scene: number of particles (including the frame), bytes of
+    memory
     during a run, and bytes of its output. If a run returns a dataset instead of writing a file, the
     output is in memory, too."""
 

@@ -60,8 +60,8 @@ class Fracturing:
         """Update the state variables of bonds in the intermediate configuration m, in place, and
         mark bonds that break, with their length.
 
-        If cells are to begin to soften `in_turn`, only those with the largest load begin, and none
-        begins before the damage of those that have begun is nearly constant.
+        With `in_turn`, only the cells with the largest load begin to soften, and only once the
+        damage of the cells that already soften is nearly constant.
         """
         assert state.broken_step is not None
         assert state.broken_length is not None

@@ -66,7 +66,8 @@ Whole = Sequence[tuple[int, int]]
 
 
 def find_groups(plan: Plan) -> tuple[NDArray[Any], Whole]:
-    """Return the group of each place of the rasters, and the groups with all neighbours."""
+    """Return the number of the group of each place of the rasters, and the groups of particles that
+    have all neighbours."""
     raster, whole = plan.scene.raster, list[tuple[int, int]]()
     groups = np.zeros(raster.shape, np.int64)
     blocks = [raster.body_block(s) for s in range(raster.shape[0])]

@@ -16,8 +16,8 @@ from pbdkit.stepping.step import Hindrance, Mode, Operation, Reach, Step
 
 
 class FollowFrame(Operation):
-    """Move frame points with the body: with its displacements after the step or, with a delay,
-    before the step."""
+    """Move frame points by the displacements of the body after the step or, if the frame has a
+    delay, by those before the step."""
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:

@@ -65,7 +65,7 @@ class KernelWriter(ABC):
 
     @abstractmethod
     def each(self, pattern: str, axes: str = "") -> Lines:
-        """Return the pattern for each axis, or for some."""
+        """Return the lines that the pattern gives for each axis, or only for those in `axes`."""
 
     @abstractmethod
     def vector(self, pattern: str) -> str:

@@ -57,7 +57,7 @@ class Clamps:
     Attributes
     ----------
     numbers
-        State variables of particles that are components of the directions they prescribe.
+        State variables that store the components of the prescribed directions.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -134,7 +134,8 @@ class Guidance:
         return self._at(step)[1]
 
     def correct(self, new: Floats, u: Floats, step: int) -> None:
-        """Add the moves from u along led axes to those along free axes, in place."""
+        """Add to the displacements of guided particles along free axes the share of their moves
+        from u along prescribed axes, in place."""
         if not self.slanted:
             return
         flat, origin = new.reshape(len(new), -1), u.reshape(len(u), -1)

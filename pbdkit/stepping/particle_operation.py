@@ -75,7 +75,8 @@ class OperateOnParticles(Operation):
         return {f"operands{self._number}": self._operated.place}
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of particles that it moves in the reference configuration."""
+        """Generate the cells of those particles that the operation moves if the body is in the
+        reference configuration."""
         yield self._moved_at_rest
 
     @cached_property

@@ -248,7 +248,7 @@ class Operation(ABC):
         return
 
     def functions(self) -> dict[str, Callable[..., Any]]:
-        """Return by name the elementwise functions that its lines call."""
+        """Return, by name, the elementwise functions that the lines of the operation call."""
         return {}
 
     def component(self) -> Component | None:
@@ -257,27 +257,29 @@ class Operation(ABC):
         return None
 
     def numbers(self) -> dict[str, tuple[str, ...]]:
-        """Return by name the named tuples that its lines create, with their fields."""
+        """Return, by name, the named tuples that the lines of the operation create, with their
+        fields."""
         return {}
 
     def constants(self) -> dict[str, Sequence[float]]:
-        """Return by name the constant numbers that its lines read."""
+        """Return, by name, the constant numbers that the lines of the operation read."""
         return {}
 
     def lists(self) -> dict[str, Indices]:
-        """Return by name the constant lists of flat places that its lines go through."""
+        """Return, by name, the constant lists of flat places over which the lines of the operation
+        loop."""
         return {}
 
     def entries(self, call: Call) -> dict[str, Entries]:
-        """Return by name the lists that its lines go through in a call."""
+        """Return, by name, the lists over which the lines of the operation loop in a call."""
         return {}
 
     def arrays(self, call: Call) -> dict[str, Array]:
-        """Return by name the arrays that its lines read in a call."""
+        """Return, by name, the arrays that the lines of the operation read in a call."""
         return {}
 
     def prescribed_numbers(self) -> tuple[int, ...]:
-        """Return the state variables of particles that it prescribes."""
+        """Return the state variables of particles that the operation prescribes."""
         return ()
 
     def reads(self, state: State) -> bool:
@@ -285,7 +287,7 @@ class Operation(ABC):
         return False
 
     def prepare(self, call: Call) -> None:
-        """Compute on the host what its lines need in the first step of a call."""
+        """Compute on the host what the lines of the operation need in the first step of a call."""
         return
 
     def is_foreseeable(self, step: int) -> bool:
@@ -293,7 +295,7 @@ class Operation(ABC):
         return True
 
     def foresee(self, call: Call, step: int) -> None:
-        """Compute on the host what its lines need in a later step of a call."""
+        """Compute on the host what the lines of the operation need in a later step of a call."""
         return
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
@@ -302,11 +304,12 @@ class Operation(ABC):
         yield from ()
 
     def fixed_places(self) -> Indices:
-        """Return the flat places of particles that are not moved while it acts."""
+        """Return the flat places of particles that are not moved while the operation is active."""
         return np.zeros(0, np.intp)
 
     def reach(self, axis: int) -> Reach:
-        """Return the distances along an axis over which it reads values that others write."""
+        """Return the distances along an axis over which the operation reads values that other
+        operations write."""
         return Reach()
 
     def sweeps(self) -> int:

@@ -145,7 +145,7 @@ class Sweep(Strict):
 
     @property
     def cases(self) -> int:
-        """Return the length of the lists of `together`; 1 without any."""
+        """Return the length of the lists of `together`; 1 if there are none."""
         return max(map(len, self.together.values()), default=1)
 
     @property

@@ -169,8 +169,8 @@ def survives_pickling(subject: Subject) -> None:
 @property_of(Lattice, is_needed=True)
 def has_a_sound_cell(subject: Subject) -> None:
     """The cell vectors span an area; basis sites differ in index, position and primitive index, and
-    lie within the period, near the position of their index; `primitive` counts equal steps equally
-    and omits none."""
+    lie within the period, near the position of their index; `primitive` has equal
+    differences for equal offsets, and no gaps."""
     try:
         cell = checked_cell(subject.component)
     except ExperimentError as error:
@@ -849,8 +849,8 @@ def _followed(follow: FrameMap, point: int) -> tuple[list[int], list[Any]]:
 
 @property_of(Diagnostic, is_needed=True)
 def measures_what_it_declares(subject: Subject) -> None:
-    """`measure` returns one array for each variable, with the shape of its `dims`, of numbers that
-    the declared dtype holds without change of kind."""
+    """`measure` returns one array for each variable; its shape is that of the variable's `dims`,
+    and the declared dtype stores its numbers without a change of kind."""
     diagnostic, scene = subject.component, subject.scene
     own_dimension = diagnostic.own_dimension
     sizes = {"particle": scene.raster.count, "axis": 2, "leader_group": len(scene.leading)}

@@ -1,8 +1,8 @@
-"""Laws of mechanics: the deviation of a scene from each, relative to its largest stiffness.
+"""Laws of mechanics: the deviation of a scene from each law, relative to the largest stiffness.
 
 A rigid motion of a body stores no energy; the stiffness is symmetric (Maxwell and Betti); no
 deformation has a negative energy; a broken bond increases no stiffness. All follow from the
-stiffness matrix K = -∂force/∂u of the particles of the body, leaders included, which is computed
+stiffness matrix K = -∂force/∂u of the particles of the body, including leaders, which is computed
 from the forces of the stepper, for small solids with free edges.
 """
 

@@ -234,6 +234,6 @@ class Shown:
 
 
 def frame_showing(frame: Any, site: Any, point: Any, body: Any) -> Any:
-    """Return the frame with other sites, and with these pairs as the nearest ones."""
+    """Return the frame with other sites; its `nearest` returns these pairs."""
     same = {name: getattr(frame, name) for name in ("cell", "low", "high", "rule", "body_at")}
     return SimpleNamespace(**same, site=site, nearest=lambda: (point, body))

@@ -486,7 +486,8 @@ class Property:
 def property_of(
     *interfaces: type[Component], is_needed: bool = False
 ) -> Callable[[Check], Property]:
-    """Return a decorator that makes a check a property of these interfaces, by default of all.
+    """Return a decorator that registers a check as a property of these interfaces, by default
+    of all interfaces.
 
     The name of the property is that of the function.
     """

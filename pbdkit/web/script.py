@@ -155,8 +155,8 @@ class AdjustableNumber:
         self.turns.append((step, value))
 
     def turned(self, value: float) -> dict[str, Any]:
-        """Return a schedule that reaches a value. Experiments with components that use the number
-        before the first step reject it."""
+        """Return a schedule that changes from the present value to another. Validation rejects it
+        if a component needs the number before the first step."""
         return {"steps": [0, 1], "values": [self.at(0), value]}
 
     def cut_back(self, step: int) -> None:

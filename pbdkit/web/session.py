@@ -348,9 +348,12 @@ REPLAY_S = 0.5
 
 @dataclass
 class GrabbedParticle:
-    """A particle held by the mouse: the group that is led, None until it is moved, its offset when
-    it was grabbed, and the displacement of the mouse since. With `frees` it follows again once it
-    is released."""
+    """A particle held by the mouse.
+
+    `group` is the leader group that moves it, or None until the mouse moves. `start` is the offset
+    of the group when the particle was grabbed, and `by` the displacement of the mouse since then.
+    With `frees` the particle becomes a follower again when it is released.
+    """
 
     row: int
     group: int | None = None

@@ -429,7 +429,7 @@ def test_the_set_up_is_drawn_before_the_run(call: Call) -> None:
 
 
 def completed(*words: str) -> list[str]:
-    """Return the completions of the tabulator key after these words in bash."""
+    """Return the completions of these words with the Tab key in bash."""
     asked = {"_PBDKIT_COMPLETE": "bash_complete", "COMP_WORDS": " ".join(["pbdkit", *words])}
     environment = os.environ | asked | {"COMP_CWORD": str(len(words))}
     command = [sys.executable, "-m", "pbdkit"]

@@ -1,4 +1,4 @@
-"""Test completions of the tabulator key on a line that has been begun."""
+"""Test completions with the Tab key on a line that has been begun."""
 
 # ruff: noqa: E501  (a row of a table is a line)
 

@@ -68,8 +68,11 @@ def constant_arrays(plan: Plan) -> Arrays:
 
 
 def list_arrays(plan: Plan, name: str, entries: Entries, *, by_rows: bool) -> Arrays:
-    """Return a list of particles with its values. With `by_rows`, for passes of several steps, it
-    is sorted, with the first index of each row and the columns."""
+    """Return a list of particles with its values.
+
+    Passes of several steps require `by_rows`: the list is then sorted by rows, and the first index
+    of each row and the columns are returned too.
+    """
     if not by_rows:
         return {name: entries.place, **entries.values}
     order, rows = banded(plan, name, entries.place)

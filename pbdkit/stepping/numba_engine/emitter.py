@@ -21,8 +21,8 @@ Groups = Sequence[tuple[int, int]]
 
 
 def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, list[str]]:
-    """Return the source of a module with ``run(arrays, step, count, chunks, band)``, which makes
-    `count` steps, and the names of the arrays."""
+    """Return the source of a module, and the names of the arrays that it reads. Its function
+    ``run(arrays, step, count, chunks, band)`` makes `count` steps."""
     events = sweeps.write_events(plan) if plan.judged else None
     judge = sweeps.write_bond_pass(plan) if plan.bonds_first else None
     functions = [function for function in (events, judge) if function]
@@ -47,8 +47,8 @@ def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, lis
 
 
 def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tuple[str, list[str]]:
-    """Return the source of a module with these functions, of which `run` is the entry, and the
-    names of the arrays."""
+    """Return the source of a module with these functions and the entry `run`, and the names of the
+    arrays that it reads."""
     jit = f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=KEPT)'
     head = [jit, f"def run({', '.join(run.own)}):", f"    {', '.join(run.used)}, = arrays"]
     return module_text(plan, functions, head, run), run.used

@@ -158,8 +158,11 @@ class Plan:
 
     @cached_property
     def kept(self) -> tuple[int, ...]:
-        """State variables of particles of which copies from before the step are needed: all that
-        change if neighbours read them, otherwise those that operations prescribe."""
+        """State variables of particles of which a copy from before the step is needed.
+
+        If the rule reads state variables of neighbours, these are all variables that change;
+        otherwise they are those that operations prescribe.
+        """
         if not self.shares:
             return self.prescribed_numbers
         numbers = self.levels[-1].seen.own
