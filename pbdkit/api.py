@@ -282,7 +282,7 @@ def rerun(
     Raises
     ------
     ExperimentError, PluginError, DivergedError
-        As `run`, and if the dataset has no experiment.
+        As for `run`, and if the dataset has no experiment.
 
     Warns
     -----
@@ -328,7 +328,7 @@ def resume(
     StorageError
         If the checkpoints are damaged, or the file cannot be written.
     DivergedError
-        As `run`, without a dataset: the file contains it.
+        As for `run`, except that the error has no dataset: the records are in the file.
 
     Examples
     --------

@@ -698,7 +698,7 @@ class Simulation:
 
     @cached_property
     def waves(self) -> Bound | None:
-        """Bound on stability from plane waves, or None without one."""
+        """Bound on stability from plane waves, or None if there is none."""
         return wave_bound(self.scene)
 
     @cached_property

@@ -150,8 +150,9 @@ def _claims_c() -> list[Claim]:
         ),
         Claim(
             "a lower lateral contraction [of 67], with respect the first gradient case",
-            f"−u_y of particle 67 in b and c is {values} at steps 9, 19 and 99: the contraction "
-            f"in c is larger at steps {above[0]} to {above[-1]} and smaller afterwards. With 24 "
+            f"At steps 9, 19 and 99, −u_y of particle 67 in b and in c respectively is {values}. "
+            f"The contraction in c is larger at steps {above[0]} to {above[-1]} and smaller "
+            "afterwards. With 24 "
             f"neighbours −u_y is {', '.join(f'{v:.4f}' for v in third)}, larger than in b at "
             f"steps {above_24[0]} to {above_24[-1]}.",
             not above,

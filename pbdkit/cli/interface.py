@@ -413,7 +413,7 @@ def list_(**options: Any) -> None:
     help="Folder in which the project is created; default the current one.",
 )
 def new(**options: Any) -> None:
-    """Write a plugin project NAME, e.g. pbdkit-my-rule, that installs and runs as it stands."""
+    """Write a complete plugin project NAME, e.g. pbdkit-my-rule, ready to install and run."""
     call("plugins:new", **options)
 
 

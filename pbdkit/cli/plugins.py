@@ -49,7 +49,7 @@ def list_(as_json: bool) -> None:
 
 
 def new(name: str, interface: str, parent: Path) -> None:
-    """Write a plugin project NAME, e.g. pbdkit-my-rule, that installs and runs as it stands."""
+    """Write a complete plugin project NAME, e.g. pbdkit-my-rule, ready to install and run."""
     project = project_of(name, interface)
     folder = project.write(parent)
     click.echo(

@@ -23,13 +23,13 @@ class NoReaderError(PbdkitError):
 
 @contextmanager
 def standard_streams() -> Iterator[None]:
-    """Handle failures of standard output and error in the block, so that the exit status remains
-    meaningful.
+    """Handle failures to write to standard output and standard error within the block, so that the
+    exit status remains meaningful.
 
     A failed write to standard output raises WriteError, or NoReaderError if the reader has closed
-    it. A failed write to standard error is ignored. Closed descriptors are occupied, so that no
-    other file gets their numbers, to which other programs and libraries write. Streams that replace
-    those of Python are kept.
+    it. A failed write to standard error is ignored. Closed standard descriptors are opened on the
+    null device. Otherwise the next file would get a number to which other programs and libraries
+    write. Streams that replace those of Python are kept.
     """
     if os.name != "posix":
         yield

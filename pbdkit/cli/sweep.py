@@ -59,7 +59,8 @@ def _refuse_folder(folder: Path) -> None:
 
 @contextmanager
 def _client(address: str | None) -> Iterator[Any]:
-    """Yield the client of the cluster at an address, or None without one; raise ExperimentError."""
+    """Yield the client of the cluster at an address, or None if there is no address. Raises
+    ExperimentError."""
     if address is None:
         yield None
         return

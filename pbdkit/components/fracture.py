@@ -92,7 +92,7 @@ class Parting(StartsCracked, FractureModel):
 
     The fictitious point that replaces the neighbour across a broken bond lies at m_j + λ R
     (`fictitious: cell`; `placement` λ = 1 is the undeformed cell, λ > 1 expands and λ < 1 contracts
-    it) or at X_k (`fictitious: reference`). With `frame_bonds: false` bonds to frame points do not
+    it) or at X_k (`fictitious: reference`). If `frame_bonds` is false, bonds to frame points do not
     break. `cracks` are segments [[x, y], [x, y]]; bonds that cross them are broken from the start.
     """
 
@@ -138,9 +138,9 @@ class Threshold(BreaksAtStrain, Parting):
 
     This is the model of the paper's section 5. The fictitious point that replaces the neighbour
     across a broken bond lies at m_j + λ R (`fictitious: cell`; `placement` λ = 1 is the undeformed
-    cell, λ > 1 expands and λ < 1 contracts it) or at X_k (`fictitious: reference`). With
-    `frame_bonds: false` bonds to frame points do not break. `cracks` are segments [[x, y], [x, y]];
-    bonds that cross them are broken from the start.
+    cell, λ > 1 expands and λ < 1 contracts it) or at X_k (`fictitious: reference`). If
+    `frame_bonds` is false, bonds to frame points do not break. `cracks` are segments [[x, y], [x,
+    y]]; bonds that cross them are broken from the start.
     """
 
     type: Literal["threshold"] = "threshold"
@@ -248,8 +248,8 @@ def _in_percent(**strains: float) -> list[str]:
 class StrainFracture(Draws, BreaksAtStrain, Parting):
     """A bond of any shell breaks when its strain |r + d| / |r| - 1 exceeds `failure`.
 
-    Bonds under compression do not break. With `scatter` s the failure strain of each bond is drawn
-    from the uniform distribution over `failure` (1 ± s), by the seed of the experiment.
+    Bonds under compression do not break. The failure strain of each bond is drawn from the uniform
+    distribution over `failure` (1 ± `scatter`), by the seed of the experiment.
     """
 
     type: Literal["strain"] = "strain"

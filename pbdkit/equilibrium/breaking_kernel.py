@@ -216,8 +216,9 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
 
 
 def _is_plain(scene: Scene) -> bool:
-    """Return whether the kernel supports all features of the scene: not loads, cuts, fields,
-    time-dependent parameters, leaders along one axis, and cells that soften one after the other."""
+    """Return whether the kernel supports all features of the scene. It does not support loads,
+    cuts, fields, time-dependent parameters, leaders along one axis, and cells that soften one after
+    the other."""
     experiment, constants = scene.experiment, scene.constants
     varies = any(
         (

@@ -180,8 +180,8 @@ class ContactSystem(System):
         return math.sqrt(2.0) * max(far)
 
     def _spread(self, n: int) -> float:
-        """Return the displacement of a part per rounding error of the positions of particles in
-        contact."""
+        """Return the displacement of a part caused by a rounding error of 1 in the positions of the
+        particles in contact."""
         if n not in self._spreads:
             members, part = self._parts[n]
             self._spreads[n] = part.spread_of(self._on_outlines[members])

@@ -2,9 +2,9 @@
 
 A grid has two arrays (row, place): `code` is the index of the stencil in `own`, -1 where no
 particle is free; `kind` is 0 outside, 1 at free particles, 2 at leaders. `halved` are the axes
-along which the next grid has half the places: its place n coincides with 2n - 1, or with n along
-other axes. Fields are planes (axis, row, place), zero where no particle is free; the outermost ring
-is never free.
+along which the next grid has half the places: there its place n coincides with place 2n - 1 of this
+grid, and along the other axes with place n. Fields are planes (axis, row, place), zero where no
+particle is free; the outermost ring is never free.
 
 A row consists of runs of places, from `begin` to `end`, that share the stencil `same`, and of lone
 places with stencils `own[which]`. A stencil is 3 × 3 places, row by row, of 4 numbers: xx, xy, yx,

@@ -269,8 +269,8 @@ class LatticeSystem(System):
         return math.sqrt(solver.dot(difference, difference) / solver.dot(pull, pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the error that some iterations remove, plus the bound on the remaining error.
-        Rounding errors count as random."""
+        """Return the error that a number of iterations remove, plus a bound on the remaining error
+        and on the effect of rounding. Rounding errors are taken to be random."""
         remainder, length = self._tracked(self._pull(moves))
         if self._spread is None:
             self._spread = self._spread_of_rounding()
@@ -338,7 +338,8 @@ class LatticeSystem(System):
         return math.sqrt(SAFETY / self._smallest * self._compliance * energy)
 
     def _spread_of_rounding(self) -> float:
-        """Return a bound on the displacement that rounding of moves by up to 1 causes."""
+        """Return a bound on the displacement caused by rounding errors of at most 1 in the
+        moves."""
         r = self._pull(np.sign(self._rows.random(self._shape)))
         if self._symmetric:
             return self._farthest(self._solver.dot(r, self._grids.cycle(r.astype(np.float32))))

@@ -269,11 +269,11 @@ def linear_solver(
     coordinates: Coordinates | None = None,
     watch: Watch | None = None,
 ) -> LinearSolver:
-    """Return the solver for a matrix by a method; `auto` is LU up to a number of unknowns, and
-    multigrid for more.
+    """Return a solver for a matrix that uses the given method; `auto` selects LU up to a certain
+    number of unknowns, and multigrid above.
 
-    `coordinates` are those of the unknowns; they are required by multigrid, and determine orders of
-    elimination. Raises LinAlgError if a factorisation finds the matrix to be singular.
+    `coordinates` are those of the unknowns. Multigrid requires them, and LU uses them for the order
+    of elimination. Raises LinAlgError if a factorisation finds the matrix to be singular.
     """
     size, coupled = matrix.shape[0], coordinates is not None and coordinates.axes > 1
     if method == "auto":

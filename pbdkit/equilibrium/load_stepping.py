@@ -101,8 +101,8 @@ def moments(scene: Scene, count: int) -> list[float]:
 
 
 def _in_parts(count: int, ways: list[float]) -> list[float]:
-    """Return the number of increments in each interval, in proportion to its path; one for each if
-    all paths are zero."""
+    """Return the number of increments in each interval, in proportion to the path of the leaders
+    there, or one in each interval if all paths are zero."""
     whole = sum(ways)
     return [count * way / whole if whole > 0.0 else 1.0 for way in ways]
 

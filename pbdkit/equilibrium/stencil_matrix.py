@@ -71,8 +71,8 @@ def most_first(
 
 
 def _most(own: Integers, tables: tuple[Floats, Floats], rows: Rows) -> tuple[Floats, Floats]:
-    """Return the most frequent stencil and its scale over all processes, among the most frequent of
-    each."""
+    """Return the stencil that is most frequent over all processes, and its scale. Only the most
+    frequent stencils of each process are considered."""
     counts = np.bincount(own[own >= 0], minlength=len(tables[0]))
     candidates = np.argsort(-counts, kind="stable")[:CANDIDATES].tolist()
     votes: dict[bytes, int] = {}
@@ -407,8 +407,8 @@ def with_held(
     code: NDArray[np.int32], stencils: Floats, held: Held
 ) -> tuple[NDArray[np.int32], Floats, NDArray[np.intp]]:
     """Return code and stencils, and the index of the former stencil of each. Places adjacent to
-    constrained components have separate stencils without the columns of these; the rows of
-    constrained components have a diagonal entry."""
+    constrained components have separate stencils, without the columns of those components; the rows
+    of constrained components have a diagonal entry."""
     from scipy.ndimage import binary_dilation
 
     is_adjacent = binary_dilation(held.any(axis=0), structure=np.ones((3, 3))) & (code >= 0)

@@ -355,8 +355,8 @@ class System(ABC):
 
     @abstractmethod
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
-        """Return ‖A c + after - before‖ / ‖A c‖, the nonlinearity of the moves before and after a
-        displacement c."""
+        """Return ‖A c + after - before‖ / ‖A c‖, which measures the nonlinearity: `before` and
+        `after` are the moves before and after a displacement c."""
 
     @abstractmethod
     def distance(self, moves: Floats, rounding: float) -> float:

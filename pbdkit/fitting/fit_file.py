@@ -501,7 +501,7 @@ class StrengthFit(Strict):
     `likelihood` assumes that a specimen fails with its first bond, `simulation` compares with
     simulated specimens, `auto` uses the second if that assumption does not hold. `check` is the
     number of specimens that are simulated to test it, `simulations` the number for the second
-    method, `seed` that of the random numbers of both.
+    method, `seed` is the seed of the random numbers of both methods.
     """
 
     version: Version = 1

@@ -387,8 +387,8 @@ def _residuals_of(observation: Observation, residuals: Floats, loss: Loss) -> Mi
 def unit_of(observation: Observation) -> tuple[float, str]:
     """Return the factor and unit that convert numbers of an observation to the experiment's units.
 
-    Forces are in N, and lengths in lattice units. Without units the factor is 1, and the unit
-    empty.
+    Forces are in N, and lengths in lattice units. Without units the factor is 1, and the unit is an
+    empty text.
     """
     units = observation.experiment.units
     if units is None:

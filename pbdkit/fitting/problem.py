@@ -289,7 +289,7 @@ class Problem:
         return Linearisation(z, residuals, jacobian, tuple(predictions))
 
     def residuals(self, z: Floats) -> Floats:
-        """Return the residuals at z; it raises the errors of `at`."""
+        """Return the residuals at z. Raises the same errors as `at`."""
         return np.concatenate(
             [
                 self.residuals_of(n, observation, z)

@@ -263,7 +263,7 @@ class Resting:
         return np.stack([u, moves])
 
     def _with_frame(self, direct: Floats | float, change: Floats) -> Floats:
-        """Return the sum of both, with the frame points of the change."""
+        """Return `direct + change`, after the frame points of `change` have been computed."""
         if frame := self.finder.scene.frame:
             flat = change.reshape(len(change), -1)
             frame.follow(flat, flat)

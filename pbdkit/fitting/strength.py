@@ -114,7 +114,7 @@ class BondStrains:
 def bond_strains(scene: Scene, state: State) -> BondStrains:
     """Return the strains of the bonds of a scene, extrapolated from a state.
 
-    p = q = 0 for bonds that are broken or cannot break.
+    The coefficients p and q of a bond that is broken or cannot break are 0.
     """
     bonds, shape = scene.bonds, scene.raster.shape
     p, q = np.zeros((2, len(bonds.ends)))
@@ -215,7 +215,7 @@ class Pull:
         )
 
     def read(self, tables: Tables, state: State) -> MachineReading:
-        """Return force and mean displacement of the group along its direction."""
+        """Return the force on the group and its mean displacement, both along its direction."""
         reaction = np.full(len(self.direction), np.nan)
         if has_forces(tables.scene):
             reaction = reactions(StateMoment(state, tables))[self.group]
@@ -1041,7 +1041,8 @@ def _simulate_peaks(
 def _refuse_short_load(specimens: Specimens, largest: float) -> None:
     """Raise ExperimentError if the load of the experiment is not far above the measured ones.
 
-    A specimen that survives that load would be counted with it as its peak.
+    The load at which the simulation ends would be counted as the peak of a specimen that survives
+    it.
     """
     if (elastic := specimens.elastic) is None:
         return
@@ -1140,7 +1141,8 @@ def _check_first_break(
     elastic: ElasticResponse,
     result: FittedStrength,
 ) -> Checked | None:
-    """Simulate specimens of the fitted strengths, to test whether they fail at their first break.
+    """Simulate specimens with the fitted strengths, to test whether they fail when their first bond
+    breaks.
 
     None if the experiment does not define what happens afterwards.
     """

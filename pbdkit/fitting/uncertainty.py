@@ -89,7 +89,8 @@ class Estimate:
 
 
 def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) -> Estimate | None:
-    """Return Young's modulus from curves, else from a force; None without either.
+    """Return Young's modulus from curves or, if there are none, from a force; None if there is no
+    force either.
 
     It is in MPa if the experiment has units.
     """

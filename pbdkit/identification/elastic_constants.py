@@ -8,8 +8,9 @@ positive B exists, the inverse of the mobility, with
 and C the elastic constants. Six linear equations determine the three numbers of B: the left side is
 symmetric in a and b (an energy exists), and in two dimensions Huang's relations hold, Γ_xxyy =
 Γ_yyxx, Γ_xxxy = Γ_xyxx, Γ_yyxy = Γ_xyyy (a rigid rotation costs no energy). B = 1 except for rules
-in which x and y approach the same equilibrium at different rates. C is determined except for the
-time that a step represents. See Born and Huang, Dynamical Theory of Crystal Lattices, section 27.
+in which x and y approach the same equilibrium at different rates. C is determined up to a factor,
+which depends on the time that a step represents. See Born and Huang, Dynamical Theory of Crystal
+Lattices, section 27.
 
 Harmonics of C by direction follow Vannucci, Anisotropic Elasticity, chapter 4.
 """

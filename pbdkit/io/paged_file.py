@@ -54,9 +54,9 @@ def write_header(file: io.FileIO, header: Header) -> None:
 
 
 def read_header(file: io.FileIO) -> Header | None:
-    """Read the header of open records; None if none was written yet.
+    """Read the header of open records. Returns None if no header was written yet.
 
-    Raises StorageError if other bytes stand there, and OSError.
+    Raises StorageError if the file begins with other bytes, and OSError if it cannot be read.
     """
     for _ in range(TRIES):
         file.seek(0)
@@ -83,8 +83,8 @@ LARGE_BYTES = 2**16
 class PagedFile(NewFile):
     """A file on the disk overlaid by pages in memory.
 
-    Large writes are appended to the disk behind everything that existed at the last `commit`, and
-    each extent is written once. Everything else, such as the metadata that HDF5 rewrites, stays in
+    Large writes are appended to the file on the disk, after all that existed at the last `commit`.
+    Each extent is written once. Everything else, such as the metadata that HDF5 rewrites, stays in
     memory until `settle`. The bytes on the disk together with the pages, extents and size of a
     commit therefore form the file as of that commit, independent of later writes. With `read_only`
     all writes stay in memory.

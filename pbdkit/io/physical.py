@@ -93,7 +93,7 @@ class Physical:
 
 
 def _with_comment(column: Column) -> Column:
-    """Add the given quantities that define the units of a column to its comment."""
+    """Add to the comment of a column the given quantities that define its units."""
     notes = [
         f"{unit}: that of {n} as it is given"
         for n, unit in OF_GIVEN.items()

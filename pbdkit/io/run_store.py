@@ -215,8 +215,8 @@ class RunStore:
         return digest
 
     def _list(self) -> None:
-        """Read identity and digests of the last commit. Raises StorageError if they were not
-        committed together."""
+        """Read the identity and the digests of the last commit. Raises StorageError if they were
+        not committed together."""
         rows = self._file.execute("SELECT key, CAST(digest AS BLOB) FROM pieces").fetchall()
         query = "SELECT CAST(data AS BLOB) FROM pieces WHERE key = ?"
         self.identity, *_ = self._file.execute(query, (IDENTITY,)).fetchone() or (b"",)

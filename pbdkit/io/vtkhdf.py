@@ -50,8 +50,9 @@ QUAD = 9
 class UnstructuredGrid:
     """A vertex for each particle, a line for each bond, then the polygons between particles.
     `connectivity` holds rows of the particle table, those of cell n from offsets[n] to offsets[n +
-    1]; `types` are VTK's; `part` is what each cell represents; `broken_step` the step in which a
-    bond, or the first bond of a polygon, broke, -1 where none did, None without fracture."""
+    1]; `types` are VTK's; `part` is what each cell represents; `broken_step` is the step in which a
+    bond, or the first bond of a polygon, broke: -1 where none did, and None for a scene without
+    fracture."""
 
     connectivity: Array
     offsets: Array

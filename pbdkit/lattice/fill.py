@@ -441,8 +441,8 @@ class _Cutter:
         Returns
         -------
         tuple
-            Shares at the place of the first corner, 0 where there is no cell; places of the large
-            cells omitted because their inside is disconnected, (cell, axis).
+            Shares at the place of the first corner, 0 where there is no cell; and the places,
+            (cell, axis), of the large cells that are omitted because their inside is disconnected.
         """
         steps, first_corners = (
             [corner.site for corner in polygon.corners],

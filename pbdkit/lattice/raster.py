@@ -265,7 +265,7 @@ class Raster:
     low
         Site index (i, j) of the first entry of `sites`.
     sites
-        Kind by site index. The particles in the order i, then j are the rows of the table.
+        Kind by site index. The rows of the table are the particles, ordered by i, then j.
     particle_offset
         Number of particles of the whole lattice before the first row. Row k has the number
         `particle_offset` + k + 1.

@@ -183,7 +183,7 @@ class Polygon(Body):
         return [Box((min(x), min(y)), (max(x), max(y)))]
 
     def distance(self, sites: Sites) -> Floats:
-        """Return the distance from the boundary, with the sign of containment."""
+        """Return the signed distance from the boundary, negative inside."""
         import shapely
 
         outline = self._outline()

@@ -176,7 +176,7 @@ class Motion(Component):
         Parameters
         ----------
         n
-            Number of the step, n ≥ 1; between the increments of an equilibrium also n > 0.
+            Number of the step. At least 1 in steps; load stepping also uses fractions, n > 0.
         start
             Positions at the start of the motion, (particle, axis).
 

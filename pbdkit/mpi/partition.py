@@ -362,7 +362,7 @@ class Halo:
         self._ranks.exchange(sent, received)
 
     def _blocks(self, arrays: list[Array], rows: slice) -> Iterator[Bytes]:
-        """Generate rows as they lie in memory, plane by plane."""
+        """Generate the contiguous memory of some rows, plane by plane."""
         for array in arrays:
             for plane in np.ndindex(array.shape[: array.ndim - self._axes]):
                 yield as_bytes(array[plane][rows])
@@ -480,8 +480,8 @@ class RowCount:
 
 
 def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
-    """Count the particles of a body and its frame in each row; return None without a body. Each
-    process counts the particles of an equal number of lines."""
+    """Count the particles of a body and its frame in each row; return None if there is no body.
+    Each process counts the particles of an equal number of lines."""
     rank = communicator.rank
     lattice, layers = ground.experiment.lattice, ground.layers
     (first, *_), (last, *_) = low, high = window(ground.experiment.body, lattice)

@@ -175,7 +175,7 @@ def compare(
     Raises
     ------
     ExperimentError
-        As `plot`, and if the datasets have no particle in common.
+        As for `plot`, and if the datasets have no particle in common.
 
     Examples
     --------

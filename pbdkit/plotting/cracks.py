@@ -199,8 +199,8 @@ def _is_long(body: Array) -> bool:
 
 
 def _axes_around(body: Array) -> Axes:
-    """Return the axes of a new figure with the aspect ratio of the body, limited by the room for
-    text."""
+    """Return the axes of a new figure. Their aspect ratio is that of the body, as far as the text
+    has enough room."""
     wide, tall = np.maximum(np.ptp(body, axis=0), 1e-9)
     height = min(max(WIDE_IN * tall / wide, MIN_IN), TALLEST_IN)
     width = min(max(height * wide / tall, MIN_IN), WIDE_IN)

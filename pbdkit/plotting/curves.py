@@ -468,8 +468,8 @@ def _lines(dataset: xarray.Dataset, series: Series, n: int, alone: bool) -> Iter
 def _numbers(
     dataset: xarray.Dataset, particle: Numbers | None, i: int | None, j: int | None
 ) -> list[int] | None:
-    """Return the numbers of the requested particles; None without a request, which only `track`
-    accepts."""
+    """Return the numbers of the requested particles, or None if none were requested, which only
+    `track` allows."""
     if particle is not None:
         if i is not None or j is not None:
             raise ExperimentError("select particles either by number or by i and j, not by both")

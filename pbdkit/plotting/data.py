@@ -1,7 +1,8 @@
 """Data of pictures: the body with its cells and outline, recorded steps, the quantity that is
 drawn, and variables by name for curves.
 
-Fields fill the cells of the body at rest, quadrilaterals or triangles, up to its outline.
+A field is drawn on the cells of the body at rest, which are quadrilaterals or triangles cut at the
+outline.
 """
 
 from __future__ import annotations
@@ -630,8 +631,8 @@ def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset, at rest where positions were not recorded. Raises ExperimentError if
-    positions at rest are missing too."""
+    """Return the dataset with positions; where they were not recorded, with the positions at rest.
+    Raises ExperimentError if positions at rest are missing too."""
     if "position" in dataset.variables:
         return dataset
     if "reference" not in dataset.variables or "role" not in dataset.variables:

@@ -90,8 +90,8 @@ class OutlineCut:
 
 
 def _kept(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
-    """Return a mask of the samples of some cells that are not cut off, (cell and sample,); None if
-    all are kept."""
+    """Return a mask over the samples of some cells, (cell and sample,), false where the outline
+    cuts a sample off; None if all are kept."""
     rows = cut.row[cells] if cut else np.empty(0, int)
     cut_cells = np.flatnonzero(rows >= 0)
     if cut is None or not len(cut_cells):

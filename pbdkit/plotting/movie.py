@@ -123,7 +123,7 @@ def animate(
     Raises
     ------
     ExperimentError
-        As `plot`, and if the library that writes movies is missing.
+        As for `plot`, and if the library that writes movies is missing.
     StorageError
         If the file cannot be written.
 
@@ -229,7 +229,7 @@ def animation(
     Raises
     ------
     ExperimentError
-        As `plot`.
+        As for `plot`.
     """
     refuse_no_matplotlib()
     from matplotlib.animation import FuncAnimation
@@ -354,8 +354,8 @@ def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
 
 
 def _write_gif(file: NewFile, few: Frame, frames: Iterator[Frame], fps: float) -> None:
-    """Write the frames with one palette, that of a `few` frames, so that static parts do not
-    flicker."""
+    """Write the frames with one palette, so that static parts do not flicker. The palette is
+    determined from `few`, a picture of several frames."""
     from PIL import Image
 
     palette = Image.fromarray(few).quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)

@@ -355,9 +355,11 @@ class Moment(ABC):
         Parameters
         ----------
         function : callable
-            Elementwise function of d = u_k - u_j and r = X_k - X_j, as `gather` of a rule.
+            Function of d = u_k - u_j and r = X_k - X_j, evaluated elementwise as the method
+            `gather` of a rule is.
         intact_only : bool
-            Whether to exclude broken bonds; otherwise they count with the real neighbour.
+            Whether to exclude broken bonds; otherwise they are included with the displacement of
+            the real neighbour, not of the fictitious point.
 
         Returns
         -------

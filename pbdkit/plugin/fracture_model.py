@@ -25,17 +25,16 @@ class FractureModel(TakesFields):
     """Breaks bonds permanently and replaces the lost neighbour by a fictitious point.
 
     To add a model, write `constants`, `breaks` and `fictitious`; the latter two are static and
-    elementwise, as the functions of a rule. Arguments: d = u_k - u_j is the difference along the
-    bond, r its rest offset, c the constants of the slot and the state variables of the bond by
+    elementwise functions, like those of a rule. Arguments: d = u_k - u_j is the difference along
+    the bond, r its rest offset, c the constants of the slot and the state variables of the bond by
     name, and p the parameters.
 
     In the intermediate configuration, for each intact bond that can break, a model that derives
     from `RenewsBonds` first updates its state variables; then ``breaks`` is evaluated. The state
     variables of broken bonds no longer change. Afterwards a model that derives from `Softens`
-    replaces the difference that the rule sees at intact bonds.
-
-    Optional capabilities are further base classes: `Remembers`, `Draws`, `RenewsBonds`, `Softens`,
-    `SoftensCells`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
+    replaces the difference that the rule uses at intact bonds. Optional capabilities are further
+    base classes: `Remembers`, `Draws`, `RenewsBonds`, `Softens`, `SoftensCells`, `StartsCracked`,
+    `BreaksAtStrain`, `KnowsStiffness`.
     """
 
     has_axes: ClassVar[bool] = False
@@ -55,7 +54,7 @@ class FractureModel(TakesFields):
         return True
 
     def parameters(self) -> dict[str, float]:
-        """Return the numbers that functions see as ``p.name``; by default the model's numeric
+        """Return the numbers that functions receive as ``p.name``; by default the model's numeric
         fields.
 
         Returns
@@ -67,7 +66,7 @@ class FractureModel(TakesFields):
 
     @abstractmethod
     def constants(self, slot: Slot) -> dict[str, float]:
-        """Return the constants of a slot, which functions see as ``c.name``.
+        """Return the constants of a slot, which functions receive as ``c.name``.
 
         Parameters
         ----------
@@ -181,7 +180,7 @@ class KnowsStiffness(ABC):
 
     @abstractmethod
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
-        """Return further constants of a slot, which functions see as ``c.name``.
+        """Return further constants of a slot, which functions receive as ``c.name``.
 
         Parameters
         ----------
@@ -205,12 +204,12 @@ class KnowsStiffness(ABC):
 
 
 class Softens(ABC):
-    """A fracture model that replaces the difference that the rule sees at intact bonds."""
+    """A fracture model that replaces the difference that the rule uses at intact bonds."""
 
     @staticmethod
     @abstractmethod
     def seen(d: Vector, lost: Vector, r: Vector, c: Constants, p: Parameters) -> Vector:
-        """Return the difference that the rule sees, elementwise.
+        """Return the difference that the rule uses, elementwise.
 
         Parameters
         ----------

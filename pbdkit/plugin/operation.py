@@ -51,23 +51,24 @@ class Selection(Strict):
 class ParticleOperation(Component):
     """Changes the displacement of selected particles in each step, after the move of their rule.
 
-    To add an operation, write `displacement`, static and elementwise as the functions of a rule. It
-    is applied after the move with relaxation and memory, and before obstacles; leaders are placed
-    at their prescribed positions afterwards, and frame points follow. Operations are applied in the
-    order in which the experiment lists them.
+    To add an operation, write `displacement`, a static and elementwise function, like those of a
+    rule. It is applied after the move with relaxation and memory, and before obstacles; leaders are
+    placed at their prescribed positions afterwards, and frame points follow. Operations are applied
+    in the order in which the experiment lists them.
     """
 
     rests: ClassVar[bool] = False
     """True if ``displacement(u, u, p)`` is exactly u, and differs from u for any other `new`.
-    Equilibria are then those of the rule alone; experiments that look for an equilibrium refuse
-    other operations."""
+    Equilibria are then those of the rule alone; an experiment that computes an equilibrium cannot
+    contain other operations."""
 
     select: Selection | None = Field(
         None, description="The particles that are changed; by default all of the body."
     )
 
     def parameters(self) -> dict[str, float]:
-        """Return the numbers that `displacement` sees as ``p.name``; by default the numeric fields.
+        """Return the numbers that `displacement` receives as ``p.name``; by default the numeric
+        fields.
 
         Returns
         -------

@@ -149,8 +149,8 @@ class FollowerRule(TakesFields):
     on both sides."""
 
     def parameters(self, setting: Setting) -> dict[str, float]:
-        """Return the numbers that `gather` and `apply` see as ``p.name``; by default the numeric
-        fields.
+        """Return the numbers that `gather` and `apply` receive as ``p.name``; by default the
+        numeric fields.
 
         Parameters
         ----------
@@ -170,7 +170,7 @@ class FollowerRule(TakesFields):
         return self.numeric_parameters()
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """Return the constants of a slot that `gather` sees as ``w.name``; by default none.
+        """Return the constants of a slot that `gather` receives as ``w.name``; by default none.
 
         Parameters
         ----------
@@ -452,7 +452,8 @@ class RenewsParticles(Remembers):
     def remember(total: tuple[Any, ...], here: Here, p: Parameters) -> tuple[Number, ...]:
         """Return the new values of the numbers that change, in their order, elementwise.
 
-        Leaders remember as followers do. A particle without neighbours keeps its numbers.
+        State variables of leaders are updated like those of followers. A particle without
+        neighbours keeps its numbers.
 
         Parameters
         ----------
@@ -473,8 +474,8 @@ class RenewsParticles(Remembers):
 class SharesParticles(Remembers):
     """A rule that reads the state variables of both particle and neighbour.
 
-    Frame points and fictitious points remember nothing, so that it can be combined neither with a
-    frame nor with bonds that break.
+    Frame points and fictitious points have no state variables, so that the rule can be combined
+    neither with a frame nor with bonds that break.
     """
 
     @staticmethod

@@ -3,5 +3,5 @@
 `build_scene` puts body and frame on rasters and creates what the experiment uses: constants of the
 rule and the fracture model, leader groups, loads, obstacles and particle operations. `checks`
 issues warnings about scenes that can be built but may not be intended, and `memory_estimate`
-refuses scenes that are too large before anything is allocated.
+detects scenes that are too large before anything is allocated.
 """

@@ -1,9 +1,9 @@
 """Estimates of the memory of a scene and of the linear systems of an equilibrium, made before
 anything large is allocated.
 
-All coefficients are measured, as the peak memory of a new process minus that after its imports, for
-sheets of 2500 to a million particles. For compact bodies that leaders hold the estimates are within
-15 % of the measured values.
+All coefficients are measured for sheets of 2500 to a million particles: the memory of a process
+after its imports is subtracted from its peak memory. For compact bodies held by leaders, the
+estimates are within 15 % of the measured values.
 """
 
 from __future__ import annotations

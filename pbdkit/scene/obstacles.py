@@ -569,7 +569,8 @@ class Barrier:
     def at(self, moment: float) -> Outline | None:
         """Return the outline at the end of a step, or at a moment within it.
 
-        Relative to site (0, 0) of the lattice. None if the obstacle does not exist at that moment.
+        Coordinates are relative to site (0, 0) of the lattice. Returns None if the obstacle does
+        not exist at that moment.
         """
         if not self.group.leads(math.ceil(moment)):
             return None

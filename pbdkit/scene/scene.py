@@ -411,7 +411,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
 
 
 def _segments(experiment: Experiment) -> dict[str, Segment]:
-    """Return the cuts and the initial cracks, by their fields."""
+    """Return the cuts and the initial cracks, by their fields in the experiment."""
     segments = {f"cuts.{n}": cut.segment for n, cut in enumerate(experiment.cuts)}
     if isinstance(model := experiment.fracture, StartsCracked):
         with blaming(model, "to return its cracks", "fracture"):

@@ -85,8 +85,8 @@ class Forecast:
     spectral_radius, smallest_eigenvalue, largest_stable_relaxation, stable, steps_to
         See `pbdkit.Analysis`.
     period, decay
-        Period in steps, and decay a step, of the slowest oscillating mode; None without momentum or
-        if no mode oscillates.
+        Period in steps, and decay a step, of the slowest oscillating mode; None if there is no
+        momentum or no mode oscillates.
     exact
         Whether the analysis holds for the whole run, or is linearised at the start.
     estimated
@@ -303,7 +303,7 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
 def refuse_unheld_loads(scene: Scene) -> None:
     """Raise the ExperimentError of the run if loads act on a part of the body without supports.
 
-    The check applies to equilibria only, which such a part does not have.
+    The check applies only to equilibria, because such a part has none.
     """
     if scene.experiment.solver.makes_steps or not scene.loads:
         return

@@ -44,7 +44,8 @@ class Function:
         return ["", "", "@part", head, *lines]
 
     def call(self, *own: str) -> str:
-        """Return a call with the values of its own arguments."""
+        """Return a call of the function, with these values for the arguments that are not
+        shared."""
         return f"{self.name}({', '.join([*own, *self.used])})"
 
     def _words(self) -> set[str]:

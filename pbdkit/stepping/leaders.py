@@ -221,9 +221,9 @@ class NewtonForces:
         return forces
 
     def stopped(self, n: int, velocity: Floats, u: Floats, step: int) -> tuple[Floats, Floats]:
-        """Return the velocities of a group's particles and their displacements, (axis, particle),
-        at the end of a step, outside the obstacles. Their velocity is reduced by the distance by
-        which they are pushed, except by an obstacle that appears in that step."""
+        """Return the velocities and displacements, (axis, particle), of a group's particles after
+        obstacles have pushed them out at the end of a step. The push is also added to the velocity,
+        unless an obstacle appears in that step."""
         leading = self._scene.leading[n]
         if self._contact is None or len(leading.axes) < self._scene.axes:
             return velocity, u

@@ -153,7 +153,8 @@ class Step:
 
 @dataclass(slots=True)
 class Call:
-    """Steps of one call of a kernel, which the operations prepare on the host.
+    """Data for one call of a kernel that computes several steps; the operations prepare them on the
+    host.
 
     Parameters
     ----------
@@ -313,8 +314,8 @@ class Operation(ABC):
         return Reach()
 
     def sweeps(self) -> int:
-        """Return the number of times that it evaluates neighbours in a step, one after the
-        other."""
+        """Return the number of successive times that the operation evaluates neighbours in a
+        step."""
         return 0
 
     def carries(self) -> Indices:

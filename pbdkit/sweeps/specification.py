@@ -93,8 +93,9 @@ Times = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, m
 
 
 class Keep(Strict):
-    """Selection of the variables and steps to keep of each run: `variables` by name, by default
-    all; of the recorded steps all, the last, or those listed, which are then recorded."""
+    """Selection of the variables and steps of each run that are kept: `variables` are names, by
+    default all; `times` are `all` recorded steps, the `last`, or a list of steps, which are then
+    recorded."""
 
     variables: Annotated[tuple[str, ...] | None, Field(strict=False, min_length=1)] = None
     times: Literal["all", "last"] | Times = "all"
@@ -103,7 +104,7 @@ class Keep(Strict):
 class Sweep(Strict):
     """An experiment with varied parameters. Members are the product of the values in `vary`, of the
     lists in `together`, which are traversed together, and of the replicates, which differ in their
-    seed. `names` are the names of parameters in the dataset, by path."""
+    seed. `names` maps paths of parameters to their names in the dataset."""
 
     version: Version = 1
     experiment: Base

@@ -325,8 +325,8 @@ def takes_part(subject: Subject) -> None:
 
 @property_of(FollowerRule, FractureModel, is_needed=True)
 def declares_what_it_remembers(subject: Subject) -> None:
-    """Every number that it remembers has a name in lower case that the dataset does not reserve, a
-    long name, units ("1" if it has none), and an initial value that its dtype can hold."""
+    """Every state variable has a name in lower case that the dataset does not reserve, a long name,
+    units ("1" if it has none), and an initial value that its dtype can hold."""
     for scene in subject.scenes:
         numbers = remembered(subject, scene)
         remembered_names(scene.experiment)  # Raises an error for names that are declared twice.
@@ -355,8 +355,8 @@ def remembered(subject: Subject, scene: Scene) -> tuple[Remembered, ...]:
 
 @property_of(FollowerRule, FractureModel, is_needed=True)
 def draws_what_it_remembers(subject: Subject) -> None:
-    """`draw` returns one finite value for each bond or particle, by the name of a number that it
-    remembers, which its dtype can hold; random numbers come from the given generator."""
+    """`draw` returns, by the name of a state variable, one finite value for each bond or particle,
+    which the dtype of the variable can hold; random numbers come from the given generator."""
     part = subject.component
     for scene in subject.scenes:
         numbers = {number.name: number for number in remembered(subject, scene)}

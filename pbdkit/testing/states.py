@@ -140,7 +140,7 @@ def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> An
 
 
 def standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
-    """Return the local values of particles that a rule reads."""
+    """Return the values at particles that the rule uses."""
     place: Any = X if scene.experiment.rule.uses_reference else None
     return Here(u, place, place, scene.constants.of_particle(*own))
 

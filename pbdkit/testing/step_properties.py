@@ -171,7 +171,7 @@ def follows_translations(subject: Subject) -> None:
 
 
 def _free(subject: Subject) -> list[Scene]:
-    """Return the scenes without another part that depends on positions.
+    """Return the scenes in which no part other than the component depends on positions.
 
     Raises
     ------

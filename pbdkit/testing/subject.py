@@ -184,7 +184,8 @@ def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Fu
     p, limits = scene.constants.fracture, scene.constants.limits
 
     def call(function: str, compute: Callable[..., Any], **inputs: Any) -> FunctionCall:
-        """Return a call along every slot, with the difference along it as `d`."""
+        """Return a call of a function that is evaluated for every slot, with the difference `d`
+        along that slot if it takes one."""
 
         def along(d: Any = slots, **arguments: Any) -> Any:
             pairs = zip(d, slots, strict=True)

@@ -146,8 +146,8 @@ def _word(dataset: xarray.Dataset, dim: str, n: int) -> str:
 
 
 def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
-    """Return one variable over another. A chart has one axis, so that among several pairs the one
-    with the largest values is drawn."""
+    """Return one variable over another. A chart has only one horizontal axis. Of several pairs,
+    only the one with the largest values is therefore drawn."""
     pairs = list(zip(_lines(dataset, x, "time"), _lines(dataset, y, "time"), strict=True))
     (label, across), (_, up) = max(pairs, key=lambda pair: float(np.nanmax(np.abs(pair[1][1]))))
     rows = slice(None, None, _every(len(across), points))
@@ -457,8 +457,8 @@ def resting(
 ) -> dict[str, Any]:
     """Return the static content: names, reference, triangles.
 
-    `reference` (particle, axis) are the positions of zero displacement, and `spacing` is the
-    distance of neighbours there, both in the units of the page.
+    `reference`, (particle, axis), contains the positions for zero displacement, and `spacing` is
+    the distance between neighbours there, both in the units of the page.
     """
     rows, role = thinning.particles, role_of(dataset)
     labels = {n: dataset[n].values for n in ("number", "i", "j") if n in dataset.variables}
@@ -831,8 +831,8 @@ def _notes(analysis: Analysis) -> list[str]:
 
 
 def _curve(analysis: Analysis, moves: SettlingMoves) -> dict[str, Any]:
-    """Return the logarithm of the moves, and a line with the predicted slope through the middle of
-    those from which the decay is measured."""
+    """Return the logarithm of the moves and a line with the predicted slope. The line passes
+    through the middle one of the moves from which the decay is measured."""
     with np.errstate(divide="ignore"):
         logs = np.log10(moves.move)
     logs[~np.isfinite(logs)] = np.nan

@@ -248,10 +248,10 @@ Parts = dict[str, Any]
 
 @dataclass
 class LeaderScript:
-    """Leader group: as in the file (`of_file`), or moved by the mouse from a step on.
+    """Leader group as in the file (`of_file`), or moved by the mouse after a certain step.
 
-    `ended` is the last step in which it leads. A group moved by the mouse may replace one that had
-    not begun to lead, `instead_of`.
+    `ended` is the last step in which it leads. `instead_of` is the group that had not begun to lead
+    when this one, moved by the mouse, replaced it.
     """
 
     of_file: Parts
@@ -323,7 +323,7 @@ class Script:
         return len(self.groups) - 1
 
     def pick(self, particle: int, step: int) -> int:
-        """Let the mouse move the particle of that number after a step."""
+        """Let the mouse move a particle, given by its number, after a step."""
         self.groups.append(
             LeaderScript({"select": {"numbers": [particle]}, "from": step + 1}, Hand())
         )

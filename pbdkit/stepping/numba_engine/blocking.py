@@ -120,7 +120,7 @@ class TileWriter(PlanWriter):
 
 
 def lag_lines(kernel: KernelWriter, mapped: Callable[[str], Lines], planes: str) -> Lines:
-    """Return lines for the displacement of frame point f one step later."""
+    """Return the lines of code that give frame point f its displacement one step later."""
     return [*mapped(planes), *kernel.each("lag_@[f] = t_@")]
 
 

@@ -387,7 +387,8 @@ def displacements(plan: Plan, level: Level) -> list[str]:
 
 
 def difference(plan: Plan, level: Level, there: str) -> str:
-    """Return a line for d to the neighbour with components of this pattern."""
+    """Return the line of code that computes d from the displacement of the neighbour; `there` is
+    the pattern of its components."""
     return f"d = {plan.vector(f'{there} - {level.source[0]}.@')}"
 
 
