@@ -259,8 +259,11 @@ class Entry:
             )
 
     def frames(self, dataset: xarray.Dataset) -> list[int]:
-        """Return the recorded steps of the movie; early ones are closer in the paper's cases, which
-        move for ten steps of some hundred."""
+        """Return the recorded steps of the movie.
+
+        Early steps have smaller intervals in the paper's cases, in which the leaders move for ten
+        of several hundred steps.
+        """
         last = dataset.sizes["time"] - 1
         shares = np.linspace(0.0, 1.0, min(FRAMES, last + 1))
         exponent = 2.0 if self.group == "paper" and last > FRAMES else 1.0

@@ -472,8 +472,8 @@ def fit(
 
     Notes
     -----
-    The sum of squared residuals, each over its noise, is minimised by the Gauss–Newton method; the
-    derivatives follow from the linear system of the equilibrium (docs/fitting.md).
+    The sum of squared residuals, each divided by its noise, is minimised by the Gauss–Newton
+    method; the derivatives follow from the linear system of the equilibrium (docs/fitting.md).
 
     Examples
     --------

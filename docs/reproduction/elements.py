@@ -40,7 +40,7 @@ def of_the_paper(problem: Problem, cells: int) -> float:
 
 
 def timed() -> dict[str, dict[str, float]]:
-    """Read from validation/materials.md the milliseconds to an error, set-up included."""
+    """Read from validation/materials.md the milliseconds to an error, including set-up."""
     text = (DOCS / "validation/materials.md").read_text("utf-8")
     times = {}
     for problem in ("bar", "cantilever", "hole"):

@@ -222,7 +222,7 @@ StrainLimit = Annotated[float, Field(gt=0.0, le=1e75), STRESS]
 Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
 """Type of the relative scatter of strengths."""
 PERCENT = 1.0
-"""Strain from which on a warning suggests that the value is in per cent."""
+"""Smallest strain for which a warning suggests that the value is in per cent."""
 SCATTER = "Scatter s: strengths are multiplied by random factors, uniform in 1 ± s."
 """Description of the parameter `scatter`."""
 

@@ -490,7 +490,8 @@ MOST_CORRECTIONS = 8
 LARGEST_BAND = 10_000_000
 """Largest number of entries of a band: 80 MB."""
 OPERATIONS_A_CALL = 100_000_000
-"""Number of operations in a call, some tenths of a second, between two checks for interruption."""
+"""Number of operations in a call, between two checks for interruption. A call takes a few tenths of
+a second."""
 
 
 class Settler:

@@ -200,7 +200,7 @@ class ContactSystem(System):
             raise self._not_unique(members)
 
     def is_loose(self, moves: Floats, rounding: float) -> bool:
-        """Return whether a part that nothing holds yet has moves."""
+        """Return whether a part that is not yet constrained has moves."""
         r = self._table(moves)
         return any(np.abs(r[members]).max(initial=0.0) > 8 * rounding for members in self._floats)
 

@@ -136,7 +136,7 @@ def changes(scene: Scene, steps: int) -> list[int]:
 
 
 VALUES_A_CALL = 200_000_000
-"""Number of values times steps in a call of an engine, which takes some tenths of a second."""
+"""Number of values times steps in a call of an engine. A call takes a few tenths of a second."""
 GROWING = 1e-6
 """Excess over 1 from which the eigenvalue of a mode counts as growth."""
 RECORD_LAST = "; or record the equilibrium of the last step only, `record: {{at: [{}]}}`"
@@ -287,8 +287,8 @@ def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int])
 
 
 def _steps_shrink(scene: Scene, step: int) -> bool:
-    """Return whether steps with the roles of a step have no growing mode, as far as the spectrum is
-    known."""
+    """Return whether steps with the roles of a step have no growing mode; True if the spectrum is
+    not known."""
     if excess(scene) or scene.experiment.neighbours.nearness():
         return True
     operator = step_operator(scene.at(step), step=step)

@@ -490,7 +490,7 @@ def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:
 
 class _ContactSearch(Search):
     """Newton's iteration with an active set: particles that would enter an obstacle are
-    constrained, until the set is complete. Parts that nothing holds yet are moved by weak
+    constrained, until the set is complete. Parts that are not yet constrained are moved by weak
     springs."""
 
     def run(self) -> Certificate:

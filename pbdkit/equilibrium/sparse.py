@@ -65,7 +65,7 @@ progress."""
 
 
 class DriftingError(Exception):
-    """A floating part is under a load that nothing balances."""
+    """A floating part is under a load that is not balanced."""
 
 
 class TooSoftError(DriftingError):

@@ -229,8 +229,7 @@ class MeasuredCurve(MeasuredColumns):
     columns: Annotated[tuple[str, str], Field(strict=False)] = ("displacement", "force")
 
     def observation(self, experiment: Experiment, modes: int) -> CurveObservation:
-        """Return the observation in a run, divided by thickness and modulus as far as they are
-        known."""
+        """Return the observation in a run, divided by thickness and modulus if they are known."""
         scale = self.thickness * (self.youngs_modulus or 1.0)
         scale *= experiment.units.length_mm if experiment.units else 1.0
         curve = CurveObservation.of(
@@ -303,8 +302,8 @@ Bounds = Annotated[Pair, AfterValidator(_two)]
 
 class Force(Strict):
     """The force of a leader group and the thickness of the body, from which Young's modulus
-    follows, in the unit of the force over those of thickness and lattice. Units are N, mm and MPa
-    if the experiment has units."""
+    follows. Its unit is that of the force, divided by those of the thickness and of the lattice.
+    Units are N, mm and MPa if the experiment has units."""
 
     group: Annotated[int, Field(ge=0)]
     value: Pair

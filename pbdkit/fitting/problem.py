@@ -423,7 +423,7 @@ class Solution:
     directions
         Directions with their variance.
     ratio
-        Standard deviation of the residuals over their noise.
+        Standard deviation of the residuals divided by their noise.
     unidentified, on_bounds
         Paths of parameters that are not identifiable, and of those at their bounds.
     evaluations

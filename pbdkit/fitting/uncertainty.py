@@ -159,8 +159,8 @@ class Candidate:
     name
         Name of the model.
     left_out, error
-        Mean square of left-out residuals over their noise (1 is the noise alone), and its standard
-        error over blocks.
+        Mean square of left-out residuals divided by their noise (1 is the noise alone), and its
+        standard error over blocks.
     behind, behind_error
         Mean difference of `left_out` to that of the best model over blocks, and its standard error.
     differs

@@ -2,11 +2,12 @@
 strain, stress and materials computed on request.
 
 The displacement gradient at a particle is the mean over the cells that meet there, weighted by
-area. The mean gradient of a polygon is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area
-(Green's theorem); it is that of the bilinear displacement of a rectangle, or of the linear
+area. The mean gradient of a polygon is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1), divided by its
+area (Green's theorem); it is that of the bilinear displacement of a rectangle, or of the linear
 displacement of a triangle. The mean over cells is a value at the mean of their centres. At an edge
-that is not the particle, to which the gradient is extrapolated with its slope, computed in the same
-way. The result is exact for quadratic displacements of rectangular cells, edges included.
+this point is not the position of the particle, and the gradient is extrapolated to the particle
+with its slope, which is computed in the same way. The result is exact for quadratic displacements
+of rectangular cells, also at edges.
 """
 
 from __future__ import annotations

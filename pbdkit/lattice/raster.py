@@ -295,12 +295,12 @@ class Raster:
 
     @cached_property
     def count(self) -> int:
-        """Number of particles, frame included."""
+        """Number of particles, including those of the frame."""
         return int(np.count_nonzero(self.sites != EMPTY))
 
     @property
     def total(self) -> int:
-        """Number of particles of the whole lattice, frame included."""
+        """Number of particles of the whole lattice, including those of the frame."""
         return self.extent.particles if self.extent else self.count
 
     @property

@@ -505,7 +505,7 @@ class Rotation(Motion):
 
 
 class Oscillation(Motion):
-    """Oscillates around the start: amplitude · sin(2πn / period), without end."""
+    """Oscillates around the start, without an end: amplitude · sin(2πn / period)."""
 
     type: Literal["oscillation"] = "oscillation"
     rests: ClassVar[bool] = False

@@ -429,9 +429,9 @@ class RowCount:
     """Number of particles in the rows of a lattice.
 
     `low` and `high` are the ends of the body's box of sites; `lines` are the numbers of particles
-    on each line of sites, frame included, from the first nonempty one; `period` and `reach` are the
-    number of indices of a repeat cell and of cells that neighbours reach along the first axis;
-    `left_out` are the cells omitted at narrow voids.
+    on each line of sites, including the frame, from the first nonempty line; `period` and `reach`
+    are the number of indices of a repeat cell and of cells that neighbours reach along the first
+    axis; `left_out` are the cells omitted at narrow voids.
     """
 
     low: Index

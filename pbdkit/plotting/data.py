@@ -657,8 +657,8 @@ THINNEST = 40.0
 @dataclass(frozen=True)
 class Extent:
     """Extent of several steps: the bounding `box` (left, right, bottom, top), the lowest and
-    highest value in the body and in total, frame included, and the kinds, and classes of the
-    quantity, that occur."""
+    highest value in the body, the same including the frame, and the kinds and the classes of the
+    quantity that occur."""
 
     box: Box
     of_body: tuple[float, float]

@@ -41,7 +41,7 @@ ROUND_ANGLE = math.pi / 12
 ROUND_ATOL = 1e-3
 """Tolerance of the recognition of multiples of `ROUND_ANGLE`."""
 DECIMALS = 2
-"""Number of decimals from which on an angle counts as not rounded."""
+"""Smallest number of decimals of an angle that counts as not rounded."""
 LOCKING_FACTOR = 0.07
 """Factor of the relative excess stiffness in bending, which is about this factor times c_shear / λ
 / n for a body of n cells across. λ is the smallest stiffness of a cell, of a mode that extends one

@@ -326,8 +326,8 @@ class _Cells:
         Returns
         -------
         tuple
-            Stiffness over that of the rule, (cell,), 0 if it is not a multiple of it; and the
-            stiffness of these cells, (cell, 3, 3).
+            Ratio of the stiffness to that of the rule, (cell,), 0 where the stiffness is not a
+            multiple of it; and the stiffness of these cells, (cell, 3, 3).
         """
         rule, x, y = self.experiment.rule, self.x.mean(axis=0), self.y.mean(axis=0)
         values = dict(values_at(self.experiment, "rule", x, y, self.inside))

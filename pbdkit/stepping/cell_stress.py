@@ -156,8 +156,8 @@ def _beside(scene: Scene, slot: Slot, side: Side) -> CellBeside:
 
 
 def _rates(polygon: CellPolygon) -> tuple[Vector, ...]:
-    """Return the rates of the mean gradient of a polygon (Green): ½ (y_k+1 - y_k-1, x_k-1 - x_k+1)
-    over its area."""
+    """Return the rates of the mean gradient of a polygon (Green): ½ (y_k+1 - y_k-1, x_k-1 - x_k+1),
+    divided by its area."""
     r, twice = polygon.rest, 2.0 * float(signed_area(polygon.rest))
     ends = [(r[(k + 1) % len(r)], r[k - 1]) for k in range(1, len(r))]
     return tuple(

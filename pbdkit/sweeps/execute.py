@@ -293,7 +293,7 @@ class SizeEstimate:
             )
 
     def _number_of_times(self) -> int:
-        """Return the length of the joined dimension, as far as it is known in advance."""
+        """Estimate the length of the joined dimension before the members run."""
         times = self._keep.times
         if times == "last":
             return len({steps for steps, *_ in self._times})

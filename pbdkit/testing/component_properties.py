@@ -516,7 +516,7 @@ def _content(value: Any) -> bytes:
 
 
 ROUNDING = 1e-12
-"""Relative tolerance of some thousand roundings; the last digit of numpy functions may depend on
+"""Relative tolerance of several thousand roundings; the last digit of numpy functions may depend on
 the position in an array."""
 
 

@@ -63,7 +63,7 @@ def state_with(scene: Scene, u: Any) -> State:
 
 
 def advanced(scene: Scene, u: Any, steps: int) -> Floats:
-    """Return the displacements of the body in the steps from u on, (step, particle, axis)."""
+    """Return the displacements of the body in the steps that follow u, (step, particle, axis)."""
     stepper, raster = Stepper(scene), scene.raster
     states = accumulate(
         range(steps), lambda state, _: stepper.advance(state), initial=state_with(scene, u)

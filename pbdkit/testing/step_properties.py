@@ -101,7 +101,7 @@ def _compare(value: object, reference: object, subject: str) -> None:
 STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
 """Interfaces of components that determine a step."""
 STEP_ROUNDING = 1e-12
-"""Tolerance relative to the largest displacement, for some hundred roundings of 1e-16."""
+"""Tolerance relative to the largest displacement, for several hundred roundings of 1e-16."""
 STEPS = 4
 """Number of steps in a case."""
 
@@ -293,7 +293,7 @@ def _refuse_difference(state: State, expected: State, origin: str, scene: Scene)
 
 
 ROUNDING = 1e-11
-"""Tolerance relative to the spacing; rotations sum some hundred roundings of 1e-16."""
+"""Tolerance relative to the spacing; rotations sum several hundred roundings of 1e-16."""
 ANGLE = 2.0
 """Angle of rotation in radians."""
 

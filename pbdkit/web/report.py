@@ -164,7 +164,7 @@ def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
 
 Rows = NDArray[np.intp]
 MIN_STEPS = 60
-"""Minimum number of steps of a run, as far as recorded."""
+"""Minimum number of steps of a run, if that many are recorded."""
 MAX_PARTICLES = 50_000
 """Maximum number of particles that a browser moves smoothly, with their bonds."""
 FEW_LEADERS = 200
