@@ -55,7 +55,7 @@ MORE = """\
     context_settings={"help_option_names": ["-h", "--help"]},
     invoke_without_command=True,
     epilog='In bash, `eval "$(_PBDKIT_COMPLETE=bash_source pbdkit)"` enables completion of '
-    "commands, settings, variables and steps by the tabulator key; for zsh and fish see "
+    "commands, settings, variables and steps with the Tab key; for zsh and fish see "
     "docs/experiments.md.",
 )
 @click.option("--debug", is_flag=True, help="Show a traceback if a command fails.")

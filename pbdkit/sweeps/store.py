@@ -227,7 +227,7 @@ class Store:
         if not exists:
             raise StorageError(
                 f"{self._folder}: was moved or removed during the sweep; once it is there again, "
-                "the same command continues with its results"
+                "repeat the command to continue with its results"
             )
 
     def _verified(self, row: Row) -> MemberReport | str:
@@ -413,7 +413,7 @@ class Store:
             )
         if is_full(self._folder):
             return FULL
-        return f"{error}; stored results remain, and the same command continues with intact ones"
+        return f"{error}; stored results remain; repeat the command to continue with the intact ones"
 
 
 def _may_become_database(path: Path) -> bool:
