@@ -29,7 +29,7 @@ def ds(file):
 
 
 @pytest.mark.parametrize("order", ["import pbdkit, xarray", "import xarray, pbdkit"])
-def test_what_xarray_opens_has_the_accessor(file, order):
+def test_datasets_opened_by_xarray_have_the_accessor(file, order):
     check = "import sys; ds = xarray.open_dataset(sys.argv[1]); print(ds.pbd.at(i=4, j=5).number)"
     command = [sys.executable, "-c", f"{order}; {check}", str(file)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)
@@ -37,7 +37,7 @@ def test_what_xarray_opens_has_the_accessor(file, order):
     assert "number" in done.stdout
 
 
-def test_importing_pbdkit_imports_no_xarray_and_looking_for_it_registers_nothing():
+def test_import_loads_no_xarray_and_a_search_registers_nothing():
     check = (
         "import sys, pbdkit, importlib.util as u; assert u.find_spec('xarray');"
         "assert 'xarray' not in sys.modules and 'numpy' not in sys.modules;"
@@ -51,13 +51,13 @@ def test_importing_pbdkit_imports_no_xarray_and_looking_for_it_registers_nothing
 
 
 @pytest.mark.parametrize("name", ["plot", "compare", "animate", "animation"])
-def test_signatures_name_their_options_as_matplotlib_does(ds, name):
+def test_signatures_use_matplotlib_option_names(ds, name):
     parameters = inspect.signature(getattr(ds.pbd, name)).parameters
     assert {"color", "cmap", "vmin", "vmax", "figsize", "dpi"} <= {*parameters}
     assert not any(p.kind is p.VAR_KEYWORD for p in parameters.values())
 
 
-def test_one_limit_of_the_colours_leaves_the_other_to_the_values(ds):
+def test_one_colour_limit_leaves_the_other_automatic(ds):
     bar = ds.pbd.plot("pe1", vmax=7.0).figure.axes[1]
     lowest = float(ds.pe1.isel(time=-1).min())
     assert max(bar.get_xlim(), bar.get_ylim(), key=max) == pytest.approx((lowest, 7.0))
@@ -71,7 +71,7 @@ def test_one_limit_of_the_colours_leaves_the_other_to_the_values(ds):
         ["steps=20", "solver.relaxation=0.25", "leaders.0.until=7"],
     ],
 )
-def test_settings_are_maps_or_texts_and_leave_all_else(settings):
+def test_settings_are_maps_or_strings_and_change_nothing_else(settings):
     plain = pbdkit.load("paper/a")
     changed = pbdkit.load("paper/a", settings=settings)
     assert (changed.steps, changed.solver.relaxation, changed.leaders[0].until) == (20, 0.25, 7)
@@ -80,7 +80,7 @@ def test_settings_are_maps_or_texts_and_leave_all_else(settings):
     assert pbdkit.analyse("paper/a", settings=settings).scene.experiment.steps == 20
 
 
-def test_a_map_with_a_type_replaces_the_part_and_a_component_does_too():
+def test_map_with_a_type_or_a_component_replaces_the_part():
     rule = {"type": "distance-weighted"}
     other = pbdkit.load("paper/a", settings={"rule": rule}).rule
     assert other.type == "distance-weighted"
@@ -91,7 +91,7 @@ def test_a_dataset_returns_its_experiment(ds):
     assert ds.pbd.experiment() == pbdkit.load("paper/a", settings=SMALL)
 
 
-def test_copies_with_other_parts_are_validated_when_they_run():
+def test_modified_copies_are_validated_when_they_run():
     experiment = pbdkit.load("modelling/composite-plate")
     again = experiment.model_copy(update={"seed": 3})
     assert again.as_written().data["seed"] == 3
@@ -152,21 +152,21 @@ def load(**more):
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_are_answered_with_place_cause_and_remedy(ds, name):
+def test_errors_have_place_cause_and_remedy(ds, name):
     call, *words = MISTAKES[name]
     with pytest.raises(pbdkit.PbdkitError) as caught:
         call(ds)
     assert [word for word in words if word not in str(caught.value)] == []
 
 
-def test_the_beginning_of_names_suggests_all_of_them(ds):
+def test_prefix_suggests_all_matching_names(ds):
     for draw in (ds.assign(heat_in=ds.pe1, heat_out=ds.pe1).pbd.plot, ds.assign(heat_in=ds.time,
                  heat_out=ds.time).pbd.curve):  # fmt: skip
         with pytest.raises(pbdkit.ExperimentError, match="mean 'heat_in' or 'heat_out'"):
             draw("heat")
 
 
-def test_a_run_into_a_file_is_what_the_command_writes(call, tmp_path, monkeypatch):
+def test_run_into_a_file_equals_the_output_of_the_command(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ds = pbdkit.run("paper/a", settings=SMALL, output="a.nc", progress=False)
     assert call("run", "paper/a", "--set", SMALL[0], "--set", SMALL[1], "-o", "b.nc").code == 0
@@ -197,7 +197,7 @@ def test_a_dataset_is_saved_as_a_sealed_result(ds, call, tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.glob("*.nc")] == ["some.nc"]
 
 
-def test_warnings_are_silenced_one_by_one(tensile):
+def test_warnings_are_silenced_individually(tensile):
     """A body with growing waves and an unused region has a warning of the class of each."""
     parts = tensile | {"solver": {"type": "stepping", "relaxation": 2.5}, "steps": 2}
     parts["regions"] = {"nowhere": {"type": "disc", "radius": 1.0, "centre": [4.5, 4.5]}}
@@ -222,12 +222,12 @@ def test_every_warning_has_a_class_of_its_subject():
     assert (again, again.category) == ("doubtful", pbdkit.errors.AccuracyWarning)
 
 
-def test_sweeps_take_keywords_alone(tensile):
+def test_sweeps_take_only_keywords(tensile):
     with pytest.raises(TypeError, match="takes 1 positional argument but 2 were given"):
         pbdkit.sweep(tensile, {"steps": [1, 2]})
 
 
-def test_analyses_and_identities_read_well(tensile):
+def test_representations_of_analyses_and_identities_are_readable(tensile):
     known = str(pbdkit.analyse(tensile))
     assert known.startswith("analysis of tensile\n  stability ")
     assert re.search(r"^  converges +to 1e-3 in \d+, .* steps$", known, re.M)

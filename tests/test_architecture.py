@@ -68,13 +68,13 @@ def imported(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_lead_upstream_only(path):
+def test_imports_follow_the_layer_order(path):
     own = room(".".join(("pbdkit", *path.relative_to(PACKAGE).with_suffix("").parts)))
     downstream = [module for module in imported(path) if room(module) > own]
     assert downstream == []
 
 
-def test_no_files_import_each_other_in_a_circle():
+def test_no_circular_imports():
     """Not for their types either, within a room as little as between rooms."""
     needs = {name: {*imported(path)} & {*MODULES} - {name} for name, path in MODULES.items()}
     assert len(list(TopologicalSorter(needs).static_order())) == len(MODULES)
@@ -95,7 +95,7 @@ def test_rules_are_evaluated_in_one_place():
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_functions_stay_short(path):
+def test_functions_are_short(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef):
             # A docstring with its sections is not counted.
@@ -103,7 +103,7 @@ def test_functions_stay_short(path):
             assert node.end_lineno - first[0].lineno < 60, node.name
 
 
-def test_every_folder_has_its_place_in_the_order():
+def test_every_package_has_a_place_in_the_order():
     folders = {p.name for p in PACKAGE.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
     assert folders <= set(ORDER)
 
@@ -111,7 +111,7 @@ def test_every_folder_has_its_place_in_the_order():
 PAGE = (PACKAGE.parent / "ARCHITECTURE.md").read_text()
 
 
-def test_the_page_names_every_package_and_no_file_that_is_missing():
+def test_page_names_every_package_and_no_missing_file():
     assert "## Data flow" in PAGE
     table = PAGE.split("## Data flow")[0]
     names = {word.strip("/") for word in re.findall(r"`([\w/]+)`", table)}
@@ -132,7 +132,7 @@ def test_the_page_lists_the_operations_in_the_order_of_a_step():
     assert sorted(ranks) == [*range(len(ORDER_OF_A_STEP))]
 
 
-def test_the_kernel_on_the_page_is_the_one_that_is_generated(monkeypatch):
+def test_kernel_on_the_page_is_the_generated_one(monkeypatch):
     sources = []
     monkeypatch.setattr(engine, "load_blamed", lambda levels, source, given: sources.append(source))
     engine.CompiledStepper(build_scene(pbdkit.load("paper/a")))

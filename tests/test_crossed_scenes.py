@@ -25,14 +25,14 @@ all."""
 REFUSED = sorted(tuple(sorted(pair)) for pair in PAIRS if refusal_of(pair))
 
 
-def test_every_pair_of_features_meets_or_is_refused():
+def test_every_pair_of_features_is_combined_or_refused():
     met = {frozenset(pair) for features in SCENES for pair in combinations(features, 2)}
     assert PAIRS - met == {frozenset(pair) for pair in REFUSED}
     assert {feature for features in SCENES for feature in features} == {*FEATURES}
 
 
 @pytest.mark.parametrize(("first", "second", "words"), REFUSALS, ids=lambda v: str(v)[:30])
-def test_what_does_not_go_together_is_refused_with_one_message(first, second, words):
+def test_incompatible_features_are_refused_with_one_message(first, second, words):
     """In pairs, each with nothing else in its way."""
     pairs = {frozenset((a, b)) for a in first for b in second} & PAIRS
     assert pairs
@@ -46,12 +46,12 @@ def test_what_does_not_go_together_is_refused_with_one_message(first, second, wo
         assert "\n" not in text, text
 
 
-def test_every_feature_is_tried_under_every_law():
+def test_every_feature_is_tested_with_every_law():
     tried = {(feature, law) for n, law in CASES for feature in SCENES[n]}
     assert tried == {(feature, law) for feature in FEATURES for law in LAWS}
 
 
 @pytest.mark.parametrize(("n", "law"), CASES)
-def test_scenes_obey_the_laws(n, law):
+def test_scenes_satisfy_the_laws(n, law):
     faults = LAWS[law](experiment_of(SCENES[n], n), n)
     assert not faults, (sorted(SCENES[n]), faults)

@@ -21,7 +21,7 @@ def read_yaml(name: str) -> Any:
 
 
 @pytest.mark.parametrize("folder", PROJECTS, ids=lambda p: p.name)
-def test_a_distribution_carries_the_licence(folder: Path) -> None:
+def test_distribution_contains_the_licence(folder: Path) -> None:
     project = project_of(folder)["project"]
     assert (project["license"], project["license-files"]) == ("BSD-3-Clause", ["LICENSE"])
     text = (folder / "LICENSE").read_text()
@@ -42,7 +42,7 @@ def test_the_citation_agrees() -> None:
     assert citation["authors"] == project["authors"]
 
 
-def test_hooks_type_check_against_what_pbdkit_depends_on() -> None:
+def test_hooks_type_check_against_the_dependencies_of_pbdkit() -> None:
     project = project_of(ROOT)
     extras = project["project"]["optional-dependencies"].values()
     groups = (project["dependency-groups"][name] for name in ("test", "lint"))

@@ -71,7 +71,7 @@ def install(page):
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("python"))
-def test_python_runs(page, code, tmp_path, monkeypatch):
+def test_python_examples_run(page, code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_experiments(page)
     install(page)
@@ -155,7 +155,7 @@ def assert_served_until_interrupted(line):
 
 
 @pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda p: p.name)
-def test_tables_are_in_one_piece(page):
+def test_tables_are_contiguous(page):
     """Rows that follow no head and no other row are shown as raw text, and cells beyond the head
     not at all."""
     text = re.sub(r"^(```+).*?^\1$", "", page.read_text(), flags=re.M | re.S)
@@ -167,7 +167,7 @@ def test_tables_are_in_one_piece(page):
 
 
 @pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda p: p.name)
-def test_links_lead_somewhere(page):
+def test_links_have_targets(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), target
@@ -182,7 +182,7 @@ TEXTS = [
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda p: f"{p.parent.name}-{p.stem}")
-def test_sources_that_are_named_in_text_exist(page):
+def test_sources_named_in_text_exist(page):
     """Files of commands, and names in backticks, relative to the repository, to the page, or to a
     folder of the package or the tests."""
     text = page.read_text("utf-8")
@@ -192,7 +192,7 @@ def test_sources_that_are_named_in_text_exist(page):
     assert [name for name in names if not any((f / name).exists() for f in folders)] == []
 
 
-def test_pages_for_users_show_a_picture_or_an_example():
+def test_pages_for_users_have_a_figure_or_an_example():
     """Reports and decisions aside; the gallery is generated with pictures."""
     apart = {"validation", "decisions", "gallery"}
     pages = [p for p in (ROOT / "docs").rglob("*.md") if apart.isdisjoint(p.parts)]
@@ -200,7 +200,7 @@ def test_pages_for_users_show_a_picture_or_an_example():
     assert [page.name for page in pages if not shown.search(page.read_text())] == []
 
 
-def test_readme_lists_the_two_commands_that_ci_runs():
+def test_readme_lists_the_two_commands_of_ci():
     text = (ROOT / "README.md").read_text()
     commands = re.findall(r"^python3 -m venv .*$", text, re.M)
     assert [c.split(" && ")[-1] for c in commands] == [
@@ -265,7 +265,7 @@ def commands(page):
 
 
 @pytest.mark.parametrize("page", SHELL, ids=lambda p: f"{p.parent.name}-{p.stem}")
-def test_every_block_is_run_somewhere(page):
+def test_every_block_is_run_by_a_test(page):
     fences = re.findall(r"^ *```(\S*)", page.read_text(), re.M)
     assert {fence for fence in fences if fence} <= FENCES
     assert len(fences) % 2 == 0
@@ -275,7 +275,7 @@ def test_every_block_is_run_somewhere(page):
 
 
 @pytest.mark.parametrize("page", SHELL, ids=lambda p: f"{p.parent.name}-{p.stem}")
-def test_commands_that_are_not_run_here_could_be(page):
+def test_commands_not_run_here_are_valid(page):
     """Their options are known, and they name files that are there."""
     for line in commands(page):
         words = shlex.split(line, comments=True)

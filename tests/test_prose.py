@@ -13,14 +13,14 @@ def planted(file, content):
     return [fault.split(": ", 1) for fault in prose.faults(prose.texts_of(file, content))]
 
 
-def test_the_project_has_no_faults(texts):
+def test_project_has_no_prose_faults(texts):
     assert list(prose.faults(texts)) == []
 
 
 @pytest.mark.parametrize(
     ("kind", "persons", "verbs"), [("docstring", 8, 200), ("message", 8, 0), ("page", 8, 0)]
 )
-def test_counts_are_those_of_well_kept_packages(texts, kind, persons, verbs):
+def test_counts_match_those_of_well_kept_packages(texts, kind, persons, verbs):
     folder = "docs/" if kind == "page" else "pbdkit/"
     chosen = [t.text for t in texts if t.kind == kind and t.file.startswith(folder)]
     counts = prose.counts(chosen)

@@ -67,7 +67,7 @@ def compare(experiment):
 
 
 @pytest.mark.parametrize("name", ["a", "b", "c", "d1", "d2", "e", "f1", "f2", "g"])
-def test_the_papers_cases_match_the_plain_loops(name):
+def test_cases_of_the_paper_match_the_plain_loops(name):
     experiment = pbdkit.load(f"paper/{name}", settings=["steps=60"])
     raw = experiment.model_dump(mode="json")
     ds, expected = pbdkit.run(experiment, progress=False), plain_loops.simulate(raw)

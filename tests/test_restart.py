@@ -118,7 +118,7 @@ def assert_same(one: Path, other: Path) -> None:
 
 
 @pytest.mark.parametrize("change", RUNS)
-def test_a_run_in_parts_is_the_whole_run(
+def test_run_in_parts_equals_the_whole_run(
     change: str, tensile: dict[str, Any], tmp_path: Path
 ) -> None:
     given = tensile | RUNS[change]
@@ -143,7 +143,7 @@ def test_any_run_in_parts_is_the_whole_run(tmp_path_factory: Any, given: dict[st
     assert_same(folder / "whole.nc", folder / "parts.nc")
 
 
-def test_a_run_is_gone_on_with_from_any_commit(
+def test_run_resumes_from_any_commit(
     tensile: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The files in the folder after each commit, as a kill leaves them, are sufficient; bytes after
@@ -186,7 +186,7 @@ def stopped(call: Call, tensile: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def test_an_unfinished_run_is_looked_at(stopped: dict[str, Any], call: Call) -> None:
+def test_unfinished_run_can_be_inspected(stopped: dict[str, Any], call: Call) -> None:
     before = {path: path.read_bytes() for path in Path().iterdir()}
     result = call("status", str(OUT))
     assert result.out.startswith("tensile.nc: step 20 of 40, stopped\n")
@@ -209,7 +209,7 @@ def test_a_run_beside_an_unfinished_one_is_refused(stopped: dict[str, Any], call
     assert sorted(path.name for path in Path().iterdir()) == ["e.json", "tensile.nc"]
 
 
-def test_python_goes_on_with_it(stopped: dict[str, Any]) -> None:
+def test_python_resumes_a_run(stopped: dict[str, Any]) -> None:
     whole = pbdkit.run(stopped, progress=False)
     with pbdkit.resume(OUT, progress=False) as ds:
         for name in whole.variables:
@@ -220,7 +220,7 @@ def test_python_goes_on_with_it(stopped: dict[str, Any]) -> None:
         pbdkit.resume("none.nc")
 
 
-def test_what_changed_since_is_refused(
+def test_changes_since_the_start_are_refused(
     stopped: dict[str, Any], call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path("e.json").write_text(json.dumps(stopped | {"seed": 7}))
@@ -238,7 +238,7 @@ CONTINUED = ["plain", "everything", "memory", "fracture", "small records", "zlib
 
 
 @pytest.mark.parametrize("change", CONTINUED)
-def test_a_finished_run_is_continued_to_the_longer_one(
+def test_finished_run_is_extended_to_the_longer_one(
     change: str, tensile: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pbdkit.restart.BLOCK_BYTES", 3000)  # several rows, not all
@@ -334,7 +334,7 @@ LATER: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("later", LATER)
 @pytest.mark.filterwarnings("ignore:.* (begins|after the last step)")
-def test_a_run_that_settles_is_continued_to_the_longer_one(later: str, tmp_path: Path) -> None:
+def test_converging_run_is_extended_to_the_longer_one(later: str, tmp_path: Path) -> None:
     """Events after the shorter run take place, whether or not it has converged."""
     given, whole = BLOCK | LATER[later] | {"steps": 400}, tmp_path / "whole.nc"
     outcome = record(Simulation.of_scene(scene_of(given)), NetcdfSink(whole)).outcome
@@ -350,7 +350,7 @@ def test_a_run_that_settles_is_continued_to_the_longer_one(later: str, tmp_path:
 
 
 @pytest.mark.parametrize("later", ["a load", "a rule that is not linear"])
-def test_an_interrupted_run_goes_on_to_more_steps(later: str, tmp_path: Path) -> None:
+def test_interrupted_run_is_extended_to_more_steps(later: str, tmp_path: Path) -> None:
     given = BLOCK | LATER[later] | {"record": {"every": 1}}
     whole, part = tmp_path / "whole.nc", tmp_path / "part.nc"
     record(Simulation.of_scene(scene_of(given | {"steps": 900})), NetcdfSink(whole))
@@ -364,7 +364,7 @@ def test_an_interrupted_run_goes_on_to_more_steps(later: str, tmp_path: Path) ->
     assert_same(whole, part)
 
 
-def test_a_run_that_is_stopped_at_its_last_look_settles_all_the_same(tmp_path: Path) -> None:
+def test_run_stopped_at_its_last_check_converges_nevertheless(tmp_path: Path) -> None:
     given = BLOCK | {"record": {"every": 1}, "steps": 400}
     steps = record(Simulation.of_scene(scene_of(given)), MemorySink()).outcome.steps
     given, whole = given | {"steps": steps}, tmp_path / "whole.nc"
@@ -386,7 +386,7 @@ def test_a_run_that_is_stopped_at_its_last_look_settles_all_the_same(tmp_path: P
 
 
 @pytest.mark.filterwarnings("ignore:.* starts after the last step")
-def test_an_interrupted_run_is_not_taken_for_a_shorter_one(tmp_path: Path) -> None:
+def test_interrupted_run_is_not_mistaken_for_a_shorter_one(tmp_path: Path) -> None:
     """A run of 100 steps would have converged before the load of the longer one."""
     given, part = BLOCK | LATER["a load"] | {"record": {"every": 1}}, tmp_path / "part.nc"
     record(
@@ -400,9 +400,7 @@ def test_an_interrupted_run_is_not_taken_for_a_shorter_one(tmp_path: Path) -> No
     assert found.record().outcome.status == "settled"
 
 
-def test_the_search_for_an_equilibrium_does_not_become_another_one(
-    tensile: dict[str, Any], tmp_path: Path
-) -> None:
+def test_resumed_equilibrium_search_is_unchanged(tensile: dict[str, Any], tmp_path: Path) -> None:
     given, part = tensile | RUNS["equilibrium, fracture"], tmp_path / "part.nc"
     record(Simulation.of_scene(scene_of(given), watch=stopping_after(9)), NetcdfSink(part))
     steps = given["steps"]
@@ -413,7 +411,7 @@ def test_the_search_for_an_equilibrium_does_not_become_another_one(
     assert resumption(part, Watch(), steps=steps) is not None
 
 
-def test_weights_that_were_chosen_are_those_of_the_longer_run(tmp_path: Path) -> None:
+def test_automatic_weights_are_those_of_the_longer_run(tmp_path: Path) -> None:
     """If roles change between the ends of both runs other groups are needed."""
     solver = {"type": "stepping", "relaxation": "auto", "memory": "auto"}
     given = BLOCK | {"solver": solver}
@@ -446,7 +444,7 @@ def test_weights_that_were_chosen_are_those_of_the_longer_run(tmp_path: Path) ->
     assert found.record().outcome.status == "complete"
 
 
-def test_a_distance_that_is_infinite_can_be_gone_on_with(tmp_path: Path) -> None:
+def test_run_with_infinite_distance_can_be_resumed(tmp_path: Path) -> None:
     """A body that loads push and that no leader holds has no equilibrium."""
     given = BLOCK | {
         "rule": {"type": "springs"},
@@ -465,7 +463,7 @@ def test_a_distance_that_is_infinite_can_be_gone_on_with(tmp_path: Path) -> None
     assert_same(whole, part)
 
 
-def test_what_cannot_be_continued_is_refused(
+def test_unsupported_continuations_are_refused(
     tensile: dict[str, Any], call: Call, tmp_path: Path
 ) -> None:
     for status, change in (("diverged", "diverges"), ("an equilibrium", "equilibrium")):

@@ -35,13 +35,13 @@ def scene_of(given: dict[str, Any], **parts: Any) -> Scene:
     return build_scene(pbdkit.Experiment(**given | parts))
 
 
-def test_every_solver_has_a_driver_and_only_its_own_parameters() -> None:
+def test_every_solver_has_a_driver_and_only_its_parameters() -> None:
     assert set(DRIVERS) == set(Solver.__subclasses__())
     assert set(Equilibrium.model_fields) == {"type", "method", "tolerance", "increments"}
     assert not hasattr(Equilibrium(), "relaxation")
 
 
-def test_nobody_asks_a_solver_for_its_class() -> None:
+def test_no_code_tests_the_class_of_a_solver() -> None:
     asked = []
     for path in Path(pbdkit.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -52,7 +52,7 @@ def test_nobody_asks_a_solver_for_its_class() -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
-def test_the_states_of_a_run_are_those_that_are_recorded(
+def test_states_of_a_run_are_the_recorded_ones(
     tensile: dict[str, Any], solver: dict[str, Any]
 ) -> None:
     given = tensile | {"solver": solver, "steps": 500, "record": {"every": 7}}
@@ -70,7 +70,7 @@ def test_the_states_of_a_run_are_those_that_are_recorded(
     assert max(places) == ds.time[-1] == run.outcome.steps
 
 
-def test_a_run_can_be_watched_between_its_records_and_changed(tensile: dict[str, Any]) -> None:
+def test_run_can_be_observed_between_records_and_changed(tensile: dict[str, Any]) -> None:
     given = tensile | {"leaders": tensile["leaders"][:1], "record": {"at": [0]}}
     run = Simulation.of_scene(scene_of(given, diagnostics=[{"type": "track", "numbers": [13]}]))
     steps, moved = [], 0.0
@@ -85,7 +85,7 @@ def test_a_run_can_be_watched_between_its_records_and_changed(tensile: dict[str,
 
 
 @pytest.mark.parametrize("solver", ["stepping", "memory", "compiled"])
-def test_a_run_goes_on_from_a_state(tensile: dict[str, Any], solver: str) -> None:
+def test_run_continues_from_a_state(tensile: dict[str, Any], solver: str) -> None:
     given = tensile | {"solver": SOLVERS[solver], "steps": 60}
     kept: State | None = None
     whole = Simulation.of_scene(scene_of(given))
@@ -98,7 +98,7 @@ def test_a_run_goes_on_from_a_state(tensile: dict[str, Any], solver: str) -> Non
     assert rest.outcome == whole.outcome
 
 
-def test_all_that_decides_when_a_run_settles_is_data(
+def test_convergence_depends_only_on_data(
     tensile: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run that is stopped, and continued from its state, guard and pace, has the same end."""
@@ -126,7 +126,7 @@ def test_all_that_decides_when_a_run_settles_is_data(
 
 
 @pytest.mark.parametrize("solver", ["stepping", "equilibrium"])
-def test_who_watches_a_run_can_stop_it(tensile: dict[str, Any], solver: str) -> None:
+def test_observer_can_stop_a_run(tensile: dict[str, Any], solver: str) -> None:
     given = tensile | {"solver": SOLVERS[solver], "record": {"at": [0]}, "steps": 10**6}
     told: list[str] = []
     watch = Watch(lambda: len(told) > 2, lambda what, share: told.append(what))
@@ -137,7 +137,7 @@ def test_who_watches_a_run_can_stop_it(tensile: dict[str, Any], solver: str) -> 
     assert sink.dataset().time[-1] == report.outcome.steps < 10**6
 
 
-def test_python_is_warned_of_what_the_command_warns_of(call: Any, tensile: dict[str, Any]) -> None:
+def test_python_and_command_give_the_same_warnings(call: Any, tensile: dict[str, Any]) -> None:
     doubtful = tensile | {"leaders": [], "solver": {"type": "stepping", "relaxation": 1.5}}
     Path("doubtful.json").write_text(json.dumps(doubtful))
     lines = call("run", "doubtful.json").err.splitlines()
@@ -160,7 +160,7 @@ def test_an_unbounded_relaxation_is_refused(tensile: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("relaxation", [1e6, 1e-300])
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_numbers_leave_all_bounds_in_silence(tensile: dict[str, Any], relaxation: float) -> None:
+def test_overflow_gives_no_numpy_warning(tensile: dict[str, Any], relaxation: float) -> None:
     solver = {"type": "stepping", "relaxation": relaxation, "memory": 1e6}
     with (
         pytest.warns(pbdkit.PbdkitWarning, match="can diverge"),
@@ -169,7 +169,7 @@ def test_numbers_leave_all_bounds_in_silence(tensile: dict[str, Any], relaxation
         pbdkit.run(tensile | {"solver": solver, "steps": 200}, progress=False)
 
 
-def test_why_an_engine_was_taken_is_true_of_a_large_body(tensile: dict[str, Any]) -> None:
+def test_reason_for_an_engine_is_correct_for_a_large_body(tensile: dict[str, Any]) -> None:
     body = {"type": "grid", "columns": 300, "rows": 300}
     run = Simulation.of_scene(scene_of(tensile, body=body, steps=1))
     assert run.choice.engine == "numpy"
@@ -207,9 +207,7 @@ def test_rerun_warns_of_another_pbdkit(tensile: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", ["experiment", "plugins"])
 @pytest.mark.parametrize("value", ["{", "[1]", 3])
-def test_a_damaged_attribute_is_said_to_be_one(
-    tensile: dict[str, Any], name: str, value: Any
-) -> None:
+def test_damaged_attribute_is_reported(tensile: dict[str, Any], name: str, value: Any) -> None:
     ds = pbdkit.run(tensile, progress=False)
     ds.attrs[name] = value
     with pytest.raises(pbdkit.StorageError, match=f"attribute '{name}' is damaged"):
@@ -232,7 +230,7 @@ def same_values(one: Any, other: Any) -> None:
 
 
 @pytest.mark.parametrize("solver", STEPPED.values(), ids=STEPPED)
-def test_steps_by_hand_are_those_of_a_run(tensile: dict[str, Any], solver: dict[str, Any]) -> None:
+def test_manual_steps_equal_those_of_a_run(tensile: dict[str, Any], solver: dict[str, Any]) -> None:
     given = tensile | {"solver": solver, "steps": 500, "diagnostics": [TRACK]}
     whole = pbdkit.run(given, progress=False)
     simulation = pbdkit.Simulation(given)
@@ -248,7 +246,7 @@ def test_steps_by_hand_are_those_of_a_run(tensile: dict[str, Any], solver: dict[
     assert simulation.time == whole.time[-1]
 
 
-def test_a_state_is_labelled_as_a_run_is_and_stays_as_it_is(tensile: dict[str, Any]) -> None:
+def test_state_has_the_labels_of_a_run_and_is_unchanged(tensile: dict[str, Any]) -> None:
     given = tensile | {"steps": 20, "fracture": {"type": "threshold", "thresholds": [1.02]}}
     given |= {"diagnostics": [{"type": "displacement"}]}
     whole, simulation = pbdkit.run(given, progress=False), pbdkit.Simulation(given)
@@ -268,7 +266,7 @@ def test_a_state_is_labelled_as_a_run_is_and_stays_as_it_is(tensile: dict[str, A
     assert state.pbd.experiment() == pbdkit.Experiment(**given)
 
 
-def test_recording_in_the_middle_begins_and_ends_with_the_state_at_hand(
+def test_partial_recording_begins_and_ends_with_the_current_state(
     tensile: dict[str, Any], tmp_path: Path
 ) -> None:
     given = tensile | {"steps": 40, "record": {"every": 5}}
@@ -290,7 +288,7 @@ def test_recording_in_the_middle_begins_and_ends_with_the_state_at_hand(
         np.testing.assert_array_equal(longer.position[-1], whole.position[-1])
 
 
-def test_a_simulation_that_is_recorded_to_its_end_is_complete(
+def test_simulation_recorded_to_its_end_is_complete(
     tensile: dict[str, Any], tmp_path: Path
 ) -> None:
     given = tensile | {"steps": 30}
@@ -306,7 +304,7 @@ def test_a_simulation_that_is_recorded_to_its_end_is_complete(
             refused()
 
 
-def test_an_equilibrium_on_the_way_is_recorded_and_gone_on_from(tensile: dict[str, Any]) -> None:
+def test_intermediate_equilibrium_is_recorded_and_continued(tensile: dict[str, Any]) -> None:
     simulation = pbdkit.Simulation(tensile | {"steps": 40})
     with simulation.record() as recording:
         simulation.step(20)
@@ -325,7 +323,7 @@ def test_an_equilibrium_on_the_way_is_recorded_and_gone_on_from(tensile: dict[st
     np.testing.assert_allclose(ds.position[-1], rest.position, rtol=0, atol=1e-12)
 
 
-def test_the_equilibrium_of_the_solver_is_that_of_a_run(tensile: dict[str, Any]) -> None:
+def test_equilibrium_of_the_solver_equals_that_of_a_run(tensile: dict[str, Any]) -> None:
     given = tensile | {"solver": {"type": "equilibrium"}}
     simulation = pbdkit.Simulation(given)
     with pytest.raises(pbdkit.ExperimentError, match=r"solver: .* call run\(\) or equilibrate\(\)"):
@@ -354,7 +352,7 @@ def test_a_simulation_starts_from_the_state_of_another(tensile: dict[str, Any]) 
         pbdkit.Simulation(given | {"steps": 20}, start=first)
 
 
-def test_steps_that_the_experiment_does_not_have_are_refused(tensile: dict[str, Any]) -> None:
+def test_steps_beyond_the_experiment_are_refused(tensile: dict[str, Any]) -> None:
     simulation = pbdkit.Simulation(tensile | {"steps": 30})
     simulation.step(10)
     message = r"step: 25 more steps exceed the 30 .* 10 are made; .*{'steps': 35}"
@@ -366,7 +364,7 @@ def test_steps_that_the_experiment_does_not_have_are_refused(tensile: dict[str, 
     assert simulation.time == 10
 
 
-def test_a_simulation_that_diverges_says_so_and_its_recording_is_kept(
+def test_diverging_simulation_raises_and_its_recording_is_kept(
     tensile: dict[str, Any],
 ) -> None:
     given = tensile | {"steps": 4000, "solver": {"type": "stepping", "relaxation": 2.5}}
@@ -381,7 +379,7 @@ def test_a_simulation_that_diverges_says_so_and_its_recording_is_kept(
     assert simulation.outcome.status == "diverged"
 
 
-def test_an_error_in_the_block_leaves_what_was_recorded(tensile: dict[str, Any]) -> None:
+def test_error_in_the_block_keeps_the_records(tensile: dict[str, Any]) -> None:
     simulation = pbdkit.Simulation(tensile | {"steps": 30})
 
     def fail() -> None:

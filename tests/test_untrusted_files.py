@@ -35,7 +35,7 @@ NO_RESULTS = {
 
 
 @pytest.mark.parametrize("name", NO_RESULTS)
-def test_what_is_no_result_is_told_in_a_line(name, call):
+def test_other_files_are_refused_in_one_line(name, call):
     Path(name).write_bytes(NO_RESULTS[name])
     said = f"{name}: is not a result of pbdkit: its first bytes are not those of netCDF"
     verified = call("verify", name)
@@ -44,7 +44,7 @@ def test_what_is_no_result_is_told_in_a_line(name, call):
         assert call(command, name)[::2] == (6, f"pbdkit: {said}\n")
 
 
-def test_an_experiment_a_folder_and_nothing_are_no_results(call):
+def test_experiment_directory_and_missing_file_are_no_results(call):
     Path("kept").mkdir()
     result = call("verify", "e.json", "kept", "gone.nc", "/dev/null")
     assert result.code == 6
@@ -72,7 +72,7 @@ LIBRARIES = {
 
 
 @pytest.mark.parametrize("name", LIBRARIES)
-def test_a_library_that_fails_brings_nothing_down(name, bare, tmp_path, monkeypatch):
+def test_failing_library_gives_an_error(name, bare, tmp_path, monkeypatch):
     source, said = LIBRARIES[name]
     (tmp_path / f"{MODULE}.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
@@ -80,7 +80,7 @@ def test_a_library_that_fails_brings_nothing_down(name, bare, tmp_path, monkeypa
         try_reading(bare)
 
 
-def test_sound_files_pass(bare):
+def test_intact_files_pass(bare):
     assert try_reading(bare) is None
     with pytest.warns(pbdkit.PbdkitWarning, match="has no seal"):
         dataset = pbdkit.open(bare)
@@ -88,7 +88,7 @@ def test_sound_files_pass(bare):
         xarray.testing.assert_identical(dataset.load(), plain.load())
 
 
-def test_the_child_finds_this_pbdkit_from_anywhere(bare):
+def test_child_process_imports_this_pbdkit_from_any_directory(bare):
     """Python was started beside the package, and the folder was changed."""
     code = "import os, sys, pbdkit; os.chdir('/'); pbdkit.open(sys.argv[1]).close()"
     done = subprocess.run(
@@ -102,7 +102,7 @@ def test_the_child_finds_this_pbdkit_from_anywhere(bare):
     assert "has no seal" in done.stderr
 
 
-def test_more_than_a_file_can_hold_is_refused(bare, tmp_path):
+def test_declared_size_beyond_the_file_is_refused(bare, tmp_path):
     """A length that was changed has libraries fill memory with what is not there."""
     import h5py
 
@@ -130,14 +130,14 @@ def test_a_large_file_is_read_in_pieces(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is measured as on Linux")
-def test_fuzzed_experiments_end_in_order():
+def test_fuzzed_experiments_end_cleanly():
     """Ten times the bounds: imports are in them, and others may be at work."""
     found = fuzz_experiments.fuzz(30, seed=0, quick=True)
     assert len(found) == 30
     assert [(n, f) for n, o in found for f in fuzz_experiments.faults(o, slack=10.0)] == []
 
 
-def test_mutated_results_are_never_silently_different(folder):
+def test_mutated_results_never_differ_silently(folder):
     found = mutate_results.mutate(10, seed=0, folder=folder)
     assert len(found) == 10
     assert [(n, fault) for n, o in found for fault in mutate_results.faults(o, slack=5.0)] == []

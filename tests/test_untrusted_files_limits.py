@@ -102,7 +102,7 @@ HARMFUL = [
 
 
 @pytest.mark.parametrize(("change", "message"), HARMFUL, ids=[c.__name__ for c, _ in HARMFUL])
-def test_what_a_file_cannot_hold_or_has_elsewhere_is_refused_sealed_and_not(
+def test_impossible_or_external_contents_are_refused_with_or_without_seal(
     call: Any, tensile: dict[str, Any], change: Any, message: str
 ) -> None:
     write_field(Path("f.nc"))
@@ -131,7 +131,7 @@ def reseal(path: Path, change: Any) -> None:
         put_seal(file)
 
 
-def test_what_results_declare_is_within_the_bounds(call: Any) -> None:
+def test_declared_sizes_of_results_are_within_the_limits(call: Any) -> None:
     """Compressed and not, with texts, dimensions only, and variables that are not written."""
     for n, more in enumerate(([], ["--set", "record.compression=zlib"])):
         assert call("run", "paper/d1", "-o", f"{n}.nc", "--quiet", *more).code == 0
@@ -159,7 +159,7 @@ PACKED = [
 
 
 @pytest.mark.parametrize(("attributes", "message"), PACKED, ids=[str(a) for a, _ in PACKED])
-def test_packed_fields_are_unpacked_or_refused_with_the_name_of_the_file(
+def test_packed_fields_are_unpacked_or_refused_by_file_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, attributes: dict[str, Any], message: str | None
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -174,7 +174,7 @@ def test_packed_fields_are_unpacked_or_refused_with_the_name_of_the_file(
     assert str(caught.value).startswith("f.nc: 'E': ")
 
 
-def test_checksums_in_a_field_file_show_a_changed_number(
+def test_checksums_in_a_field_file_detect_a_changed_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -189,7 +189,7 @@ def test_checksums_in_a_field_file_show_a_changed_number(
         read_field(FIELD, OF_PROGRAM)
 
 
-def test_a_field_file_in_the_classic_format_is_told_how_to_be_written(
+def test_classic_field_file_is_refused_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -231,7 +231,7 @@ OUTSIDE = ("../data.csv", "/data.csv", "link.csv", "below/../../data.csv")
 
 
 @pytest.mark.parametrize("name", OUTSIDE)
-def test_a_file_outside_the_folder_needs_a_word(
+def test_file_outside_the_directory_requires_permission(
     call: Any, tensile: dict[str, Any], elsewhere: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = name.replace("/data.csv", f"{elsewhere.parent}/data.csv") if name[0] == "/" else name
@@ -247,7 +247,7 @@ def test_a_file_outside_the_folder_needs_a_word(
     assert call("check", "o.json").code == 0
 
 
-def test_files_below_the_folder_and_those_of_a_program_need_none(
+def test_files_below_the_directory_and_of_programs_require_none(
     tensile: dict[str, Any], elsewhere: Path
 ) -> None:
     for parts in (with_table(tensile, "below/data.csv"), with_field(tensile, "below/f.nc")):
@@ -261,7 +261,7 @@ def test_files_below_the_folder_and_those_of_a_program_need_none(
         assert pbdkit.analyse(parts).spectral_radius
 
 
-def test_fields_sweeps_and_fits_need_the_same_word(
+def test_fields_sweeps_and_fits_require_the_same_permission(
     call: Any, tensile: dict[str, Any], elsewhere: Path
 ) -> None:
     parts = with_field(tensile, "../f.nc")
@@ -292,11 +292,11 @@ def test_fields_sweeps_and_fits_need_the_same_word(
 @pytest.mark.parametrize(
     "command", ["run", "check", "plot", "identify", "live", "bench", "sweep", "fit"]
 )
-def test_every_command_that_reads_an_experiment_takes_the_word(call: Any, command: str) -> None:
+def test_every_command_that_reads_an_experiment_has_the_option(call: Any, command: str) -> None:
     assert "--allow-outside" in call(command, "--help").out
 
 
-def test_an_experiment_with_units_keeps_the_folder_of_its_files(
+def test_experiment_with_units_keeps_the_directory_of_its_files(
     tensile: dict[str, Any], elsewhere: Path
 ) -> None:
     """Its parts are built again as they are written, wherever the program stands by then."""
@@ -336,7 +336,7 @@ def test_an_experiment_in_a_result_names_no_files(call: Any, parts: Any, elsewhe
 
 
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300, "", ".", "/dev/zero", 7])
-def test_names_that_are_none_are_refused_in_a_line(tensile: dict[str, Any], name: Any) -> None:
+def test_invalid_file_names_are_refused_in_one_line(tensile: dict[str, Any], name: Any) -> None:
     for parts in (with_table(tensile, name), with_field(tensile, name)):
         with pytest.raises(pbdkit.ExperimentError) as caught:
             pbdkit.Experiment(**parts)
@@ -351,7 +351,7 @@ TABLES = [
 
 
 @pytest.mark.parametrize(("content", "message"), TABLES, ids=["wide", "columns", "underscore"])
-def test_tables_are_refused_soon(
+def test_invalid_tables_are_refused_quickly(
     tensile: dict[str, Any], tmp_path: Path, content: str, message: str
 ) -> None:
     (tmp_path / "d.csv").write_text(content)
@@ -362,7 +362,7 @@ def test_tables_are_refused_soon(
     assert time.process_time() - begun < 2.0
 
 
-def test_a_sample_of_hostile_files_ends_in_order(tmp_path: Path) -> None:
+def test_sample_of_hostile_files_ends_cleanly(tmp_path: Path) -> None:
     found = hostile_files.attack(8, seed=0, folder=tmp_path, workers=1)
     assert len(found) == 8
     assert [(n, f) for n, outcome in found for f in hostile_files.faults(outcome)] == []

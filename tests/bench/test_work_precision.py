@@ -33,7 +33,7 @@ def measured(method=FOUR[0], size=10, error=0.0):
     return Row(size, *method, particles=size**2, ns_per_particle_step=20.0, error=error)
 
 
-def test_the_table_the_figures_and_the_picture(call, few):
+def test_table_figures_and_plot_are_written(call, few):
     result = call(
         "bench", "e.json", "--sizes", "6", "--steps", "8", "--json", "b.json", "--plot", "b.png"
     )
@@ -60,7 +60,7 @@ def test_the_table_the_figures_and_the_picture(call, few):
                    for line in result.out.splitlines())  # fmt: skip
 
 
-def test_without_sizes_it_runs_as_it_is(call, monkeypatch):
+def test_without_sizes_the_body_keeps_its_size(call, monkeypatch):
     monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: FOUR[:1])
     result = call("bench", "e.json", "--set", "leaders.0.select={numbers: [7, 8]}", "--json", "b")
     assert result.code == 0, result.err
@@ -89,7 +89,7 @@ def test_without_sizes_it_runs_as_it_is(call, monkeypatch):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_what_is_refused_is_refused_in_one_line(call, arguments, code, words):
+def test_invalid_input_is_refused_in_one_line(call, arguments, code, words):
     result = call("bench", "e.json", *arguments)
     assert result.code == code
     assert words in result.err
@@ -97,7 +97,7 @@ def test_what_is_refused_is_refused_in_one_line(call, arguments, code, words):
     assert "Traceback" not in result.err
 
 
-def test_a_method_that_cannot_be_had_is_a_row_with_its_reason(tmp_path, tensile, monkeypatch):
+def test_unavailable_method_is_a_row_with_a_reason(tmp_path, tensile, monkeypatch):
     file = tmp_path / "e.json"
     file.write_text(json.dumps(tensile))
     never = ("abacus", "float64", 1)
@@ -111,7 +111,7 @@ def test_a_method_that_cannot_be_had_is_a_row_with_its_reason(tmp_path, tensile,
         list(measure(str(file), (), None, lambda _: None))
 
 
-def test_an_engine_that_is_not_installed_names_its_extra(monkeypatch, tmp_path, tensile):
+def test_missing_engine_names_its_extra(monkeypatch, tmp_path, tensile):
     """The measuring process itself finds no numba."""
     (tmp_path / "sitecustomize.py").write_text(
         "import importlib.util as util\nfind = util.find_spec\n"
@@ -143,7 +143,7 @@ def at_size(tmp_path, experiment, size):
     return build_scene(pbdkit.load(file, settings=resized(experiment, size)))
 
 
-def test_a_grid_grows_and_what_has_coordinates_keeps_its_place(tmp_path):
+def test_resizing_a_grid_keeps_coordinates_in_place(tmp_path):
     groups = [
         {"select": {"box": [4.5, 0.0, 5.5, 9.0]}, "motion": HOLD},
         {
@@ -197,7 +197,7 @@ def test_a_grid_within_another_body_cannot_be_resized():
         resized(sheet(body={"type": "union", "of": [grid]}), 10)
 
 
-def test_every_method_is_a_row_and_a_marker():
+def test_every_method_has_a_row_and_a_marker():
     rows = [measured(m, s, e) for m, e in zip(engines(), (0.0, 1e-7) * 3, strict=False)
             for s in (10, 20)]  # fmt: skip
     assert table(rows).row_count == len(rows)

@@ -64,7 +64,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(measurement, "TOLERANCES", TOLERANCES)
 
 
-def test_the_slowest_mode_decays_as_the_closed_form_says():
+def test_slowest_mode_decays_at_the_closed_form_rate():
     """λ = (1 + cos(π/N))/2, and u = x/N has the share (2/π) (π/2N)/tan(π/2N) of its sine."""
     solver = {"type": "equilibrium", "tolerance": 1e-11}
     scene = scene_of([HOLD, pulled(edge="right")], columns=21, solver=solver)
@@ -75,7 +75,7 @@ def test_the_slowest_mode_decays_as_the_closed_form_says():
     assert decay.share == pytest.approx(share, rel=1e-3)
 
 
-def test_steps_to_a_tolerance_are_counted_or_there_are_none():
+def test_steps_to_a_tolerance_are_counted_or_absent():
     assert Decay(0.5, 0.1).steps_to(1e-3) == 3
     assert Decay(0.5, 0.1).steps_to(0.7) == 1
     assert Decay(0.5, 1.0).steps_to(1e-3) is None
@@ -87,7 +87,7 @@ def test_steps_to_a_tolerance_are_counted_or_there_are_none():
     [(AFFINE, TOLERANCES), (BENT, TOLERANCES[1:])],
     ids=["affine", "bent"],
 )
-def test_the_table_the_figures_and_the_picture(call, quick, monkeypatch, leaders, tolerances):
+def test_table_figures_and_plot_are_written(call, quick, monkeypatch, leaders, tolerances):
     monkeypatch.setattr(measurement, "TOLERANCES", tolerances)
     Path("s.json").write_text(json.dumps(sheet(leaders)))
     result = call("bench", "s.json", "--json", "b.json", "--plot", "b.png")
@@ -115,7 +115,7 @@ def test_the_table_the_figures_and_the_picture(call, quick, monkeypatch, leaders
                    for line in result.out.splitlines())  # fmt: skip
 
 
-def test_steps_that_take_too_long_are_counted_ahead(tmp_path, quick, monkeypatch):
+def test_number_of_slow_steps_is_estimated_beforehand(tmp_path, quick, monkeypatch):
     monkeypatch.setattr(measurement, "METHODS", ("lu",))
     monkeypatch.setattr(measurement, "MAX_PARTICLES_LU", 10)
     monkeypatch.setattr(measurement, "MAX_STEPPING_S", 0.0)
@@ -133,7 +133,7 @@ def test_steps_that_take_too_long_are_counted_ahead(tmp_path, quick, monkeypatch
     assert tight.steps - loose.steps == pytest.approx(more, abs=1)
 
 
-def test_a_method_that_took_too_long_is_left_out_where_it_would_take_longer():
+def test_slow_method_is_skipped_at_tighter_tolerances():
     row = {"steps": 9, "seconds": 99.0, "cpu_s": 99.0, "certified": 1e-3, "distance": 1e-4}
 
     def work(*asked, **job):
@@ -148,7 +148,7 @@ def test_a_method_that_took_too_long_is_left_out_where_it_would_take_longer():
     ) in lines(found)
 
 
-def test_bonds_that_can_break_are_refused(call):
+def test_breakable_bonds_are_refused(call):
     fracture = {"type": "threshold", "thresholds": [9.0]}
     Path("s.json").write_text(json.dumps(sheet(AFFINE, fracture=fracture)))
     result = call("bench", "s.json")
@@ -172,7 +172,7 @@ ROWS = [
 ]
 
 
-def test_every_row_is_in_the_table_and_every_measurement_in_the_picture():
+def test_all_rows_are_in_the_table_and_all_measurements_in_the_plot():
     assert table(ROWS).row_count == len(ROWS)
     measured = [r for r in ROWS if not r.reason]
     (ax,) = (a for a in work_precision_figure(ROWS, "a title").axes if a.get_visible())

@@ -37,12 +37,12 @@ def left() -> list[str]:
 PROBED = ("run", "e.json", "--set", "diagnostics=[{type: probe}]")
 
 
-def test_every_command_explains_itself(call: Call) -> None:
+def test_every_command_has_help(call: Call) -> None:
     listed = python("-m", "pbdkit", "--help").stdout
     assert [c for c in builtin_commands() if c not in listed or call(c, "--help").code] == []
 
 
-def test_alone_it_says_what_to_type_first(call: Call) -> None:
+def test_without_a_command_first_commands_are_suggested(call: Call) -> None:
     result = call()
     assert (result.code, result.err) == (0, "")
     assert [name for name in builtin_commands() if f"\n  {name} " not in result.out] == []
@@ -53,13 +53,13 @@ def test_alone_it_says_what_to_type_first(call: Call) -> None:
     assert [does for does in sentences if does[0].islower() or does[-1] != "."] == []
 
 
-def test_what_is_to_be_typed_first_works(call: Call) -> None:
+def test_suggested_first_commands_work(call: Call) -> None:
     for typed in FIRST:
         assert call(*typed.removeprefix("pbdkit ").split()).code == 0
     assert left() == ["experiment.yaml", "paper-a.nc", "paper-a.png"]
 
 
-def test_run_writes_the_file_it_names(call: Call) -> None:
+def test_run_writes_the_named_file(call: Call) -> None:
     result = call("run", "e.json")
     assert (result.code, result.err, left()) == (0, "", ["tensile.nc"])
     assert "complete: 30 particles, 10 steps in " in result.out
@@ -70,7 +70,7 @@ def test_run_writes_the_file_it_names(call: Call) -> None:
     assert left() == ["paper-a.nc", "tensile.nc"]
 
 
-def test_the_figures_of_run(call: Call) -> None:
+def test_json_output_of_run(call: Call) -> None:
     result = call("run", "e.json", "--json")
     figures = json.loads(result.out)
     known = {"status": "complete", "steps": 10, "particles": 30, "output": "tensile.nc"}
@@ -79,7 +79,7 @@ def test_the_figures_of_run(call: Call) -> None:
     assert (set(figures) >= known.keys() | measured, result.err) == (True, "")
 
 
-def test_the_figures_of_check(call: Call) -> None:
+def test_json_output_of_check(call: Call) -> None:
     figures = json.loads(call("check", "e.json", "--json").out)
     known = {"particles": 30, "followers": 6, "bonds": 31, "warnings": []}
     assert known.items() <= figures.items()
@@ -87,7 +87,7 @@ def test_the_figures_of_check(call: Call) -> None:
     assert left() == []
 
 
-def test_check_warns_and_is_content(call: Call) -> None:
+def test_check_with_warnings_exits_with_zero(call: Call) -> None:
     fracture = "--set=fracture={type: threshold, thresholds: [1.2]}"
     others = ["--set=neighbours={type: chebyshev}", "--set=leaders=[]"]
     result = call("check", "e.json", fracture, *others)
@@ -101,7 +101,7 @@ def said_by_check(call: Call, *arguments: str) -> dict[str, str]:
     return {title: text for title, _, text in (line.strip().partition(" ") for line in lines)}
 
 
-def test_check_says_first_who_is_held_and_led_and_what_will_happen(call: Call) -> None:
+def test_check_starts_with_groups_and_events(call: Call) -> None:
     said = {title: text.strip() for title, text in said_by_check(call, "e.json").items()}
     assert said["body"] == "12 particles over 3 × 2 lattice units, and 18 of the frame"
     assert said["supports"] == "leaders.0, 3 particles (edge left)"
@@ -115,7 +115,7 @@ def test_check_says_first_who_is_held_and_led_and_what_will_happen(call: Call) -
     assert "bonds      31" in whole
 
 
-def test_check_says_what_is_loaded_and_what_regions_hold(call: Call) -> None:
+def test_check_lists_loads_and_regions(call: Call) -> None:
     said = said_by_check(call, "modelling/composite-plate")
     assert said["regions"].strip() == "steel, 197 particles"
     assert said["loads"].strip().startswith("loads.0, 41 particles (edge right) force [")
@@ -126,7 +126,7 @@ def test_check_says_what_is_loaded_and_what_regions_hold(call: Call) -> None:
     assert said["solver"].strip().startswith("computes the equilibrium directly")
 
 
-def test_check_names_few_of_many_groups(call: Call) -> None:
+def test_check_lists_only_some_of_many_groups(call: Call) -> None:
     held = ", ".join(
         f"{{select: {{numbers: [{n}]}}, motion: {{type: hold}}}}" for n in (7, 8, 9, 12, 13)
     )
@@ -136,7 +136,7 @@ def test_check_names_few_of_many_groups(call: Call) -> None:
     assert "leaders.4" in said_by_check(call, "e.json", "--verbose", "--set", setting)["supports"]
 
 
-def test_check_says_that_a_run_diverges_or_is_long_enough(call: Call) -> None:
+def test_check_predicts_divergence_and_sufficient_length(call: Call) -> None:
     said = said_by_check(call, "e.json", "--set", "solver.relaxation=3")
     assert said["stable"].strip().startswith("NO, some modes grow (spectral radius ")
     assert "converges" not in said
@@ -146,7 +146,7 @@ def test_check_says_that_a_run_diverges_or_is_long_enough(call: Call) -> None:
     assert said["converges"].endswith("once it has converged, or after 10 steps")
 
 
-def test_identify_says_the_verdict_and_the_constants_first(call: Call) -> None:
+def test_identify_prints_classification_and_constants_first(call: Call) -> None:
     settings = ("--set", "rule={type: springs}", "--set", "neighbours.type=chebyshev")
     lines = call("identify", "e.json", *settings).out.splitlines()
     titles = [line[:22].strip() for line in lines[1:] if line.strip() and "note" not in line]
@@ -158,7 +158,7 @@ def test_identify_says_the_verdict_and_the_constants_first(call: Call) -> None:
         assert f" {title} " in whole
 
 
-def test_identify_says_what_materials_have_in_common_once(call: Call) -> None:
+def test_identify_prints_common_properties_of_materials_once(call: Call) -> None:
     other = call("identify", "modelling/composite-plate").out
     assert (other.count("identity "), other.count("note")) == (2, 1)
     alike = "rule.poisson_ratio={otherwise: 0.3, steel: 0.3}"
@@ -223,7 +223,7 @@ SETTINGS = {
 
 
 @pytest.mark.parametrize(("setting", "holds"), SETTINGS.values(), ids=SETTINGS)
-def test_a_setting(call: Call, setting: str, holds: Callable[[Any], bool]) -> None:
+def test_valid_setting(call: Call, setting: str, holds: Callable[[Any], bool]) -> None:
     call("run", "e.json", "--set", setting)
     assert holds(pbdkit.Experiment(**json.loads(pbdkit.open(OUT).attrs["experiment"])))
 
@@ -240,7 +240,7 @@ UNSET = {
 
 
 @pytest.mark.parametrize(("setting", "message"), UNSET.items())
-def test_a_wrong_setting(call: Call, setting: str, message: str) -> None:
+def test_invalid_setting(call: Call, setting: str, message: str) -> None:
     result = call("run", "e.json", "--set", setting)
     assert (result.code, left()) == (2, [])
     assert result.err.startswith(f"pbdkit: setting {setting}")
@@ -251,7 +251,7 @@ BLOWN = ["--set=solver.relaxation=50", "--set=steps=300", "--set=diagnostics=[{t
 
 
 @pytest.mark.parametrize("arguments", [["identify", "paper/a"], ["schema", "experiment"]])
-def test_a_reader_who_has_had_enough_is_no_error(arguments: list[str]) -> None:
+def test_closed_pipe_is_no_error(arguments: list[str]) -> None:
     command = [sys.executable, "-m", "pbdkit", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout
@@ -261,7 +261,7 @@ def test_a_reader_who_has_had_enough_is_no_error(arguments: list[str]) -> None:
     assert process.returncode == 0
 
 
-def test_a_run_that_diverges_keeps_what_was_finite(call: Call) -> None:
+def test_diverging_run_keeps_finite_records(call: Call) -> None:
     result = python("-m", "pbdkit", "run", "e.json", *BLOWN)
     assert (result.returncode, left()) == (4, ["tensile.nc"])
     ds = pbdkit.open(OUT)
@@ -274,7 +274,9 @@ def test_a_run_that_diverges_keeps_what_was_finite(call: Call) -> None:
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 @pytest.mark.parametrize("every", [1, 7])
-def test_an_interruption_keeps_all(call: Call, probing: Probing, name: str, every: int) -> None:
+def test_interrupted_run_keeps_all_records(
+    call: Call, probing: Probing, name: str, every: int
+) -> None:
     probing(f"signal.raise_signal(signal.{name})")
     result = call(*PROBED, "--set", f"record.every={every}")
     code = {"SIGINT": 130, "SIGTERM": 143}[name]
@@ -286,7 +288,7 @@ def test_an_interruption_keeps_all(call: Call, probing: Probing, name: str, ever
     assert int(ds["time"][-1]) == 3
 
 
-def test_a_killed_run_leaves_nothing_that_looks_like_a_result(call: Call, probing: Probing) -> None:
+def test_killed_run_leaves_no_apparent_result(call: Call, probing: Probing) -> None:
     probing("os.kill(os.getpid(), signal.SIGKILL)")
     OUT.write_text("mine")
     assert python("-m", "pbdkit", *PROBED, "--force").returncode == -9
@@ -306,7 +308,7 @@ FAILING = {
 
 
 @pytest.mark.parametrize(("code", "fault", "word"), FAILING.values(), ids=FAILING)
-def test_a_run_that_fails_leaves_nothing(
+def test_failed_run_leaves_no_file(
     call: Call, probing: Probing, code: int, fault: Any, word: str
 ) -> None:
     probing(**fault)
@@ -315,7 +317,7 @@ def test_a_run_that_fails_leaves_nothing(
     assert word in result.err
 
 
-def test_the_file_appears_only_whole(call: Call, probing: Probing) -> None:
+def test_file_appears_only_when_complete(call: Call, probing: Probing) -> None:
     probing("seen.extend(os.listdir())")
     assert call(*PROBED).code == 0
     seen = sys.modules["pbdkit_probe"].seen
@@ -326,7 +328,7 @@ HELP = "from pbdkit.cli import main\ntry: main(['--help'])\nexcept SystemExit: p
 
 
 @pytest.mark.parametrize("start", [HELP, "import pbdkit"], ids=["help", "import"])
-def test_starting_loads_nothing_heavy(start: str) -> None:
+def test_startup_imports_no_heavy_package(start: str) -> None:
     heavy = "{'xarray', 'scipy', 'numba', 'netCDF4', 'matplotlib', 'rich'}"
     ask = f"{start}\nimport sys\nprint('heavy:', sorted({heavy} & set(sys.modules)))"
     assert python("-c", ask).stdout.splitlines()[-1] == "heavy: []"
@@ -352,7 +354,7 @@ are not."""
 
 @pytest.mark.parametrize(("asked", "needed"), NEEDED.items(), ids=NEEDED)
 @pytest.mark.usefixtures("call")  # its folder
-def test_what_is_not_used_is_not_imported(asked: str, needed: tuple[set[str], set[str]]) -> None:
+def test_unused_modules_are_not_imported(asked: str, needed: tuple[set[str], set[str]]) -> None:
     start = asked if asked.startswith("import") else HELP.replace("['--help']", str(asked.split()))
     told = python("-c", f"{start}\nimport sys\nprint('loaded:', *sys.modules)").stdout
     (line,) = (line for line in told.splitlines() if line.startswith("loaded:"))
@@ -369,7 +371,7 @@ ASKED = {
 
 
 @pytest.mark.parametrize(("arguments", "imported"), ASKED.values(), ids=ASKED)
-def test_built_in_parts_import_no_plugin(
+def test_built_in_components_import_no_plugin(
     install: Any, call: Call, arguments: list[str], imported: bool
 ) -> None:
     install("pbdkit-loud", "open('imported', 'w').close()\nraise ImportError('loud')")
@@ -377,7 +379,7 @@ def test_built_in_parts_import_no_plugin(
     assert Path("imported").exists() == imported
 
 
-def test_plugins_list_has_a_row_a_plugin_and_a_row_a_component(install: Any, call: Call) -> None:
+def test_plugins_list_has_rows_for_plugins_and_components(install: Any, call: Call) -> None:
     install("pbdkit-sick", "raise ImportError('sick')", "0.3")
     rows = json.loads(call("plugins", "list", "--json").out)
     assert {*rows[-1]} == {"interface", "type", "distribution", "version", "state", "reason"}
@@ -388,19 +390,19 @@ def test_plugins_list_has_a_row_a_plugin_and_a_row_a_component(install: Any, cal
     )
 
 
-def test_init_writes_an_experiment_that_runs_and_can_be_drawn(call: Call) -> None:
+def test_init_writes_an_experiment_that_runs_and_plots(call: Call) -> None:
     assert call("init", "a.yaml").code == 0
     assert call("run", "a.yaml", "--set", "steps=5", "-o", "a.nc").code == 0
     assert call("plot", "a.nc", "--color", "pe1").code == 0
     assert left() == ["a.nc", "a.png", "a.yaml"]
 
 
-def test_a_shipped_experiment_is_printed_as_it_stands(call: Call) -> None:
+def test_shipped_experiment_is_printed_verbatim(call: Call) -> None:
     assert call("experiments", "paper/f1") == (0, shipped_text("paper/f1"), "")
 
 
 @pytest.mark.parametrize("name", ["material/dogbone", "modelling/measured-boundary"])
-def test_a_copy_of_a_shipped_experiment_is_the_same_experiment(call: Call, name: str) -> None:
+def test_copy_of_a_shipped_experiment_is_equal(call: Call, name: str) -> None:
     assert call("init", "a.yaml", "--from", name).code == 0
     copy, shipped = Path("a.yaml").read_text(), shipped_text(name)
     assert copy == shipped
@@ -410,7 +412,7 @@ def test_a_copy_of_a_shipped_experiment_is_the_same_experiment(call: Call, name:
     assert call("check", "a.yaml").code == 0
 
 
-def test_a_copy_takes_the_name_of_the_shipped_experiment_and_replaces_nothing(call: Call) -> None:
+def test_copy_takes_the_shipped_name_and_overwrites_nothing(call: Call) -> None:
     assert "f1.yaml written; next: pbdkit check f1.yaml" in call("init", "--from", "paper/f1").out
     Path("measured-boundary.csv").write_text("mine")
     refused = call("init", "--from", "modelling/measured-boundary")
@@ -421,7 +423,7 @@ def test_a_copy_takes_the_name_of_the_shipped_experiment_and_replaces_nothing(ca
     assert left() == ["f1.yaml", "measured-boundary.csv"]
 
 
-def test_the_set_up_is_drawn_before_the_run(call: Call) -> None:
+def test_setup_can_be_plotted_before_the_run(call: Call) -> None:
     assert call("plot", "e.json", "--dpi", "50").out == "tensile-setup.png written\n"
     assert call("plot", "paper/a", "--set", "steps=3", "-o", "a.svg").out == "a.svg written\n"
     assert left() == ["a.svg", "tensile-setup.png"]
@@ -450,11 +452,11 @@ COMPLETED = {
 
 
 @pytest.mark.parametrize(("words", "offered"), COMPLETED.values(), ids=COMPLETED)
-def test_a_shell_completes(words: list[str], offered: list[str]) -> None:
+def test_shell_completes_commands(words: list[str], offered: list[str]) -> None:
     assert completed(*words) == offered
 
 
-def test_the_shells_of_the_documentation_are_known() -> None:
+def test_documented_shells_are_supported() -> None:
     text = (Path(pbdkit.__file__).parent.parent / "docs" / "experiments.md").read_text()
     shells = re.findall(r"_PBDKIT_COMPLETE=(\w+) pbdkit", text)
     assert shells == ["bash_source", "zsh_source", "fish_source"]
@@ -471,13 +473,13 @@ def test_titles_of_experiments_are_whole_sentences(call: Call) -> None:
     assert all(line.endswith(".") and len(line) < 160 for line in listed)
 
 
-def test_a_group_alone_shows_its_help(call: Call) -> None:
+def test_command_group_alone_shows_its_help(call: Call) -> None:
     result = call("plugins")
     assert (result.code, result.err) == (0, "")
     assert result.out.startswith("Usage: pbdkit plugins")
 
 
-def test_an_exit_out_of_nowhere_is_not_silent(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unexpected_exit_prints_a_message(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     def leave() -> None:
         raise SystemExit(0)
 
@@ -489,7 +491,7 @@ def test_an_exit_out_of_nowhere_is_not_silent(call: Call, monkeypatch: pytest.Mo
     )
 
 
-def test_every_command_that_is_suggested_for_another_word_is_there():
+def test_suggested_commands_exist():
     named = [word for told in MEANT.values() for word in re.findall(r"`pbdkit ([a-z]+)", told)]
     assert {*named} <= {*builtin_commands()}
     assert not {word for words in MEANT for word in words} & {*builtin_commands()}

@@ -71,7 +71,7 @@ def test_an_error_of_a_command_names_its_plugin(add: Install, call: Call) -> Non
     )
 
 
-def test_a_disabled_plugin_adds_none(
+def test_disabled_plugin_adds_no_command(
     add: Install, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add("pbdkit-shear", source())
@@ -84,7 +84,7 @@ def test_a_disabled_plugin_adds_none(
     assert call("plugins", "list").err == ""
 
 
-def test_a_command_of_pbdkit_has_precedence(add: Install, call: Call) -> None:
+def test_built_in_command_has_precedence(add: Install, call: Call) -> None:
     add("pbdkit-thief", source("run"))
     assert call("run", "e.json").code == 0
     told = "run Unavailable from pbdkit-thief 1.0: pbdkit has a command of this name."
@@ -94,7 +94,7 @@ def test_a_command_of_pbdkit_has_precedence(add: Install, call: Call) -> None:
     assert (row["state"], row["reason"]) == ("conflict", "pbdkit has a command 'run'")
 
 
-def test_of_two_plugins_with_one_command_the_user_chooses(
+def test_user_chooses_between_plugins_with_the_same_command(
     add: Install, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add("pbdkit-one", source())
@@ -150,9 +150,7 @@ def test_a_broken_plugin_stops_no_command(add: Install, call: Call, text: str, r
         ("json:dumps", "cannot be used: json:dumps is not a click command"),
     ],
 )
-def test_a_target_that_cannot_be_used_is_named(
-    add: Install, call: Call, target: str, reason: str
-) -> None:
+def test_unusable_target_is_named(add: Install, call: Call, target: str, reason: str) -> None:
     add("pbdkit-shear", source(target=target))
     result = call("shear")
     assert result.code == 3
@@ -170,7 +168,7 @@ print(sorted({name for name in sys.modules if name.startswith("pbdkit_")}))
 """
 
 
-def test_modules_that_are_not_used_are_not_imported(
+def test_unused_command_modules_are_not_imported(
     add: Install, install: Install, call: Call
 ) -> None:
     add("pbdkit-shear", source())
@@ -191,12 +189,12 @@ TARGETS = sorted({*re.findall(r'(?:call|completed_by)\("([\w:]+)"', SOURCE)})
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_every_command_and_completer_has_its_function(target: str) -> None:
+def test_every_command_and_completer_has_a_function(target: str) -> None:
     """The command line names them by texts, so that they are imported when they are called."""
     assert callable(import_object(f"pbdkit.cli.{target}"))
 
 
-def test_every_command_is_declared_by_its_name() -> None:
+def test_every_command_is_declared_under_its_name() -> None:
     for name, command in builtin_commands().items():
         assert command.load().name == name
     assert len(TARGETS) > len(builtin_commands())

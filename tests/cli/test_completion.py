@@ -68,7 +68,7 @@ def test_settings(offered: Offered, words: list[str], expected: list[str]) -> No
 
 
 @pytest.mark.parametrize("name", in_turn(shipped_names(), 3))
-def test_every_path_that_is_offered_can_be_set(name: str) -> None:
+def test_every_suggested_path_can_be_set(name: str) -> None:
     source, defaults = read_experiment(name), pbdkit.Experiment.defaults()
     schema = experiment_schema(Registry(), installed=False)
     paths = SettingPaths({**defaults, **source.data}, schema).paths()
@@ -80,7 +80,7 @@ def test_every_path_that_is_offered_can_be_set(name: str) -> None:
     assert {"steps", "seed", "rule.type", "solver.type"} <= {*paths}
 
 
-def test_types_are_those_of_the_registry() -> None:
+def test_suggested_types_match_the_registry() -> None:
     schema = experiment_schema(Registry(), installed=False)
     known = SettingPaths(read_experiment("paper/a").data, schema)
     motions = {"hold", "velocity", "displace", "path", "rotation", "oscillation", "table"}
@@ -104,13 +104,13 @@ RESULT = {
 
 
 @pytest.mark.parametrize(("words", "expected"), RESULT.values(), ids=RESULT)
-def test_results_and_what_is_in_them(
+def test_results_and_their_variables(
     offered: Offered, words: list[str], expected: list[str]
 ) -> None:
     assert offered(*words) == expected
 
 
-def test_bonds_and_what_was_left_unfinished(offered: Offered, call: Any) -> None:
+def test_bonds_and_unfinished_runs(offered: Offered, call: Any) -> None:
     assert call("run", "e.json", "-o", "torn.nc", "--set", "cuts=[{from: [1.5, -9], to: [1.5, 9]}]")
     assert "broken_step" in offered("plot", "torn.nc", "--color", "")
     Path("left.nc.run").touch()
@@ -119,21 +119,21 @@ def test_bonds_and_what_was_left_unfinished(offered: Offered, call: Any) -> None
     assert offered("resume", "f") == ["folder/"]
 
 
-def test_of_many_steps_some_are_offered(offered: Offered, call: Any) -> None:
+def test_only_some_of_many_steps_are_suggested(offered: Offered, call: Any) -> None:
     call("run", "e.json", "--set", "steps=1000", "-o", "long.nc", "--quiet")
     steps = [int(step) for step in offered("plot", "long.nc", "--time", "")]
     assert (steps[0], steps[-1]) == (0, 1000)
     assert 100 < len(steps) <= 201
 
 
-def test_damaged_results_offer_nothing_and_say_nothing(offered: Offered) -> None:
+def test_damaged_results_suggest_nothing_silently(offered: Offered) -> None:
     whole = Path("tensile.nc").read_bytes()
     for damaged in (whole[:100], b"", b"\x89HDF\r\n\x1a\n" + bytes(500), whole[: len(whole) // 2]):
         Path("bad.nc").write_bytes(damaged)
         assert offered("plot", "bad.nc", "--color", "") == []
 
 
-def test_little_is_imported(call: Any) -> None:
+def test_completion_imports_little(call: Any) -> None:
     """Test the two lines that a shell runs: they import neither xarray nor the numerical code."""
     call("run", "e.json", "--quiet")
     for words in (["run", "e.json", "--set", "ru"], ["plot", "tensile.nc", "--color", "p"]):

@@ -43,7 +43,7 @@ SPECIAL = {
 
 @pytest.mark.parametrize("force", [(), ("--force",)], ids=["", "forced"])
 @pytest.mark.parametrize(("make", "word"), SPECIAL.values(), ids=SPECIAL)
-def test_only_plain_files_that_are_not_the_experiment_are_replaced(
+def test_only_regular_files_other_than_the_experiment_are_replaced(
     call: Call, make: Callable[[], None], word: str, force: tuple[str, ...]
 ) -> None:
     make()
@@ -63,7 +63,7 @@ def test_a_device_is_not_replaced() -> None:
 
 
 @pytest.mark.parametrize("name", ["e.json", "./e.json", "linked.json"])
-def test_the_experiment_itself_is_not_replaced(call: Call, name: str) -> None:
+def test_experiment_file_is_not_replaced(call: Call, name: str) -> None:
     Path("linked.json").symlink_to("e.json")
     text = Path("e.json").read_text()
     around = f"../{Path.cwd().name}/e.json"
@@ -73,7 +73,7 @@ def test_the_experiment_itself_is_not_replaced(call: Call, name: str) -> None:
     assert Path("e.json").read_text() == text
 
 
-def test_a_name_that_is_no_utf_8_is_refused(call: Call) -> None:
+def test_file_name_that_is_not_utf_8_is_refused(call: Call) -> None:
     result = call("run", "e.json", "-o", os.fsdecode(b"o\xff.nc"))
     assert (result.code, left()) == (2, [])
     assert "o\\xff.nc: the name is not UTF-8; name another file with -o" in result.err
@@ -93,7 +93,7 @@ FAILING = {
 
 
 @pytest.mark.parametrize(("status", "code", "settings"), [(k, *v) for k, v in FAILING.items()])
-def test_a_run_that_fails_leaves_a_good_result_as_it_is(
+def test_failed_run_keeps_a_previous_result(
     call: Call, status: str, code: int, settings: list[str]
 ) -> None:
     again = "--set=rule={type: mean-displacement}"
@@ -110,14 +110,14 @@ def test_a_run_that_fails_leaves_a_good_result_as_it_is(
     assert figures["output"] == "tensile-partial-3.nc"
 
 
-def test_a_run_that_fails_takes_its_name_where_nobody_has_it(call: Call) -> None:
+def test_failed_run_takes_the_output_name_if_it_is_free(call: Call) -> None:
     code, settings = FAILING["diverged"]
     result = call("run", "e.json", "--force", *settings)
     assert (result.code, left()) == (code, ["tensile.nc"])
     assert result.err.endswith("the records up to this step are in tensile.nc\n")
 
 
-def test_a_result_beside_is_kept_where_there_are_no_hard_links(
+def test_existing_result_is_kept_without_hard_links(
     call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: Any) -> None:
@@ -130,7 +130,7 @@ def test_a_result_beside_is_kept_where_there_are_no_hard_links(
     assert (OUT.read_text(), left()) == ("mine", ["tensile-partial.nc", "tensile.nc"])
 
 
-def test_an_output_that_does_not_fit_on_the_disk_is_warned_of_before_the_run(
+def test_run_warns_beforehand_of_output_larger_than_the_disk(
     call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = SimpleNamespace(free=1000)
@@ -147,7 +147,7 @@ MOVES = "import os, tempfile\nos.chdir(tempfile.mkdtemp())\n"
 
 
 @pytest.mark.parametrize("when", ["imported", "used"])
-def test_a_plugin_that_changes_the_folder_moves_no_output(
+def test_plugin_that_changes_directory_does_not_move_output(
     call: Call, probing: Any, tmp_path: Path, when: str
 ) -> None:
     probing("import tempfile; os.chdir(tempfile.mkdtemp())" if when == "used" else "pass")
@@ -160,7 +160,7 @@ def test_a_plugin_that_changes_the_folder_moves_no_output(
     assert (folder / "tensile.nc").is_file()
 
 
-def test_where_there_is_no_folder_it_is_said(call: Call) -> None:
+def test_missing_current_directory_is_reported(call: Call) -> None:
     gone = Path.cwd() / "gone"
     gone.mkdir()
     os.chdir(gone)
@@ -169,7 +169,7 @@ def test_where_there_is_no_folder_it_is_said(call: Call) -> None:
     assert (result.code, result.err.startswith("pbdkit: the current folder: ")) == (6, True)
 
 
-def test_plot_replaces_a_picture_only_where_it_is_told_to(call: Call) -> None:
+def test_plot_overwrites_only_on_request(call: Call) -> None:
     assert call("run", "e.json", "--quiet").code == 0
     picture = Path("tensile.png")
     picture.write_text("mine")
@@ -199,9 +199,7 @@ runpy.run_module("pbdkit", run_name="__main__")
 
 
 @pytest.mark.parametrize("module", ["pbdkit.cli", "click", "pbdkit.scene.scene", "h5netcdf"])
-def test_an_interruption_while_the_program_is_loaded_shows_no_traceback(
-    call: Call, module: str
-) -> None:
+def test_interrupt_during_startup_shows_no_traceback(call: Call, module: str) -> None:
     command = [sys.executable, "-c", INTERRUPT.replace("NAME", repr(module))]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr.strip(), left()) == (130, "pbdkit: interrupted", [])
@@ -224,7 +222,7 @@ runpy.run_module("pbdkit", run_name="__main__", alter_sys=True)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 10, 30, 100, 200, 300])
-def test_a_signal_as_any_module_is_loaded_ends_it_in_a_line(call: Call, number: int) -> None:
+def test_signal_during_any_import_exits_with_one_line(call: Call, number: int) -> None:
     command = [sys.executable, "-c", SIGNAL, str(number), "run", "e.json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr.strip(), left()) == (130, "pbdkit: interrupted", [])
@@ -241,7 +239,7 @@ class Made:
 
 
 @pytest.mark.parametrize("body", ["raise KeyboardInterrupt", CLASS], ids=["exec", "class"])
-def test_an_interruption_that_python_makes_something_else_of(body: str) -> None:
+def test_interrupt_converted_by_python_is_handled(body: str) -> None:
     """Code that is a text, as that of named tuples, ends by the signal; classes by an error."""
     code = (
         f"import pbdkit.cli as c; c.program.main = lambda *a, **k: exec({body!r}, {{}}); c.main()"
@@ -252,7 +250,7 @@ def test_an_interruption_that_python_makes_something_else_of(body: str) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits on address space are Linux's")
 @pytest.mark.parametrize(("mib", "code"), [(100, 6), (900, 6), (1030, 2), (1300, 0)])
-def test_little_memory_is_told_in_a_line(call: Call, mib: int, code: int) -> None:
+def test_memory_limit_is_reported_in_one_line(call: Call, mib: int, code: int) -> None:
     """Libraries that get no memory spin, or end the process: they are not called."""
     limit = f"import resource as r; r.setrlimit(r.RLIMIT_AS, ({mib} * 2**20,) * 2)"
     program = f"{limit}; from pbdkit.__main__ import main; main()"
@@ -271,9 +269,7 @@ def test_little_memory_is_told_in_a_line(call: Call, mib: int, code: int) -> Non
         "ImportError('libx.so: failed to map segment from shared object')",
     ],
 )
-def test_memory_that_runs_out_on_the_way_is_told_as_such(
-    error: str, capsys: Any, monkeypatch: Any
-) -> None:
+def test_out_of_memory_during_a_run_is_reported(error: str, capsys: Any, monkeypatch: Any) -> None:
     from pbdkit.cli import main, program
 
     def raises(*_: Any, **more: Any) -> None:
@@ -286,7 +282,7 @@ def test_memory_that_runs_out_on_the_way_is_told_as_such(
     assert capsys.readouterr().err.startswith("pbdkit: out of memory")
 
 
-def test_a_container_bounds_memory(tmp_path: Path, monkeypatch: Any) -> None:
+def test_container_limit_bounds_memory(tmp_path: Path, monkeypatch: Any) -> None:
     from pbdkit import memory
 
     monkeypatch.setattr(memory, "CONTAINER", tmp_path / "memory.max")

@@ -39,7 +39,7 @@ def until(shown: io.StringIO, text: str) -> None:
         time.sleep(0.01)
 
 
-def test_what_takes_longer_is_told_and_what_comes_next() -> None:
+def test_slow_phases_and_the_next_one_are_reported() -> None:
     with looking(Terminal()) as shown, waiting("counting [sheep]") as say:
         until(shown, "counting [sheep]")
         say("sleeping")
@@ -49,7 +49,7 @@ def test_what_takes_longer_is_told_and_what_comes_next() -> None:
     assert "0:00:0" in shown.getvalue()
 
 
-def test_what_is_quick_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quick_phases_are_not_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "DELAY_S", 60.0)
     with looking(Terminal()) as shown, waiting("blinking"):
         pass
@@ -57,7 +57,7 @@ def test_what_is_quick_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("silent", [True, False])
-def test_nobody_is_told_without_a_terminal_or_where_silence_is_asked_for(silent: bool) -> None:
+def test_no_progress_without_a_terminal_or_with_quiet(silent: bool) -> None:
     file = Terminal() if silent else io.StringIO()
     with looking(file) as shown, waiting("counting", silent=silent) as say:
         say("sleeping")
@@ -65,7 +65,7 @@ def test_nobody_is_told_without_a_terminal_or_where_silence_is_asked_for(silent:
     assert shown.getvalue() == ""
 
 
-def test_the_line_goes_where_something_fails() -> None:
+def test_progress_line_disappears_on_failure() -> None:
     def divide() -> None:
         with waiting("dividing"):
             until(shown, "dividing")
@@ -78,7 +78,7 @@ def test_the_line_goes_where_something_fails() -> None:
 
 
 @pytest.mark.parametrize("command", ["check", "identify"])
-def test_with_json_nothing_else_is_said(
+def test_json_output_contains_only_json(
     call: Any, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "DELAY_S", 0.0)

@@ -65,7 +65,7 @@ def healthy(install: Install, call: Call) -> None:
     record(run, NetcdfSink(Path("left.nc")))
 
 
-def test_every_command_is_tried() -> None:
+def test_all_commands_are_tested() -> None:
     assert {arguments[0] for arguments in EVERY_COMMAND.values()} == set(builtin_commands())
 
 
@@ -106,7 +106,7 @@ def test_no_broken_plugin_stops_a_command(install: Install, call: Call, kind: st
     assert f"pbdkit-broken 0.3 broken {reason}" in table
 
 
-def test_the_program_itself_survives_all(install: Install, call: Call) -> None:
+def test_program_survives_all_broken_plugins(install: Install, call: Call) -> None:
     install("zz-healthy", "print('noise')\n" + rule("zz-healthy"))
     install("pbdkit-exit", BROKEN["exit"][0])
     install("pbdkit-warns", "import warnings\nwarnings.simplefilter('error')\n" + rule("w"))
@@ -127,7 +127,7 @@ METADATA = {
 
 @pytest.mark.usefixtures("healthy")
 @pytest.mark.parametrize(("file", "content", "name"), METADATA.values(), ids=METADATA)
-def test_torn_metadata_stop_nobody(
+def test_corrupt_metadata_stops_no_command(
     install: Install, call: Call, tmp_path: Path, file: str, content: Any, name: str
 ) -> None:
     install("pbdkit-torn", rule("torn"))
@@ -143,7 +143,7 @@ def test_torn_metadata_stop_nobody(
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_another_api_version_is_incompatible(install: Install, call: Call) -> None:
+def test_other_api_version_is_incompatible(install: Install, call: Call) -> None:
     install("pbdkit-newer", NEWER, "9.0")
     row = listed(call)["pbdkit-newer"]
     expected = "it implements version 2 of the plugin API, but pbdkit "
@@ -155,7 +155,7 @@ def test_another_api_version_is_incompatible(install: Install, call: Call) -> No
     assert "; pbdkit-newer 9.0 is incompatible: it implements version 2" in result.err
 
 
-def test_this_api_version_is_fine(install: Install) -> None:
+def test_current_api_version_is_accepted(install: Install) -> None:
     install("pbdkit-same", "pbdkit_api = 1\n" + rule("same"))
     assert [p.state for p in Registry().installed] == ["ok"]
 
@@ -181,7 +181,7 @@ def test_an_api_version_is_a_number(install: Install) -> None:
     )
 
 
-def test_a_run_that_needs_the_broken_part_says_whose_it_is(install: Install, call: Call) -> None:
+def test_run_names_the_plugin_of_a_broken_component(install: Install, call: Call) -> None:
     install("pbdkit-broken", "import no_such_module\n" + rule("lost"), "0.3")
     reason = "ModuleNotFoundError: No module named 'no_such_module' (pbdkit_broken.py, line 1)"
     result = call("run", "e.json", "--set=rule={type: 'pbdkit-broken:lost'}")
@@ -194,7 +194,7 @@ def test_a_run_that_needs_the_broken_part_says_whose_it_is(install: Install, cal
     assert f"; pbdkit-broken 0.3 is broken: {reason}" in result.err
 
 
-def test_a_plugin_that_changes_the_folder_changes_it_for_itself(
+def test_directory_change_by_a_plugin_is_undone(
     install: Install, call: Call, tmp_path: Path
 ) -> None:
     install("pbdkit-moving", f"import os\nos.chdir({str(tmp_path)!r})\n" + rule("moving"))
@@ -202,7 +202,7 @@ def test_a_plugin_that_changes_the_folder_changes_it_for_itself(
     assert Path("here.nc").exists()
 
 
-def test_a_name_is_echoed_in_one_short_line(install: Install, call: Call) -> None:
+def test_long_names_are_printed_in_one_short_line(install: Install, call: Call) -> None:
     for name in ("\x1b[31mred", "y" * 100_000, "pbdkit-\x1b:red"):
         result = call("run", "e.json", "--set", f"rule.type={json.dumps(name)}")
         assert result.code in (2, 3)
@@ -221,7 +221,7 @@ class Bad(Rule):
 HALF = HALF.replace("[Rule]", "[Bad, Rule, int]")
 
 
-def test_one_bad_class_leaves_the_others_in_use(install: Install, call: Call) -> None:
+def test_one_invalid_class_leaves_the_others_usable(install: Install, call: Call) -> None:
     install("pbdkit-half", HALF, "0.3")
     assert call("run", "e.json", "--set=rule={type: half}").code == 0
     result = call("check", "e.json", "--set=rule={type: bad}")

@@ -48,12 +48,12 @@ def new(call: Call, install: Install) -> New:
     return make
 
 
-def test_every_open_interface_is_offered() -> None:
+def test_every_open_interface_is_available() -> None:
     assert sorted(OFFERED) == sorted(i.__name__ for i in INTERFACES.values())
 
 
 @pytest.mark.parametrize("interface", OFFERED)
-def test_the_project_runs_as_it_stands(new: New, call: Call, interface: str) -> None:
+def test_project_runs_unchanged(new: New, call: Call, interface: str) -> None:
     folder = new("pbdkit-brand-new", interface)
     assert listed(call)["pbdkit-brand-new"]["state"] == "ok"
     result = call("run", str(folder / "example.yaml"), "--json")
@@ -74,7 +74,7 @@ def test_bonds_break_in_the_example_of_a_fracture_model(new: New) -> None:
 
 
 @pytest.mark.parametrize("interface", OFFERED)
-def test_the_project_conforms(new: New, interface: str) -> None:
+def test_project_passes_conformance(new: New, interface: str) -> None:
     new("pbdkit-brand-new", interface)
     kind = next(i for i in INTERFACES.values() if i.__name__ == interface)
     with nullcontext() if interface in ("FollowerRule", "FractureModel") else interpreting():
@@ -83,14 +83,14 @@ def test_the_project_conforms(new: New, interface: str) -> None:
 
 
 @pytest.mark.parametrize("interface", OFFERED)
-def test_the_example_is_known_to_editors(new: New, interface: str) -> None:
+def test_example_validates_in_editors(new: New, interface: str) -> None:
     folder = new("pbdkit-brand-new", interface)
     source = read_file(folder / "example.yaml")
     jsonschema.validate(json.loads(json.dumps(source.data)), experiment_schema(Registry()))
     assert (folder / "example.yaml").read_text().startswith("# yaml-language-server: $schema=")
 
 
-def test_the_project_is_in_style(call: Call) -> None:
+def test_project_passes_style_checks(call: Call) -> None:
     for interface in OFFERED:
         assert call("plugins", "new", f"my-{interface}", "--interface", interface).code == 0
     rules = ["--isolated", "--line-length=100"]
@@ -114,7 +114,7 @@ OWN = ("return r + d, 1.0", "return d, 1.0")
 
 
 @pytest.mark.parametrize(("edited", "same"), [((), "barycentre"), (OWN, "mean-displacement")])
-def test_the_rule_is_the_barycentre_and_one_line_makes_it_another(
+def test_rule_is_the_barycentre_and_one_line_changes_it(
     new: New, call: Call, edited: tuple[str, ...], same: str
 ) -> None:
     module = new("pbdkit-mine", "FollowerRule") / "pbdkit_mine.py"
@@ -179,18 +179,18 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("name", "message"), REFUSED.items())
-def test_names_that_cannot_be_had(call: Call, name: str, message: str) -> None:
+def test_invalid_names(call: Call, name: str, message: str) -> None:
     result = call("plugins", "new", name)
     assert (result.code, result.err.startswith(f"pbdkit: {message}")) == (2, True)
     assert [path.name for path in Path().iterdir()] == ["e.json"]
 
 
-def test_one_spelling_of_the_name_counts(call: Call) -> None:
+def test_spellings_of_a_name_are_normalised(call: Call) -> None:
     assert call("plugins", "new", "PBDkit_My.Rule").code == 0
     assert "class MyRule(" in Path("pbdkit-my-rule/pbdkit_my_rule.py").read_text()
 
 
-def test_what_is_there_is_left_as_it_is(call: Call) -> None:
+def test_existing_files_are_kept(call: Call) -> None:
     Path("pbdkit-mine").mkdir()
     result = call("plugins", "new", "pbdkit-mine")
     message = "pbdkit: pbdkit-mine: exists and is not replaced; choose another name or --dir\n"
@@ -198,14 +198,14 @@ def test_what_is_there_is_left_as_it_is(call: Call) -> None:
     assert list(Path("pbdkit-mine").iterdir()) == []
 
 
-def test_another_folder(call: Call, tmp_path: Path) -> None:
+def test_other_directory(call: Call, tmp_path: Path) -> None:
     result = call("plugins", "new", "pbdkit-mine", "--dir", str(tmp_path))
     assert f"  pip install -e {tmp_path / 'pbdkit-mine'}\n" in result.out
     assert (tmp_path / "pbdkit-mine" / "README.md").exists()
     assert call("plugins", "new", "pbdkit-mine", "--dir", "nowhere").code == 2
 
 
-def test_half_a_project_does_not_stay(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partial_project_is_removed(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[int] = []
 
     def full(descriptor: int) -> None:
@@ -220,7 +220,7 @@ def test_half_a_project_does_not_stay(call: Call, monkeypatch: pytest.MonkeyPatc
     assert [path.name for path in Path.cwd().iterdir()] == ["e.json"]
 
 
-def test_a_folder_that_is_closed(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_directory_without_permission(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     def closed(self: Path, *_: Any, **more: Any) -> None:
         raise PermissionError(13, "Permission denied")
 

@@ -83,7 +83,7 @@ def test_components_are_frozen(component):
 
 
 @every_component
-def test_components_survive_json_and_pickling(component):
+def test_components_round_trip_through_json_and_pickle(component):
     kind = type(component)
     assert kind.model_validate_json(component.model_dump_json()) == component
     assert kind.model_validate(json.loads(component.model_dump_json())) == component
@@ -91,13 +91,13 @@ def test_components_survive_json_and_pickling(component):
 
 
 @every_component
-def test_components_take_no_unknown_key(component):
+def test_components_refuse_unknown_keys(component):
     with pytest.raises(ValidationError, match="nonsense"):
         type(component).model_validate(component.model_dump() | {"nonsense": 1})
 
 
 @every_experiment
-def test_shipped_experiments_survive_json_and_pickling(name):
+def test_shipped_experiments_round_trip_through_json_and_pickle(name):
     experiment = load(name)
     as_data = experiment.model_dump()
     assert Experiment(**json.loads(experiment.model_dump_json())).model_dump() == as_data
@@ -105,7 +105,7 @@ def test_shipped_experiments_survive_json_and_pickling(name):
     assert pickle.loads(pickle.dumps(experiment)).model_dump() == as_data
 
 
-def test_experiments_that_say_the_same_are_equal():
+def test_equivalent_experiments_are_equal():
     one, other = load("paper/a"), load("paper/a")
     assert one == other
     assert one != load("paper/b")
@@ -130,7 +130,7 @@ def constants_of(rule):
 
 
 @every_rule
-def test_rules_change_none_of_their_inputs_and_give_the_same_twice(rule):
+def test_rules_keep_their_inputs_and_are_deterministic(rule):
     rng = np.random.default_rng(0)
     slot, w, p = constants_of(rule)
     d, here = read_only(rng), Here(read_only(rng), read_only(rng), read_only(rng))
@@ -163,7 +163,7 @@ def test_rules_are_elementwise(rule):
 
 
 @every_rule
-def test_zero_differences_of_opposite_pairs_mean_rest(rule):
+def test_zero_differences_give_zero_displacement(rule):
     slot, w, p = constants_of(rule)
     zero, r = Vector(0.0, 0.0), slot.rest
     parts = [rule.gather(zero, end, w, p) for end in (r, -r)]
@@ -184,7 +184,7 @@ def test_zero_differences_of_opposite_pairs_mean_rest(rule):
     ],
     ids=["none", "cell", "loosened", "reference", "strain", "strain, reference"],
 )
-def test_fracture_functions_are_pure_and_the_same_from_both_ends(model):
+def test_fracture_functions_are_pure_and_symmetric_in_the_bond_ends(model):
     rng = np.random.default_rng(0)
     slot = build_neighbourhood(Hexagonal(a=1.0).cell(), Coordination()).slots[0][0]
     d, r, c = read_only(rng), slot.rest, SimpleNamespace(**model.constants(slot))

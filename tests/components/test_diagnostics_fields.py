@@ -63,7 +63,7 @@ def close(found, expected, atol=1e-12):
         if field is not bending or "hexagonal" not in name
     ],
 )
-def test_solutions_have_their_strain_rotation_and_stress_everywhere(name, field):
+def test_solutions_have_strain_rotation_and_stress_everywhere(name, field):
     """Small rotation, free tension and pure bending: at edges and leaders too."""
     given, _ = held_as(field, CASES[name], width=0.3)
     ds = pbdkit.run(given | {"diagnostics": FIELDS}, progress=False)
@@ -79,7 +79,7 @@ def test_solutions_have_their_strain_rotation_and_stress_everywhere(name, field)
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_affine_deformations_are_exact_on_every_lattice_under_every_rule(lattice):
+def test_affine_deformations_are_exact_on_every_lattice_for_every_rule(lattice):
     """A turn by 30° after a stretch, F = R U, from step 0; the frame does not matter."""
     turn, U = math.radians(30.0), np.array([[1.3, 0.2], [0.2, 0.8]])
     R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
@@ -148,7 +148,7 @@ GRADIENTS = {
 
 @pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=GRADIENTS)
 @pytest.mark.parametrize("name", SHEARED)
-def test_stresses_of_affine_deformations_are_those_of_hookes_law(name, gradient):
+def test_stress_of_affine_deformations_follows_hookes_law(name, gradient):
     """Test all components, von Mises of the tensor in space, and principal values in the plane."""
     rule, law, stiffness = SHEARED[name]
     given = experiment(initial={"type": "affine", "gradient": gradient}) | SQUARE | {
@@ -189,7 +189,7 @@ def test_stresses_of_affine_deformations_are_those_of_hookes_law(name, gradient)
 )
 @pytest.mark.parametrize("frame", ["natural", "mean"])
 @pytest.mark.parametrize("lattice", [SQUARE, HEXAGONAL], ids=["square", "hexagonal"])
-def test_beyond_the_outline_there_is_no_stress(body, beyond, frame, lattice):
+def test_stress_is_undefined_outside_the_outline(body, beyond, frame, lattice):
     """Corners of cut cells lie beyond it; sites on it do not."""
     lattice = lattice | {"lattice": lattice["lattice"] | {"a": 1.0}}
     given = experiment(steps=1, leaders=[], frame={"type": frame}) | lattice | {
@@ -210,7 +210,7 @@ def test_beyond_the_outline_there_is_no_stress(body, beyond, frame, lattice):
 
 
 @pytest.mark.parametrize("angle", [30.0, 135.0, -90.0])
-def test_a_finite_rotation_strains_nothing(angle):
+def test_finite_rotation_has_zero_strain(angle):
     turn = math.radians(angle)
     H = [[math.cos(turn) - 1, -math.sin(turn)], [math.sin(turn), math.cos(turn) - 1]]
     energy = {"type": "strain-energy", "youngs_modulus": E}
@@ -257,7 +257,7 @@ def test_quadratic_displacements_are_exact_on_curved_edges(lattice, body):
 
 
 @pytest.mark.parametrize(("lattice", "order"), [("square", 2), ("hexagonal", 1)])
-def test_the_largest_error_of_a_smooth_field_falls_with_the_spacing(lattice, order):
+def test_maximum_error_of_a_smooth_field_decreases_with_spacing(lattice, order):
     """Four times at half the spacing, edges included; on triangles twice, by their edges."""
     errors = []
     for n in (2, 4):
@@ -279,7 +279,7 @@ CALIBRATED = {"rule": STRESS, "frame": NATURAL}
     [{}, {"lattice": "hexagonal"}, SQUARE | CALIBRATED, HEXAGONAL | CALIBRATED],
     ids=["square, mean", "hexagonal, mean", "square, natural", "hexagonal, natural"],
 )
-def test_cells_with_a_broken_bond_do_not_count(parts):
+def test_cells_with_a_broken_bond_are_excluded(parts):
     """Two halves, cracked apart, of which one has moved away."""
     X = scene_of(**parts).raster.reference()
     middle = X[:, 0].mean() + 0.01
@@ -295,7 +295,7 @@ def test_cells_with_a_broken_bond_do_not_count(parts):
         assert strained or (H == 0).all()
 
 
-def test_the_gradient_is_made_once_where_it_is_asked_for_and_else_not_at_all(monkeypatch):
+def test_gradient_is_computed_once_and_only_if_required(monkeypatch):
     made = []
     of = StateCells._gradient.func
 

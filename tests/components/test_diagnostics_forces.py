@@ -79,7 +79,7 @@ LINEAR = {
 
 
 @pytest.mark.parametrize("name", LINEAR)
-def test_the_work_of_the_leaders_is_the_strain_energy(name):
+def test_work_of_the_leaders_equals_the_strain_energy(name):
     """Clapeyron: ½ reaction · displacement."""
     by = (0.3, 0.2)
     ds = ran(pulled(LINEAR[name], by))
@@ -92,7 +92,7 @@ def test_the_work_of_the_leaders_is_the_strain_energy(name):
 
 @pytest.mark.parametrize("body", [GRID, DISC], ids=["grid", "disc"])
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_all_leader_groups_together_exert_nothing(lattice, body):
+def test_reactions_of_all_leader_groups_sum_to_zero(lattice, body):
     """Test forces and torques of three bodies that share particles; no other particle is in
     equilibrium yet."""
     box = {"box": [1.0, 1.0, 2.5, 2.2]}
@@ -121,7 +121,7 @@ def random_state(parts, seed=3):
 
 @pytest.mark.parametrize("body", [GRID, DISC], ids=["grid", "disc"])
 @pytest.mark.parametrize("lattice", ["square", "rectangular"])
-def test_the_energy_of_any_state_is_that_of_its_cells(lattice, body):
+def test_energy_of_any_state_is_the_sum_over_its_cells(lattice, body):
     """Σ share ½ uᵀK u with the cells' own matrices, cut cells too."""
     parts = LATTICES[lattice] | {"rule": AUXETIC, "body": body}
     scene, u, energy = random_state(parts)
@@ -138,7 +138,7 @@ def test_the_energy_of_any_state_is_that_of_its_cells(lattice, body):
 
 
 @pytest.mark.parametrize("lattice", SPRINGS)
-def test_springs_have_the_energy_of_their_definition(lattice):
+def test_energy_of_springs_matches_its_definition(lattice):
     _, u, energy = random_state(
         SPRINGS[lattice] | {"rule": {"type": "springs"}, "body": SMALL_GRID}
     )
@@ -150,7 +150,7 @@ def test_springs_have_the_energy_of_their_definition(lattice):
 
 
 @pytest.mark.parametrize("lattice", SPRINGS)
-def test_the_reaction_of_springs_is_the_slope_of_their_energy(lattice):
+def test_reaction_of_springs_is_the_derivative_of_their_energy(lattice):
     """Test by central differences, far from rest: a stretch of a third and a turn."""
     given = SPRINGS[lattice] | {"rule": {"type": "springs"}}
 
@@ -190,7 +190,7 @@ def problem(name, n):
         ("hole", 20, 9e-4),
     ],
 )
-def test_reaction_and_energy_against_finite_elements(name, n, within):
+def test_reaction_and_energy_match_finite_elements(name, n, within):
     given, reference = problem(name, n)
     ds = ran(given)
     reaction = float(ds.reaction[-1, 1, reference.problem.pulled])
@@ -199,7 +199,7 @@ def test_reaction_and_energy_against_finite_elements(name, n, within):
     assert float(ds.strain_energy[-1]) == pytest.approx(reference.energy, rel=within)
 
 
-def test_the_energy_does_not_depend_on_where_the_body_has_gone():
+def test_energy_is_independent_of_rigid_translation():
     given = pulled(SQUARE | {"rule": STRESS})
     far = json.loads(json.dumps(given))
     far["leaders"][0]["motion"], far["leaders"][1]["motion"] = (
@@ -210,7 +210,7 @@ def test_the_energy_does_not_depend_on_where_the_body_has_gone():
     assert energies[1] == pytest.approx(energies[0], rel=1e-9)
 
 
-def test_a_group_that_does_not_lead_exerts_nothing():
+def test_group_without_leading_exerts_no_force():
     given = pulled(SQUARE | {"rule": STRESS}, steps=4, solver={"type": "stepping"})
     given["leaders"][1]["until"] = 2
     reaction = ran(given).reaction[:, 1, 0].values
@@ -218,7 +218,7 @@ def test_a_group_that_does_not_lead_exerts_nothing():
     assert (reaction[3:] == 0).all()
 
 
-def test_broken_bonds_exert_what_the_rule_sees():
+def test_forces_of_broken_bonds_match_the_rule():
     """The right half, cracked off and moved away, is at rest."""
     crack = {"type": "threshold", "thresholds": [9.0], "cracks": [[[1.8, -9.0], [1.8, 9.0]]]}
     more = {"solver": {"type": "stepping"}, "steps": 2000, "record": {"every": 2000}}
@@ -270,7 +270,7 @@ class Loose(pbdkit.plugin.Calibrated, pbdkit.FollowerRule):
         return total[0]
 
 
-def test_forces_of_neighbours_that_come_and_go_are_refused():
+def test_forces_with_changing_neighbours_are_refused():
     near = {"type": "euclidean", "radius": 0.6, "reevaluate": True}
     parts = SQUARE | {"rule": {"type": "loose"}, "neighbours": near, "frame": {"type": "none"}}
     given = pulled(parts, solver={"type": "stepping"})
@@ -295,7 +295,7 @@ def test_a_calibrated_rule_without_forces_is_named():
 
 
 @pytest.mark.parametrize(("name", "off"), [("bar", 0.194), ("cantilever", 7.0)])
-def test_frame_points_at_held_corners_are_warned_of(name, off):
+def test_frame_points_at_held_corners_give_a_warning(name, off):
     given, reference = problem(name, 10)
     columns = round(reference.problem.length * 10) + 1
     body = {"type": "grid", "columns": columns, "rows": 11}

@@ -47,7 +47,7 @@ GAUGES = {
 
 
 @pytest.mark.parametrize("gauge", GAUGES.values(), ids=GAUGES)
-def test_a_bar_without_contraction_has_the_slope_of_youngs_modulus(gauge):
+def test_bar_without_contraction_has_youngs_modulus_as_slope(gauge):
     stress, strain = curve(specimen(SQUARE, BAR, diagnostic={"width": 2.5} | gauge))
     assert strain == pytest.approx(0.05 / 4, rel=1e-10)
     assert stress / strain == pytest.approx(E, rel=1e-10)
@@ -56,7 +56,7 @@ def test_a_bar_without_contraction_has_the_slope_of_youngs_modulus(gauge):
 @pytest.mark.parametrize(("axis", "edges"), [("x", "left right"), ("y", "bottom top")])
 @pytest.mark.parametrize("pulled", [0, 1])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_tension_is_positive_whoever_pulls_and_whereto(axis, edges, pulled, sign):
+def test_tension_is_positive_for_any_group_and_direction(axis, edges, pulled, sign):
     outwards = sign * (1.0 if pulled else -1.0) * 0.01
     pull = [outwards, 0.0] if axis == "x" else [0.0, outwards]
     names = {"group": pulled, "against": 1 - pulled, "axis": axis}
@@ -71,7 +71,7 @@ def test_tension_is_positive_whoever_pulls_and_whereto(axis, edges, pulled, sign
     assert np.sign(stress) == np.sign(strain) == sign
 
 
-def test_the_curve_has_a_point_a_record():
+def test_curve_has_one_point_per_record():
     """Two levels of load, each held until the body has come to rest."""
     given = specimen(SQUARE, BAR, diagnostic={"width": 2.5}, steps=4000)
     path = {"steps": [1, 2000, 2001], "displacements": [[0.1, 0.0], [0.1, 0.0], [0.3, 0.0]]}
@@ -100,13 +100,13 @@ def modulus(parts, rule, a, pull):
 @pytest.mark.parametrize(
     ("parts", "within"), [(SQUARE, 1e-6), (HEXAGONAL, 1e-3)], ids=["square", "hexagonal"]
 )
-def test_in_the_middle_of_a_long_bar_clamps_are_not_felt(parts, within):
+def test_clamps_do_not_affect_the_middle_of_a_long_bar(parts, within):
     """Triangles that the outline cuts are rough at the edge; squares here are whole."""
     rule = {"type": "elastic", "poisson_ratio": 0.3}
     assert modulus(parts, rule, 0.25, 0.01) == pytest.approx(1.0, rel=within)
 
 
-def test_the_gauge_of_a_dogbone_has_the_slope_of_youngs_modulus():
+def test_gauge_of_a_dogbone_has_youngs_modulus_as_slope():
     """The specimen of docs/dataset.md, at half the spacing the error is smaller."""
     outline = {"length": 20.0, "width": 6.0, "gauge_length": 8.0, "gauge_width": 3.0, "radius": 3.0}
     gauge = {"width": 3.0, "points": [[7.0, 3.0], [13.0, 3.0]]}
@@ -120,7 +120,7 @@ def test_the_gauge_of_a_dogbone_has_the_slope_of_youngs_modulus():
     assert off[1] < off[0]
 
 
-def test_springs_have_youngs_modulus_at_first_and_then_bend_off_in_proportion():
+def test_springs_start_at_youngs_modulus_and_deviate_in_proportion():
     """To first order in the strain."""
     off = [modulus(SQUARE, {"type": "springs"}, 0.25, pull) - 1 for pull in (1e-4, 1e-3, 1e-2)]
     assert 0 < off[0] < 3e-5
@@ -143,7 +143,7 @@ def test_springs_have_youngs_modulus_at_first_and_then_bend_off_in_proportion():
          "are at 0; choose points that differ along this axis"),
     ],
 )  # fmt: skip
-def test_what_makes_no_curve_is_refused(wrong, message):
+def test_scenes_without_a_curve_are_refused(wrong, message):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         pbdkit.run(specimen(SQUARE, BAR, diagnostic={"width": 1.0} | wrong), progress=False)
     assert str(caught.value) == message

@@ -89,7 +89,7 @@ PATCHES = [
 
 
 @pytest.mark.parametrize(("name", "field"), PATCHES)
-def test_patch(name, field):
+def test_patch_test(name, field):
     """Small rotation, free uniaxial tension and pure bending between two held ends."""
     experiment, exact = held_as(field, CASES[name], width=0.3)
     found = body_displacements(pbdkit.run(experiment, progress=False))
@@ -116,7 +116,7 @@ def steps_of(rule, frame="mean", neighbours=SQUARE["neighbours"]):
     return pbdkit.run(experiment, progress=False).u.values
 
 
-def test_a_poisson_ratio_of_minus_one_is_the_barycentre():
+def test_poisson_ratio_of_minus_one_gives_the_barycentre():
     """That of the four nearest: nothing is left on the diagonals."""
     elastic = steps_of({"type": "elastic", "poisson_ratio": -1.0})
     four = steps_of({"type": "barycentre"}, neighbours={"type": "coordination", "shells": 1})
@@ -132,7 +132,7 @@ def test_orthotropic_with_the_ratios_of_an_isotropic_material_is_elastic():
 
 
 @pytest.mark.parametrize("nu", [-0.5, 0.0, 0.3, 0.45])
-def test_hexagonal_elastic_is_linear_triangles(nu):
+def test_hexagonal_elastic_equals_linear_triangles(nu):
     """Against the stiffness that scikit-fem assembles on the same triangles."""
     skfem = pytest.importorskip("skfem")
     from skfem.models.elasticity import linear_elasticity
@@ -176,7 +176,7 @@ SMALL_GRID = {"type": "grid", "columns": 6, "rows": 5}
 
 
 @pytest.mark.parametrize("parts", SPRINGS.values(), ids=SPRINGS)
-def test_springs_turn_with_their_leaders_exactly(parts):
+def test_springs_rotate_exactly_with_their_leaders(parts):
     """A quarter turn of both ends about the origin, in 60 steps; the body follows."""
 
     def turn(edge):
@@ -200,7 +200,7 @@ def test_springs_turn_with_their_leaders_exactly(parts):
 
 @samples(30)
 @given(seed=st.integers(0, 2**31), lattice=st.sampled_from(list(SPRINGS)))
-def test_the_energy_of_springs_never_rises(seed, lattice):
+def test_energy_of_springs_never_increases(seed, lattice):
     """From scrambled starts, up to two spacings from rest, with relaxation 1."""
     experiment = SPRINGS[lattice] | {
         "name": "scrambled",

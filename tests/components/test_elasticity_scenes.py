@@ -91,7 +91,7 @@ UNFIT = {
 
 
 @pytest.mark.parametrize(("parts", "place", "said"), UNFIT.values(), ids=UNFIT)
-def test_what_does_not_go_together_is_refused_with_what_does(parts, place, said):
+def test_incompatible_parts_are_refused_with_alternatives(parts, place, said):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         scene(**parts)
     assert said in str(caught.value)
@@ -112,14 +112,14 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize(("rule", "said"), IMPOSSIBLE.values(), ids=IMPOSSIBLE)
-def test_materials_that_do_not_exist_are_refused(rule, said):
+def test_unphysical_materials_are_refused(rule, said):
     with pytest.raises(pbdkit.ExperimentError, match="rule") as caught:
         scene(rule=rule)
     assert said in str(caught.value)
 
 
 @pytest.mark.parametrize(("frame", "warned"), [(MEAN, True), (NATURAL, False)])
-def test_copying_frames_are_warned_of_with_the_size_of_the_error(frame, warned):
+def test_copying_frames_give_a_warning_with_the_error(frame, warned):
     said = [w for w in scene(frame=frame).warnings if "edges are not free of stress" in w]
     assert len(said) == warned
     for text in said:
@@ -148,7 +148,7 @@ def test_cut_cells_have_the_area_of_the_outline(monkeypatch):
     assert hexagons.cells.share.sum() * triangle == pytest.approx(3.141592653589793, rel=1e-3)
 
 
-def test_cells_between_given_sites_are_whole():
+def test_cells_between_explicit_sites_are_whole():
     assert set(scene().cells.share.ravel().tolist()) == {0.0, 1.0}
     assert scene().cells.share.sum() == 5 * 4
 
@@ -160,13 +160,13 @@ class Tiring(pbdkit.plugin.Remembers, StrainGradient):
         return (pbdkit.plugin.Remembered("tiredness", "how tired it is", "1"),)
 
 
-def test_a_rule_on_the_moves_of_another_remembers_nothing():
+def test_rule_composed_with_a_rule_with_state_is_refused():
     tiring = Tiring(poisson_ratio=0.3, length=2.0)
     with pytest.raises(pbdkit.ExperimentError, match="one without remembered numbers"):
         scene(rule=tiring)
 
 
-def test_bodies_of_given_sites_are_part_of_differences_without_a_warning():
+def test_difference_of_bodies_of_explicit_sites_gives_no_warning():
     """Such bodies have no outline and are infinitely far: their differences have whole cells."""
     body = {
         "type": "difference",

@@ -97,7 +97,7 @@ def stiffness(scene, state):
 
 @samples(25)
 @given(torn_bodies())
-def test_forces_come_from_a_stiffness_that_rigid_motions_do_not_feel(torn):
+def test_forces_derive_from_a_stiffness_without_rigid_motions(torn):
     scene, state, generator = torn
     K, X = stiffness(scene, state), scene.raster.reference(scene.raster.body_rows)
     size = np.abs(K).max()
@@ -125,7 +125,7 @@ CRACKED = {
 
 @pytest.mark.parametrize("rule", [*RULES[1:5], ORTHOTROPIC], ids=lambda rule: str(rule)[:45])
 @pytest.mark.parametrize("through", [True, False])
-def test_a_stress_along_a_cut_passes_it_undisturbed(rule, through):
+def test_stress_parallel_to_a_cut_is_undisturbed(rule, through):
     """Exactly beside a cut through the body; the two cells at the tips of a shorter one, of which
     one edge across the cut is whole, disturb it by less than their size times the strain."""
     ends, largest = ((-1.0, 11.0), 1e-11) if through else ((2.4, 7.6), 0.7)
@@ -153,7 +153,7 @@ def test_a_stress_along_a_cut_passes_it_undisturbed(rule, through):
 
 
 @pytest.mark.parametrize("rule", [*RULES[:5], ORTHOTROPIC], ids=lambda rule: str(rule)[:45])
-def test_a_notched_plate_turns_as_a_whole(rule):
+def test_notched_plate_rotates_rigidly(rule):
     """So little that the strain which a linear rule sees in a rotation is below rounding."""
     angle = 1e-7
     turn = {"type": "rotation", "centre": [10.0, 5.0], "angle": np.degrees(angle), "steps": 1}
@@ -184,7 +184,7 @@ at its tip."""
 
 
 @pytest.mark.parametrize("nu", MOMENTS)
-def test_the_moment_of_a_cracked_plate_is_that_of_fine_elements(nu):
+def test_moment_of_a_cracked_plate_matches_fine_elements(nu):
     def bent(edge, centre, angle):
         motion = {"type": "rotation", "centre": [centre, 10.0], "angle": angle, "steps": 1}
         return {"select": {"edge": edge}, "motion": motion}
@@ -212,7 +212,7 @@ def test_the_moment_of_a_cracked_plate_is_that_of_fine_elements(nu):
     ],
 )
 @pytest.mark.parametrize("rule", [elastic(0.3), {"type": "springs"}], ids=["elastic", "springs"])
-def test_fictitious_points_that_pull_are_refused(rule, fracture):
+def test_fictitious_points_that_exert_forces_are_refused(rule, fracture):
     experiment = pbdkit.Experiment(
         **CRACKED
         | {
@@ -226,7 +226,7 @@ def test_fictitious_points_that_pull_are_refused(rule, fracture):
         build_scene(experiment)
 
 
-def test_energy_of_softened_springs_is_the_work_that_stretched_them():
+def test_energy_of_softened_springs_is_the_work_of_stretching():
     """Every bond has lost half of its pull, in a strip pulled within what is elastic."""
     experiment = pbdkit.Experiment(
         **CRACKED
@@ -253,7 +253,7 @@ def test_energy_of_softened_springs_is_the_work_that_stretched_them():
 
 @pytest.mark.parametrize("lattice", LATTICES, ids=lambda lattice: lattice["type"])
 @pytest.mark.parametrize("rule", [elastic(0.0), elastic(0.3), {"type": "springs"}], ids=str)
-def test_stress_of_softened_cells_is_what_they_carry(lattice, rule):
+def test_stress_of_softened_cells_is_the_transmitted_stress(lattice, rule):
     """If all bonds have lost half of their force, the stress is halved."""
     if rule["type"] == "springs" and lattice["type"] == "rectangular":
         rule = ORTHOTROPIC

@@ -42,7 +42,7 @@ def pulled(velocity, steps=40):
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("a", [1.0, 0.25])
-def test_a_bond_breaks_when_its_strain_exceeds_failure(precision, a):
+def test_bond_breaks_if_its_strain_exceeds_failure(precision, a):
     """Both ends led: the strain in step n is n RATE, exactly, and 0.5 does not exceed 0.5."""
     given = bar(2, pulled(RATE * a), {"type": "strain", "failure": 0.5},
                 lattice={"type": "square", "a": a},
@@ -55,7 +55,7 @@ def test_a_bond_breaks_when_its_strain_exceeds_failure(precision, a):
 
 
 @pytest.mark.parametrize("fracture", [{"type": "strain", "failure": 0.01}, DAMAGE])
-def test_compression_breaks_and_damages_nothing(fracture):
+def test_compression_causes_no_damage(fracture):
     ds = run(bar(2, pulled(-RATE, 30), fracture))
     assert ds.broken_step.values.tolist() == [-1]
     assert np.isnan(ds.broken_strain).all()
@@ -64,7 +64,7 @@ def test_compression_breaks_and_damages_nothing(fracture):
 
 
 @pytest.mark.parametrize("length", [1.0, 2.0])
-def test_every_shell_breaks_at_the_same_strain(length):
+def test_all_shells_break_at_the_same_strain(length):
     """Chebyshev's second shell lies along the row, twice as long as the first."""
     near = {"type": "chebyshev", "shells": 2}
     given = bar(1 + int(length), pulled(RATE * length), {"type": "strain", "failure": 0.5},
@@ -94,7 +94,7 @@ def test_the_softening_curve_is_exact():
 
 
 @pytest.mark.parametrize("placement", [1.0, 1.2])
-def test_a_damaged_bond_counts_as_its_damage_says(placement):
+def test_damaged_bond_is_weighted_by_its_damage(placement):
     """One follower between two leaders: its move is the mean of (1 - D) d + D lost."""
     fracture = DAMAGE | {"placement": placement}
     given = bar(3, {"type": "displace", "displacement": [0.3, 0.0]}, fracture, steps=2)
@@ -137,7 +137,7 @@ def test_a_bar_softens_at_its_weakest_bond(extension, way):
 
 
 @pytest.mark.parametrize("fracture", [{"type": "strain", "failure": 0.1}, DAMAGE | {"onset": 0.1}])
-def test_scattered_strengths_come_from_the_seed(fracture):
+def test_scattered_strengths_depend_on_the_seed(fracture):
     given = bar(30, pulled(0.05), fracture | {"scatter": 0.5})
     one, same, other = run(given), run(given), run(given | {"seed": 1})
     assert one.drop_attrs().identical(same.drop_attrs())
@@ -162,7 +162,7 @@ STRAIN = {"type": "strain", "failure": 0.4371, **CUT}
     ("lattice", "precision"),
     [("square", "float64"), ("square", "float32"), ("hexagonal", "float64")],
 )
-def test_the_compiled_engine_breaks_by_strain_to_the_last_bit(lattice, precision):
+def test_compiled_engine_breaks_by_strain_bit_for_bit(lattice, precision):
     """Single precision is compiled; for the others `stepping/numba_engine/test_engine` does."""
     solver = {"type": "stepping", "precision": precision}
     scene = build_scene(pbdkit.Experiment(**bar(
@@ -176,13 +176,13 @@ def test_the_compiled_engine_breaks_by_strain_to_the_last_bit(lattice, precision
     assert (states[0].broken_step > 1).any()
 
 
-def test_an_onset_beyond_failure_is_refused():
+def test_onset_above_failure_is_refused():
     with pytest.raises(pbdkit.ExperimentError, match=r"onset.*0\.5 is not below failure 0\.5"):
         pbdkit.Experiment(**bar(3, pulled(0.1), DAMAGE | {"onset": 0.5}))
 
 
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
-def test_the_crack_path_is_the_broken_bonds_in_order(lattice, tmp_path):
+def test_crack_path_lists_broken_bonds_in_order(lattice, tmp_path):
     from pbdkit.io.netcdf import NetcdfSink
     from pbdkit.simulation import Simulation, record
 

@@ -113,7 +113,7 @@ CELLS = [
 
 
 @pytest.mark.parametrize(("lattice", "rule"), CELLS)
-def test_a_cell_bears_the_onset_and_takes_the_energy(lattice, rule):
+def test_cell_has_onset_strength_and_fracture_energy(lattice, rule):
     """Strained across the crack alone, as a band between cells that stay elastic: the stress peaks
     at onset times the modulus along its normal, and its work on the band is energy · E."""
     onset, energy = 1e-3, 6e-6
@@ -148,7 +148,7 @@ GRID = {"type": "grid", "columns": 5, "rows": 5}
 
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("rule", [SPRINGS, ELASTIC], ids=["springs", "elastic"])
-def test_it_is_the_same_turned_and_mirrored(turn, rule):
+def test_law_is_invariant_under_rotation_and_reflection(turn, rule):
     Q = TURNS[turn]
     for seed in range(5):
         one, other = Strained(rule=rule, body=GRID), Strained(rule=rule, body=GRID)
@@ -159,7 +159,7 @@ def test_it_is_the_same_turned_and_mirrored(turn, rule):
         assert any((value != 0.0).any() for value in one.state.bond_values)
 
 
-def test_it_is_the_same_in_other_units():
+def test_law_is_independent_of_units():
     known = None
     for a in (0.25, 1.0, 4.0):
         fracture = COHESIVE | {"energy": 6e-4 * a}
@@ -173,7 +173,7 @@ def test_it_is_the_same_in_other_units():
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_nothing_stiffens_and_forces_balance(lattice):
+def test_stiffness_never_increases_and_forces_balance(lattice):
     """Whatever the body has been through: no probe of its energy rises, a rigid turn costs
     nothing, and the stiffness is symmetric."""
     generator = np.random.default_rng(3)
@@ -195,7 +195,7 @@ def test_nothing_stiffens_and_forces_balance(lattice):
     assert given.broken > 0
 
 
-def test_it_unloads_along_the_secant_and_never_heals():
+def test_unloading_follows_the_secant_without_healing():
     given = Strained(rule=ELASTIC, body=GRID)
     gradient = np.array([[0.0, 0.0], [0.0, 2.0 * ONSET]])
     pulled = given.stress(gradient)
@@ -207,7 +207,7 @@ def test_it_unloads_along_the_secant_and_never_heals():
             assert np.array_equal(value, old)
 
 
-def test_the_crack_of_a_cell_keeps_its_direction():
+def test_crack_direction_of_a_cell_is_fixed():
     """Pulled upwards, then sideways: bonds along the crack do not soften."""
     given = Strained(rule=ELASTIC, body=GRID)
     given.stress([[0.0, 0.0], [0.0, 1.1 * ONSET]])
@@ -223,7 +223,7 @@ def test_the_crack_of_a_cell_keeps_its_direction():
     assert failure[level].min() < 0.0
 
 
-def test_a_bond_breaks_where_both_cells_are_torn():
+def test_bond_breaks_if_both_cells_are_broken():
     given = Strained(rule=ELASTIC, body={"type": "grid", "columns": 3, "rows": 2})
     planes = given.scene.neighbourhood.planes
     upright = next(n for n, plane in enumerate(planes) if plane.slot.rest.x == 0.0)
@@ -255,7 +255,7 @@ TORN = {
 }
 
 
-def test_kernels_soften_as_numpy_does(interpreted):
+def test_kernels_soften_like_numpy(interpreted):
     """One that softens is compiled in `testing/test_conformance`, which takes half a minute."""
     pytest.importorskip("numba")
     fracture = {"type": "cohesive", "energy": 2e-3, "onset": 0.01}
@@ -289,14 +289,14 @@ def test_kernels_soften_as_numpy_does(interpreted):
     ],
     ids=["spacing", "barycentre", "frame"],
 )  # fmt: skip
-def test_what_does_not_go_with_it_is_told(parts, words):
+def test_incompatible_parts_are_refused(parts, words):
     with pytest.raises(pbdkit.ExperimentError) as error:
         build_scene(pbdkit.Experiment(**parts))
     for word in words:
         assert word in str(error.value)
 
 
-def test_the_remedies_for_a_large_spacing_are_true():
+def test_remedies_for_a_large_spacing_are_effective():
     with pytest.raises(pbdkit.ExperimentError) as error:
         build_scene(pbdkit.Experiment(**body(14.0)))
     words = str(error.value).split()
@@ -308,7 +308,7 @@ def test_the_remedies_for_a_large_spacing_are_true():
         build_scene(pbdkit.Experiment(**body(size, fracture=COHESIVE | more)))
 
 
-def test_a_bar_bears_its_strength_and_takes_its_energy():
+def test_bar_has_its_strength_and_fracture_energy():
     """A sample of `cohesive_strength.py`: the onset is 1.5 % lower in a zone."""
     import cohesive_strength
 
@@ -321,7 +321,7 @@ def test_a_bar_bears_its_strength_and_takes_its_energy():
     assert left < 1e-9
 
 
-def test_a_beam_tears_as_griffith_says():
+def test_beam_cleaves_at_griffith_load():
     """A sample of `fracture_energy.py`; the whole is in docs/validation/fracture.md."""
     import fracture_energy
 
@@ -330,7 +330,7 @@ def test_a_beam_tears_as_griffith_says():
 
 
 @pytest.mark.parametrize("last", [0, 5])
-def test_a_condensed_body_carries_what_a_whole_one_does(last):
+def test_condensed_body_matches_the_whole_body(last):
     """A cracked beam of `fracture_energy.py`, of which the bonds across the columns up to `last`
     are torn, and the same by pbdkit: both linear, so that they differ by rounding alone."""
     import fracture_energy

@@ -35,7 +35,7 @@ ADVICE = "frame.type: 'traction-free' is retired, and is replaced by 'natural' u
 
 
 @pytest.mark.parametrize("name", ["traction-free", "pbdkit:traction-free"])
-def test_what_is_retired_is_read_as_its_successor(name):
+def test_retired_type_is_read_as_its_replacement(name):
     with pytest.warns(pbdkit.PbdkitWarning, match=ADVICE) as caught:
         found = pbdkit.Experiment(**SHEET | {"frame": {"type": name}})
     assert found == pbdkit.Experiment(**SHEET)
@@ -43,7 +43,7 @@ def test_what_is_retired_is_read_as_its_successor(name):
     assert "traction-free" not in found.model_dump_json() + str(found.as_written().data)
 
 
-def test_what_is_built_of_an_experiment_again_does_not_warn_again():
+def test_rebuilding_an_experiment_does_not_warn_again():
     given = OLD | {"units": {"length": "1 mm"}, "diagnostics": []}
     with pytest.warns(pbdkit.PbdkitWarning, match=ADVICE):
         found = Experiment.build(Source(data=given))
@@ -52,7 +52,7 @@ def test_what_is_built_of_an_experiment_again_does_not_warn_again():
         assert found.of_parts(found.as_written().data) == found
 
 
-def test_the_program_warns_once_and_names_the_place(call, tmp_path):
+def test_program_warns_once_with_the_place(call, tmp_path):
     (tmp_path / "old.yaml").write_text(json.dumps(OLD))
     file = str(tmp_path / "old.yaml")
     told = json.loads(call("check", file, "--json").out)["warnings"]
@@ -63,7 +63,7 @@ def test_the_program_warns_once_and_names_the_place(call, tmp_path):
     assert call("run", file, "-o", "out.nc", "--force", "--quiet").err == ""
 
 
-def test_members_of_a_sweep_are_warned_of_together(call, tmp_path):
+def test_members_of_a_sweep_give_one_warning(call, tmp_path):
     sweep = {"version": 1, "experiment": OLD, "vary": {"steps": [2, 3, 4]}}
     (tmp_path / "sweep.yaml").write_text(json.dumps(sweep))
     done = call("sweep", str(tmp_path / "sweep.yaml"), "-o", "out", "--workers", "1")
@@ -82,18 +82,18 @@ def test_members_of_a_sweep_are_warned_of_together(call, tmp_path):
         ({"diagnostics": [{"type": "track", "numbers": [9]}]}, "diagnostics.0"),
     ],
 )
-def test_numbers_of_particles_are_refused_since_they_are_others_now(parts, place):
+def test_particle_numbers_are_refused_after_renumbering(parts, place):
     with pytest.raises(pbdkit.ExperimentError, match="which is retired; under 'natural'") as error:
         pbdkit.Experiment(**OLD | parts)
     assert str(error.value).startswith(f"{place}.numbers: ")
 
 
-def test_it_takes_no_parameter_as_before():
+def test_retired_frame_takes_no_parameter():
     with pytest.raises(pbdkit.ExperimentError, match=r"^frame\.layers: unknown key"):
         pbdkit.Experiment(**OLD | {"frame": {"type": "traction-free", "layers": 2}})
 
 
-def test_the_schema_takes_it_as_deprecated():
+def test_schema_marks_it_as_deprecated():
     schema = experiment_schema(Registry(), installed=False)
     jsonschema.Draft202012Validator(schema).validate(OLD)
     known = schema["properties"]["frame"]["oneOf"]
@@ -114,7 +114,7 @@ class Taken(pbdkit.FramePolicy):
         raise NotImplementedError
 
 
-def test_its_name_stays_reserved():
+def test_retired_name_stays_reserved():
     with pytest.raises(pbdkit.ExperimentError, match="'traction-free' is the name of a built-in"):
         pbdkit.run(SHEET, components=[Taken], progress=False)
 
@@ -130,7 +130,7 @@ def old_result(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*has no seal:pbdkit.PbdkitWarning")
-def test_old_results_open_and_run_again(old_result):
+def test_old_results_open_and_rerun(old_result):
     with pbdkit.open(old_result) as ds:
         with pytest.warns(pbdkit.PbdkitWarning, match=ADVICE):
             again = pbdkit.rerun(ds, progress=False)
@@ -140,7 +140,7 @@ def test_old_results_open_and_run_again(old_result):
 
 
 @pytest.mark.filterwarnings("ignore:.*has no seal:pbdkit.PbdkitWarning")
-def test_what_needs_the_scene_that_was_run_is_refused(old_result, call):
+def test_operations_on_the_original_scene_are_refused(old_result, call):
     refusal = "requires the scene of the run, but its frame 'traction-free' is retired"
     with pbdkit.open(old_result) as ds:
         with pytest.raises(pbdkit.ExperimentError, match=refusal):

@@ -66,7 +66,7 @@ def by_kernel(monkeypatch):
 
 
 @pytest.mark.parametrize("parts", SCENES.values(), ids=SCENES)
-def test_the_kernel_breaks_and_softens_as_numpy_does(parts, monkeypatch):
+def test_kernel_breaks_and_softens_like_numpy(parts, monkeypatch):
     scene = scene_of(**parts)
     expected, certificate = equilibrium_state(scene)
     settled = by_kernel(monkeypatch)
@@ -82,7 +82,7 @@ def test_the_kernel_breaks_and_softens_as_numpy_does(parts, monkeypatch):
     assert own.distance <= scene.experiment.solver.tolerance * 2.0
 
 
-def test_a_compiled_kernel_breaks_as_numpy_does(monkeypatch):
+def test_compiled_kernel_breaks_like_numpy(monkeypatch):
     scene = scene_of(**SCENES["threshold, with frame bonds"])
     expected, _ = equilibrium_state(scene)
     settled = by_kernel(monkeypatch)
@@ -92,7 +92,7 @@ def test_a_compiled_kernel_breaks_as_numpy_does(monkeypatch):
     np.testing.assert_allclose(found.u, expected.u, rtol=0, atol=1e-10)
 
 
-def test_an_increment_taken_up_again_comes_out_the_same_to_the_bit(monkeypatch):
+def test_repeated_increment_is_bitwise_identical(monkeypatch):
     by_kernel(monkeypatch)
     scene = scene_of(fracture=DAMAGE)
     whole, kept = initial_state(scene), None
@@ -106,12 +106,12 @@ def test_an_increment_taken_up_again_comes_out_the_same_to_the_bit(monkeypatch):
         np.testing.assert_array_equal(mine, others)
 
 
-def test_what_is_over_soon_is_not_compiled():
+def test_short_computations_are_not_compiled():
     scene = scene_of(fracture=DAMAGE)
     assert choice.settler_of(scene, 1e-8, Watch()) is None
 
 
-def test_a_kernel_is_found_again_whatever_the_order_of_sets():
+def test_cache_key_is_independent_of_set_order():
     program = (
         "from pbdkit.components.fracture import Damage\n"
         "from pbdkit.stepping.numba_engine.cache import source_key\n"

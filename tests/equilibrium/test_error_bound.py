@@ -64,7 +64,7 @@ def error_of(ds, rest):
 
 @samples(4)
 @given(experiments(), st.sampled_from([1e-2, 1e-4, 1e-7]))
-def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tolerance):
+def test_no_random_scene_exceeds_its_error_bound(drawn, tolerance):
     """Compare all lattices, rules, frames, motions and fracture with the steps themselves."""
     assume(not drawn["neighbours"].get("reevaluate"))
     solver = drawn["solver"] | {"settle": {"tolerance": tolerance}, "engine": "numpy"}
@@ -95,7 +95,7 @@ def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tol
         for m, rule in enumerate(("barycentre", "mean-displacement", "mixed-coordinate"))
     ],
 )
-def test_it_ends_hardly_after_the_first_step_within_the_tolerance(lattice, rule, tolerance):
+def test_run_ends_soon_after_the_first_step_within_tolerance(lattice, rule, tolerance):
     near = {"type": "chebyshev", "shells": 1}
     parts = {"lattice": lattice, "rule": rule, "neighbours": near}
     given_ = sheet(**parts, tolerance=tolerance, solver={"relaxation": 0.9})
@@ -125,7 +125,7 @@ LATE = [
 
 @pytest.mark.parametrize("leaders", LATE, ids=["begins", "ends", "moves again"])
 @pytest.mark.filterwarnings("ignore:leaders.2. starts after")
-def test_it_never_ends_before_the_last_motion_and_change_of_roles(leaders):
+def test_run_never_ends_before_the_last_motion_and_role_change(leaders):
     ds = run(sheet(5, 4, leaders=leaders, tolerance=1e-3))
     assert ds.attrs["status"] == "settled"
     assert steps_of(ds) >= 700
@@ -152,7 +152,7 @@ BEYOND = {
 
 @pytest.mark.parametrize("beyond", BEYOND)
 @pytest.mark.filterwarnings("ignore:.*(begins|after the last step|end at|last step)")
-def test_what_begins_after_the_last_step_does_not_delay_the_end(beyond):
+def test_events_after_the_last_step_do_not_delay_the_end(beyond):
     elastic = {"rule": {"type": "elastic", "poisson_ratio": 0.3}, "frame": {"type": "natural"}}
     parts = {"neighbours": {"type": "chebyshev", "shells": 1}, "tolerance": 0.02, "steps": 2000,
              "solver": {"relaxation": 0.8, "engine": "numpy"}} | elastic  # fmt: skip
@@ -162,7 +162,7 @@ def test_what_begins_after_the_last_step_does_not_delay_the_end(beyond):
     np.testing.assert_array_equal(ds.position[-1], plain.position[-1])
 
 
-def test_a_load_that_has_ended_does_not_delay_the_end_by_its_course():
+def test_finished_load_does_not_delay_the_end():
     """Its force would continue to change, and acts on no particle."""
     force = [0.0, {"steps": [0, 1500], "values": [0.0, 1.0]}]
     load = {"select": {"edge": "top"}, "force": force, "until": 60}
@@ -173,14 +173,14 @@ def test_a_load_that_has_ended_does_not_delay_the_end_by_its_course():
     assert 60 < steps_of(ds) < 600
 
 
-def test_a_body_at_rest_has_settled_in_the_first_step():
+def test_body_at_rest_converges_in_the_first_step():
     ds = run(sheet(leaders=BOTH_ENDS_HELD))
     assert (ds.attrs["status"], steps_of(ds), certificate(ds)["distance"]) == ("settled", 1, 0.0)
 
 
 @pytest.mark.parametrize("memory", [0.5, 0.97, -0.5])
 @pytest.mark.parametrize("frame", ["mean", "lag"])
-def test_what_swings_through_its_equilibrium_has_not_settled(memory, frame):
+def test_oscillation_through_equilibrium_has_not_converged(memory, frame):
     """From the end of the run on, no state is farther than the tolerance."""
     solver = {"memory": memory, "relaxation": 0.5}
     given_ = sheet(frame=frame, solver=solver, tolerance=1e-3)
@@ -206,7 +206,7 @@ NECK = {
 }  # fmt: skip
 
 
-def test_it_does_not_end_before_a_bond_that_breaks_on_the_way_to_equilibrium():
+def test_run_does_not_end_before_a_bond_breaks_near_equilibrium():
     """A sheet on a thin neck, pulled slowly: the neck is longest at rest, after all motion."""
     whole = run(sheet(**NECK, tolerance=0.05))
     rest = run(sheet(**NECK, tolerance=1e-10))
@@ -234,7 +234,7 @@ def test_it_does_not_end_before_a_bond_that_breaks_on_the_way_to_equilibrium():
 SWINGING = {"memory": 0.8, "relaxation": 0.5}
 
 
-def test_it_does_not_end_while_a_bond_may_break_farther_than_the_equilibrium():
+def test_run_does_not_end_while_bonds_may_break_beyond_equilibrium():
     """Displacements that momentum still causes count, at both ends of the bond."""
     pulled = {"select": NECK["leaders"][1]["select"],
               "motion": {"type": "displace", "displacement": [1.0, 0.0]}}  # fmt: skip
@@ -260,7 +260,7 @@ def test_it_does_not_end_while_a_bond_may_break_farther_than_the_equilibrium():
 
 
 @pytest.mark.parametrize(("memory", "lag"), [(0.8, 0), (-0.4, 0), (0.0, 1)])
-def test_what_carries_the_body_on_is_part_of_the_distance(memory, lag):
+def test_momentum_and_delay_contribute_to_the_distance(memory, lag):
     """The bound is |b| / (1 - |b|) times the last step for memory b, plus the last step for a frame
     with delay, in addition to the true distance, which is that of the correction to rounding
     here."""
@@ -275,7 +275,7 @@ def test_what_carries_the_body_on_is_part_of_the_distance(memory, lag):
     assert certificate(ds)["distance"] == pytest.approx(error_of(ds, rest) + carried, rel=1e-6)
 
 
-def test_nonlinear_rules_settle_where_leaders_hold_them():
+def test_nonlinear_rules_converge_between_leaders():
     rule, solver = {"type": "distance-weighted"}, {"relaxation": 0.5}
     given_ = sheet(rule=rule, solver=solver, leaders=[HOLD_LEFT, pull_right(0.6, 0.2)])
     ds = run(given_)
@@ -285,7 +285,7 @@ def test_nonlinear_rules_settle_where_leaders_hold_them():
     assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.1 * error_of(ds, rest)
 
 
-def test_a_bound_to_first_order_is_not_given_where_the_rule_has_a_kink():
+def test_no_first_order_bound_for_a_rule_with_a_kink():
     """A body without a frame that shrinks to a point: there the distance-weighted rule has no
     derivative, and a correction that is too short by far must not be trusted."""
     body = {"type": "dogbone", "length": 9.1, "width": 5.0, "gauge_length": 3.0,
@@ -313,7 +313,7 @@ def test_a_bound_to_first_order_is_not_given_where_the_rule_has_a_kink():
 
 
 @pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
-def test_a_nonlinear_body_that_nothing_holds_goes_on_and_says_why():
+def test_free_nonlinear_body_does_not_converge_and_gives_the_reason():
     noise = {"type": "noise", "amplitude": 0.1}
     given_ = sheet(4, 3, rule="distance-weighted", solver={"relaxation": 0.5}, leaders=[],
                    initial=noise, steps=100)  # fmt: skip
@@ -338,7 +338,7 @@ class Leaning(pbdkit.FollowerRule):
 
 
 @pytest.mark.parametrize("columns", [9, 30])
-def test_unsymmetric_rules_settle_within_what_is_certified(columns):
+def test_unsymmetric_rules_converge_within_the_error_bound(columns):
     given_ = sheet(columns, 9, rule=Leaning(), frame={"type": "none"})
     ds = run(given_)
     assert ds.attrs["status"] == "settled"
@@ -347,14 +347,14 @@ def test_unsymmetric_rules_settle_within_what_is_certified(columns):
 
 
 @pytest.mark.parametrize("record", [{"every": 1}, {"every": 37}, {"at": [0, 3]}])
-def test_what_is_recorded_does_not_move_the_end(record):
+def test_recording_does_not_change_the_end(record):
     plain, ds = run(sheet()), run(sheet(record=record))
     assert steps_of(ds) == steps_of(plain)
     np.testing.assert_array_equal(ds.position[-1], plain.position[-1])
     assert ds.attrs["certificate"] == plain.attrs["certificate"]
 
 
-def test_diagnostics_of_every_step_end_with_the_run_and_it_repeats_itself():
+def test_diagnostics_of_every_step_end_with_the_run_reproducibly():
     ds = run(sheet(diagnostics=[{"type": "track", "numbers": [8]}]))
     assert ds.step[-1] == steps_of(ds)
     again = pbdkit.rerun(ds, progress=False)
@@ -369,7 +369,7 @@ def test_both_engines_end_at_the_same_step(interpreted):
     np.testing.assert_array_equal(ends[0].position, ends[1].position)
 
 
-def test_single_precision_settles_as_far_as_it_goes():
+def test_single_precision_converges_to_its_limit():
     given_ = sheet(solver={"precision": "float32"}, tolerance=1e-3)
     ds = run(given_)
     assert ds.attrs["status"] == "settled"
@@ -380,14 +380,14 @@ def test_single_precision_settles_as_far_as_it_goes():
     assert "not converged: at step" in fine.attrs["stop_reason"]
 
 
-def test_neighbours_found_anew_cannot_settle():
+def test_changing_neighbours_cannot_converge():
     near = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
     message = r"solver.*the distance from equilibrium has no bound.*remove solver.settle"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         run(sheet(neighbours=near))
 
 
-def test_motions_without_end_never_settle_and_the_run_says_so():
+def test_endless_motions_never_converge_and_give_the_reason():
     swinging = {"type": "oscillation", "amplitude": [1.0, 0.0], "period": 30.0}
     leaders = [HOLD_LEFT, {"select": {"edge": "right"}, "motion": swinging}]
     ds = run(sheet(leaders=leaders, steps=100))
@@ -397,12 +397,12 @@ def test_motions_without_end_never_settle_and_the_run_says_so():
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1.0, -1e-3])
-def test_a_tolerance_is_a_share(tolerance):
+def test_tolerance_is_a_fraction(tolerance):
     with pytest.raises(pbdkit.ExperimentError, match=r"solver.*settle.*tolerance"):
         run(sheet(tolerance=tolerance))
 
 
-def test_the_command_says_how_far_from_equilibrium_the_run_ended(tmp_path, monkeypatch):
+def test_command_prints_the_final_distance_from_equilibrium(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     call = ["run", "paper/a", "--set", "solver.settle.tolerance=1e-3", "--set", "steps=5000"]
     done = CliRunner().invoke(program, call)
@@ -417,7 +417,7 @@ def test_the_command_says_how_far_from_equilibrium_the_run_ended(tmp_path, monke
     assert "completed all steps, not converged: in step " in short.output
 
 
-def test_runs_without_it_import_nothing_of_it():
+def test_runs_without_settle_import_no_error_bound():
     start = (
         "import sys, pbdkit\n"
         "pbdkit.run(pbdkit.load('paper/a', settings=['steps=2']), progress=False)\n"
@@ -432,7 +432,7 @@ def test_runs_without_it_import_nothing_of_it():
     ("rule", "memory", "frame"),
     [("barycentre", 0.3, "lag"), ("mixed-coordinate", 0.0, "mean")],
 )
-def test_a_large_released_body_settles_within_what_is_certified(rule, memory, frame):
+def test_large_released_body_converges_within_the_error_bound(rule, memory, frame):
     """More than 500 unknowns that nothing holds, which keep what they had at the release."""
     solver = {"memory": memory, "relaxation": 0.9}
     leaders = [pull_right(0.3, 0.1) | {"until": 9}]
@@ -444,7 +444,7 @@ def test_a_large_released_body_settles_within_what_is_certified(rule, memory, fr
     assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.01 * error_of(ds, rest)
 
 
-def test_what_swings_for_ever_never_settles():
+def test_undamped_oscillation_never_converges():
     """Relaxation 1 has a mode that alternates for ever (eigenvalue -1), by .0018 a step here."""
     leaders = [pull_right(0.3, 0.1) | {"until": 9}]
     parts = {"rule": "mixed-coordinate", "leaders": leaders, "frame": "lag", "steps": 4000}
@@ -454,7 +454,7 @@ def test_what_swings_for_ever_never_settles():
     assert re.search(reason, ds.attrs["stop_reason"])
 
 
-def test_parts_that_remember_have_no_known_distance():
+def test_components_with_state_have_no_error_bound():
     given = experiment(
         fracture={"type": "damage", "onset": 0.1, "failure": 0.5},
         solver={"type": "stepping", "settle": {"tolerance": 1e-4}},
@@ -465,7 +465,7 @@ def test_parts_that_remember_have_no_known_distance():
 
 
 @pytest.mark.parametrize("memory", [0.9, 0.97])
-def test_what_memory_may_carry_a_body_on_by_counts_as_distance(memory):
+def test_momentum_displacement_counts_as_distance(memory):
     """A body that moves by momentum alone moves by memory/(1 - memory) times its last step."""
     solver = {"memory": memory, "relaxation": 0.5}
     ds = run(sheet(solver=solver, tolerance=1e-3, record={"every": 1}))

@@ -48,7 +48,7 @@ def certificate(ds):
 
 @pytest.mark.parametrize("method", ["lu", "multigrid", "conjugate-gradients"])
 @pytest.mark.parametrize("size", [10, 60])
-def test_every_method_finds_the_affine_sheet_within_its_certificate(method, size):
+def test_every_method_solves_the_affine_sheet_within_its_error_bound(method, size):
     ds = run(sheet(size, size, solver=STRAIGHT | {"method": method, "tolerance": 1e-10}))
     exact = ds.reference.isel(axis=0) / (size - 1)
     body = ds.kind.isel(time=-1) < 2
@@ -70,7 +70,7 @@ def came_to_rest(state):
 @pytest.mark.filterwarnings("ignore::pbdkit.PbdkitWarning")  # drawn scenes may be doubtful
 @samples(4)
 @given(experiments())
-def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
+def test_stepping_random_scenes_leads_to_their_equilibrium(experiment):
     """If steps from the start converge, they do so within the error bound."""
     assume(experiment["fracture"]["type"] == "none")
     assume(experiment["rule"]["type"] != "distance-weighted")
@@ -99,7 +99,7 @@ LAST = {"every": 10_000}
 
 
 @pytest.mark.parametrize("until", [7, 600])
-def test_a_released_body_keeps_what_it_had_at_rest(until):
+def test_released_body_keeps_its_mean_displacement_at_rest(until):
     """If there is no leader in the last step, the mean at the release remains, that of the body at
     rest."""
 
@@ -114,7 +114,7 @@ def test_a_released_body_keeps_what_it_had_at_rest(until):
 
 
 @pytest.mark.parametrize("lag", [0, 1])
-def test_late_leaders_start_where_the_body_rests(lag):
+def test_late_leaders_start_at_the_equilibrium_position(lag):
     """Stopping works in any step, also after so long that steps rest there."""
 
     def parts(begin):
@@ -132,7 +132,7 @@ def test_late_leaders_start_where_the_body_rests(lag):
 
 @pytest.mark.parametrize("nu", [0.3, 0.4, 0.49])
 @pytest.mark.parametrize("begin", [30, 300])
-def test_late_leaders_start_at_rest_where_steps_without_relaxation_diverge(nu, begin):
+def test_late_leaders_start_at_rest_if_undamped_steps_diverge(nu, begin):
     parts = {
         "neighbours": {"type": "chebyshev", "shells": 1},
         "rule": {"type": "elastic", "poisson_ratio": nu},
@@ -145,7 +145,7 @@ def test_late_leaders_start_at_rest_where_steps_without_relaxation_diverge(nu, b
     np.testing.assert_allclose(ds.u[-1], rest.u[-1], rtol=0, atol=1e-10)
 
 
-def test_check_says_before_which_changes_the_body_settles(tmp_path):
+def test_check_lists_changes_before_which_the_body_converges(tmp_path):
     leaders = [LEFT | {"until": 9}, pulled(1.0, 0.5), LEFT | {"from": 30}]
     path = tmp_path / "late.yaml"
     path.write_text(json.dumps(sheet(leaders=leaders, record=LAST)))
@@ -153,7 +153,7 @@ def test_check_says_before_which_changes_the_body_settles(tmp_path):
     assert "also before leaders or loads change, after steps 9, 29" in output
 
 
-def test_what_is_pushed_before_a_leader_holds_it_is_refused_where_steps_diverge():
+def test_load_before_leaders_is_refused_if_steps_diverge():
     push = {"select": {"edge": "right"}, "force": [0.1, 0.0]}
     parts = {
         "neighbours": {"type": "chebyshev", "shells": 1},
@@ -166,7 +166,7 @@ def test_what_is_pushed_before_a_leader_holds_it_is_refused_where_steps_diverge(
         run(sheet(6, 5, leaders=[LEFT | {"from": 10}], loads=[push], record=LAST, **parts))
 
 
-def test_a_nonlinear_rule_is_linearised_anew_and_rests_where_it_stands():
+def test_nonlinear_rule_is_relinearised_and_rests_at_the_solution():
     solver = STRAIGHT | {"tolerance": 1e-10}
     ds = run(sheet(9, 7, rule={"type": "distance-weighted"}, leaders=[LEFT, pulled(3.0, 1.0)],
                    solver=solver))  # fmt: skip
@@ -176,7 +176,7 @@ def test_a_nonlinear_rule_is_linearised_anew_and_rests_where_it_stands():
     assert known["residual"] < 1e-10
 
 
-def test_fracture_by_increments_breaks_what_is_too_long_and_nothing_else():
+def test_fracture_by_increments_breaks_only_overlong_bonds():
     fracture = {"type": "threshold", "thresholds": [1.52]}
     motion = {"type": "velocity", "velocity": [0.5, 0.0], "steps": 20}
     leaders = [LEFT, {"select": {"edge": "right"}, "motion": motion}]
@@ -188,7 +188,7 @@ def test_fracture_by_increments_breaks_what_is_too_long_and_nothing_else():
     assert torn.attrs["status"] == "complete"
 
 
-def test_motions_without_end_are_refused():
+def test_endless_motions_are_refused():
     swinging = {"type": "oscillation", "amplitude": [1.0, 0.0], "period": 30.0}
     leaders = [LEFT, {"select": {"edge": "right"}, "motion": swinging}]
     with pytest.raises(pbdkit.ExperimentError, match=r"leaders.1.motion.*never comes to rest"):
@@ -209,7 +209,7 @@ class Pushed(pbdkit.FollowerRule):
         return total[0] / 4 + pbdkit.plugin.Vector(0.01, 0.0)
 
 
-def test_a_part_that_is_pushed_on_for_ever_is_refused_by_name():
+def test_part_under_unbalanced_load_is_refused_by_name():
     with pytest.raises(pbdkit.ExperimentError, match=r"a part of 12 particles \(with number"):
         run(sheet(4, 3, rule=Pushed(type="pushed"), leaders=[]))
     held = run(sheet(4, 3, rule=Pushed(type="pushed")))
@@ -234,7 +234,7 @@ def test_an_error_of_a_rule_names_the_rule_and_the_step():
         run(sheet(4, 3, rule=Limited(type="limited"), leaders=leaders))
 
 
-def test_a_tolerance_below_rounding_is_not_reached_and_says_so(tmp_path, monkeypatch):
+def test_tolerance_below_rounding_is_reported_as_unreachable(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
         pbdkit.DivergedError, match="rounding errors limit the relative distance"
@@ -246,7 +246,7 @@ def test_a_tolerance_below_rounding_is_not_reached_and_says_so(tmp_path, monkeyp
     assert "unconverged: rounding errors" in result.output
 
 
-def test_neighbours_found_anew_have_no_equilibrium_solver():
+def test_changing_neighbours_have_no_equilibrium_solver():
     neighbours = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
     with pytest.raises(pbdkit.ExperimentError, match="an equilibrium is not defined"):
         run(sheet(neighbours=neighbours))

@@ -60,7 +60,7 @@ def run(experiment):
 
 
 @pytest.mark.parametrize("displacement", [[0, 2.0], [0, 1.2], [3.0, 0], [0.5, 4.0]], ids=str)
-def test_springs_end_where_slow_loading_leads_and_are_not_folded(displacement):
+def test_springs_follow_slow_loading_without_folding(displacement):
     found = run(springs(displacement))
     steps = 200
     velocity = [along / steps for along in displacement]
@@ -76,7 +76,7 @@ def test_springs_end_where_slow_loading_leads_and_are_not_folded(displacement):
     assert json.loads(found.attrs["certificate"])["distance"] <= 1e-8 * np.hypot(*displacement)
 
 
-def test_a_body_that_buckles_is_no_equilibrium():
+def test_buckled_body_is_no_equilibrium():
     """A strip that is pressed along its axis can buckle to either side."""
     with pytest.raises(pbdkit.DivergedError, match="several equilibria meet there"):
         run(springs([-2.0, 0.0]))
@@ -112,7 +112,7 @@ def path_of(*leaders, steps=60):
     return build_scene(pbdkit.Experiment(**sheet(list(leaders), steps=steps, version=1)))
 
 
-def test_increments_are_equal_parts_of_the_way_and_events_end_them():
+def test_increments_are_equal_parts_ended_by_events():
     there_and_back = moving(type="path", steps=[10, 20], displacements=[[2.0, 0.0], [0.0, 0.0]])
     late = {"select": {"edge": "top"}, "motion": {"type": "hold"}, "from": 41, "until": 50}
     scene = path_of(HOLD, there_and_back, late)
@@ -135,7 +135,7 @@ def test_a_motion_between_two_increments_is_not_skipped():
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
-def test_no_bond_changes_by_more_than_the_tolerance_where_the_way_ends(tolerance):
+def test_bond_changes_are_within_tolerance_at_the_end_of_the_path(tolerance):
     cohesive = {"type": "cohesive", "energy": 6e-4, "onset": 0.01}
     scene = build_scene(
         pbdkit.Experiment(
@@ -158,7 +158,7 @@ def test_no_bond_changes_by_more_than_the_tolerance_where_the_way_ends(tolerance
         assert np.abs(new - old).max() <= tolerance
 
 
-def test_bounds_to_first_order_are_doubled():
+def test_first_order_bounds_are_doubled():
     """Test springs, by the search and by a state on the path."""
     scene = build_scene(pbdkit.Experiment(**springs([0.5, 1.0])))
     state = initial_state(scene)

@@ -71,7 +71,7 @@ def refuse_overstretched(ds, failure):
         assert (strains(ds, n)[~broken] <= failure * (1 + 1e-9)).all(), moment
 
 
-def test_each_recorded_step_of_a_pull_is_its_equilibrium():
+def test_each_recorded_step_of_a_pull_is_an_equilibrium():
     ds = ran()
     steps = np.arange(STEPS + 1)
     np.testing.assert_array_equal(ds.time, steps)
@@ -125,7 +125,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("parts", SCENES.values(), ids=SCENES)
-def test_each_recorded_step_is_the_equilibrium_of_so_many_steps(parts):
+def test_each_recorded_step_equals_the_equilibrium_of_as_many_steps(parts):
     """With the roles, loads, numbers, cuts and obstacles of that step."""
     whole = ran(parts)
     assert len(whole.time) == whole.time[-1] + 1
@@ -135,14 +135,14 @@ def test_each_recorded_step_is_the_equilibrium_of_so_many_steps(parts):
         np.testing.assert_array_equal(whole.kind[step], alone.kind[-1])
 
 
-def test_what_is_recorded_changes_nothing():
+def test_recording_changes_no_result():
     whole, some = ran(), ran({"record": {"at": [7, 12]}})
     np.testing.assert_array_equal(some.time, [0, 7, 12, STEPS])
     np.testing.assert_array_equal(some.u, whole.u.sel(time=some.time))
     assert some.attrs["certificate"] == whole.attrs["certificate"]
 
 
-def test_a_linear_body_is_factorised_once_for_as_long_as_roles_stay(monkeypatch):
+def test_linear_body_is_factorised_once_while_roles_are_unchanged(monkeypatch):
     made, linearised = [], newton.linearised
     monkeypatch.setattr(
         newton, "linearised", lambda *given: made.append(given[2]) or linearised(*given)
@@ -154,7 +154,7 @@ def test_a_linear_body_is_factorised_once_for_as_long_as_roles_stay(monkeypatch)
     assert made == [1, 13]
 
 
-def test_increments_are_recorded_with_fractions_of_a_step_on_request():
+def test_increments_are_recorded_with_fractional_steps_on_request():
     parts = FRACTURE | {"steps": 4, "solver": {"type": "equilibrium", "increments": 8}}
     course = {"leaders": [HELD, PULLED | {"from": 3}]}
     plain, fine = (ran(parts, course, {"record": {"increments": i}}) for i in (False, True))
@@ -177,12 +177,12 @@ def test_increments_are_recorded_with_fractions_of_a_step_on_request():
     assert narrow.position.dtype == np.float32
 
 
-def test_increments_of_steps_are_refused():
+def test_increments_are_refused_for_the_stepping_solver():
     with pytest.raises(pbdkit.ExperimentError, match="increments of load exist only for an equil"):
         ran({"record": {"increments": True}, "solver": {"type": "stepping"}})
 
 
-def test_a_part_that_a_load_pulls_off_ends_the_run_at_the_last_equilibrium():
+def test_detached_part_ends_the_run_at_the_last_equilibrium():
     ds = came_apart(LOADED, FRACTURE)
     assert ds.attrs["status"] == "separated"
     assert "certificate" not in ds.attrs
@@ -198,7 +198,7 @@ def test_a_part_that_a_load_pulls_off_ends_the_run_at_the_last_equilibrium():
     refuse_overstretched(ds, 0.05)
 
 
-def test_what_a_separated_run_recorded_is_kept_in_its_file(call, tmp_path):
+def test_records_of_a_separated_run_are_kept_in_its_file(call, tmp_path):
     path, out = tmp_path / "bar.json", tmp_path / "bar.nc"
     path.write_text(json.dumps(BAR | LOADED | FRACTURE))
     ended = call("run", str(path), "-o", str(out))
@@ -213,7 +213,7 @@ def test_what_a_separated_run_recorded_is_kept_in_its_file(call, tmp_path):
     assert "has status separated" in refused.err
 
 
-def test_a_refusal_on_the_way_is_no_run_to_resume(call, tmp_path, monkeypatch):
+def test_refusal_during_a_run_leaves_nothing_to_resume(call, tmp_path, monkeypatch):
     """Resumed, it would be refused again."""
     monkeypatch.setattr(NetcdfSink, "due", lambda self: True)
     push = {"select": {"edge": "right"}, "force": [0.01, 0.0], "from": 5, "until": 8}
@@ -228,7 +228,7 @@ def test_a_refusal_on_the_way_is_no_run_to_resume(call, tmp_path, monkeypatch):
     assert "continues it" not in ended.err
 
 
-def test_a_body_torn_into_two_held_halves_has_a_curve_to_the_end():
+def test_body_broken_into_two_held_halves_has_a_complete_curve():
     """There are equilibria after the fracture: the halves are held, and bear no load."""
     ds = ran(FRACTURE, {"steps": STEPS})
     force = ds.reaction.values[:, 1, 0]
@@ -241,7 +241,7 @@ def test_a_body_torn_into_two_held_halves_has_a_curve_to_the_end():
 
 
 @pytest.mark.parametrize("increments", [False, True])
-def test_a_quasi_static_test_in_parts_is_the_whole(increments, tmp_path):
+def test_quasi_static_test_in_parts_equals_the_whole(increments, tmp_path):
     """A run that is stopped anywhere continues to the same file; steps after the last event too."""
     given = BAR | FRACTURE | {"steps": STEPS + 5, "record": {"increments": increments}}
     given |= {"solver": {"type": "equilibrium", "increments": 60}}
@@ -264,7 +264,7 @@ def test_a_quasi_static_test_in_parts_is_the_whole(increments, tmp_path):
         assert ds.attrs["certificate"] == whole.attrs["certificate"]
 
 
-def test_members_of_a_sweep_that_came_apart_are_kept(call, tmp_path):
+def test_separated_members_of_a_sweep_are_kept(call, tmp_path):
     path = tmp_path / "sweep.yaml"
     (tmp_path / "bar.json").write_text(json.dumps(BAR | LOADED | FRACTURE))
     path.write_text(
@@ -288,7 +288,7 @@ DOGBONES = {
 
 
 @pytest.mark.parametrize("given", DOGBONES.values(), ids=DOGBONES)
-def test_dogbones_are_torn_and_nothing_flies_off(given):
+def test_dogbones_break_without_flying_parts(given):
     """tests/reliability/dogbones.py tries random ones."""
     lattice, rule, once = given
     experiment = specimen(lattice, rule, failure=0.02, once=once)
@@ -298,7 +298,7 @@ def test_dogbones_are_torn_and_nothing_flies_off(given):
     assert force.max() > 1.5 * abs(force[-1])
 
 
-def test_what_hangs_by_one_bond_does_not_end_a_test():
+def test_part_on_one_bond_does_not_end_the_test():
     """Two bars of springs between grips; the upper one is cut, and its end hangs by one bond."""
     given = BAR | {
         "rule": {"type": "springs"},
@@ -318,7 +318,7 @@ def test_what_hangs_by_one_bond_does_not_end_a_test():
     assert len(ds.time) == 7
 
 
-def test_the_shipped_dogbone_bears_what_its_page_says(monkeypatch):
+def test_shipped_dogbone_has_the_documented_strength(monkeypatch):
     if not AT_LENGTH:  # numpy is done before its kernel is compiled
         monkeypatch.setattr(breaking_kernel, "PATIENCE_S", math.inf)
     hexagonal = "lattice={type: hexagonal, a: 1.0}", "neighbours={type: coordination, shells: 1}"
@@ -330,7 +330,7 @@ def test_the_shipped_dogbone_bears_what_its_page_says(monkeypatch):
     refuse_overstretched(ds, 0.02)
 
 
-def test_equilibria_within_a_step_are_drawn_and_explained(call, tmp_path):
+def test_equilibria_within_a_step_are_plotted_and_explained(call, tmp_path):
     given = specimen("square", "elastic", failure=0.02, once=True)
     Path("dogbone.json").write_text(json.dumps(given))
     assert call("run", "dogbone.json", "-o", "dogbone.nc").code == 0

@@ -44,7 +44,7 @@ def run(experiment):
 
 @pytest.mark.filterwarnings("ignore::pbdkit.PbdkitWarning")
 @pytest.mark.parametrize("n", range(10))
-def test_equilibria_lie_within_their_certificates(n):
+def test_equilibria_are_within_their_error_bounds(n):
     """A short sample of tests/reliability/slender_bodies.py."""
     experiment, known = slender_bodies.scene(np.random.default_rng([7, n]), 24)
     if experiment["solver"]["method"] == "multigrid":
@@ -53,7 +53,7 @@ def test_equilibria_lie_within_their_certificates(n):
 
 
 @pytest.mark.parametrize("load", [1e-10, 1e-6])
-def test_a_softly_held_body_is_held(load):
+def test_softly_supported_body_is_supported(load):
     """Solved independently, a load of 1e-10 moves the tip by .03138."""
     ds = run(cantilever(60, 2, [0.0, -load], **soft(30.5, 99.0, 1e-3)))
     tip = -float(abs(ds.u.values[-1, :, 1]).max())
@@ -62,7 +62,7 @@ def test_a_softly_held_body_is_held(load):
     assert float(ds.reaction.values[-1].sum(axis=0)[1]) == pytest.approx(load, rel=1e-3)
 
 
-def test_a_block_on_the_softest_layer_is_held():
+def test_block_on_the_softest_layer_is_supported():
     layer = {"type": "rectangle", "width": 99.0, "height": 1.0, "origin": [-9.0, 0.0]}
     rule = {
         "type": "elastic",
@@ -79,7 +79,7 @@ def test_a_block_on_the_softest_layer_is_held():
 
 
 @pytest.mark.parametrize("columns", [600, 1500])
-def test_slender_cantilevers_bend_as_beams(columns):
+def test_slender_cantilevers_bend_like_beams(columns):
     """The deflection under a load is that of a shorter one by the cube of the lengths."""
 
     def softness(columns):
@@ -90,7 +90,7 @@ def test_slender_cantilevers_bend_as_beams(columns):
     assert softness(columns) == pytest.approx(softness(100), rel=2e-2)
 
 
-def test_what_is_too_soft_for_double_precision_is_said_to_be_so():
+def test_bodies_too_soft_for_double_precision_are_reported():
     experiment = cantilever(120, 2, [0.0, -1e-10], **soft(31.0, 99.0, 1e-8))
     with pytest.raises((pbdkit.ExperimentError, pbdkit.DivergedError), match="double precision"):
         run(experiment)
@@ -99,14 +99,14 @@ def test_what_is_too_soft_for_double_precision_is_said_to_be_so():
 @pytest.mark.parametrize("a", [1e-9, 1e-6, 1.0, 1e9])
 @pytest.mark.parametrize("strain", [1e-12, 1e-4])
 @pytest.mark.parametrize("leaders", [[HOLD | {"axes": ["y"]}], []], ids=["sliding", "free"])
-def test_what_is_pushed_on_for_ever_is_refused_in_all_units(a, strain, leaders):
+def test_unbalanced_load_is_refused_in_all_units(a, strain, leaders):
     push = [strain * 4 * a, 0.0]
     with pytest.raises(pbdkit.ExperimentError, match="is loaded, but not constrained"):
         run(cantilever(9, 5, push, a=a, leaders=leaders, **NO_REACTION))
 
 
 @pytest.mark.parametrize("a", [1e-9, 1.0, 1e9])
-def test_loads_in_balance_leave_a_free_body_where_it_is(a):
+def test_balanced_loads_do_not_move_a_free_body(a):
     loads = [
         {"select": {"edge": edge}, "force": [force * a, 0.0]}
         for edge, force in (("left", -0.004), ("right", 0.004))
@@ -117,14 +117,14 @@ def test_loads_in_balance_leave_a_free_body_where_it_is(a):
     assert abs(u.mean(axis=0)).max() < 1e-6
 
 
-def test_an_iteration_that_gets_stuck_certifies_nothing():
+def test_stalled_iteration_certifies_nothing():
     solver = {"type": "equilibrium", "tolerance": 1e-3, "method": "conjugate-gradients"}
     with pytest.raises(pbdkit.DivergedError, match=r"does not converge.* take solver\.method: lu"):
         run(cantilever(200, 2, [0.0, -1e-6], solver=solver))
 
 
 @pytest.mark.filterwarnings("error")
-def test_grids_of_a_slender_soft_body_solve_or_are_stuck():
+def test_multigrid_on_a_slender_soft_body_converges_or_stalls():
     pytest.importorskip("numba")
     parts = {
         "lattice": {"type": "hexagonal", "a": 1.0},
@@ -137,7 +137,7 @@ def test_grids_of_a_slender_soft_body_solve_or_are_stuck():
 
 
 @pytest.mark.parametrize("power", [-20, 20])
-def test_springs_find_their_equilibrium_in_all_units(power):
+def test_springs_reach_equilibrium_in_all_units(power):
     """If all lengths are scaled by a power of 2 all numbers are the same except for their
     exponent."""
 
@@ -154,7 +154,7 @@ def test_springs_find_their_equilibrium_in_all_units(power):
 
 
 @pytest.mark.parametrize("rule", [{"type": "elastic", "poisson_ratio": 0.3}, {"type": "springs"}])
-def test_a_tolerance_that_can_be_reached_is_named(rule):
+def test_reachable_tolerance_is_named(rule):
     way = {"type": "displace", "displacement": [0.3, 0.15]}
     ends = [HOLD, {"select": {"edge": "right"}, "motion": way}]
     solver = {"type": "equilibrium", "tolerance": 1e-17}

@@ -112,7 +112,7 @@ def solved(given, method="multigrid", tolerance=1e-8):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_few_iterations_lead_within_what_is_certified(name):
+def test_few_iterations_reach_the_error_bound(name):
     """The error bound is never below the true error, and near it; it is the same in a second run,
     to the bit."""
     exact, _ = solved(SCENES[name], "lu", 1e-11)
@@ -138,7 +138,7 @@ MORE = {
 
 
 @pytest.mark.parametrize("name", [*SCENES, *MORE])
-def test_without_numba_grids_of_hats_serve(name, monkeypatch):
+def test_without_numba_bilinear_grids_are_used(name, monkeypatch):
     given = (SCENES | MORE)[name]
     exact, _ = solved(given, "lu", 1e-11)
     monkeypatch.setattr(linearisation, "find_spec", lambda name: None)
@@ -168,7 +168,7 @@ def cracked(n, cracks):
 
 
 @pytest.mark.parametrize("cracks", ["half", "seven"])
-def test_hats_do_not_bridge_cracks(cracks):
+def test_bilinear_interpolation_does_not_bridge_cracks(cracks):
     n = 90
     rows = [n // 2] if cracks == "half" else range(10, 80, 10)
     matrix, at = cracked(n, [(row, 0, n // 2 if cracks == "half" else n - 8) for row in rows])
@@ -182,7 +182,7 @@ def test_hats_do_not_bridge_cracks(cracks):
     assert solver.iterations <= 35
 
 
-def test_the_method_follows_the_size(monkeypatch):
+def test_method_depends_on_the_size(monkeypatch):
     monkeypatch.setattr(moves, "LARGEST_BY_NUMPY", 10**6)
     for n, method in ((12, "lu"), (160, "multigrid, conjugate-gradients")):
         scene = build_scene(pbdkit.Experiment(**sheet(n, n)))
@@ -205,7 +205,7 @@ def interpreted_moves():
 
 
 @pytest.mark.parametrize("name", NOT_LINEAR)
-def test_rules_that_are_not_linear_are_followed_on_grids(name, monkeypatch):
+def test_nonlinear_rules_are_solved_by_multigrid(name, monkeypatch):
     """Differences of compiled moves, of one rule really compiled, lead to the result of the direct
     solver."""
     exact, _ = solved(NOT_LINEAR[name], "lu", 1e-10)
@@ -217,7 +217,7 @@ def test_rules_that_are_not_linear_are_followed_on_grids(name, monkeypatch):
     assert certificate["iterations"] <= 6
 
 
-def test_grids_tell_a_body_that_buckles(monkeypatch):
+def test_multigrid_detects_buckling(monkeypatch):
     monkeypatch.setattr(moves, "LARGEST_BY_NUMPY", 0)
     monkeypatch.setattr(increments, "MOST_ROUNDS", 2)
     push = {"type": "displace", "displacement": [-4.0, 0.0]}

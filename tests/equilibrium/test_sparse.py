@@ -37,7 +37,7 @@ def solver_of(matrix, method="auto", shape=(40, 20), **more):
     return linear_solver(matrix, method, coordinates=coordinates, **more)
 
 
-def test_the_method_follows_size_and_symmetry(monkeypatch):
+def test_method_depends_on_size_and_symmetry(monkeypatch):
     monkeypatch.setattr(linear, "LARGEST_LU", 700)
     small, medium, large = averaging(10, 20), averaging(30, 20), averaging(40, 20)
     assert isinstance(solver_of(small), linear.Dense)
@@ -62,7 +62,7 @@ def test_every_method_solves(method, upwind):
 
 
 @pytest.mark.parametrize("shape", [(40, 20), (20, 40)])
-def test_bands_run_across_the_shorter_side_and_solve_as_sparse_factors_do(shape):
+def test_bands_run_along_the_short_side_and_match_sparse_factors(shape):
     matrix = averaging(*shape, 0.3)
     band, other = solver_of(matrix, shape=shape), linear_solver(matrix, "lu")
     assert band._half == 20
@@ -80,7 +80,7 @@ def test_a_singular_band_is_refused():
         solver_of(matrix.tocsr())
 
 
-def test_a_cycle_of_the_grids_is_symmetric_and_contracts():
+def test_multigrid_cycle_is_symmetric_and_contracts():
     matrix = averaging(60, 50)
     cycle = solver_of(matrix, "multigrid", (60, 50))._cycle
     a, b = np.random.default_rng(2).normal(size=(2, 3000))
@@ -92,7 +92,7 @@ def test_a_cycle_of_the_grids_is_symmetric_and_contracts():
 
 
 @pytest.mark.filterwarnings("error")
-def test_conjugate_gradients_on_a_matrix_that_is_none_for_them_show_it():
+def test_conjugate_gradients_on_an_indefinite_matrix_do_not_converge():
     matrix = sparse.diags_array([1.0, -1.0] * 300).tocsr()
     b = np.ones(600)
     x = solver_of(matrix, "conjugate-gradients").solve(b, 1e-9)
@@ -122,7 +122,7 @@ HOOK = {"type": "polygon", "vertices": [[0, 0], [40, 0], [40, 9], [9, 9], [9, 30
 
 @pytest.mark.parametrize("body", [RING, HOOK], ids=lambda body: body["type"])
 @pytest.mark.parametrize("neighbours", ["coordination", "chebyshev"])
-def test_multigrid_stays_within_its_certificate_on_bodies_with_corners(body, neighbours):
+def test_multigrid_is_within_its_error_bound_on_bodies_with_corners(body, neighbours):
     left, right = ({"box": [x, -50.0, x + 6.0, 50.0]} for x in (0.0, 34.0))
     moved = {"type": "displace", "displacement": [1.0, 0.5]}
     leaders = [HOLD | {"select": left}, {"select": right, "motion": moved}]
@@ -148,7 +148,7 @@ def stopping_at(monkeypatch, what, load="", by=lambda: signal.raise_signal(signa
 
 
 @pytest.mark.parametrize("what", ["assembling", "bounding the error", "solving"])
-def test_an_interrupted_search_keeps_the_start(call, monkeypatch, what):
+def test_interrupted_solve_keeps_the_initial_state(call, monkeypatch, what):
     Path("s.json").write_text(json.dumps(sheet()))
     stopping_at(monkeypatch, what)
     result = call("run", "s.json")
@@ -163,7 +163,7 @@ def test_an_interrupted_search_keeps_the_start(call, monkeypatch, what):
     assert not ds.u.values.any()
 
 
-def test_an_interrupted_load_keeps_the_last_increment_that_settled(call, monkeypatch):
+def test_interrupted_loading_keeps_the_last_converged_increment(call, monkeypatch):
     fracture = {"type": "threshold", "thresholds": [9.0]}
     solver = {"type": "equilibrium", "increments": 4}
     Path("s.json").write_text(json.dumps(sheet(fracture=fracture, solver=solver)))
@@ -176,7 +176,7 @@ def test_an_interrupted_load_keeps_the_last_increment_that_settled(call, monkeyp
     assert error < 1e-7
 
 
-def test_an_iteration_hears_of_it():
+def test_iteration_reports_progress_and_can_be_stopped():
     asked = []
     matrix = averaging(30, 30)
     watch = Watch(lambda: len(asked) == 3, lambda what, share: asked.append(share))
@@ -187,7 +187,7 @@ def test_an_iteration_hears_of_it():
     assert all(0.0 <= share < 1.0 for share in asked)
 
 
-def test_progress_is_told_in_phases_and_shares(monkeypatch):
+def test_progress_is_reported_as_phase_and_fraction(monkeypatch):
     from pbdkit.equilibrium.load_stepping import settle
     from pbdkit.scene.scene import build_scene
     from pbdkit.stepping.state import initial_state

@@ -35,7 +35,7 @@ def plane(columns, rows, far=1):
 
 
 @pytest.mark.parametrize("far", [1, 2])
-def test_dissection_puts_strips_last_that_nothing_leaps_over(far):
+def test_dissection_orders_uncrossed_separators_last(far):
     matrix, places = plane(60, 25, far)
     order = dissected(matrix, places)
     assert np.array_equal(np.sort(order), np.arange(len(places)))
@@ -52,7 +52,7 @@ def test_dissection_puts_strips_last_that_nothing_leaps_over(far):
     assert rank[strip].min() > max(rank[left].max(), rank[right].max())
 
 
-def test_unknowns_of_one_place_stay_together():
+def test_unknowns_of_one_site_stay_adjacent():
     matrix, places = plane(40, 30)
     both = sparse.csr_array(sparse.kron(matrix, np.ones((2, 2))))
     order = dissected(both, np.repeat(places, 2, axis=0))
@@ -60,7 +60,7 @@ def test_unknowns_of_one_place_stay_together():
     assert np.array_equal(order[0::2] // 2, dissected(matrix, places))
 
 
-def test_few_places_and_couplings_that_reach_far_are_not_dissected():
+def test_few_sites_and_far_couplings_are_not_dissected():
     assert dissected(*plane(FEWEST // 10, 10)) is None
     matrix, places = plane(60, 25)
     matrix = matrix.tolil()
@@ -69,7 +69,7 @@ def test_few_places_and_couplings_that_reach_far_are_not_dissected():
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e6], ids=["here", "far away"])
-def test_dissected_factors_solve_both_ways_and_fill_in_less(shift):
+def test_dissected_factors_solve_both_systems_with_less_fill_in(shift):
     scene = build_scene(pbdkit.Experiment(**experiment(HEXAGONAL_BAR, 40)))
     operator = step_operator(scene)
     both = sparse.csr_array(sparse.eye_array(operator.current.shape[0]) - operator.current)
@@ -84,13 +84,13 @@ def test_dissected_factors_solve_both_ways_and_fill_in_less(shift):
         assert np.abs(of @ x - b).max() < 1e-10
 
 
-def test_matrices_without_a_symmetric_pattern_are_told_apart():
+def test_matrices_without_a_symmetric_pattern_are_detected():
     matrix, _ = plane(30, 20)
     assert linear.is_nearly_symmetric(matrix)
     assert not linear.is_nearly_symmetric(sparse.csr_array(sparse.triu(matrix)))
 
 
-def test_derivatives_are_exact_where_functions_are_analytic_and_to_nine_digits_elsewhere():
+def test_derivatives_are_exact_if_analytic_otherwise_to_nine_digits():
     x, y = np.array([0.3, -0.7, 2.0]), np.array([1.5, -0.4, 0.9])
     root = np.sqrt(x * x + y * y)
     exact = derivative(lambda s: (np.sqrt((x + s) ** 2 + y * y), x / (y - 2 * s)), x.shape, 1.0)
@@ -110,7 +110,7 @@ BODIES = [
 
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
 @pytest.mark.parametrize("body", BODIES, ids=lambda body: body["type"])
-def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch):
+def test_uncut_cells_are_whole_or_outside(body, lattice, monkeypatch):
     """Shares are the same where far more cells are looked at."""
     near = "chebyshev" if lattice == "square" else "coordination"
     given = {
@@ -130,7 +130,7 @@ def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch)
     assert np.array_equal(found, build_scene(pbdkit.Experiment(**given)).cells.share)
 
 
-def test_a_process_reads_a_kernel_once(interpreted):
+def test_kernel_is_loaded_once_per_process(interpreted):
     pytest.importorskip("numba")
     from pbdkit.stepping.numba_engine.engine import CompiledStepper
 

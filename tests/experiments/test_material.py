@@ -37,14 +37,14 @@ def on_sites(ds, shape):
     ("name", "pulled", "within", "reaction"),
     [("bar", 0, 5.2e-4, 5.3e-4), ("cantilever", 1, 2.3e-4, 4.5e-3), ("hole", 0, 1.7e-3, 9e-4)],
 )
-def test_bodies_are_as_finite_elements_have_them(name, pulled, within, reaction):
+def test_bodies_match_finite_elements(name, pulled, within, reaction):
     reference, ds = load(name, 20), run(name)
     assert relative_l2(on_sites(ds, reference.x.shape), reference) < within
     assert float(ds.reaction[-1, 1, pulled]) == pytest.approx(reference.reaction, rel=reaction)
 
 
 @pytest.mark.parametrize(("name", "off"), [("bar", 0.067), ("cantilever", 0.145)])
-def test_the_copying_frame_goes_elsewhere(name, off):
+def test_copying_frame_gives_another_solution(name, off):
     for cells in (10, 20):
         reference = load(name, cells)
         columns, rows = reference.x.shape
@@ -54,7 +54,7 @@ def test_the_copying_frame_goes_elsewhere(name, off):
         assert error == pytest.approx(off, abs=0.002)
 
 
-def test_the_worked_example_finds_the_modulus_that_went_in():
+def test_worked_example_recovers_the_modulus():
     (given,) = re.findall(r"^```yaml\n(.*?)^```", PAGE.read_text(), re.M | re.S)
     experiment = pbdkit.Experiment.build(read_text(given, PAGE.name))
     ds = pbdkit.run(experiment, progress=False)
@@ -84,7 +84,7 @@ def layers(x, length):
     return A + B * x + C * np.exp(-x / length) + D * np.exp((x - 1) / length)
 
 
-def test_the_gradient_layer_is_the_exact_one():
+def test_gradient_layer_matches_the_exact_solution():
     errors = []
     for a in (0.05, 0.025):
         ds = run("gradient-layer", f"lattice.a={a}")
@@ -94,7 +94,7 @@ def test_the_gradient_layer_is_the_exact_one():
     assert errors[1] < errors[0] / 3.5
 
 
-def test_a_fine_gradient_layer_is_known_as_well_as_rounding_allows():
+def test_error_bound_of_a_fine_gradient_layer_is_near_rounding():
     known = (
         r"rounding errors limit the relative distance to .*; set solver.tolerance: (\S+); the "
         r"state is within"
@@ -108,7 +108,7 @@ def test_a_fine_gradient_layer_is_known_as_well_as_rounding_allows():
     assert np.abs(ds.u[-1, :, 0].values - exact).max() < 6e-5
 
 
-def test_a_specimen_without_its_nick_has_youngs_modulus():
+def test_specimen_without_nick_has_youngs_modulus():
     settings = ["fracture={type: none}", "solver={type: equilibrium}"]
     ds = run("dogbone", *settings, "rule={type: elastic, poisson_ratio: 0.35}")
     slope = float(ds.nominal_stress[-1] / ds.nominal_strain[-1])
@@ -128,7 +128,7 @@ def pieces(ds):
     return connected_components(coo_array((np.ones(len(i)), (i, j)), (size, size)), False)
 
 
-def test_the_curve_of_the_dogbone_is_straight_until_a_bond_breaks_and_ends_at_zero():
+def test_dogbone_curve_is_linear_until_fracture_and_ends_at_zero():
     ds = run("dogbone")
     strain, stress = ds.nominal_strain.values, ds.nominal_stress.values
     steps, _ = new_cracks(ds)
@@ -153,7 +153,7 @@ def test_the_dogbone_breaks_within_its_gauge_from_the_nick():
     assert set(label[leads & (x < 12)]) != set(label[leads & (x > 12)])
 
 
-def test_the_crack_of_the_notch_starts_at_its_tip_and_is_its_own_mirror_image():
+def test_notch_crack_starts_at_its_tip_and_is_mirror_symmetric():
     ds = run("notch")
     steps, middle = new_cracks(ds)
     np.testing.assert_allclose(middle[0], [3.5, 4.75])
@@ -196,7 +196,7 @@ def strength(a, notched):
     return 0.02 * float(ds.nominal_stress[-1]) / float(strain[middle][0])
 
 
-def test_a_notched_plate_is_weaker_on_a_finer_lattice_and_a_whole_one_is_not():
+def test_only_a_notched_plate_weakens_on_a_finer_lattice():
     """Strain at a crack's tip grows as 1/√h: the strength falls as √h, the fracture energy as h."""
     spacings = (0.5, 0.25, 0.125)
     whole = [strength(a, notched=False) for a in spacings[:2]]
@@ -224,7 +224,7 @@ def affine(lattice, rule, gradient, a=0.5, **more):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_pe1_is_strain_energy_on_the_hexagonal_lattice_alone(seed):
+def test_pe1_is_strain_energy_only_on_the_hexagonal_lattice(seed):
     """4 h² W/E at ν = 1/3; on the square lattice it does not see shear."""
     gradient = 1e-5 * np.random.default_rng(seed).uniform(-1, 1, (2, 2))
     strain, nu, a = (gradient + gradient.T) / 2, 1 / 3, 0.5

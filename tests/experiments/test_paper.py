@@ -9,7 +9,7 @@ from paper_cases import FOLLOWER, FRAME, LEADER, moved, run, track_x
     ("case", "number", "column", "row"),
     [("a", 67, 5, 6), ("d1", 103, 8, 6), ("f1", 133, 8, 5), ("g", 133, 8, 5)],
 )
-def test_the_numbers_of_the_paper_name_its_particles(case, number, column, row):
+def test_particle_numbers_of_the_paper_select_its_particles(case, number, column, row):
     # Section 1: column and row of the body, from 1.
     assert run(case).site.sel(particle=number).values.tolist() == [column - 1, row - 1]
 
@@ -21,13 +21,13 @@ def test_a_pe1_of_67_rises_to_step_24_and_then_falls():
     assert (np.diff(pe1[24:]) < 0).all()
 
 
-def test_a_rows_move_exactly_alike():
+def test_a_rows_move_identically():
     u = moved("a").values.reshape(401, 12, 12, 2)
     assert not u[..., 1].any()
     assert np.array_equal(u[..., 0], np.broadcast_to(u[:, :, :1, 0], (401, 12, 12)))
 
 
-def test_a_67_is_pulled_after_a_delay_does_not_oscillate_and_is_not_fully_back():
+def test_a_67_pulled_after_a_delay_recovers_partly_without_oscillation():
     x = track_x("a", 67)
     # Column 5 is 5 layers from the leaders in column 10.
     assert not x[:5].any()
@@ -38,7 +38,7 @@ def test_a_67_is_pulled_after_a_delay_does_not_oscillate_and_is_not_fully_back()
     assert x[400] > 0.01
 
 
-def test_a_largest_pe1_while_pulling_is_at_and_just_left_of_the_leaders():
+def test_a_maximum_pe1_during_the_pull_is_near_the_leaders():
     ds = run("a")
     at_10 = ds.pe1.sel(time=10).where(ds.kind.sel(time=10) == FOLLOWER)
     assert ds.site[int(at_10.argmax("particle")), 0] == 8
@@ -50,7 +50,7 @@ def test_a_text_is_a_at_its_speed():
     np.testing.assert_allclose(moved("a-text").values, scaled, rtol=0, atol=1e-13)
 
 
-def test_b_contracts_across_with_a_relaxation_time():
+def test_b_contracts_transversely_with_a_relaxation_time():
     y = moved("b").sel(particle=67, axis="y").values
     assert y[100] == pytest.approx(-0.075, abs=5e-4)
     assert not y[:5].any()
@@ -72,13 +72,13 @@ def contraction_at(case, i, j):
 
 
 @pytest.mark.parametrize("case", ["d1", "d2"])
-def test_d_tears_a_column_off_and_103_falls_back_without_rebound(case):
+def test_d_detaches_a_column_and_103_returns_without_rebound(case):
     x = track_x(case, 103)
     assert (np.diff(x[x.argmax() :]) < 0).all()
     assert (run(case).broken_step > 0).any()
 
 
-def test_e_spares_far_particles_for_a_time_but_not_for_ever():
+def test_e_far_particles_move_late():
     ds, size = run("e"), np.linalg.norm(moved("e").values, axis=2)
     rim = (np.isin(ds.site, (0, 9)).any(axis=1)) & (ds.kind[0] != FRAME).values
     lead = (ds.kind[0] == LEADER).values
@@ -100,7 +100,7 @@ def test_f_133_rebounds_with_one_shell_and_not_with_two():
 
 
 @pytest.mark.parametrize(("case", "expected"), [("f1", 2), ("f2", 2), ("g", 0)])
-def test_two_frame_points_stay_in_the_gap_under_a_mean_frame_and_none_under_first(case, expected):
+def test_two_frame_points_remain_under_a_mean_frame_and_none_under_first(case, expected):
     ds = run(case)
     x = ds.position.sel(time=400, axis="x").values
     body, torn = (ds.kind[0] != FRAME).values, ds.site[:, 0].values == 9
@@ -111,11 +111,11 @@ def test_two_frame_points_stay_in_the_gap_under_a_mean_frame_and_none_under_firs
     assert ((frame > low + 1.5) & (frame < high - 1.5)).sum() == expected
 
 
-def test_f2_has_no_second_fracture_about_step_100():
+def test_f2_has_no_second_fracture_near_step_100():
     assert run("f2").broken_step.max() < 20
 
 
-def test_g_comes_back_close_to_the_start():
+def test_g_returns_close_to_the_start():
     ds = run("g")
     stays = ((ds.kind[0] != FRAME) & (ds.site[:, 0] < 9)).values
     assert np.abs(moved("g").values[400][stays]).max() < 0.01

@@ -31,11 +31,11 @@ CORRECTED = {
 
 
 @pytest.mark.parametrize("quote", CORRECTED)
-def test_verdicts_that_were_corrected(quote):
+def test_corrected_verdicts(quote):
     assert verdict(quote).startswith(CORRECTED[quote])
 
 
-def test_d_f_and_g_tear_at_the_times_of_the_figures_with_one_threshold():
+def test_d_f_and_g_break_at_the_published_times_with_one_threshold():
     """The paper's time is a step more."""
     times = {case: {n + 1 for n in parted(case)} for case in ("d1", "d2", "f1", "f2", "g")}
     spans = {case: (min(found), max(found)) for case, found in times.items()}
@@ -48,7 +48,7 @@ def test_d_f_and_g_tear_at_the_times_of_the_figures_with_one_threshold():
     assert parted("f1", 6.0).count(None) == 5
 
 
-def test_edges_part_strictly_first_at_four_of_eighteen_thresholds_with_two_shells():
+def test_edges_break_first_at_four_of_eighteen_thresholds_with_two_shells():
     torn = {t: parted("d2", t) for t in np.arange(2.25, 7.26, 0.25).tolist()}
     torn = {t: rows for t, rows in torn.items() if None not in rows}
     first = [t for t, rows in torn.items() if max(rows[0], rows[-1]) < min(rows[1:-1])]
@@ -56,7 +56,7 @@ def test_edges_part_strictly_first_at_four_of_eighteen_thresholds_with_two_shell
     assert "two shells: 4 of 18 (3, 4.25, 4.75, 6);" in measured("the others [first gradient]")
 
 
-def test_the_longest_bond_is_of_the_configuration_in_which_bonds_are_judged():
+def test_longest_bond_is_that_of_the_configuration_of_the_fracture_test():
     """Rows move alike: two of a follower's neighbours stand where it stands. Leaders come first."""
     longest = {}
     for speed in (1.2, 0.35):
@@ -73,7 +73,7 @@ def test_the_longest_bond_is_of_the_configuration_in_which_bonds_are_judged():
     assert parted("d1", longest[1.2] + 1e-9) == [None] * 10
 
 
-def test_c_narrows_less_than_b_by_little_until_late():
+def test_c_contracts_little_less_than_b_until_late():
     u = {case: body_u(case, QUIET)[[9, 19, 99]] for case in ("b", "c")}
     narrow = {case: (v[:, :, 0, 1] - v[:, :, -1, 1]).max(axis=1) for case, v in u.items()}
     less = 1 - narrow["c"] / narrow["b"]
@@ -82,7 +82,7 @@ def test_c_narrows_less_than_b_by_little_until_late():
 
 
 @pytest.mark.parametrize(("problem", "off"), [(BAR, 0.067), (CANTILEVER, 0.145)])
-def test_the_paper_s_rule_is_as_far_from_finite_elements_on_every_lattice(problem, off):
+def test_rule_of_the_paper_has_the_same_error_on_every_lattice(problem, off):
     parts = {"rule": {"type": "barycentre"}, "frame": {"type": "mean"}}
     for cells in (10, 20):
         u = solved(problem, cells, **parts, **between_edges(problem, cells)).u
@@ -90,7 +90,7 @@ def test_the_paper_s_rule_is_as_far_from_finite_elements_on_every_lattice(proble
     assert f"{off:.1%} and {off:.1%} ({problem.name})" in measured("much shorter time")
 
 
-def test_times_against_finite_elements_are_those_of_the_page_on_materials():
+def test_times_against_finite_elements_match_the_materials_page():
     """Both with what prepares: the numbers in brackets."""
     table = re.findall(
         r"^\| \w+ \| 1e-3 \|(.*)\|$", (DOCS / "validation/materials.md").read_text("utf-8"), re.M
@@ -103,7 +103,7 @@ def test_times_against_finite_elements_are_those_of_the_page_on_materials():
     assert f"{memory} times" in measured("much shorter time")
 
 
-def test_gains_of_threads_are_those_of_the_page_on_performance():
+def test_speedup_by_threads_matches_the_performance_page():
     threads = json.loads((DOCS / "validation/performance.json").read_text("utf-8"))["threads"]
     gains = [(r["one_ns"] / r["two_ns"], r["size"]) for r in threads if r["rule"] == "barycentre"]
     said = ", ".join(f"{gain:.2f} ({size}²)" for gain, size in gains)
@@ -111,7 +111,7 @@ def test_gains_of_threads_are_those_of_the_page_on_performance():
     assert "Nothing was measured on a GPU" in measured("between the GPU cores")
 
 
-def test_what_the_paper_s_rules_are():
+def test_classification_of_the_rules_of_the_paper():
     def identified(name, *settings):
         return pbdkit.identify(pbdkit.load(f"paper/{name}", settings=list(settings)))
 
@@ -128,7 +128,7 @@ def test_what_the_paper_s_rules_are():
 @pytest.mark.parametrize(
     ("lattice", "tension", "shear"), [("square", 2.0, 0.0), ("hexagonal", 2.25, 0.75)]
 )
-def test_pe1_is_an_elastic_energy_on_the_hexagonal_lattice_only(lattice, tension, shear):
+def test_pe1_is_an_elastic_energy_only_on_the_hexagonal_lattice(lattice, tension, shear):
     """The factors are those of ν = 1/3: four times E / (2 (1 - ν²)) and E / (4 (1 + ν)), times the
     square of a strain."""
     for gradient, expected in (([[1, 0], [0, 0]], tension), ([[0, 0.5], [0.5, 0]], shear)):
@@ -141,7 +141,7 @@ def test_pe1_is_an_elastic_energy_on_the_hexagonal_lattice_only(lattice, tension
 
 
 @pytest.mark.parametrize("relaxation", [1.0, 0.3])
-def test_a_weighted_neighbour_pulls_with_the_square_of_its_distance(relaxation):
+def test_influence_of_a_weighted_neighbour_is_quadratic_in_distance(relaxation):
     """The move of a follower amid four leaders, times the sum of its weights."""
     places = [[0, 1], [1, 0], [1, 2], [2, 1]]
     for way in (0.1, 1.0, 2.0):

@@ -49,7 +49,7 @@ ATTRIBUTES = [
 
 
 @every_case
-def test_datasets_have_the_names_dims_and_dtypes_of_the_contract(case):
+def test_datasets_have_the_specified_names_dims_and_dtypes(case):
     ds = run(case)
     expected = BASE | (FRACTURE if case in TORN else {})
     assert set(ds.variables) == set(expected)
@@ -70,7 +70,7 @@ def test_datasets_have_the_names_dims_and_dtypes_of_the_contract(case):
 
 
 @every_case
-def test_datasets_have_the_attributes_of_the_contract(case):
+def test_datasets_have_the_specified_attributes(case):
     ds = run(case)
     assert set(ATTRIBUTES) <= set(ds.attrs)
     assert ds.attrs["status"] == "complete"
@@ -86,7 +86,7 @@ def test_datasets_have_the_attributes_of_the_contract(case):
 
 
 @every_case
-def test_bonds_are_sorted_once_each_and_have_a_body_end(case):
+def test_bonds_are_sorted_unique_and_have_a_body_end(case):
     ds = run(case)
     ends, body = ds.bond_ends.values, (ds.kind[0] != FRAME).values
     assert (ends[:, 0] < ends[:, 1]).all()
@@ -96,7 +96,7 @@ def test_bonds_are_sorted_once_each_and_have_a_body_end(case):
 
 
 @every_case
-def test_leaders_lead_when_they_should_and_stand_where_they_should(case):
+def test_leaders_follow_their_schedule_and_path(case):
     ds = run(case)
     kind, u = ds.kind.values, moved(case).values
     assert np.array_equal(kind[0], kind[1])
@@ -113,7 +113,7 @@ def test_leaders_lead_when_they_should_and_stand_where_they_should(case):
 
 
 @pytest.mark.parametrize("case", ["a", "f2"])
-def test_a_rerun_from_the_dataset_alone_is_the_same_bit_for_bit(case):
+def test_rerun_from_the_dataset_is_bitwise_identical(case):
     again = pbdkit.rerun(run(case), progress=False)
     assert again.drop_attrs().identical(run(case).drop_attrs())
     assert again.attrs["experiment"] == run(case).attrs["experiment"]

@@ -23,7 +23,7 @@ def section(case):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_every_claim_has_numbers_and_one_of_three_verdicts(case):
+def test_every_claim_has_figures_and_one_of_three_verdicts(case):
     claims = rows(section(case))
     assert len(claims) >= CASES[case]
     for quote, measured, verdict in claims:
@@ -45,13 +45,13 @@ def test_every_measurement_ends_as_a_sentence():
     assert [quote for quote, measured, _ in rows(PAGE) if not measured.endswith(".")] == []
 
 
-def test_pictures_exist_are_small_and_all_are_shown():
+def test_figures_exist_are_small_and_are_all_used():
     shown = re.findall(r"\(\.\./(pictures/reproduction/[^)]+)\)", PAGE + OTHER)
     assert {DOCS / name for name in shown} == set((DOCS / "pictures/reproduction").iterdir())
     assert all((DOCS / name).stat().st_size <= 150_000 for name in shown)
 
 
-def test_the_times_that_the_page_takes_from_performance_are_found(monkeypatch):
+def test_times_quoted_from_the_performance_page_are_there(monkeypatch):
     monkeypatch.syspath_prepend(DOCS / "reproduction")
     assert runpy.run_path(str(DOCS / "reproduction" / "cost.py"))["MEASURED"].is_file()
 
@@ -64,7 +64,7 @@ def test_experiments_named_on_the_page_are_shipped_and_run(name):
 
 
 @pytest.mark.parametrize(("name", "spread"), [("a-lag", 0.134), ("a-chebyshev", 0.061)])
-def test_convexity_comes_with_a_late_frame_or_eight_neighbours(name, spread):
+def test_convexity_requires_a_delayed_frame_or_eight_neighbours(name, spread):
     x = body_u(name, QUIET)[..., 0]
     assert np.ptp(x, axis=2).max() == pytest.approx(spread, abs=1e-3)
     assert x[9, 8, 0] < x[9, 8, 5]
@@ -75,13 +75,13 @@ def test_without_a_frame_the_sheet_collapses():
     assert np.ptp(ds.position.values[-1], axis=0).max() < 1e-3
 
 
-def test_frame_rows_part_first_with_lag_in_windows_of_the_threshold():
+def test_frame_rows_break_first_with_delay_in_threshold_windows():
     assert parted("d1-lag") == [5, *[6] * 8, 5]
     assert parted("d1") == [6] * 10
     assert parted("d1-lag", 6.0) == [7] * 10
 
 
-def test_103_rebounds_for_good_only_where_frame_bonds_hold():
+def test_103_rebounds_permanently_only_if_frame_bonds_hold():
     x = body_u("d2-frame-bonds", QUIET)[:, 7, 5, 0]
     low = low_after_top(x)
     assert (low, x[low]) == (21, pytest.approx(1.358, abs=1e-3))
@@ -92,7 +92,7 @@ def test_103_rebounds_for_good_only_where_frame_bonds_hold():
     assert abs(dip[400]) < 1e-4
 
 
-def test_second_fractures_of_f2_come_at_certain_thresholds():
+def test_second_fractures_of_f2_occur_at_certain_thresholds():
     assert run("f2-second-fracture", *LAST).broken_step.max() == 116
     assert run("f2-cusp", *LAST).broken_step.max() == 108
     assert np.linalg.norm(body_u("f2-early", *LAST)[-1, :9], axis=-1).max() < 0.01
@@ -104,14 +104,14 @@ def test_a_right_angle_is_not_followed():
 
 
 @pytest.mark.parametrize(("placement", "threshold"), [(0.8, 5.2), (1.2, 3.0), (1.2, 7.0)])
-def test_a_strain_of_lambda_less_one_stays_however_far_the_piece_was_pulled(placement, threshold):
+def test_strain_of_lambda_minus_one_remains_at_any_stretch(placement, threshold):
     """So that it is no plastic strain."""
     torn = [f"fracture.placement={placement}", f"fracture.thresholds=[{threshold}]"]
     x = body_u("d1", *torn, "steps=1500", *LAST)[-1, :9, 5, 0]
     np.testing.assert_allclose(np.diff(x), placement - 1, atol=1e-5)
 
 
-def test_the_far_rim_of_e_falls_as_one_over_the_distance():
+def test_far_edge_of_e_decays_as_inverse_distance():
     def share(name):
         ds = run(name, QUIET)
         size = np.linalg.norm((ds.position - ds.reference).transpose("time", ..., "axis"), axis=2)

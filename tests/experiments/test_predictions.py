@@ -88,7 +88,7 @@ def shaken(scene, state):
 
 
 @pytest.mark.parametrize("name", in_turn(BARE, 2))
-def test_runs_settle_in_the_steps_that_check_says(call, name):
+def test_runs_converge_in_the_predicted_steps(call, name):
     """With bonds that hold: torn bodies have another operator, see below."""
     whole = ["fracture={type: none}"] if name in TORN else []
     if name in TORN:
@@ -118,7 +118,7 @@ def test_runs_settle_in_the_steps_that_check_says(call, name):
 
 
 @pytest.mark.parametrize("name", in_turn(STEPS, 2))
-def test_torn_bodies_stay_stable_and_settle_more_slowly_than_whole_ones(call, name):
+def test_broken_bodies_stay_stable_and_converge_more_slowly(call, name):
     """The prediction is for the unbroken body, and the output states that; the operator of the torn
     one has the rate.
 

@@ -16,7 +16,7 @@ def skfem():
 
 
 @pytest.mark.parametrize(("name", "cells"), KEPT)
-def test_sites_are_those_of_the_lattice(name, cells):
+def test_sites_match_the_lattice(name, cells):
     reference, problem = load(name, cells), PROBLEMS[name]
     columns, rows = reference.x.shape
     assert columns == problem.length * cells + 1
@@ -28,7 +28,7 @@ def test_sites_are_those_of_the_lattice(name, cells):
 
 
 @pytest.mark.parametrize(("name", "cells"), KEPT)
-def test_every_site_of_the_body_has_a_displacement_and_no_other(name, cells):
+def test_every_body_site_and_no_other_has_a_displacement(name, cells):
     reference, problem = load(name, cells), PROBLEMS[name]
     middle = np.hypot(reference.x - problem.length / 2, reference.y - problem.height / 2)
     body = (reference.x < problem.length + 1e-9) & (middle > problem.radius - 1e-9)
@@ -36,7 +36,7 @@ def test_every_site_of_the_body_has_a_displacement_and_no_other(name, cells):
 
 
 @pytest.mark.parametrize(("name", "cells"), KEPT)
-def test_edges_are_held_where_they_should_be(name, cells):
+def test_edges_are_held_as_specified(name, cells):
     reference, problem = load(name, cells), PROBLEMS[name]
     inside = np.isfinite(reference.u[0])
     left, right = (np.isclose(reference.x, x) & inside for x in (0, problem.length))
@@ -46,7 +46,7 @@ def test_edges_are_held_where_they_should_be(name, cells):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_energy_is_half_the_work_of_the_right_edge_and_errors_are_small(name):
+def test_energy_is_half_the_work_of_the_right_edge_with_small_error(name):
     reference = load(name)
     assert reference.energy == pytest.approx(reference.reaction / 2, rel=1e-8)
     assert reference.error < 1e-6
@@ -59,7 +59,7 @@ def test_relative_error_is_zero_for_the_reference_and_scales(name, cells):
     assert relative_l2(1.25 * reference.u, reference) == pytest.approx(0.25)
 
 
-def test_sites_on_edges_count_half_and_in_corners_a_quarter():
+def test_edge_sites_count_half_and_corner_sites_a_quarter():
     reference = load("bar", 10)
     assert reference.weights.sum() == pytest.approx(2 * 1 * 10**2)
     assert reference.weights[0, 0] == 0.25
@@ -70,7 +70,7 @@ def test_sites_on_edges_count_half_and_in_corners_a_quarter():
     assert relative_l2(u, reference) == pytest.approx(0.5 * np.sqrt(0.5) / norm)
 
 
-def test_hexagonal_weights_are_the_area():
+def test_hexagonal_weights_equal_the_area():
     reference = load("hexagonal-bar", 20)
     cell = np.sqrt(3) / 2 / 20**2
     area = reference.problem.length * reference.problem.height
@@ -121,7 +121,7 @@ def test_uniform_strain_is_exact(skfem, problem, element):
 
 
 @pytest.mark.parametrize("problem", [BAR, CANTILEVER, HOLE], ids=lambda p: p.name)
-def test_references_come_out_again(skfem, problem):
+def test_references_are_reproduced(skfem, problem):
     """A coarser graded mesh of the quarter, at the sites of the coarsest lattice."""
     from finite_elements.graded import solve
 

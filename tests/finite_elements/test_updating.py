@@ -19,7 +19,7 @@ def elements():
     return updating.alike(N, plain=False)
 
 
-def test_a_bar_that_is_pulled_evenly_is_exact():
+def test_uniformly_pulled_bar_is_exact():
     """Without its hole it would be: so the boundary of the hole is pulled along, too."""
     plate = specimen.Plate(4)
     x, y = plate.basis.doflocs
@@ -37,7 +37,7 @@ def test_a_bar_that_is_pulled_evenly_is_exact():
     assert plate.basis.dx.sum() == pytest.approx(area, rel=1e-5)
 
 
-def test_derivatives_are_those_of_differences():
+def test_derivatives_match_finite_differences():
     data = specimen.read().inside(0.5)
     model = updating.Model(2, data)
     modes = model.plate.modes(2)
@@ -52,14 +52,14 @@ def test_derivatives_are_those_of_differences():
     np.testing.assert_allclose(found.seen @ weights, shown, atol=1e-10)
 
 
-def test_plain_and_well_written_updating_find_the_same():
+def test_plain_and_optimised_updating_agree():
     plain, well = (updating.usual(4, plain=plain, inset=2.0) for plain in (True, False))
     assert plain.poisson.value == pytest.approx(well.poisson.value, abs=1e-4)
     assert plain.young.value == pytest.approx(well.young.value, rel=1e-6)
     assert plain.young.error == pytest.approx(well.young.error, rel=1e-3)
 
 
-def test_pbdkit_finds_what_elements_find(elements):
+def test_pbdkit_matches_finite_element_updating(elements):
     """Poisson's ratio within its error; both errors are those of the same noise. Young's modulus
     within what the meshes leave to be desired, 0.05 %."""
     fit = yaml.safe_load(specimen.FILE.with_suffix(".yaml").read_text("utf-8"))
@@ -75,7 +75,7 @@ def test_pbdkit_finds_what_elements_find(elements):
     assert found.ratio == pytest.approx(elements.ratio, rel=0.01)
 
 
-def test_both_ends_tell_the_same_strain_that_falls():
+def test_both_ends_show_the_same_decreasing_strain():
     found, apart = ends.fall(), ends.ends()
     assert apart["left"].modulus.value < 0.9 * apart["right"].modulus.value
     spread = np.hypot(found.left.error, found.right.error)
@@ -87,7 +87,7 @@ def test_both_ends_tell_the_same_strain_that_falls():
     assert abs(moduli[0].value - moduli[1].value) < 2.0 * np.hypot(*(m.error for m in moduli))
 
 
-def test_who_clamps_an_end_that_moves_finds_another_modulus(elements):
+def test_clamping_a_moving_end_biases_the_modulus(elements):
     held, free = ends.clamped(), ends.clamped(rigid=True)
     assert held.young.value < 0.65 * elements.young.value
     assert free.young.value == pytest.approx(elements.young.value, rel=5e-3)

@@ -87,7 +87,7 @@ MATERIALS = {
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-def test_parameters_come_back_from_what_they_made(name, tmp_path):
+def test_parameters_are_recovered_from_synthetic_data(name, tmp_path):
     rule, unknown = MATERIALS[name]
     made = plate(rule)
     measured(made, tmp_path / "field.csv")
@@ -103,7 +103,7 @@ def test_parameters_come_back_from_what_they_made(name, tmp_path):
     assert found.ratio < 1.0
 
 
-def test_youngs_modulus_follows_from_a_force(tmp_path):
+def test_force_identifies_youngs_modulus(tmp_path):
     made = plate()
     resting = measured(made, tmp_path / "field.csv")
     ds = pbdkit.run(
@@ -123,7 +123,7 @@ def test_youngs_modulus_follows_from_a_force(tmp_path):
     assert found.youngs_modulus.value == pytest.approx(70e3, rel=1e-4)
 
 
-def test_the_noise_of_a_force_is_part_of_the_error_of_youngs_modulus(tmp_path):
+def test_force_noise_enters_the_error_of_youngs_modulus(tmp_path):
     """E is F over what the group carries at E = 1: their relative errors add as squares."""
     made = plate(lattice={"type": "square", "a": 2.0})
     measured(made, tmp_path / "field.csv", noise=NOISE)
@@ -143,7 +143,7 @@ def test_the_noise_of_a_force_is_part_of_the_error_of_youngs_modulus(tmp_path):
         assert each.error == pytest.approx(expected, rel=1e-9)
 
 
-def test_errors_are_those_of_repeats():
+def test_errors_match_repeated_experiments():
     """The field and the prescribed displacements have noise, as both are measured; the long trial
     has more repeats. The error of Poisson's ratio agrees with its standard error."""
     generator = np.random.default_rng(3)
@@ -191,7 +191,7 @@ UNTOLD = {
 
 
 @pytest.mark.parametrize("name", UNTOLD)
-def test_what_the_data_cannot_tell_is_said(name, tmp_path):
+def test_unidentifiable_parameters_are_reported(name, tmp_path):
     rule, unknown, untold = UNTOLD[name]
     made = plate(rule)
     if rule["type"] == "strain-gradient":
@@ -239,7 +239,7 @@ BOTH = {"rule.stiffness.otherwise": [0.2, 8.0], "rule.stiffness.half": [0.3, 5.0
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-7])
 @pytest.mark.parametrize("more", [{}, {"rule.poisson_ratio": [0.0, 0.45]}])
-def test_a_ratio_is_found_where_both_of_its_parts_are_not_told(noise, more, tmp_path):
+def test_ratio_is_identified_if_neither_of_its_parts_is(noise, more, tmp_path):
     """The best fit is that with one of them known, and so is the error of the ratio."""
     made, path = in_series(), tmp_path / "field.csv"
     one = fitted(made, path, {"rule.stiffness.half": [0.3, 5.0]} | more, noise)
@@ -281,7 +281,7 @@ SUMS = {
 
 
 @pytest.mark.parametrize("name", SUMS)
-def test_what_is_told_of_several_is_a_product_or_a_sum(name, tmp_path):
+def test_identifiable_combination_is_a_product_or_a_sum(name, tmp_path):
     force, unknown, formula, value = SUMS[name]
     found = fitted(loaded(force), tmp_path / "field.csv", unknown, 1e-4)
     told, untold = found.combinations
@@ -291,7 +291,7 @@ def test_what_is_told_of_several_is_a_product_or_a_sum(name, tmp_path):
     assert told.estimate.value == pytest.approx(value, abs=4 * told.estimate.error)
 
 
-def test_a_single_parameter_that_is_not_told_makes_no_combination(tmp_path):
+def test_single_unidentifiable_parameter_gives_no_combination(tmp_path):
     unknown = {"rule.stiffness": [0.5, 2.0], "rule.poisson_ratio": [0.0, 0.45]}
     rule = {"type": "elastic", "poisson_ratio": 0.2, "stiffness": 1.0}
     found = fitted(in_series(rule=rule), tmp_path / "field.csv", unknown, 1e-4)
@@ -299,7 +299,7 @@ def test_a_single_parameter_that_is_not_told_makes_no_combination(tmp_path):
     assert found.combinations == ()
 
 
-def test_outliers_count_less_where_the_loss_says_so(tmp_path):
+def test_robust_loss_downweights_outliers(tmp_path):
     made, path = plate(), tmp_path / "field.csv"
     measured(made, path, noise=NOISE)
     with path.open() as file:
@@ -320,7 +320,7 @@ def test_outliers_count_less_where_the_loss_says_so(tmp_path):
     assert max(far["huber"], far["soft_l1"], far["cauchy"]) < 0.3 * far["linear"]
 
 
-def test_without_a_noise_residuals_tell_it(tmp_path):
+def test_without_given_noise_it_is_estimated_from_residuals(tmp_path):
     made = plate()
     measured(made, tmp_path / "field.csv", noise=NOISE)
     found = pbdkit.fit(
@@ -334,7 +334,7 @@ def test_without_a_noise_residuals_tell_it(tmp_path):
     assert found.ratio == pytest.approx(1.0, rel=0.01)
 
 
-def test_the_command_writes_what_python_returns(call, tmp_path):
+def test_command_writes_the_result_of_the_python_call(call, tmp_path):
     result = call("fit", "plate-with-hole", "-o", str(tmp_path / "plate.json"))
     assert result.code == 0, result.err
     found = json.loads((tmp_path / "plate.json").read_text())
@@ -365,7 +365,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_named(name, tmp_path):
+def test_invalid_input_is_named(name, tmp_path):
     changed, told = WRONG[name]
     path = tmp_path / "field.csv"
     measured(plate(), path)
@@ -391,7 +391,7 @@ ROWS = {
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_rows_that_cannot_do_are_named(name, tmp_path):
+def test_invalid_rows_are_named(name, tmp_path):
     change, more, told = ROWS[name]
     path = tmp_path / "field.csv"
     measured(plate(), path)
@@ -404,7 +404,7 @@ def test_rows_that_cannot_do_are_named(name, tmp_path):
 
 
 @pytest.mark.parametrize("noise", [{}, {"noise": 1e-6}])
-def test_one_point_at_rest_tells_nothing_and_breaks_nothing(noise, tmp_path):
+def test_single_point_at_rest_is_harmless(noise, tmp_path):
     path = tmp_path / "field.csv"
     path.write_text("x,y,ux,uy\n3,2,0,0\n")
     bar = {
@@ -424,7 +424,7 @@ def test_one_point_at_rest_tells_nothing_and_breaks_nothing(noise, tmp_path):
     assert not found.values["rule.poisson_ratio"].identifiable
 
 
-def test_the_picture_has_a_row_an_axis_and_no_text_over_another(tmp_path):
+def test_plot_has_one_row_per_axis_without_overlapping_text(tmp_path):
     pytest.importorskip("matplotlib")
     from pbdkit.plotting.fit_figures import draw_fit
 
@@ -452,7 +452,7 @@ def test_the_picture_has_a_row_an_axis_and_no_text_over_another(tmp_path):
     assert np.std(left) == pytest.approx(NOISE, rel=0.1)
 
 
-def test_a_dataset_is_fitted_as_the_file_with_its_columns(tmp_path):
+def test_dataset_is_fitted_like_the_file_with_its_columns(tmp_path):
     import xarray
 
     made = plate()

@@ -49,7 +49,7 @@ OUTLINES = {
 
 
 @pytest.mark.parametrize("name", OUTLINES)
-def test_the_depth_of_a_point_is_the_way_to_the_nearest_one_outside(name):
+def test_depth_of_a_point_is_the_distance_to_the_nearest_outside_point(name):
     """Compared with the signs of points all over, with distances as fine as they are."""
     body, fine = BODY.validate_python(OUTLINES[name]), 0.03
     x, y = (each.ravel() for each in np.meshgrid(*[np.arange(-1.0, 9.0, fine)] * 2))
@@ -77,7 +77,7 @@ def lattice(given):
 
 
 @pytest.mark.parametrize("name", LATTICES)
-def test_a_grid_is_as_deep_as_the_same_rectangle(name):
+def test_grid_has_the_depth_of_the_equal_rectangle(name):
     """The body alone, with a hole, beside another body, and cut out of another: the remaining part
     then ends at the particles next to it."""
     given, a, b = LATTICES[name]
@@ -104,7 +104,7 @@ def test_a_grid_is_as_deep_as_the_same_rectangle(name):
         np.testing.assert_allclose(*found, atol=1e-8 * a)
 
 
-def test_a_grid_of_triangles_ends_at_their_sides():
+def test_triangular_grid_ends_at_its_sides():
     """The zigzag of its left and right sides is part of the outline."""
     grid = BODY.validate_python({"type": "grid", "columns": 6, "rows": 5})
     high = 3**0.5 / 2
@@ -114,7 +114,7 @@ def test_a_grid_of_triangles_ends_at_their_sides():
     np.testing.assert_allclose(found, [-across, 0.0, 0.5, 2 * high, 0.0], atol=1e-9)
 
 
-def test_points_on_the_margin_count_whatever_the_unit():
+def test_points_on_the_margin_count_in_any_unit():
     """A rectangle of 12 x 8 spacings, a grid of as many and the rectangle in millimetres."""
     inner = np.stack(np.meshgrid(np.arange(13.0), np.arange(9.0)), axis=-1).reshape(-1, 2)
     kept = ((inner >= 3.0) & (inner <= [9.0, 5.0])).all(axis=1)
@@ -132,7 +132,7 @@ def test_points_on_the_margin_count_whatever_the_unit():
     assert (deeper(experiment.body, experiment.lattice, inner, 3.0) == kept).all()
 
 
-def test_a_margin_leaves_out_as_many_points_of_a_grid_as_of_a_rectangle(tmp_path):
+def test_margin_excludes_as_many_points_of_a_grid_as_of_a_rectangle(tmp_path):
     points = np.random.default_rng(2).uniform([0.0, 0.0], [12.0, 8.0], (300, 2))
     rows = np.c_[points, 0.01 * points[:, 0], -0.003 * points[:, 1]]
     np.savetxt(tmp_path / "field.csv", rows, delimiter=",", header="x,y,ux,uy", comments="")
@@ -185,7 +185,7 @@ def test_points_in_a_hole_lie_between_no_particles(kind, radius):
 
 
 @pytest.mark.parametrize("kind", ["square", "hexagonal"])
-def test_points_in_cells_that_are_torn_from_the_start_do_not_count(kind):
+def test_points_in_initially_broken_cells_are_excluded(kind):
     """On both sides of a cut the field is another; no point is between."""
     cut = {"from": [-1.0, 2.6], "to": [5.3, 2.6]}
     made = plate(

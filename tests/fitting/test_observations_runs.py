@@ -90,7 +90,7 @@ def within(found, *, of=TRUE):
         assert estimate.value == pytest.approx(of[path], abs=4 * estimate.error)
 
 
-def test_tracks_in_time_tell_the_material_and_the_relaxation(measured):
+def test_tracks_in_time_identify_material_and_relaxation(measured):
     found = pbdkit.fit({"experiment": bar(), "unknown": TOLD, "measured": tracks(measured)})
     within(found)
     assert found.ratio == pytest.approx(1.0, abs=0.2)
@@ -98,7 +98,7 @@ def test_tracks_in_time_tell_the_material_and_the_relaxation(measured):
 
 
 @pytest.mark.parametrize("against", ["displacement", "time"])
-def test_a_curve_of_force_tells_youngs_modulus_too(measured, against):
+def test_force_curve_also_identifies_youngs_modulus(measured, against):
     given = curve(measured)
     if against == "time":
         given |= {"file": str(measured / "force.csv"), "against": "time"}
@@ -118,7 +118,7 @@ def test_a_curve_of_force_tells_youngs_modulus_too(measured, against):
     assert error[id(known)] <= error[id(found)]
 
 
-def test_with_units_forces_are_newtons_and_the_modulus_is_in_mpa(measured, tmp_path):
+def test_with_units_forces_are_in_newtons_and_moduli_in_mpa(measured, tmp_path):
     rows = np.loadtxt(measured / "curve.csv", delimiter=",", skiprows=1)
     write(tmp_path / "newtons.csv", ["displacement", "force"], rows * [1.0, 2.0])
     unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
@@ -143,7 +143,7 @@ def test_with_units_forces_are_newtons_and_the_modulus_is_in_mpa(measured, tmp_p
     np.testing.assert_allclose(seen, rows * 2.0)
 
 
-def test_two_measurements_tell_more_than_each(measured):
+def test_two_measurements_reduce_the_error(measured):
     unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
     both = [tracks(measured), curve(measured, youngs_modulus=MODULUS)]
     found = [
@@ -155,7 +155,7 @@ def test_two_measurements_tell_more_than_each(measured):
     assert [met.kind for met in found[2].misfits] == ["tracks", "curve"]
 
 
-def test_a_weight_counts_like_a_smaller_noise(measured):
+def test_weight_is_equivalent_to_smaller_noise(measured):
     unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
     weighted, finer = (
         pbdkit.fit(
@@ -172,7 +172,7 @@ def test_a_weight_counts_like_a_smaller_noise(measured):
 
 
 @pytest.mark.parametrize("noise", [{}, {"noise": NOISE}])
-def test_residuals_are_told_over_the_same_noise_whatever_the_weight(noise, measured):
+def test_normalised_residuals_are_independent_of_the_weight(noise, measured):
     """Birge's ratio takes back what a weight above 1 promises; one below 1 makes errors larger."""
     unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
     given = {k: v for k, v in tracks(measured).items() if k != "noise"} | noise
@@ -194,7 +194,7 @@ def test_residuals_are_told_over_the_same_noise_whatever_the_weight(noise, measu
         assert errors[0] / errors[1] == pytest.approx(max(1.0, weight**-0.5), rel=0.1)
 
 
-def test_left_out_residuals_are_told_over_the_same_noise_whatever_the_weight(measured):
+def test_excluded_normalised_residuals_are_independent_of_the_weight(measured):
     unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
     rival = {"settings": {"rule": {"type": "springs"}}, "unknown": {"rule.stiffness": [0.5, 2.0]}}
     one, other = (
@@ -225,7 +225,7 @@ def posed(experiment, given):
 
 
 @pytest.mark.parametrize("kind", ["tracks", "curve"])
-def test_a_run_that_has_settled_stays_at_rest(kind, tmp_path):
+def test_converged_run_stays_at_rest(kind, tmp_path):
     """At its last steps, and at steps between; derivatives as well."""
     times = [3.0, 12.5, 250.0, 321.25, 400.0]
     at = [[1.0, 1.0], [2.0, 0.5], [3.0, 2.0]]
@@ -262,7 +262,7 @@ def on_rollers(**more):
 
 
 @pytest.mark.parametrize("times", [[10.0], [0.0, 10.0], [5.0, 7.5, 10.0]])
-def test_each_step_that_tracks_need_is_an_equilibrium(times, tmp_path):
+def test_each_step_required_by_tracks_is_an_equilibrium(times, tmp_path):
     """The reference is the closed form with ν = .25."""
     places = np.array([[3.0, 0.0], [3.0, HEIGHT], [6.5, 0.5]])
     u = np.c_[places[:, 0], -0.25 * (places[:, 1] - HEIGHT / 2)]
@@ -279,7 +279,7 @@ def test_each_step_that_tracks_need_is_an_equilibrium(times, tmp_path):
     assert found.ratio < 0.01
 
 
-def test_a_state_that_does_not_come_is_no_displacement_of_0(tmp_path, monkeypatch):
+def test_missing_state_is_not_read_as_zero_displacement(tmp_path, monkeypatch):
     write(tmp_path / "rows.csv", ["time", "x", "y", "ux", "uy"], [[7.5, 1.0, 1.0, 0.0, 0.0]])
     problem = posed(bar(), {"type": "tracks", "file": str(tmp_path / "rows.csv"), "noise": 1.0})
     every = TracksObservation._recorded
@@ -292,7 +292,7 @@ def test_a_state_that_does_not_come_is_no_displacement_of_0(tmp_path, monkeypatc
         problem.at(problem.start())
 
 
-def test_curves_have_the_equilibria_within_steps(tmp_path):
+def test_curves_contain_equilibria_within_steps(tmp_path):
     """Bonds may break, so that the load is applied in increments."""
     write(tmp_path / "rows.csv", ["displacement", "force"], [[0.02, 0.0], [0.05, 0.0]])
     given = {"type": "curve", "file": str(tmp_path / "rows.csv"), "group": 1, "noise": 1.0}
@@ -319,7 +319,7 @@ def test_rows_beyond_the_end_of_a_curve_are_named(measured, tmp_path):
     assert found.as_dict()["measured"][0]["left_out_because"] in said
 
 
-def test_a_measurement_may_have_settings_of_its_own(measured, tmp_path):
+def test_measurement_may_have_its_own_settings(measured, tmp_path):
     """Two tests of one material: the second pulls the other way, and half as far."""
     back = {"leaders.1.motion.velocity": [-0.01, 0.0]}
     ds = pbdkit.run(
@@ -345,7 +345,7 @@ def test_a_measurement_may_have_settings_of_its_own(measured, tmp_path):
     assert found.misfits[1].ratio < 0.5  # it has no noise
 
 
-def test_derivatives_are_those_of_differences(measured):
+def test_derivatives_match_finite_differences(measured):
     fit = {
         "experiment": bar(),
         "unknown": TOLD,
@@ -383,7 +383,7 @@ WRONG = {
 }
 
 
-def test_a_curve_of_the_other_sign_is_named(measured, monkeypatch):
+def test_curve_of_opposite_sign_is_named(measured, monkeypatch):
     monkeypatch.chdir(measured)
     given = curve(measured)
     rows = np.loadtxt(given["file"], delimiter=",", skiprows=1) * [1.0, -1.0]
@@ -395,7 +395,7 @@ def test_a_curve_of_the_other_sign_is_named(measured, monkeypatch):
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_named(name, measured, monkeypatch):
+def test_invalid_input_is_named(name, measured, monkeypatch):
     monkeypatch.chdir(measured)
     make, more, told = WRONG[name]
     unknown = {"rule.poisson_ratio": [0.0, 0.45]}
@@ -403,7 +403,7 @@ def test_what_is_wrong_is_named(name, measured, monkeypatch):
         pbdkit.fit({"experiment": bar(**more), "unknown": unknown, "measured": make(measured)})
 
 
-def test_bonds_that_break_otherwise_are_refused(measured):
+def test_bonds_that_break_differently_are_refused(measured):
     """The limit decides in which step a bond breaks."""
     slow = bar()["leaders"]
     slow[1]["motion"] |= {"velocity": [0.002, 0.001], "steps": STEPS}

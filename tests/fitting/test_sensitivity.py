@@ -128,7 +128,7 @@ def by_complex_step(experiment, path, monkeypatch):
 
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("name", RULES)
-def test_derivatives_are_those_of_complex_steps(name, frame, monkeypatch):
+def test_derivatives_match_complex_steps(name, frame, monkeypatch):
     rule, path, more = RULES[name]
     calibrated = rule["type"] in ("elastic", "orthotropic")
     if frame == "natural" and not calibrated:
@@ -158,7 +158,7 @@ LINEAR = {
 
 
 @pytest.mark.parametrize("name", LINEAR)
-def test_what_equilibria_are_linear_in_has_the_derivative_of_its_differences(name):
+def test_derivative_of_linear_parameters_equals_differences(name):
     parts, path = LINEAR[name]
     experiment = pbdkit.Experiment(**SHEET | parts)
     parameter = Parameter(path)
@@ -186,7 +186,7 @@ SMOOTH = {
 
 
 @pytest.mark.parametrize("name", SMOOTH)
-def test_derivatives_are_those_of_differences_of_equilibria(name):
+def test_derivatives_match_differences_of_equilibria(name):
     parts, path = SMOOTH[name]
     experiment, parameter = pbdkit.Experiment(**SHEET | parts), Parameter(path)
     found = Resting.of(experiment).change(parameter)
@@ -196,7 +196,7 @@ def test_derivatives_are_those_of_differences_of_equilibria(name):
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7 * size)
 
 
-def test_what_loads_do_falls_with_the_stiffness_beside_a_field_of_another_number():
+def test_load_response_decreases_with_stiffness_beside_another_field():
     """u is as 1/k: ∂u/∂k = -u/k, whatever Poisson's ratio of each cell."""
     core = {"core": {"type": "disc", "radius": 1.2, "centre": [1.9, 1.4]}}
     rule = ELASTIC | {"stiffness": 4.0, "poisson_ratio": {"otherwise": 0.3, "core": 0.1}}
@@ -217,7 +217,7 @@ RULES_AND_FRAMES = [
 
 
 @pytest.mark.parametrize(("rule", "frame"), RULES_AND_FRAMES)
-def test_derivatives_and_gradients_are_those_of_equilibria_found_anew(rule, frame):
+def test_derivatives_and_gradients_match_recomputed_equilibria(rule, frame):
     given = sensitivity_cases.case(rule, frame)
     rules, told = sensitivity_cases.REFUSED.get(frame, ((), ""))
     if rule in rules:
@@ -234,7 +234,7 @@ def test_derivatives_and_gradients_are_those_of_equilibria_found_anew(rule, fram
 
 @pytest.mark.parametrize("frame", ["natural", "mean"])
 @pytest.mark.parametrize("path", sensitivity_cases.MORE)
-def test_derivatives_by_other_parts_are_those_of_equilibria_found_anew(path, frame):
+def test_derivatives_by_other_parameters_match_recomputed_equilibria(path, frame):
     given = sensitivity_cases.other_case(frame, sensitivity_cases.MORE[path])
     ((_, size, off, along),) = sensitivity_cases.errors(given, [path])
     assert size > 1e-3
@@ -242,7 +242,7 @@ def test_derivatives_by_other_parts_are_those_of_equilibria_found_anew(path, fra
     assert along < 1e-12
 
 
-def test_every_rule_and_frame_that_ships_is_among_those_compared():
+def test_every_shipped_rule_and_frame_is_compared():
     own = next(plugin for plugin in Registry().plugins if plugin.distribution == BUILTIN)
     rules = {sensitivity_cases.RULES[name][0]["type"] for name, _ in RULES_AND_FRAMES}
     frames = {frame for _, frame in RULES_AND_FRAMES}
@@ -260,7 +260,7 @@ METHODS = {
 
 @pytest.mark.parametrize("frame", ["natural", "mean", "mirror"])
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_solved_transposed_is_the_transpose(method, frame):
+def test_transposed_solve_solves_the_transpose(method, frame):
     """⟨A⁻¹a, b⟩ = ⟨a, A⁻ᵀb⟩: of symmetric systems, of others, and of ones in stages."""
     asked, (columns, rows), name = METHODS[method]
     for rule in (ELASTIC, {"type": "mixed-coordinate", "K": -0.01}):
@@ -292,7 +292,7 @@ WIDE = SHEET | {
 
 
 @by_grids
-def test_answers_that_begin_at_those_of_another_equilibrium_are_the_same():
+def test_solutions_started_from_another_equilibrium_are_the_same():
     parameter, accuracy = Parameter("rule.poisson_ratio"), 1e-9
     there = Resting.of(pbdkit.Experiment(**WIDE), accuracy=accuracy)
     led = np.zeros_like(there.state.u)
@@ -311,7 +311,7 @@ def test_answers_that_begin_at_those_of_another_equilibrium_are_the_same():
 
 
 @by_grids
-def test_what_leaders_do_is_among_the_stencils():
+def test_leader_columns_are_part_of_the_stencils():
     resting = Resting.of(pbdkit.Experiment(**WIDE))
     led = np.zeros_like(resting.state.u)
     place = resting.scene.leading[1].place
@@ -320,13 +320,13 @@ def test_what_leaders_do_is_among_the_stencils():
     np.testing.assert_allclose(pushed, resting.along(resting._moves, led), atol=1e-13)
 
 
-def test_a_rough_derivative_is_as_accurate_as_asked():
+def test_loose_derivative_meets_its_tolerance():
     exact, rough = (Resting.of(pbdkit.Experiment(**WIDE), None, a) for a in (1e-12, 1e-7))
     one, other = (resting.change(Parameter("rule.poisson_ratio")) for resting in (exact, rough))
     assert 0.0 < np.abs(one - other).max() < 1e-6 * np.abs(one).max()
 
 
-def test_sensitivities_have_no_kernel_compiled_anew():
+def test_sensitivities_compile_no_new_kernel():
     pytest.importorskip("numba")
     from pbdkit.equilibrium.stencil_matrix import kernels
 
@@ -338,7 +338,7 @@ def test_sensitivities_have_no_kernel_compiled_anew():
         assert len(getattr(kernels(), name).signatures) == ways, name
 
 
-def test_a_displaced_part_that_nothing_holds_is_refused():
+def test_unsupported_displaced_part_is_refused():
     pulled = [
         {"select": {"edge": edge}, "force": [sign * 0.01, 0.0]}
         for edge, sign in (("left", -1.0), ("right", 1.0))
@@ -351,7 +351,7 @@ def test_a_displaced_part_that_nothing_holds_is_refused():
         resting.gradient(resting.state.u, [Parameter("rule.poisson_ratio")])
 
 
-def test_bonds_that_change_and_obstacles_are_refused():
+def test_changing_bonds_and_obstacles_are_refused():
     torn = {"rule": ELASTIC, "frame": {"type": "natural"},
             "fracture": {"type": "strain", "failure": 0.01}}  # fmt: skip
     with pytest.raises(pbdkit.ExperimentError, match="bonds break or soften on the load path"):
@@ -370,19 +370,19 @@ def test_bonds_that_change_and_obstacles_are_refused():
         ("rule.type", "is not a number"),
     ],
 )
-def test_what_is_no_number_of_the_experiment_is_refused(path, told):
+def test_parameter_that_is_not_a_number_is_refused(path, told):
     experiment = pbdkit.Experiment(**SHEET | {"rule": ELASTIC})
     with pytest.raises(pbdkit.ExperimentError, match=told):
         Parameter(path).value_in(experiment)
 
 
-def test_a_number_on_its_bound_has_no_derivative():
+def test_parameter_on_its_bound_has_no_derivative():
     experiment = pbdkit.Experiment(**SHEET | {"rule": ELASTIC | {"poisson_ratio": 0.5}})
     with pytest.raises(pbdkit.ExperimentError, match="is at its bound"):
         Resting.of(experiment).change(Parameter("rule.poisson_ratio"))
 
 
-def test_a_number_that_decides_who_is_there_has_no_derivative():
+def test_parameter_that_changes_the_particles_has_no_derivative():
     experiment = pbdkit.Experiment(
         **SHEET | {"rule": ELASTIC, "body": {"type": "rectangle", "width": 5.1, "height": 4.1}}
     )

@@ -99,7 +99,7 @@ def fit_of(peaks, *, bonds=16, unknown=WEIBULL, **more):
     } | more  # fmt: skip
 
 
-def test_the_likelihood_of_an_even_bar_is_weibulls_own():
+def test_likelihood_of_a_uniform_bar_is_weibull():
     """The reference is ln of the density of the weakest of n bonds, with the scale s n^(-1/m)."""
     loads, m, s = np.array([0.8, 1.1, 1.7]), np.array([3.0, 9.0]), 0.02
     sums, slopes = weibull_sums(even(50), Breaks(loads, np.ones(3, bool)), m)
@@ -109,7 +109,7 @@ def test_the_likelihood_of_an_even_bar_is_weibulls_own():
         np.testing.assert_allclose(density, own.logpdf(loads), rtol=1e-12, atol=1e-12)
 
 
-def test_alike_bonds_count_as_often_as_there_are():
+def test_identical_bonds_are_counted_with_multiplicity():
     experiment = pbdkit.Experiment(**chain(16))
     strains = ElasticResponse.of(experiment, ANY).strains
     merged = strains.merged()
@@ -119,7 +119,7 @@ def test_alike_bonds_count_as_often_as_there_are():
     assert merged.load_at(np.array([0.03])) == pytest.approx([3.0], rel=1e-6)
 
 
-def test_strains_of_bonds_that_turn_are_exact():
+def test_strains_of_rotating_bonds_are_exact():
     p, q = 0.2, 0.5
     strains, load = BondStrains(np.array([p]), np.array([q]), np.ones(1)), np.array([0.7])
     d = np.array([p, np.sqrt(q - p * p)])
@@ -130,7 +130,7 @@ def test_strains_of_bonds_that_turn_are_exact():
 
 
 @pytest.mark.parametrize("law", ["weibull", "uniform"])
-def test_strengths_come_back(law):
+def test_strengths_are_recovered(law):
     """Within 4.5 standard errors, of 200 chains; the long trial counts how often intervals
     hold."""
     numbers = np.random.default_rng(2)
@@ -147,7 +147,7 @@ def test_strengths_come_back(law):
     assert np.allclose(np.diag(found.correlations), 1.0)
 
 
-def test_large_samples_know_what_fishers_information_says():
+def test_error_of_large_samples_matches_fisher_information():
     """ln m of n specimens has the error √(6/n)/π; intervals are 3.92 of them wide."""
     found = pbdkit.fit_strength(fit_of(16 * drawn(16, 2000, 5)))
     modulus = found.values["fracture.modulus"]
@@ -156,7 +156,7 @@ def test_large_samples_know_what_fishers_information_says():
     assert (modulus.high - modulus.low) / modulus.value == pytest.approx(3.92 * expected, rel=0.05)
 
 
-def test_the_modulus_does_not_depend_on_the_size_and_the_scale_does_as_the_theory_says():
+def test_modulus_is_independent_of_size_and_scale_follows_theory():
     """Chains of 10 and of 1000 bonds with the same peaks: s grows by 100^(1/m), draw by draw."""
     loads = drawn(10, 40, 3)
     small, large = (
@@ -169,7 +169,7 @@ def test_the_modulus_does_not_depend_on_the_size_and_the_scale_does_as_the_theor
     np.testing.assert_allclose(s_large / s, 100 ** (1 / m), rtol=1e-5)
 
 
-def test_mean_strength_of_specimens_falls_as_the_root_of_their_size():
+def test_mean_strength_of_specimens_scales_as_the_root_of_size():
     """s Γ(1 + 1/m) n^(-1/m), at the strengths that were found."""
     found = pbdkit.fit_strength(fit_of(16 * drawn(16, 400, 7)))
     s, m = (each.value for each in found.values.values())
@@ -178,7 +178,7 @@ def test_mean_strength_of_specimens_falls_as_the_root_of_their_size():
         assert s * gamma(1 + 1 / m) * bonds ** (-1 / m) == pytest.approx(mean, rel=0.04)
 
 
-def test_what_outlasts_its_test_counts():
+def test_censored_specimens_count():
     """Tests that end at 0.8 of the scale of chains: counted as breaks they would overestimate the
     modulus, left out they would underestimate the strength."""
     strength = drawn(16, 300, 4)
@@ -208,7 +208,7 @@ def test_the_first_break_of_a_run_is_where_it_is_computed():
         assert (ds.broken_step > 0).any() == some
 
 
-def test_a_torn_specimen_bears_what_the_run_shows():
+def test_broken_specimen_carries_the_load_of_the_run():
     """In the increments after its first break, run by run with one more of them: the peak force is
     the largest of these, or up to an increment above."""
     elastic = ElasticResponse.of(pbdkit.Experiment(**sheet(WHOLE)), ANY)
@@ -228,7 +228,7 @@ def test_a_torn_specimen_bears_what_the_run_shows():
         assert found.failed
 
 
-def test_broken_and_spared_bonds_bear_nothing():
+def test_broken_and_unbreakable_bonds_are_excluded():
     cracked = sheet(WHOLE | {"cracks": [[[1.5, -1.0], [1.5, 0.5]]]})
     scene = build_scene(pbdkit.Experiment(**cracked))
     state = initial_state(scene)
@@ -243,7 +243,7 @@ def test_broken_and_spared_bonds_bear_nothing():
 
 
 @pytest.mark.parametrize("breaks", [False, True])
-def test_bonds_to_the_frame_count_where_they_can_break(breaks):
+def test_breakable_frame_bonds_count(breaks):
     """In a body that is drawn out with its frame all bonds are strained; those to the frame are
     spared by `frame_bonds: false`, and so they are none of the links that may fail."""
     framed = sheet(WHOLE | {"frame_bonds": breaks}) | {
@@ -262,7 +262,7 @@ def test_bonds_to_the_frame_count_where_they_can_break(breaks):
     assert strains.merged().count.sum() == (len(framed) if breaks else (~framed).sum())
 
 
-def test_where_the_first_break_is_not_the_failure_it_is_said():
+def test_warning_if_the_first_break_is_not_the_failure():
     specimens = 0.03 * np.random.default_rng(1).weibull(8.0, 30)
     fit = {
         "kind": "strength", "experiment": sheet(STRAIN), "unknown": UNIFORM,
@@ -275,7 +275,7 @@ def test_where_the_first_break_is_not_the_failure_it_is_said():
     assert found.as_dict()["first_break_is_failure"] is False
 
 
-def test_simulation_finds_the_strengths_of_chains_torn_in_closed_form(monkeypatch):
+def test_simulation_recovers_closed_form_strengths_of_chains(monkeypatch):
     """The estimates are within 4.5 of their errors, which are larger than those of the likelihood:
     mean and spread of ln peak do not contain all information."""
     peaks = 16 * drawn(16, 60, 8)
@@ -314,7 +314,7 @@ def test_a_spread_of_weibull_is_the_coefficient_of_variation():
     assert LAWS["uniform"].variation(1.0, np.array(0.3)) == pytest.approx(0.3 / 3**0.5)
 
 
-def test_curves_and_peaks_tell_the_same(tmp_path):
+def test_curves_and_peaks_give_the_same_result(tmp_path):
     peaks = 16 * drawn(16, 12, 6)
     lines = ["specimen,u,f"]
     for n, peak in enumerate(peaks):
@@ -329,7 +329,7 @@ def test_curves_and_peaks_tell_the_same(tmp_path):
     assert whole.as_dict() == alone.as_dict()
 
 
-def test_the_shipped_fit_finds_what_its_data_were_made_of(call, tmp_path):
+def test_shipped_fit_recovers_its_parameters(call, tmp_path):
     result = call("fit", "fibres", "-o", str(tmp_path / "fibres.json"))
     assert result.code == 0, result.err
     found = json.loads((tmp_path / "fibres.json").read_text())
@@ -341,7 +341,7 @@ def test_the_shipped_fit_finds_what_its_data_were_made_of(call, tmp_path):
     assert "has no picture" in refused.err
 
 
-def test_kinds_of_fits_are_told_apart():
+def test_kinds_of_fits_are_distinguished():
     assert is_strength_fit("fibres")
     assert is_strength_fit({"kind": "strength"})
     assert not is_strength_fit("plate-with-hole")
@@ -413,14 +413,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_named(name):
+def test_invalid_input_is_named(name):
     changed, told = WRONG[name]
     fit = fit_of(16 * drawn(16, 10, 1)) | changed
     with pytest.raises(pbdkit.ExperimentError, match=told):
         pbdkit.fit_strength({key: value for key, value in fit.items() if value is not None})
 
 
-def test_bounds_that_cut_are_named():
+def test_truncating_bounds_are_named():
     narrow = WEIBULL | {"fracture.modulus": [9.5, 60.0]}
     found = pbdkit.fit_strength(fit_of(16 * drawn(16, 40, 1), unknown=narrow))
     assert found.values["fracture.modulus"].cut
@@ -428,7 +428,7 @@ def test_bounds_that_cut_are_named():
     assert "truncated by its bounds" in str(found.values["fracture.modulus"])
 
 
-def test_an_experiment_may_be_given_besides():
+def test_experiment_may_be_passed_separately():
     fit = fit_of(16 * drawn(16, 10, 1))
     del fit["experiment"]
     experiment = pbdkit.Experiment.build(Source("x", chain(16)))

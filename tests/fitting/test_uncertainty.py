@@ -26,7 +26,7 @@ def fit(tmp_path_factory):
     return {"experiment": plate(**COARSE), "unknown": POISSON, "measured": given, "modes": 3}
 
 
-def test_a_profile_agrees_with_the_standard_error_where_the_problem_is_straight(fit):
+def test_linear_profile_agrees_with_the_standard_error(fit):
     found = pbdkit.fit(fit | {"profile": ["rule.poisson_ratio"]})
     estimate, profile = found.values["rule.poisson_ratio"], found.profiles["rule.poisson_ratio"]
     assert profile.low == pytest.approx(estimate.value - 1.96 * estimate.error, rel=0.02)
@@ -47,7 +47,7 @@ def test_a_profile_agrees_with_the_standard_error_of_a_loss(loss, fit):
     assert profile.high - profile.low == pytest.approx(3.92 * estimate.error, rel=0.1)
 
 
-def test_the_rise_of_a_loss_is_that_of_its_scores():
+def test_increase_of_a_loss_matches_its_scores():
     """Huber's, of normal residuals: ψ² is z² within k, else k², and ψ' the share within."""
     from scipy.stats import norm
 
@@ -58,7 +58,7 @@ def test_the_rise_of_a_loss_is_that_of_its_scores():
 
 
 @pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
-def test_noise_that_is_understated_leaves_errors_as_they_are(loss, fit):
+def test_understated_noise_does_not_change_the_errors(loss, fit):
     """They come from the residuals: those of half the noise are as good, or a little worse."""
     found = [
         pbdkit.fit(fit | {"loss": loss, "measured": fit["measured"] | {"noise": noise}})
@@ -68,7 +68,7 @@ def test_noise_that_is_understated_leaves_errors_as_they_are(loss, fit):
     assert right * 0.95 < understated < right * 1.5
 
 
-def test_a_profile_with_two_parameters_fits_the_other_anew(fit):
+def test_profile_with_two_parameters_refits_the_other(fit):
     """The profile of one of two correlated parameters is wider than a cut through the valley."""
     rule = {"type": "elastic", "poisson_ratio": 0.3, "stiffness": {"otherwise": 1.0, "half": 1.0}}
     unknown = {"rule.poisson_ratio": [0.0, 0.49], "rule.stiffness.half": [0.3, 3.0]}
@@ -78,7 +78,7 @@ def test_a_profile_with_two_parameters_fits_the_other_anew(fit):
     assert profile.high - profile.low == pytest.approx(3.92 * estimate.error, rel=0.05)
 
 
-def test_where_the_data_tell_a_ratio_the_bounds_of_one_part_bound_the_other(tmp_path):
+def test_identified_ratio_transfers_bounds_between_its_parts(tmp_path):
     """The stiffness of one half is that of the other, which is between its bounds, times 2.5."""
     bounds = {"rule.stiffness.otherwise": [0.4, 1.2], "rule.stiffness.half": [0.3, 5.0]}
     asked = {"profile": ["rule.stiffness.half"]}
@@ -87,7 +87,7 @@ def test_where_the_data_tell_a_ratio_the_bounds_of_one_part_bound_the_other(tmp_
     assert (profile.low, profile.high) == pytest.approx((2.5 * 0.4, 2.5 * 1.2), rel=0.05)
 
 
-def test_what_data_do_not_bound_has_no_end(fit):
+def test_unidentified_parameters_have_unbounded_intervals(fit):
     rule = {"type": "elastic", "poisson_ratio": 0.3, "stiffness": 1.0}
     given = fit | {"experiment": plate(rule, **COARSE), "unknown": {"rule.stiffness": [0.5, 2.0]}}
     profile = pbdkit.fit(given | {"profile": ["rule.stiffness"]}).profiles["rule.stiffness"]
@@ -95,7 +95,7 @@ def test_what_data_do_not_bound_has_no_end(fit):
     assert "from no bound to no bound" in str(profile)
 
 
-def test_the_posterior_of_a_straight_problem_is_the_normal_one(fit):
+def test_posterior_of_a_linear_problem_is_normal(fit):
     """On a grid, without a sampler: its mean is the estimate, its deviation the standard error."""
     found = pbdkit.fit(fit)
     estimate = found.values["rule.poisson_ratio"]
@@ -107,7 +107,7 @@ def test_the_posterior_of_a_straight_problem_is_the_normal_one(fit):
     assert np.sqrt(-0.5 / second) == pytest.approx(estimate.error, rel=0.03)
 
 
-def test_the_posterior_of_parameters_is_the_integral_over_all_else(fit):
+def test_posterior_of_parameters_is_marginalised(fit):
     """Boundaries are straight unknowns: the integral of exp(-½ r²) over them is as large as the
     root of the determinant of JᵀJ is small, which changes with Poisson's ratio."""
     problem, z = pbdkit.fit(fit).problem, pbdkit.fit(fit).solution.z
@@ -128,7 +128,7 @@ def test_the_posterior_of_parameters_is_the_integral_over_all_else(fit):
     assert found[1] - found[0] == pytest.approx(logs[1] - logs[0], abs=1e-3)
 
 
-def test_what_is_told_twice_leaves_the_posterior_as_it_is(fit):
+def test_repeating_an_observation_leaves_the_posterior_unchanged(fit):
     """A shift of all is one of the boundaries, and one of the images."""
     twice = fit["measured"] | {"distortion": {"ux": [[0, 0]], "uy": [[0, 0]]}}
     values = 0.3 + 0.01 * np.linspace(-1.0, 1.0, 5)
@@ -141,7 +141,7 @@ def test_what_is_told_twice_leaves_the_posterior_as_it_is(fit):
     np.testing.assert_allclose(more, once, atol=0.05)
 
 
-def test_the_sampler_draws_from_it(fit):
+def test_sampler_draws_from_the_posterior(fit):
     pytest.importorskip("emcee")
     found = pbdkit.fit(fit | {"modes": 1, "sampler": {"walkers": 8, "steps": 24}})
     estimate, sample = found.values["rule.poisson_ratio"], found.sample
@@ -154,14 +154,14 @@ def test_the_sampler_draws_from_it(fit):
     assert again.sample.draws.tobytes() == sample.draws.tobytes()
 
 
-def test_a_sampler_that_is_missing_is_named_before_the_fit(fit, monkeypatch):
+def test_missing_sampler_is_named_before_the_fit(fit, monkeypatch):
     monkeypatch.setattr("pbdkit.errors.find_spec", lambda library: None)
     monkeypatch.setattr("pbdkit.fitting.fit.solved", None)
     with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[sample\]'"):
         pbdkit.fit(fit | {"sampler": {"walkers": 8, "steps": 24}})
 
 
-def test_the_right_model_foretells_best(tmp_path):
+def test_correct_model_predicts_best(tmp_path):
     """The isotropic rule predicts left-out points of an orthotropic plate worse."""
     rule = {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.5, "shear_ratio": 0.3}
     made = plate(rule, **COARSE)
@@ -209,7 +209,7 @@ class Lazy(pbdkit.FollowerRule):
         return p.share * total[0] / total[1]
 
 
-def test_a_third_party_s_rule_is_a_candidate(fit):
+def test_third_party_rule_is_a_candidate(fit):
     """Its equilibrium is that of barycentres, so that its share is not identifiable."""
     settings = {"rule": {"type": "lazy", "share": 0.5}, "frame.type": "mean"}
     rival = {"settings": settings, "unknown": {"rule.share": [0.2, 0.9]}}
@@ -223,7 +223,7 @@ def test_a_third_party_s_rule_is_a_candidate(fit):
     assert not own.values["rule.share"].identifiable
 
 
-def test_wide_bounds_start_where_the_gap_is_least(tmp_path):
+def test_wide_bounds_start_at_the_smallest_misfit(tmp_path):
     """The middle of 0.01 to 100 is far off; the gap determines the order of magnitude."""
     rule = {"type": "elastic", "poisson_ratio": 0.2, "stiffness": {"otherwise": 1.0, "half": 1.7}}
     made = plate(rule)
@@ -259,7 +259,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_named(name, fit):
+def test_invalid_input_is_named(name, fit):
     more, told = WRONG[name]
     with pytest.raises(pbdkit.ExperimentError, match=told):
         pbdkit.fit(fit | more)

@@ -20,7 +20,7 @@ from property_cases import (
 import pbdkit
 
 
-def test_case_5_collinear_neighbours_are_warned_of():
+def test_case_5_collinear_neighbours_give_a_warning():
     oblique = {"type": "oblique", "a": 1.0, "b": 1.0, "angle": 5.0}
     (warning,) = scene_of(lattice=oblique, neighbours="coordination-1").warnings
     assert "all lie along one line" in warning
@@ -30,7 +30,7 @@ def test_case_5_collinear_neighbours_are_warned_of():
 
 @pytest.mark.filterwarnings("ignore:neighbours. all lie along one line")
 @pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
-def test_case_6_components_without_leader_are_named_and_stay_put():
+def test_case_6_components_without_leader_are_named_and_stay():
     flat = {"type": "rectangular", "a": 1.0, "b": 2.5}
     scene = scene_of(lattice=flat)
     assert "rows are not coupled" in scene.warnings[0]
@@ -50,7 +50,7 @@ def test_case_6_components_without_leader_are_named_and_stay_put():
 @pytest.mark.parametrize("lattice", LATTICES)
 @pytest.mark.filterwarnings("ignore:neighbours. all lie along one line")
 @pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
-def test_case_7_a_single_follower_in_its_frame_stays_put(lattice):
+def test_case_7_a_single_follower_in_its_frame_stays(lattice):
     start = np.array([[0.3, -0.2]])
     u = advanced(scene_of(1, 1, lattice=lattice), start, 50)
     # Its frame stands as it does: only rounding of the mean of equal numbers can move it.
@@ -58,7 +58,7 @@ def test_case_7_a_single_follower_in_its_frame_stays_put(lattice):
     assert not displacements(1, 1, lattice=lattice, steps=50).any()
 
 
-def test_case_8_contradictory_leaders_are_refused_with_the_particle_and_both_groups():
+def test_case_8_contradictory_leaders_are_refused_with_particle_and_groups():
     up = {"type": "velocity", "velocity": [0.0, 0.1], "steps": 3}
     leaders = [HOLD_LEFT, {"select": {"edge": "bottom"}, "motion": up}]
     message = r"leaders.1: moves particle 9 in step 1 differently from leaders.0"
@@ -83,7 +83,7 @@ def test_case_9_coincident_particles_stay_under_distance_weights(frame):
         assert np.array_equal(u[-1], at_origin)
 
 
-def test_case_9_a_mean_by_distance_of_coincident_particles_spreads_a_layer_a_step():
+def test_case_9_distance_mean_of_coincident_particles_spreads_by_layers():
     """Σ|d| x / Σ|d| is 0 / 0 where all neighbours coincide: 1, 5, 13, 25 particles."""
     x = np.indices((15, 15)).astype(float)
     x[:, 6:9, 6:9] = 7.0
@@ -145,14 +145,14 @@ class Loose(pbdkit.FramePolicy):
         return pbdkit.plugin.FrameMap(point[kept], body[kept], np.ones(kept.sum()))
 
 
-def test_case_21_a_frame_point_that_follows_nobody_is_refused():
+def test_case_21_a_frame_point_without_a_particle_is_refused():
     given = experiment(frame={"type": "loose"})
     message = "'loose' maps frame point 56 to no particle of the body, so that the point would be"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         pbdkit.run(given, components=[Loose], progress=False)
 
 
-def test_case_21_a_single_frame_point_that_stays_behind_anchors_the_body():
+def test_case_21_a_fixed_frame_point_anchors_the_body():
     """A 6 x 5 sheet pulled by 1 naively, one frame point above its middle left at rest."""
     u, affine = np.zeros((6, 7)), np.arange(6)[:, None] / 5
     u[-1] = 1.0
@@ -163,7 +163,7 @@ def test_case_21_a_single_frame_point_that_stays_behind_anchors_the_body():
     assert np.abs(u[:, 1:-1] - affine).max() == pytest.approx(0.2306, abs=1e-4)
 
 
-def test_case_24_a_diagnostic_beyond_the_finite_numbers_is_an_error_with_step_and_particle():
+def test_case_24_a_diagnostic_overflow_is_an_error_with_step_and_particle():
     leaders = [displace([9], 1e200, 0.0)]
     given = experiment(leaders=leaders, diagnostics=[{"type": "pe1"}], steps=3)
     with pytest.raises(pbdkit.DivergedError, match=r"particle \d+ at step 1") as caught:

@@ -48,7 +48,7 @@ def stretched(lattice, neighbours, stretch):
     ("lattice", "neighbours", "rule"),
     all_pairs(LATTICES, ["coordination-1", "chebyshev-1"], ["barycentre", "mean-displacement"]),
 )
-def test_affine_leaders_all_round_make_an_affine_interior(lattice, neighbours, rule):
+def test_affine_leaders_all_round_give_an_affine_interior(lattice, neighbours, rule):
     parts = {"lattice": lattice, "neighbours": neighbours, "rule": rule}
     scene = scene_of(7, 7, **parts)
     body, reach = scene.raster, scene.neighbourhood.reach
@@ -73,9 +73,7 @@ def test_case_1_the_equilibrium_of_a_stretched_sheet_is_affine(lattice, neighbou
 
 @pytest.mark.parametrize("through", [1.001, 1.2, 3.0])
 @sheets
-def test_case_2_a_sheet_pushed_through_itself_reports_its_signed_area_and_is_warned_of(
-    lattice, neighbours, through
-):
+def test_case_2_an_inverted_sheet_has_signed_area_and_a_warning(lattice, neighbours, through):
     parts, _, _, leaders = stretched(lattice, neighbours, -through)
     cells = 50 if lattice == "hexagonal" else 25
     given = experiment(6, 6, leaders=leaders, steps=600, solver=RELAXED, **parts)
@@ -90,7 +88,7 @@ def test_case_2_a_sheet_pushed_through_itself_reports_its_signed_area_and_is_war
     np.testing.assert_allclose(ds.smallest_cell_area, [1.0, 1.0 - through], rtol=0, atol=1e-11)
 
 
-def test_case_2_a_sheet_pushed_almost_flat_is_not_warned_of(recwarn):
+def test_case_2_an_almost_flat_sheet_gives_no_warning(recwarn):
     parts, _, _, leaders = stretched("square", "coordination-1", -0.999)
     given = experiment(6, 6, leaders=leaders, steps=600, solver=RELAXED, **parts)
     ds = pbdkit.run(given | {"diagnostics": [{"type": "smallest-cell-area"}]}, progress=False)
@@ -104,7 +102,7 @@ def coupled(K, reach):
     return experiment(rule=rule, leaders=[HOLD_LEFT, displace([48], reach, 0.0)], steps=300)
 
 
-def test_case_3_an_absurd_coupling_is_exact_in_its_numbers_and_warned_of():
+def test_case_3_an_excessive_coupling_is_exact_and_gives_a_warning():
     """x does not feel y, and y is proportional to K: finite, and inside out."""
     with pytest.warns(pbdkit.PbdkitWarning, match="reduce the displacement of the leaders"):
         absurd = pbdkit.run(coupled(1e6, 0.5), progress=False).u.values
@@ -115,7 +113,7 @@ def test_case_3_an_absurd_coupling_is_exact_in_its_numbers_and_warned_of():
 
 
 @pytest.mark.parametrize("steps_of", ["one particle", "paper/b"])
-def test_case_3_a_coupling_that_passes_a_million_times_the_body_is_stopped(steps_of):
+def test_case_3_a_coupling_beyond_a_million_body_lengths_is_stopped(steps_of):
     wide = pbdkit.load("paper/b", settings=["rule.K=1e6"])
     given = coupled(1e6, 1.0) if steps_of == "one particle" else wide
     with pytest.raises(pbdkit.DivergedError, match="diverged under rule 'mixed-coordinate'"):
@@ -123,7 +121,7 @@ def test_case_3_a_coupling_that_passes_a_million_times_the_body_is_stopped(steps
 
 
 @pytest.mark.parametrize(("columns", "speed"), [(20, 0.0035), (12, 0.35)])
-def test_case_22_the_body_lags_behind_a_leader_by_the_formula(columns, speed):
+def test_case_22_the_lag_behind_a_leader_matches_the_formula(columns, speed):
     """The steady lag w solves (1 - P) w = the motion of the equilibrium in a step, less the part
     that the leaders, which move first, pass on within the step: (2v/3N) i (N² - i² - 3/2), N =
     columns - 1."""
@@ -140,7 +138,7 @@ def test_case_22_the_body_lags_behind_a_leader_by_the_formula(columns, speed):
     assert lag.max() == pytest.approx(4 * speed * N**2 / (9 * np.sqrt(3)), rel=0.023)
 
 
-def test_case_22_a_fast_leader_stretches_its_first_bond_nine_times_as_far_as_equilibrium():
+def test_case_22_a_fast_leader_stretches_its_first_bond_ninefold():
     long = ["body.columns=20", "record={every: 1}", "diagnostics=[{type: displacement}]"]
     ds = pbdkit.run(pbdkit.load("paper/a", settings=long), progress=False)
     row = ds.u.values[:, ((ds.kind[0] != 2) & (ds.site[:, 1] == 0)).values, 0]

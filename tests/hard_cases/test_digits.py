@@ -30,7 +30,7 @@ def naively_broken(spacing, origin):
 @pytest.mark.parametrize("neighbours", ["coordination-1", "coordination-2"])
 @pytest.mark.parametrize("h", [0.1, 0.7, 1.0, 1.23, 1 / 3, 1e-7, 123.4])
 @pytest.mark.filterwarnings("ignore:neighbours. all lie along one line")
-def test_case_10_nothing_breaks_at_rest_at_a_threshold_of_the_rest_distance(lattice, neighbours, h):
+def test_case_10_nothing_breaks_at_rest_at_the_rest_distance(lattice, neighbours, h):
     scaled = {k: h * v if k in ("a", "b") else v for k, v in LATTICES[lattice].items()}
     parts = {"lattice": scaled, "neighbours": neighbours, "leaders": BOTH_ENDS_HELD}
     shells = scene_of(**parts).neighbourhood.shells()
@@ -40,7 +40,7 @@ def test_case_10_nothing_breaks_at_rest_at_a_threshold_of_the_rest_distance(latt
 
 
 @pytest.mark.parametrize("h", [0.1, 0.7, 1.0, 1.23, 2.37, 123.4])
-def test_case_10_a_hexagonal_threshold_written_as_the_spacing_breaks_nothing_at_rest(h):
+def test_case_10_a_hexagonal_threshold_equal_to_the_spacing_breaks_nothing(h):
     parts = {"lattice": {"type": "hexagonal", "a": h}, "leaders": BOTH_ENDS_HELD}
     fracture = {"type": "threshold", "thresholds": [h]}
     ds = pbdkit.run(experiment(fracture=fracture, **parts, steps=5), progress=False)
@@ -49,7 +49,7 @@ def test_case_10_a_hexagonal_threshold_written_as_the_spacing_breaks_nothing_at_
 
 @pytest.mark.parametrize("below", [1e-16, 2e-13, 5e-13, 8e-13, 2e-12, 1e-9])
 @pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
-def test_case_10_a_threshold_that_is_accepted_does_not_break_a_body_at_rest(below):
+def test_case_10_an_accepted_threshold_breaks_nothing_at_rest(below):
     fracture = {"type": "threshold", "thresholds": [1.0 - below]}
     try:
         ds = pbdkit.run(experiment(fracture=fracture, steps=2), progress=False)
@@ -73,7 +73,7 @@ def near_and_away(far, **parts):
 
 
 @every_lattice
-def test_case_12_far_from_the_origin_the_same_bonds_break(lattice):
+def test_case_12_the_same_bonds_break_far_from_the_origin(lattice):
     parts = {"lattice": LATTICES[lattice], "neighbours": "chebyshev-1"}
     parts |= {"leaders": [HOLD_LEFT, pull_right(0.35, 0.1)]}
     fracture = {"type": "threshold", "thresholds": [2.2]}
@@ -113,7 +113,7 @@ def test_case_18_single_precision_keeps_its_digits_in_displacements():
 @every_lattice
 @pytest.mark.parametrize("far", [1e8, 1e12])
 @pytest.mark.filterwarnings("ignore:neighbours. all lie along one line")
-def test_case_19_far_from_the_origin_the_same_moves_are_made(lattice, far):
+def test_case_19_displacements_are_the_same_far_from_the_origin(lattice, far):
     parts = {"lattice": LATTICES[lattice], "leaders": [HOLD_LEFT, pull_right(0.35, 0.1)]}
     near, away = near_and_away(far, **parts, steps=200)
     assert np.abs(near.u).max() > 1.0
@@ -123,12 +123,12 @@ def test_case_19_far_from_the_origin_the_same_moves_are_made(lattice, far):
 
 
 @pytest.mark.parametrize(("far", "error"), [(1e8, 5e-8), (1e12, 1e-3)])
-def test_case_19_a_program_of_positions_loses_digits_far_from_the_origin(far, error):
+def test_case_19_a_position_based_program_loses_digits_far_from_the_origin(far, error):
     near, away = (by_positions(20, 0.35, 1000, np.float64, at) for at in (0.0, far))
     assert np.abs(away - near).max() > error
 
 
-def test_case_23_a_step_is_jacobi_every_follower_sees_the_same_configuration():
+def test_case_23_a_step_is_a_jacobi_iteration():
     scene = scene_of(5, 4)
     site = scene.raster.site_of(scene.raster.body_rows).tolist()
     u = np.random.default_rng(2).normal(size=(len(site), 2))
@@ -148,7 +148,7 @@ def test_case_23_a_step_is_jacobi_every_follower_sees_the_same_configuration():
     assert np.abs(forward - backward).max() > 0.1
 
 
-def test_case_23_the_numbers_of_the_particles_do_not_matter():
+def test_case_23_results_do_not_depend_on_particle_numbers():
     """The second sheet is the same, numbered along its rows in place of its columns, with x and y
     exchanged."""
     u = np.random.default_rng(3).normal(size=(4, 5, 2))

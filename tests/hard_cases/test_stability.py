@@ -40,7 +40,7 @@ class CurrentY(pbdkit.FollowerRule):
         return pbdkit.plugin.Vector(move.x, move.y + p.K * (here.u.x + move.x) * above)
 
 
-def test_case_4_the_current_y_in_mixed_coordinates_diverges_and_is_known_to_beforehand():
+def test_case_4_divergence_of_current_y_in_mixed_coordinates_is_predicted():
     pull = {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [2.0, 0.0]}}
     stretched = {"type": "affine", "gradient": [[2 / 7, 0.0], [0.0, 0.0]]}
     parts = {"leaders": [HOLD_LEFT, pull], "initial": stretched, "steps": 1000}
@@ -92,7 +92,7 @@ class Even(Periodic):
 
 @pytest.mark.parametrize("frame", ["periodic", "even"])
 @pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
-def test_case_13_the_mode_that_never_decays_is_found_and_decays_below_relaxation_1(frame):
+def test_case_13_the_undamped_mode_decays_at_relaxation_below_1(frame):
     parts = {"frame": {"type": frame}, "initial": {"type": "noise", "amplitude": 0.1}}
     given = experiment(6, 4, **parts, steps=600)
     known = pbdkit.analyse(given, components=[Periodic, Even])
@@ -117,12 +117,12 @@ def test_case_13_the_mode_that_never_decays_is_found_and_decays_below_relaxation
     assert pbdkit.analyse(relaxed, components=[Periodic, Even]).stable
 
 
-def test_case_13_the_mirror_frame_turns_the_normal_component_and_has_no_such_mode():
+def test_case_13_the_mirror_frame_has_no_undamped_mode():
     known = pbdkit.analyse(experiment(6, 6, frame={"type": "mirror"}))
     assert known.smallest_eigenvalue == pytest.approx(-(1 + np.cos(np.pi / 5)) / 2, abs=1e-12)
 
 
-def test_case_14_leaders_all_round_give_a_symmetric_spectrum_and_settle():
+def test_case_14_leaders_all_round_give_a_symmetric_spectrum_and_converge():
     edges = [{"select": {"edge": e}, "motion": {"type": "hold"}} for e in ("bottom", "top")]
     scene = scene_of(7, 6, leaders=[*BOTH_ENDS_HELD, *edges])
     values = np.linalg.eigvalsh(step_map(scene))
@@ -172,7 +172,7 @@ def test_case_15_the_distance_weighted_rule_runs_as_printed_with_the_warning():
     ],
     ids=["relaxation", "memory", "both"],
 )
-def test_case_16_divergence_is_warned_of_and_stopped_and_the_last_good_state_kept(
+def test_case_16_divergence_is_predicted_stopped_and_leaves_the_last_state(
     solver, waves, exact, engine, call, tmp_path, interpreted
 ):
     sparse = experiment(8, 6, leaders=[HOLD_LEFT, pull_right(0.1, 0.0)], steps=3000)
@@ -197,7 +197,7 @@ def test_case_16_divergence_is_warned_of_and_stopped_and_the_last_good_state_kep
         assert f"the last recorded state is step {int(ds.time[-1])}, the last in which" in end
 
 
-def test_case_16_memory_1_swings_for_ever_and_does_not_grow():
+def test_case_16_momentum_1_oscillates_without_growth():
     """Every mode has |μ| = 1 there; what grows begins above."""
     given = experiment(8, 6, leaders=[HOLD_LEFT, pull_right(0.1, 0.0)], steps=3000)
     given |= {"solver": {"type": "stepping", "memory": 1.0}}
@@ -210,7 +210,7 @@ def test_case_16_memory_1_swings_for_ever_and_does_not_grow():
 
 
 @pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
-def test_case_17_in_1e5_steps_without_a_leader_the_frame_does_not_drift():
+def test_case_17_without_a_leader_the_frame_does_not_drift_in_1e5_steps():
     parts = {"lattice": "hexagonal", "frame": "first", "neighbours": "chebyshev-1"}
     start = {"initial": {"type": "noise", "amplitude": 0.3}, "record": {"at": [0, 1000, 100000]}}
     solver = {"type": "stepping", "engine": "compiled"}

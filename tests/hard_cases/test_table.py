@@ -37,23 +37,23 @@ def numbered_tests():
                 yield int(number[1]), node
 
 
-def test_the_table_has_a_row_for_each_case_and_no_other():
+def test_table_has_one_row_per_case():
     assert [int(cells[0]) for cells in rows()] == list(range(1, COUNT + 1))
 
 
 @pytest.mark.parametrize("cells", rows(), ids=lambda cells: cells[0])
-def test_a_row_says_what_happens_what_is_done_and_gives_a_measured_number(cells):
+def test_row_has_event_treatment_and_a_measured_number(cells):
     assert len(cells) == 5
     assert all(len(cell) > 3 for cell in cells[1:])
     assert re.search(r"\d", cells[4])
 
 
 @pytest.mark.parametrize("number", range(1, COUNT + 1))
-def test_a_case_has_tests_of_its_own_that_can_fail(number):
+def test_every_case_has_tests_with_assertions(number):
     own = [function for n, function in numbered_tests() if n == number]
     assert own
     assert all(checks(function) for function in own)
 
 
-def test_no_test_is_of_a_case_that_is_not_in_the_table():
+def test_every_test_belongs_to_a_case_of_the_table():
     assert {n for n, _ in numbered_tests()} <= set(range(1, COUNT + 1))

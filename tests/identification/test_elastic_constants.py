@@ -64,7 +64,7 @@ def four_of(lattice):
 
 
 @pytest.mark.parametrize("lattice", [RECTANGULAR, CENTRED, oblique(75.0)], ids=lambda x: x["type"])
-def test_averaging_over_four_neighbours_elsewhere_is_anisotropic_diffusion(lattice):
+def test_averaging_over_four_neighbours_elsewhere_is_anisotropic(lattice):
     found = identity(lattice, four_of(lattice), BARYCENTRE)
     assert (found.kind, found.symmetry, found.diffusivity) == ("diffusion", "anisotropic", None)
     assert (found.poisson_ratio, found.body) == (None, None)
@@ -126,7 +126,7 @@ def test_distance_weighting_has_the_poisson_ratio_of_springs_without_rest_length
 
 @pytest.mark.parametrize("lattice", [SQUARE, RECTANGULAR], ids=["square", "rectangular"])
 @pytest.mark.parametrize("nu", POISSON_RATIOS)
-def test_elastic_on_rectangles_is_the_material_asked_for(lattice, nu):
+def test_elastic_on_rectangles_has_the_specified_material(lattice, nu):
     found = identity(lattice, EIGHT, elastic(nu))
     assert (found.kind, found.symmetry) == ("elasticity", "isotropic")
     assert found.poisson_ratio == pytest.approx(nu, abs=1e-12)
@@ -138,7 +138,7 @@ def test_elastic_on_rectangles_is_the_material_asked_for(lattice, nu):
 
 
 @pytest.mark.parametrize("nu", POISSON_RATIOS)
-def test_elastic_on_triangles_is_the_material_asked_for(nu):
+def test_elastic_on_triangles_has_the_specified_material(nu):
     found = identity(HEXAGONAL, NEAREST, elastic(nu))
     assert (found.kind, found.symmetry, found.symmetric) == ("elasticity", "isotropic", True)
     assert found.poisson_ratio == pytest.approx(nu, abs=1e-12)
@@ -151,7 +151,7 @@ def test_elastic_on_triangles_is_the_material_asked_for(nu):
 
 @pytest.mark.parametrize("nu", [-0.5, 0.0, 0.3, 0.45])
 @pytest.mark.parametrize(("lattice", "neighbours"), [(SQUARE, EIGHT), (HEXAGONAL, NEAREST)])
-def test_plane_strain_has_the_ratio_of_another_material_in_plane_stress(lattice, neighbours, nu):
+def test_plane_strain_has_the_ratio_of_another_plane_stress_material(lattice, neighbours, nu):
     found = identity(lattice, neighbours, elastic(nu, plane="strain"))
     assert found.poisson_ratio == pytest.approx(nu / (1 - nu), abs=1e-12)
 
@@ -159,7 +159,7 @@ def test_plane_strain_has_the_ratio_of_another_material_in_plane_stress(lattice,
 @pytest.mark.parametrize(
     ("lattice", "neighbours", "alike"), [(SQUARE, EIGHT, NEAREST), (HEXAGONAL, NEAREST, NEAREST)]
 )
-def test_the_member_with_poisson_ratio_minus_one_is_the_barycentre(lattice, neighbours, alike):
+def test_poisson_ratio_of_minus_one_is_the_barycentre(lattice, neighbours, alike):
     """With the four nearest neighbours on the square lattice the weights of the diagonals are (1 +
     ν)."""
     found, mean = identity(lattice, neighbours, elastic(-1.0)), identity(lattice, alike, BARYCENTRE)
@@ -173,7 +173,7 @@ def test_the_member_with_poisson_ratio_minus_one_is_the_barycentre(lattice, neig
 @pytest.mark.parametrize(
     ("nu", "modulus", "shear"), [(0.3, 0.5, 0.2), (0.1, 3.0, 0.6), (0.0, 1.0, 0.1), (-0.4, 0.8, 1)]
 )
-def test_orthotropic_is_the_material_asked_for(lattice, nu, modulus, shear):
+def test_orthotropic_has_the_specified_material(lattice, nu, modulus, shear):
     rule = {
         "type": "orthotropic",
         "poisson_ratio": nu,
@@ -194,7 +194,7 @@ def test_orthotropic_is_the_material_asked_for(lattice, nu, modulus, shear):
 
 
 @pytest.mark.parametrize(("lattice", "neighbours"), [(SQUARE, EIGHT), (HEXAGONAL, NEAREST)])
-def test_springs_have_a_third(lattice, neighbours):
+def test_springs_have_a_poisson_ratio_of_one_third(lattice, neighbours):
     found = identity(lattice, neighbours, "springs")
     assert (found.kind, found.symmetry) == ("elasticity", "isotropic")
     assert found.poisson_ratio == pytest.approx(1 / 3, abs=1e-12)
@@ -238,7 +238,7 @@ def test_positive_further_shells_are_no_gradient_elasticity(lattice, neighbours,
     assert any("which is not the sign of gradient elasticity" in note for note in found.notes)
 
 
-def test_nearest_rows_alone_have_the_lattice_s_own_fourth_order():
+def test_nearest_rows_have_the_fourth_order_of_the_lattice():
     found = identity(SQUARE, NEAREST, BARYCENTRE)
     assert [(g.direction, g.rows_apart) for g in found.long.gradients] == [
         (0.0, 1.0), (45.0, pytest.approx(math.sqrt(0.5))), (90.0, 1.0)
@@ -249,7 +249,7 @@ def test_nearest_rows_alone_have_the_lattice_s_own_fourth_order():
 
 
 @pytest.mark.parametrize("c", [0.01, 1.0])
-def test_the_operator_twice_is_gradient_elasticity(c):
+def test_squared_operator_is_gradient_elasticity(c):
     """c (1 - P)²: l² = c D in every direction, stable below 2/(2 + 4c)."""
     neighbours = {"type": "euclidean", "radius": 2.0}
     found = identity(SQUARE, neighbours, {"type": "twice", "c": c})
@@ -274,7 +274,7 @@ def test_the_operator_twice_is_gradient_elasticity(c):
         (SQUARE, EIGHT, "odd"),
     ],
 )
-def test_the_second_order_is_what_a_step_does(lattice, neighbours, rule):
+def test_second_order_matches_a_step(lattice, neighbours, rule):
     """u_b = x·H_b·x / 2 moves the particle in the middle by Q_abcd H_bcd, whatever H."""
     source = Source(data=experiment(lattice, neighbours, rule))
     scene = build_scene(pbdkit.Experiment.build(source, THIRD_PARTY))
@@ -290,7 +290,7 @@ def test_the_second_order_is_what_a_step_does(lattice, neighbours, rule):
     np.testing.assert_allclose((after - before)[middle][0], expected, rtol=1e-11)
 
 
-def test_waves_with_memory_have_the_speed_that_the_steps_give_them():
+def test_waves_with_momentum_have_the_speed_of_the_steps():
     """ω² = c² k² less a constant, along x where λ = (1 + cos k)/2."""
     memory, k = 0.81, np.array([0.25, 0.26])
     found = identity(SQUARE, NEAREST, BARYCENTRE, solver={"type": "stepping", "memory": memory})
@@ -300,7 +300,7 @@ def test_waves_with_memory_have_the_speed_that_the_steps_give_them():
     assert np.diff(frequency**2) / np.diff(k**2) == pytest.approx(speed**2, rel=0.01)
 
 
-def test_slow_waves_follow_their_series_to_the_fourth_order():
+def test_long_waves_match_their_series_to_fourth_order():
     found = identity({"type": "honeycomb"}, NEAREST, "central")
     waves = slow_waves(found.stencil)
     direction = np.array([np.cos(0.4), np.sin(0.4)])
@@ -313,7 +313,7 @@ def test_slow_waves_follow_their_series_to_the_fourth_order():
 
 @pytest.mark.parametrize("lattice", LATTICES)
 @pytest.mark.parametrize("neighbours", NEIGHBOURS)
-def test_averaging_spreads_by_half_the_mean_square_of_the_rest_offsets(lattice, neighbours):
+def test_averaging_spreads_by_half_the_mean_square_of_the_offsets(lattice, neighbours):
     found = identity(LATTICES[lattice], NEIGHBOURS[neighbours], BARYCENTRE)
     assert (found.kind, found.stencil.sites) == ("diffusion", 1)
     rest = found.stencil.rest
@@ -328,7 +328,7 @@ def test_every_shipped_experiment_has_an_identity(name):
     assert (found.kind == "neither") == (found.rule == "mixed-coordinate")
 
 
-def test_neighbours_found_anew_are_those_at_rest():
+def test_changing_neighbours_are_identified_at_rest():
     neighbours = {"type": "euclidean", "radius": 1.0, "reevaluate": True}
     found = identity(SQUARE, neighbours, BARYCENTRE)
     assert found.diffusivity == pytest.approx(0.25)

@@ -24,7 +24,7 @@ from pbdkit.identification.elastic_constants import Elasticity
 HONEYCOMB = {"type": "honeycomb"}
 
 
-def test_a_lattice_with_two_sites_is_seen_through_its_slow_waves():
+def test_lattice_with_two_sites_is_identified_by_its_long_waves():
     """A walk over three neighbours at distance 1 spreads by 1/4; waves λ = ±|Σ exp(ik·r)|/3."""
     found = identity(HONEYCOMB, NEAREST, BARYCENTRE)
     assert (found.kind, found.symmetry) == ("diffusion", "isotropic")
@@ -34,7 +34,7 @@ def test_a_lattice_with_two_sites_is_seen_through_its_slow_waves():
     assert "2 sites per cell: their relative shifts are eliminated" in found.notes
 
 
-def test_springs_along_a_honeycomb_resist_no_shear():
+def test_springs_along_a_honeycomb_have_no_shear_stiffness():
     """Three bonds a site are too few: C11 = C12 and C66 = 0, with the sites' shift let go."""
     found = identity(HONEYCOMB, NEAREST, "central")
     constants = found.body.stiffness / found.body.stiffness[0, 0]
@@ -44,7 +44,7 @@ def test_springs_along_a_honeycomb_resist_no_shear():
     assert any(note.endswith("do not decay at all") for note in found.notes)
 
 
-def test_equal_springs_along_triangles_are_isotropic_and_along_squares_are_not():
+def test_equal_springs_are_isotropic_on_triangles_and_not_on_squares():
     triangles = identity(HEXAGONAL, NEAREST, "central")
     assert (triangles.symmetry, triangles.poisson_ratio) == ("isotropic", pytest.approx(1 / 3))
     squares = identity(SQUARE, EIGHT, "central")
@@ -58,7 +58,7 @@ def test_equal_springs_along_triangles_are_isotropic_and_along_squares_are_not()
     assert squares.body.zener == pytest.approx(2.0)
 
 
-def test_a_cell_larger_than_needed_changes_nothing():
+def test_larger_cell_changes_nothing():
     two_sites, one_site = (
         identity(lattice, NEAREST, WEIGHTED)
         for lattice in ({"type": "hexagonal", "a": 1.0}, oblique(60.0))
@@ -68,7 +68,7 @@ def test_a_cell_larger_than_needed_changes_nothing():
     assert two_sites.spectrum.smallest == pytest.approx(one_site.spectrum.smallest, abs=1e-9)
 
 
-def test_the_scale_of_the_lattice_changes_nothing():
+def test_lattice_scale_changes_nothing():
     small, large = (
         identity({"type": "square", "a": a}, EIGHT, {"type": "elastic", "poisson_ratio": 0.3})
         for a in (1e-3, 1e3)
@@ -124,25 +124,25 @@ def test_the_scale_of_the_lattice_changes_nothing():
         ),
     ],
 )  # fmt: skip
-def test_what_is_neither_is_told_why(rule, reason):
+def test_unclassified_rule_has_a_reason(rule, reason):
     found = identity(SQUARE, EIGHT, rule)
     assert (found.kind, found.symmetry, found.poisson_ratio) == ("neither", None, None)
     assert reason in found.reasons
     json.dumps(found.as_dict())
 
 
-def test_sites_that_never_move_are_not_one_body():
+def test_immobile_sites_are_not_one_body():
     found = identity(HONEYCOMB, NEAREST, "idle")
     said = "relative displacements of the sublattices do not decay: they are not coupled"
     assert (found.kind, found.reasons) == ("neither", (said,))
 
 
-def test_where_stretching_costs_nothing_no_anisotropy_is_told():
+def test_zero_stretching_stiffness_has_no_anisotropy():
     costless = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.5]])
     assert Elasticity(costless, np.eye(2)).zener is None
 
 
-def test_a_rule_that_remembers_is_identified_as_it_starts():
+def test_rule_with_state_is_identified_in_its_initial_state():
     """Fresh particles follow the barycentre by their zeal: 0.9 of its diffusivity."""
     found = pbdkit.identify(experiment(SQUARE, NEAREST, Tiring()), components=[Tiring])
     fresh = identity(SQUARE, NEAREST, BARYCENTRE)
@@ -150,20 +150,20 @@ def test_a_rule_that_remembers_is_identified_as_it_starts():
     assert found.diffusivity == pytest.approx(0.9 * fresh.diffusivity, rel=1e-9)
 
 
-def test_growing_waves_are_stable_at_no_relaxation():
+def test_growing_waves_are_unstable_at_any_relaxation():
     found = identity(SQUARE, EIGHT, "growing")
     assert found.spectrum.largest_stable_relaxation is None
     assert "some waves grow at any relaxation" in found.notes
 
 
-def test_turning_waves_have_their_own_bound():
+def test_rotating_waves_have_their_own_bound():
     """z = 1 ± 0.3 i times that of the barycentre, up to 3/2: w < 2 / (1.5 · 1.09)."""
     found = identity(SQUARE, EIGHT, "odd")
     assert found.spectrum.largest_stable_relaxation == pytest.approx(2 / (1.5 * 1.09))
     assert found.spectrum.imaginary == pytest.approx(0.45)
 
 
-def test_a_rule_at_fault_is_named():
+def test_failing_rule_is_named():
     with pytest.raises(pbdkit.PluginError) as caught:
         identity(SQUARE, EIGHT, "failing")
     assert str(caught.value).startswith(

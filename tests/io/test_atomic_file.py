@@ -68,9 +68,7 @@ def result(call: Call) -> Call:
     return call
 
 
-def test_a_seal_that_is_written_piece_by_piece_is_whole(
-    result: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_seal_written_in_pieces_is_complete(result: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(io, "FileIO", Short)
     assert result("run", "e.json", "-o", "out.nc").code == 0
     assert result("sweep", "s.json", "-o", "s", "--workers", "1").code == 0
@@ -78,7 +76,7 @@ def test_a_seal_that_is_written_piece_by_piece_is_whole(
     assert sealed(Path("s/sweep.nc"))
 
 
-def test_a_result_that_the_disk_gives_back_otherwise_gets_no_name(
+def test_result_read_back_differently_from_disk_gets_no_name(
     call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run of less than a second has no store, and is read back nevertheless."""
@@ -106,7 +104,7 @@ WRITING = {
 
 
 @pytest.mark.parametrize("name", WRITING)
-def test_a_full_disk_leaves_the_earlier_file_and_blames_no_other(
+def test_full_disk_leaves_the_earlier_file_and_is_named(
     result: Call, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     words = WRITING[name]
@@ -121,7 +119,7 @@ def test_a_full_disk_leaves_the_earlier_file_and_blames_no_other(
 
 
 @pytest.mark.parametrize("name", ["export", "animate"])
-def test_short_writes_make_the_same_file(
+def test_short_writes_give_the_same_file(
     result: Call, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     words = WRITING[name]
@@ -146,7 +144,7 @@ def test_a_sweep_on_a_full_disk_keeps_its_earlier_dataset(
     assert Path("s/sweep.nc").read_bytes() == earlier
 
 
-def test_hdf5_never_hears_of_a_fault(tmp_path: Path) -> None:
+def test_write_errors_are_hidden_from_hdf5(tmp_path: Path) -> None:
     """It would try again as the process ends, and crash it."""
     disk = Full(tmp_path / "x", "x+b")
     file = NewFile(disk)
@@ -158,7 +156,7 @@ def test_hdf5_never_hears_of_a_fault(tmp_path: Path) -> None:
     disk.close()
 
 
-def test_an_error_in_the_block_that_is_no_fault_of_the_disk_stays_what_it_is(
+def test_unrelated_error_in_the_block_is_raised_unchanged(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "x"
@@ -172,7 +170,7 @@ def test_an_error_in_the_block_that_is_no_fault_of_the_disk_stays_what_it_is(
     assert [p.name for p in tmp_path.iterdir()] == ["x"]
 
 
-def test_the_earlier_file_gives_its_permissions(tmp_path: Path) -> None:
+def test_permissions_of_the_earlier_file_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_text("earlier")
     path.chmod(0o600)
@@ -198,7 +196,7 @@ def test_the_figures_of_bench_replace_no_link(call: Call) -> None:
     assert (found.code, "is a symbolic link, which is not replaced" in found.err) == (2, True)
 
 
-def test_a_folder_and_files_that_belong_together_appear_whole_or_not_at_all(
+def test_related_files_appear_together_or_not_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(io, "FileIO", Full)
@@ -216,7 +214,7 @@ def test_a_folder_and_files_that_belong_together_appear_whole_or_not_at_all(
 
 
 @pytest.mark.parametrize("letter", ["a", "名"])
-def test_names_may_be_as_long_as_the_system_takes(call: Call, letter: str) -> None:
+def test_names_may_have_the_maximum_length_of_the_system(call: Call, letter: str) -> None:
     most = 243 - len(".nc")  # a run has files with names that are 12 bytes longer
     name = letter * (most // len(letter.encode())) + ".nc"
     assert call("run", "e.json", "-o", name).code == 0
@@ -225,7 +223,7 @@ def test_names_may_be_as_long_as_the_system_takes(call: Call, letter: str) -> No
 
 
 @pytest.mark.parametrize("length", [244, 250, 251, 255, 256])
-def test_a_name_that_is_too_long_is_named(call: Call, length: int) -> None:
+def test_too_long_a_name_is_named(call: Call, length: int) -> None:
     name = "a" * (length - 3) + ".nc"
     for words in (["run", "e.json", "-o", name], ["resume", name]):
         found = call(*words)
@@ -237,13 +235,13 @@ PROGRAM = [sys.executable, "-m", "pbdkit"]
 OTHER_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
-def test_a_name_in_utf_8_is_one_in_any_locale(call: Call) -> None:
+def test_utf_8_name_is_the_same_in_any_locale(call: Call) -> None:
     command = [*PROGRAM, "run", "e.json", "-o", "ü.nc"]
     done = subprocess.run(command, env=os.environ | OTHER_LOCALE, capture_output=True, check=False)
     assert (done.returncode, done.stderr, Path("ü.nc").exists()) == (0, b"", True)
 
 
-def test_too_few_descriptors_for_the_workers_of_a_sweep_are_named(result: Call) -> None:
+def test_too_few_descriptors_for_the_workers_are_named(result: Call) -> None:
     def few() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (22, 22))
 
@@ -255,7 +253,7 @@ def test_too_few_descriptors_for_the_workers_of_a_sweep_are_named(result: Call) 
     assert "Too many open files; raise the limit (`ulimit -n`)" in done.stderr
 
 
-def test_standard_output_that_fails_is_named_and_no_bug(result: Call) -> None:
+def test_failing_standard_output_is_named_and_no_bug(result: Call) -> None:
     listing, told = ["experiments"], "pbdkit: standard output: {}\n"
     full = "No space left on device"
     runs = ["run", "e.json", "-o", "out.nc", "--force"]
@@ -275,7 +273,7 @@ def test_standard_output_that_fails_is_named_and_no_bug(result: Call) -> None:
     assert sealed(Path("out.nc"))
 
 
-def test_a_sample_of_the_faults_of_a_disk() -> None:
+def test_sample_of_disk_faults() -> None:
     """The script tries each call of each command; tests/reliability/disk_faults.py."""
     some = ["--commands", "run,export vtkhdf,init", "--first", "2", "--every", "120"]
     done = subprocess.run(

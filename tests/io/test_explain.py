@@ -82,7 +82,7 @@ def test_an_intact_bond(explain):
     ]
 
 
-def test_what_happened_around_a_bond(explain):
+def test_adjacent_bonds_are_listed(explain):
     """3-4 breaks in the end: after 1-3."""
     answer = explain("--bond", "3", "4", fracture={"type": "strain", "failure": 0.3})
     lines = answer.out.splitlines()
@@ -102,7 +102,7 @@ def test_the_whole_run(explain):
     assert answer.out.splitlines()[-1].startswith("nearest to breaking: 1-2: intact, strain 0 in")
 
 
-def test_a_run_of_a_model_that_does_not_say_when_it_breaks(explain, monkeypatch):
+def test_run_of_a_model_without_a_limit(explain, monkeypatch):
     silent = staticmethod(lambda r, c, p: None)
     monkeypatch.setattr("pbdkit.components.fracture.Threshold.breaking_strain", silent)
     lines = explain(fracture={"type": "threshold", "thresholds": [1.3]}).out.splitlines()
@@ -113,7 +113,7 @@ def test_a_run_of_a_model_that_does_not_say_when_it_breaks(explain, monkeypatch)
     )
 
 
-def test_json_tells_the_same(explain):
+def test_json_contains_the_same_facts(explain):
     found = json.loads(explain("--bond", "1", "3", "--json").out)
     assert (found["fracture"], found["broken_in_all"]) == ("strain", 1)
     assert found["bond"] == {
@@ -138,7 +138,7 @@ def test_json_tells_the_same(explain):
         (["--bond", "1", "5"], "bar.nc: there is no particle 5; they are numbered 1 to 4"),
     ],
 )
-def test_a_bond_that_is_not_there(explain, arguments, message):
+def test_missing_bond(explain, arguments, message):
     answer = explain(*arguments)
     assert (answer.code, answer.out) == (2, "")
     assert message in answer.err
@@ -167,7 +167,7 @@ def explained(given, **more):
     ],
     ids=["threshold", "spared", "damage", "strain"],
 )  # fmt: skip
-def test_who_broke_was_above_its_limit_and_who_did_not_never_was(parts):
+def test_only_broken_bonds_exceeded_their_limit(parts):
     ds, found = explained(BAR | parts)
     standings = found.statuses(np.arange(ds.sizes["bond"]))
     broken = [s for s in standings if s.state == "broken"]
@@ -189,7 +189,7 @@ def test_the_limit_of_a_threshold_is_its_length():
     assert (ds.broken_strain.values[ds.broken_step.values > 0] > 1.0).all()
 
 
-def test_a_model_that_does_not_say_when_it_breaks():
+def test_model_without_a_limit():
     given = BAR | SHEET | {"fracture": Weakest(spread=0.3)}
     ds, found = explained(given, components=[Weakest])
     row = int(found.order[0])
@@ -202,7 +202,7 @@ def test_a_model_that_does_not_say_when_it_breaks():
     assert remembered["damage"] >= 1.0
 
 
-def test_a_file_that_was_changed_is_refused():
+def test_modified_file_is_refused():
     given = BAR | SHEET
     ds = pbdkit.run(given, progress=False)
     other = build_scene(pbdkit.Experiment(**given | {"neighbours": {"type": "chebyshev"}}))

@@ -40,7 +40,7 @@ def sheet():
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_every_particle_has_indices_of_its_own(lattice):
+def test_every_particle_has_unique_indices(lattice):
     ds = pbdkit.run(experiment(lattice=lattice, steps=1), progress=False)
     assert (np.stack([ds.i, ds.j], axis=1) == ds.site).all()
     assert len(set(zip(ds.i.values, ds.j.values, strict=True))) == ds.sizes["particle"]
@@ -65,7 +65,7 @@ def test_fields_unstack_to_rasters(sheet):
     np.testing.assert_array_equal(raster.sel(i=3, j=2), sheet.pbd.at(i=3, j=2).pe1)
 
 
-def test_roles_never_change_and_kinds_do():
+def test_roles_are_constant_and_kinds_change():
     released = pull_right(0.3, 0.0, 2) | {"until": 2}
     ds = torn(leaders=[HELD, released])
     assert ((ds.kind == FRAME) == (ds.role == OF_FRAME)).all()
@@ -76,7 +76,7 @@ def test_roles_never_change_and_kinds_do():
     assert ds.role.dtype == ds.role.flag_values.dtype == np.int8
 
 
-def test_bonds_select_sort_and_group_by_number(sheet):
+def test_bonds_can_be_selected_sorted_and_grouped_by_number(sheet):
     third = sheet.sel(bond=3)
     assert third.bond_ends.values.tolist() == sheet.bond_ends.values[2].tolist()
     assert sheet.sortby("bond", ascending=False).bond.values[-1] == 1
@@ -95,7 +95,7 @@ def texts(figure):
     return [" ".join(text.split()) for text in found if text]
 
 
-def test_axes_of_plots_say_what_is_there(sheet):
+def test_plot_axes_are_labelled_with_their_contents(sheet):
     plt = pytest.importorskip("matplotlib.pyplot")
     parts, last = sheet.pbd.components(), {"time": -1}
     drawn = {
@@ -120,7 +120,7 @@ def test_axes_of_plots_say_what_is_there(sheet):
     assert said["places"][:2] == [x, y]
 
 
-def test_components_are_those_of_every_vector(sheet):
+def test_components_splits_every_vector(sheet):
     parts = sheet.pbd.components()
     assert "axis" not in parts.dims
     np.testing.assert_array_equal(parts.position_y, sheet.position.sel(axis="y"))
@@ -130,7 +130,7 @@ def test_components_are_those_of_every_vector(sheet):
     assert alone.pbd.components().identical(alone)
 
 
-def test_stresses_say_in_which_unit_they_are():
+def test_stresses_have_units():
     calibrated = {
         "neighbours": {"type": "chebyshev", "shells": 1},
         "rule": {"type": "elastic", "poisson_ratio": 0.3},
@@ -158,7 +158,7 @@ def test_plain_concatenation_of_runs():
     assert {"experiment"} <= runs[0].attrs.keys() - whole.attrs.keys() <= {"experiment", "created"}
 
 
-def test_concatenated_runs_carry_what_differs():
+def test_concatenated_runs_contain_their_differences():
     runs = [torn(0.2), torn(1.2), torn(2.2, name="other", leaders=[HELD])]
     whole = pbdkit.concat(runs)
     assert whole.cracks_0_1_1.values.tolist() == [0.2, 1.2, 2.2]
@@ -171,7 +171,7 @@ def test_concatenated_runs_carry_what_differs():
     np.testing.assert_array_equal(again.broken_step, whole.broken_step.isel(run=1))
 
 
-def test_runs_of_other_bodies_and_parts_are_concatenated(tmp_path):
+def test_runs_of_different_bodies_are_concatenated(tmp_path):
     wider = torn(body={"type": "grid", "columns": 7, "rows": 5})
     whole = pbdkit.concat([torn(), wider, torn(fracture={"type": "none"})], "sheet")
     assert whole.columns.values.tolist() == [6, 7, 6]
@@ -184,7 +184,7 @@ def test_runs_of_other_bodies_and_parts_are_concatenated(tmp_path):
         assert opened.load().equals(whole)
 
 
-def test_what_is_no_run_is_not_concatenated(sheet):
+def test_datasets_that_are_no_runs_are_not_concatenated(sheet):
     for runs, said in [
         ([], "there are no runs"),
         ([sheet, sheet.drop_attrs()], "has no experiment"),
@@ -222,7 +222,7 @@ def test_members_of_a_sweep_are_joined_along_their_cracks():
     assert (found.crack_step.sel(thresholds=1) == found.crack_step.fill_value).all()
 
 
-def test_a_run_that_is_not_finished_shows_the_same_layout(tmp_path, monkeypatch):
+def test_unfinished_run_has_the_same_layout(tmp_path, monkeypatch):
     given = pbdkit.Experiment(**experiment(leaders=[HELD, pull_right(0.3, 0.0)], steps=40,
                                            fracture={"type": "threshold", "thresholds": [1.4]},
                                            diagnostics=[{"type": "crack-path"}]))  # fmt: skip
@@ -246,7 +246,7 @@ def old(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*(has no seal|made by):pbdkit.PbdkitWarning")
-def test_a_file_of_version_1_has_the_names_of_now(old):
+def test_file_of_version_1_has_current_names(old):
     with pbdkit.open(old) as before:
         again = pbdkit.rerun(before, progress=False)
         assert (before.schema_version, again.schema_version) == ("1", "2")
@@ -266,7 +266,7 @@ def test_a_file_of_version_1_has_the_names_of_now(old):
 
 
 @pytest.mark.filterwarnings("ignore:.*has no seal:pbdkit.PbdkitWarning")
-def test_a_file_of_version_1_is_drawn_explained_and_tried(old, call, tmp_path):
+def test_file_of_version_1_can_be_plotted_and_explained(old, call, tmp_path):
     with xarray.open_dataset(old, engine="h5netcdf") as raw:
         before = raw.copy(deep=True)
         assert raw.pbd.at(i=0, j=0).kind.isel(time=0) == 0

@@ -69,7 +69,7 @@ CRAFTED: dict[str, Callable[[Any], None]] = {
 
 
 @pytest.mark.parametrize("name", CRAFTED)
-def test_a_crafted_file_is_drawn_or_refused_in_a_line(name: str, sound: Path, call: Call) -> None:
+def test_crafted_file_is_plotted_or_refused_in_one_line(name: str, sound: Path, call: Call) -> None:
     shutil.copy(sound, "crafted.nc")
     with netCDF4.Dataset("crafted.nc", "a") as file:
         CRAFTED[name](file)
@@ -89,7 +89,7 @@ REFUSED = ["no position", "positions not finite", "bonds of nobody", "no JSON", 
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_damaged_is_not_explained(name: str, sound: Path, call: Call) -> None:
+def test_damaged_file_is_not_explained(name: str, sound: Path, call: Call) -> None:
     shutil.copy(sound, "crafted.nc")
     with netCDF4.Dataset("crafted.nc", "a") as file:
         CRAFTED[name](file)
@@ -97,9 +97,7 @@ def test_what_is_damaged_is_not_explained(name: str, sound: Path, call: Call) ->
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_file_with_bytes_overwritten_is_read_or_refused(
-    seed: int, sound: Path, call: Call
-) -> None:
+def test_file_with_overwritten_bytes_is_read_or_refused(seed: int, sound: Path, call: Call) -> None:
     random, damaged = np.random.default_rng(seed), bytearray(sound.read_bytes())
     begin = int(random.integers(len(damaged)))
     damaged[begin : begin + 400] = random.bytes(min(400, len(damaged) - begin))
@@ -111,7 +109,7 @@ def test_a_file_with_bytes_overwritten_is_read_or_refused(
         assert ("damaged.nc" in result.err) == bool(result.code)
 
 
-def test_a_file_cut_short_is_refused(sound: Path, call: Call) -> None:
+def test_truncated_file_is_refused(sound: Path, call: Call) -> None:
     whole = sound.read_bytes()
     for length in (0, 10, 1000, len(whole) // 2, len(whole) - 1000):
         Path("cut.nc").write_bytes(whole[:length])
@@ -120,7 +118,7 @@ def test_a_file_cut_short_is_refused(sound: Path, call: Call) -> None:
             pbdkit.open("cut.nc")
 
 
-def test_a_file_without_the_end_of_its_seal_is_read_with_a_warning(sound: Path, call: Call) -> None:
+def test_file_without_the_end_of_its_seal_gives_a_warning(sound: Path, call: Call) -> None:
     Path("cut.nc").write_bytes(sound.read_bytes()[:-10])
     result = call("explain", "cut.nc")
     assert (result.code, result.out) == (0, call("explain", str(sound)).out)

@@ -54,9 +54,7 @@ def test_a_sample_of_the_long_trials(trial: str) -> None:
 
 @samples(6)
 @given(experiments(leaders=pulled_apart()), st.integers(0, 10**6))
-def test_runs_that_are_stopped_and_gone_on_with_are_the_same(
-    parts: dict[str, Any], seed: int
-) -> None:
+def test_stopped_and_resumed_runs_are_the_same(parts: dict[str, Any], seed: int) -> None:
     from stopping import NUMPY, resumed_otherwise
 
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
@@ -108,7 +106,7 @@ def is_whole(right: Any) -> bool:
 @pytest.mark.parametrize(
     ("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129), ("SIGUSR1", 138)]
 )
-def test_a_signal_leaves_a_run_to_go_on_with(
+def test_run_ended_by_a_signal_can_be_resumed(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch, name: str, code: int
 ) -> None:
     right, number = whole(call), getattr(signal, name)
@@ -136,7 +134,7 @@ FAILING = {
 
 
 @pytest.mark.parametrize("what", FAILING)
-def test_a_full_disk_is_named_and_the_run_gone_on_with(
+def test_full_disk_is_named_and_the_run_can_be_resumed(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """At the fourth commit, or what comes after it; tests/reliability/full_disk.py fills a real
@@ -168,7 +166,7 @@ def test_a_full_disk_is_named_and_the_run_gone_on_with(
     assert is_whole(right)
 
 
-def test_a_folder_that_takes_no_file_is_refused_before_the_first_step(
+def test_read_only_directory_is_refused_before_the_first_step(
     call: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class ReadOnly(io.FileIO):
@@ -203,7 +201,7 @@ def stopped(call: Any, patch: pytest.MonkeyPatch) -> None:
         assert call("run", "e.json", "-o", str(OUT)).code == 1
 
 
-def test_whatever_is_raised_in_a_run_leaves_what_was_kept(
+def test_any_exception_in_a_run_keeps_the_records(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = whole(call)
@@ -213,7 +211,7 @@ def test_whatever_is_raised_in_a_run_leaves_what_was_kept(
     assert is_whole(right)
 
 
-def test_clocks_that_are_set_back_show_in_no_figure(
+def test_clock_changes_affect_no_timing(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stopped(call, monkeypatch)
@@ -242,7 +240,7 @@ def test_a_newer_store_is_refused_with_its_version(
         assert (found.code, "has the format 4" in found.err) == (6, True), found
 
 
-def test_a_store_that_a_killed_process_was_making_is_none(call: Any) -> None:
+def test_incomplete_store_of_a_killed_process_is_ignored(call: Any) -> None:
     Path("out.nc.run").touch()
     Path("out.nc.run-records").touch()
     assert call("status", str(OUT)).code == 2
@@ -284,7 +282,7 @@ def flipped(data: bytes, at: int) -> bytes:
     return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
 
 
-def test_damage_to_the_log_of_a_store_is_named_and_the_rest_is_kept(
+def test_damaged_log_of_a_store_is_named_and_the_rest_is_kept(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A bit of its head, or of its first frame, or all of it: what the log held is lost, and known
@@ -308,7 +306,7 @@ def test_damage_to_the_log_of_a_store_is_named_and_the_rest_is_kept(
     assert is_whole(right)
 
 
-def test_what_is_missing_of_a_store_is_named_and_the_rest_is_kept(
+def test_missing_part_of_a_store_is_named_and_the_rest_is_kept(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right, files = whole(call), killed(call, monkeypatch)
@@ -337,7 +335,7 @@ def test_what_is_missing_of_a_store_is_named_and_the_rest_is_kept(
     assert is_whole(right)
 
 
-def test_stores_that_are_put_together_from_two_are_named(
+def test_store_combined_from_two_is_named(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From another run of the same experiment, and from the same run before. Where the log holds
@@ -382,7 +380,7 @@ def stopping(keep: Any, number: int) -> Any:
 
 
 @pytest.mark.parametrize("cut", [0, 100, 4096])
-def test_a_store_that_was_never_whole_is_in_nobodys_way(call: Any, cut: int) -> None:
+def test_incomplete_store_blocks_no_run(call: Any, cut: int) -> None:
     """The disk was full, or the power failed, while it was written."""
     with RunStore(store_of(OUT), mode="rwc"):
         data = store_of(OUT).read_bytes()
@@ -411,7 +409,7 @@ def test_a_journal_that_names_another_file_is_refused(
     assert Path("precious").exists()
 
 
-def test_on_a_network_the_store_keeps_a_journal_that_needs_no_shared_memory(
+def test_store_on_a_network_uses_a_journal_without_shared_memory(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     mounts = tmp_path / "mountinfo"
@@ -428,7 +426,7 @@ def test_on_a_network_the_store_keeps_a_journal_that_needs_no_shared_memory(
     assert is_whole(right)
 
 
-def test_what_has_its_name_and_was_killed_before_its_store_went_is_finished(
+def test_named_result_of_a_killed_process_is_finished(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = whole(call)

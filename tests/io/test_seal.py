@@ -31,7 +31,7 @@ def sound(tmp_path_factory):
     return path
 
 
-def test_other_programs_read_the_same(sound):
+def test_other_programs_read_the_same_values(sound):
     plain = xarray.open_dataset(sound, engine="netcdf4", decode_times=False)
     with plain, pbdkit.open(sound) as checked:
         xarray.testing.assert_identical(plain.load(), checked.load())
@@ -41,7 +41,7 @@ def test_other_programs_read_the_same(sound):
 
 @samples(20)
 @given(data=st.data())
-def test_a_flipped_bit_is_never_a_silent_difference(sound, tmp_path_factory, data):
+def test_flipped_bit_is_never_silent(sound, tmp_path_factory, data):
     """The changed byte may lie anywhere: in values, in the metadata of HDF5, in the seal."""
     content = bytearray(sound.read_bytes())
     at = data.draw(st.integers(0, len(content) - 1))
@@ -60,7 +60,7 @@ def read_all(path):
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.999])
-def test_a_file_that_is_cut_short_is_refused(sound, kept, tmp_path):
+def test_truncated_sealed_file_is_refused(sound, kept, tmp_path):
     content = sound.read_bytes()
     short = tmp_path / "short.nc"
     short.write_bytes(content[: int(kept * len(content))])
@@ -68,7 +68,7 @@ def test_a_file_that_is_cut_short_is_refused(sound, kept, tmp_path):
         read_all(short)
 
 
-def test_only_what_is_read_is_checked(sound, tmp_path):
+def test_only_data_that_is_read_is_verified(sound, tmp_path):
     """Files larger than memory stay usable, and one bad block spares the others."""
     with xarray.open_dataset(sound, engine="netcdf4", decode_times=False) as plain:
         before, last = (plain["position"][n].values for n in (-2, -1))
@@ -88,7 +88,7 @@ def test_only_what_is_read_is_checked(sound, tmp_path):
 
 @given(st.binary(max_size=3 * BLOCK), st.integers(0, 2 * BLOCK), st.integers(0, 3 * BLOCK))
 @samples(20)
-def test_a_sealed_file_reads_as_the_content_alone(tmp_path_factory, content, place, length):
+def test_sealed_file_reads_like_its_content(tmp_path_factory, content, place, length):
     path = tmp_path_factory.mktemp("any") / "any"
     path.write_bytes(content)
     with path.open("r+b", buffering=0) as file:
@@ -102,7 +102,7 @@ def test_a_sealed_file_reads_as_the_content_alone(tmp_path_factory, content, pla
         assert file.read() == content
 
 
-def test_verify_says_a_line_a_file(sound, call, tmp_path):
+def test_verify_prints_one_line_per_file(sound, call, tmp_path):
     good, bad, bare = (tmp_path / name for name in ("good.nc", "bad.nc", "bare.nc"))
     shutil.copy(sound, good)
     content, table = bytearray(sound.read_bytes()), SealedFile(sound).seal.table
@@ -137,20 +137,20 @@ def test_a_damaged_seal_is_named(sound, call, tmp_path):
     )
 
 
-def test_what_another_program_wrote_is_read_with_a_warning(sound, tmp_path):
+def test_file_rewritten_by_another_program_gives_a_warning(sound, tmp_path):
     with xarray.open_dataset(sound, engine="netcdf4", decode_times=False) as plain:
         plain.isel(time=[0]).to_netcdf(tmp_path / "first.nc")
     with pytest.warns(pbdkit.PbdkitWarning, match=r"first\.nc: has no seal"):
         assert pbdkit.open(tmp_path / "first.nc").sizes["time"] == 1
 
 
-def test_a_process_that_leaves_a_file_open_ends_in_peace(sound):
+def test_process_with_open_file_exits_cleanly(sound):
     code = "import sys, pbdkit; kept = pbdkit.open(sys.argv[1]); kept.position[0].load()"
     done = subprocess.run([sys.executable, "-c", code, str(sound)], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_dataset_can_be_handed_to_another_process(sound):
+def test_dataset_can_be_passed_to_another_process(sound):
     with pbdkit.open(sound) as dataset:
         copy = pickle.loads(pickle.dumps(dataset))
         np.testing.assert_array_equal(copy["position"][-1], dataset["position"][-1])

@@ -54,7 +54,7 @@ class Noting(KeepingSink):
         self.calls.append("abandon")
 
 
-def test_small_values_are_written_at_once():
+def test_small_values_are_written_immediately():
     inner = Noting()
     sink = OverlappingSink(inner)
     sink.begin([], {}, {})
@@ -64,7 +64,7 @@ def test_small_values_are_written_at_once():
     assert inner.threads == {threading.main_thread()}
 
 
-def test_large_values_are_written_in_order_by_one_other_thread():
+def test_large_values_are_written_in_order_by_one_thread():
     inner = Noting()
     sink = OverlappingSink(inner)
     sink.begin([], {}, {})
@@ -75,7 +75,7 @@ def test_large_values_are_written_in_order_by_one_other_thread():
     assert len(inner.threads - {threading.main_thread()}) == 1
 
 
-def test_what_is_known_at_the_end_may_be_large():
+def test_final_values_may_be_large():
     """The value has the size of a record in which every bond of a large body broke."""
     inner = Noting()
     sink = OverlappingSink(inner)
@@ -87,7 +87,7 @@ def test_what_is_known_at_the_end_may_be_large():
     assert inner.calls == ["begin", "a", "end", "b", "finish"]
 
 
-def test_memory_stays_bounded_when_the_disk_is_slow():
+def test_memory_stays_bounded_if_the_disk_is_slow():
     inner = Noting()
     inner.gate.clear()
     sink, done = OverlappingSink(inner), []
@@ -107,7 +107,7 @@ def test_memory_stays_bounded_when_the_disk_is_slow():
     assert inner.calls == [*map(str, range(10)), "finish"]
 
 
-def test_what_fails_in_the_other_thread_is_raised():
+def test_error_in_the_writer_thread_is_raised():
     inner = Noting(fails_at="b")
     sink = OverlappingSink(inner)
 
@@ -123,7 +123,7 @@ def test_what_fails_in_the_other_thread_is_raised():
     assert "finish" not in inner.calls
 
 
-def test_a_large_run_is_the_same_written_beside_or_not(tmp_path):
+def test_large_run_is_identical_with_overlapped_writing(tmp_path):
     experiment = pbdkit.load(
         "start", settings=["body.columns=300", "body.rows=250", "steps=6", "record.every=2"]
     )
@@ -137,7 +137,7 @@ def test_a_large_run_is_the_same_written_beside_or_not(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["beside.nc", "plain.nc"]
 
 
-def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
+def test_output_created_by_another_program_is_kept(tmp_path):
     path = tmp_path / "out.nc"
     sink = NetcdfSink(path)
     scene = build_scene(pbdkit.load("paper/b", settings=["steps=3"]))
@@ -154,7 +154,7 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
         assert ds.attrs["status"] == "complete"
 
 
-def test_what_another_run_writes_is_no_leftover_where_nothing_is_locked(tmp_path, monkeypatch):
+def test_file_of_another_run_is_no_leftover_without_locks(tmp_path, monkeypatch):
     """The name of its result begins with this one's."""
     monkeypatch.setattr("pbdkit.io.atomic_file.lock", lambda file: True)
     with Destination(tmp_path / "x.nc.2", replace=False).temporary() as live:
@@ -165,7 +165,7 @@ def test_what_another_run_writes_is_no_leftover_where_nothing_is_locked(tmp_path
             assert not Path(left.name).exists()
 
 
-def test_compression_changes_the_file_and_not_the_values(tmp_path):
+def test_compression_changes_the_file_but_not_the_values(tmp_path):
     sizes = {}
     for compression in ("none", "zlib"):
         settings = ["body.columns=100", "steps=20", f"record.compression={compression}"]
@@ -180,7 +180,7 @@ def test_compression_changes_the_file_and_not_the_values(tmp_path):
 
 
 @pytest.mark.parametrize(("columns", "along_time"), [(10, True), (400, False)])
-def test_chunks_serve_a_history_and_a_snapshot(tmp_path, columns, along_time):
+def test_chunks_suit_a_history_and_a_snapshot(tmp_path, columns, along_time):
     settings = [f"body.columns={columns}", f"body.rows={columns}", "steps=30"]
     path = tmp_path / "out.nc"
     record(

@@ -53,7 +53,7 @@ def torn(tmp_path_factory):
     return dataset, list(grids(path)), path
 
 
-def test_every_recorded_step_is_there_with_its_points(torn):
+def test_every_recorded_step_has_its_points(torn):
     ds, read, _ = torn
     assert [field(g.GetFieldData(), "Time").item() for g in read] == ds.time.values.tolist()
     for k, grid in enumerate(read):
@@ -62,7 +62,7 @@ def test_every_recorded_step_is_there_with_its_points(torn):
         assert not points[:, 2].any()
 
 
-def test_point_data_are_the_variables_of_particles(torn):
+def test_point_data_are_the_particle_variables(torn):
     ds, read, _ = torn
     for k, grid in enumerate(read):
         now, data = ds.isel(time=k), grid.GetPointData()
@@ -95,7 +95,7 @@ def test_cells_are_particles_bonds_and_squares(torn):
     assert (part == CELL).sum() == 5 * 4
 
 
-def test_what_is_broken_is_told_at_each_step(torn):
+def test_broken_bonds_are_marked_at_each_step(torn):
     ds, read, _ = torn
     assert (ds.broken_step == 0).any()
     assert (ds.broken_step > 1).any()
@@ -113,7 +113,7 @@ def test_what_is_broken_is_told_at_each_step(torn):
             assert here[n] == torn_here
 
 
-def test_numbers_of_the_whole_are_field_data(torn):
+def test_global_numbers_are_field_data(torn):
     ds, read, _ = torn
     for k, grid in enumerate(read):
         data = grid.GetFieldData()
@@ -122,7 +122,7 @@ def test_numbers_of_the_whole_are_field_data(torn):
         np.testing.assert_array_equal(field(data, "crack_midpoint")[:, :2], ds.crack_midpoint)
 
 
-def test_forces_have_a_tuple_for_each_group(tmp_path):
+def test_forces_have_one_tuple_per_group(tmp_path):
     calibrated = {
         "neighbours": {"type": "chebyshev", "shells": 1},
         "rule": {"type": "elastic", "poisson_ratio": 0.3},
@@ -138,7 +138,7 @@ def test_forces_have_a_tuple_for_each_group(tmp_path):
         np.testing.assert_array_equal(forces[:, :2], ds.reaction.isel(time=k))
 
 
-def test_damage_is_of_bonds_and_changes(tmp_path):
+def test_damage_is_per_bond_and_changes(tmp_path):
     made = pbdkit.load("modelling/double-cantilever", settings=["solver.increments=1"])
     ds = pbdkit.run(made, progress=False)
     export(ds, tmp_path / "out.vtkhdf", build_scene(made), replace=False)
@@ -150,7 +150,7 @@ def test_damage_is_of_bonds_and_changes(tmp_path):
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_cells_of_every_lattice_fill_the_body_once(lattice, tmp_path):
+def test_cells_of_every_lattice_cover_the_body_once(lattice, tmp_path):
     made = pbdkit.Experiment(**experiment(lattice=lattice, steps=1))
     export(pbdkit.run(made, progress=False), tmp_path / "out.vtkhdf", build_scene(made),
            replace=False)  # fmt: skip
@@ -167,7 +167,7 @@ def test_cells_of_every_lattice_fill_the_body_once(lattice, tmp_path):
     assert min(areas) > 0
 
 
-def test_what_does_not_change_stands_there_once(torn):
+def test_constant_data_are_stored_once(torn):
     ds, _, path = torn
     count, steps = ds.sizes["particle"], ds.sizes["time"]
     with h5py.File(path) as file:
@@ -194,7 +194,7 @@ def test_the_command_writes_beside_the_result(call, tmp_path, monkeypatch):
     assert len(list(grids("a.vtkhdf"))) == 4
 
 
-def test_without_the_experiments_parts_there_are_no_cells(call, tmp_path, monkeypatch):
+def test_without_the_components_of_the_experiment_there_are_no_cells(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     call("run", "paper/a", "--set", "steps=1", "-o", "a.nc", "--quiet")
     ds = pbdkit.open("a.nc").load()

@@ -71,7 +71,7 @@ def measured(scene, u, *, intact_only=False):
 
 
 @every_lattice
-def test_all_cells_of_an_affine_deformation_have_the_share_of_its_determinant(lattice):
+def test_cell_areas_of_an_affine_deformation_scale_with_its_determinant(lattice):
     scene = scene_of(5, 4, lattice=lattice)
     X = scene.raster.reference(scene.raster.body_rows)
     assert (measured(scene, 0 * X) == 1.0).all()
@@ -85,7 +85,7 @@ def test_all_cells_of_an_affine_deformation_have_the_share_of_its_determinant(la
         np.testing.assert_allclose(shares, determinant, rtol=0, atol=1e-13)
 
 
-def test_a_corner_folded_over_its_diagonal_makes_a_square_concave_and_not_inside_out():
+def test_square_folded_over_its_diagonal_is_concave_and_not_inverted():
     """A square with a corner at (.4, .4) has .4 of its area, though the triangle there -.2."""
     scene = scene_of(2, 2)
     u = np.zeros((4, 2))
@@ -100,7 +100,7 @@ def test_a_corner_folded_over_its_diagonal_makes_a_square_concave_and_not_inside
 
 
 @every_lattice
-def test_cells_with_a_broken_bond_count_where_they_are_asked_for(lattice):
+def test_cells_with_a_broken_bond_count_on_request(lattice):
     crack = {"type": "threshold", "thresholds": [9.0], "cracks": [[[1.75, -9.0], [1.75, 9.0]]]}
     scene = scene_of(6, 5, lattice=lattice, fracture=crack)
     moment = StateMoment(initial_state(scene), Tables(scene))
@@ -113,7 +113,7 @@ def test_cells_with_a_broken_bond_count_where_they_are_asked_for(lattice):
         assert (len(intact), len(every)) == (16, 20)  # the crack runs through a column of four
 
 
-def test_parts_of_a_broken_body_may_pass_each_other():
+def test_parts_of_a_broken_body_may_overlap():
     """Both halves as they were, the right one moved to the other side of the left one."""
     crack = {"type": "threshold", "thresholds": [9.0], "cracks": [[[2.5, -9.0], [2.5, 9.0]]]}
     scene = scene_of(6, 5, fracture=crack)
@@ -141,7 +141,7 @@ def test_the_warning_is_printed_by_run_and_silenced_by_quiet(call, tmp_path):
 
 @pytest.mark.parametrize(("columns", "rows"), [(1, 5), (6, 1), (1, 1)])
 @pytest.mark.filterwarnings("ignore:leaders. all particles are leaders")
-def test_a_body_without_a_cell_is_refused_by_the_diagnostic_and_never_inside_out(columns, rows):
+def test_diagnostic_refuses_a_body_without_cells(columns, rows):
     given = experiment(columns, rows, leaders=BOTH_ENDS_HELD[:1])
     asked = given | {"diagnostics": [{"type": "smallest-cell-area"}]}
     message = "diagnostics.0.*requires cells, but no cell has all its corners in the body"
@@ -167,14 +167,14 @@ class Areas(pbdkit.Diagnostic):
 
 
 @pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")
-def test_a_diagnostic_of_ones_own_gets_the_cells():
+def test_custom_diagnostic_gets_the_cells():
     given = experiment(6, 5, initial={"type": "affine", "gradient": [[0.5, 0.0], [0.0, 0.0]]})
     ds = pbdkit.run(given | {"diagnostics": [Areas()]}, components=[Areas], progress=False)
     assert ds.areas[0] == pytest.approx(1.5 * 20)
 
 
 @pytest.mark.parametrize("sliver", [0.025, 0.05, 0.09, 0.5])
-def test_cells_of_a_fortieth_and_more_belong_to_the_body(sliver):
+def test_cells_above_the_sliver_limit_belong_to_the_body(sliver):
     """Its area is that of the outline; below a fiftieth slivers are left out."""
     rules = {"rule": {"type": "elastic", "poisson_ratio": 0.3}, "frame": {"type": "natural"}}
     neighbours = {"type": "chebyshev", "shells": 1}

@@ -76,7 +76,7 @@ def left_out(scene):
 @pytest.mark.parametrize("angle", [0.0, 90.0, 33.0])
 @pytest.mark.parametrize("width", [0.1, 0.3, 0.9, 1.5])
 @pytest.mark.parametrize("middle", [(5.0, 4.9), (5.3, 5.2)])
-def test_a_slot_through_a_body_parts_it(name, angle, width, middle):
+def test_slot_through_a_body_separates_it(name, angle, width, middle):
     scene = scene_of(LATTICES[name], less(slot(width, angle, np.array(middle))))
     X, piece = pieces(scene)
     assert len(set(piece.tolist())) == 2
@@ -169,7 +169,7 @@ def stiffness(lattice, body, **parts):
 
 
 @pytest.mark.filterwarnings("ignore:body")
-def test_a_beam_with_a_narrow_slot_is_about_as_soft_as_with_a_cut():
+def test_beam_with_a_narrow_slot_has_the_stiffness_of_one_with_a_cut():
     lattice, x, depth = {"type": "square", "a": A}, 20.4 * A, 10 * A
     cut = stiffness(lattice, BEAM, cuts=[{"from": [x, -1.0], "to": [x, depth]}])
     assert stiffness(lattice, BEAM) > 1.5 * cut
@@ -181,7 +181,7 @@ def test_a_beam_with_a_narrow_slot_is_about_as_soft_as_with_a_cut():
 
 @pytest.mark.parametrize("size", [2, 3])
 @pytest.mark.parametrize("middle", [(5.0, 5.0), (0.5, 5.0), (5.3, 5.2)])
-def test_each_process_leaves_out_the_same(size, middle):
+def test_every_process_excludes_the_same_cells(size, middle):
     lattice = {"type": "square", "a": 0.5}
     body = less(slot(0.2, 80.0, np.array(middle)))
     solver = {"type": "equilibrium"}

@@ -82,7 +82,7 @@ def test_slots_come_in_exactly_opposite_mutual_pairs(lattice, metric):
 
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(lattice=any_lattice, shells=st.integers(1, 4))
-def test_coordination_finds_the_smallest_distances(lattice, shells):
+def test_coordination_selects_the_smallest_distances(lattice, shells):
     neighbourhood = build_neighbourhood(lattice.cell(), Coordination(shells=shells))
     chosen = max(max(lengths) for lengths in neighbourhood.shells())
     for s in range(len(lattice.cell().sites)):
@@ -110,7 +110,7 @@ def test_every_bond_has_the_rest_offset_of_its_particles(lattice, neighbours):
 
 
 @combinations
-def test_with_its_frame_every_body_particle_has_all_neighbours(lattice, neighbours):
+def test_every_body_particle_with_its_frame_has_all_neighbours(lattice, neighbours):
     scene = scene_of(lattice=lattice, neighbours=neighbours)
     ends = np.bincount(scene.bonds.ends.ravel(), minlength=scene.raster.count)
     assert set(ends[scene.raster.body_rows]) == {len(scene.neighbourhood.slots[0])}
@@ -139,7 +139,7 @@ class OnTheCorner(pbdkit.Lattice):
         )
 
 
-def test_neighbours_that_surround_a_site_unevenly_are_refused():
+def test_asymmetric_neighbourhoods_are_refused():
     """Mutual as they are, a body at rest would drift under the barycentre."""
     expected = (
         r"'coordination' is unbalanced on this lattice: the barycentre of the 1 neighbours of a "

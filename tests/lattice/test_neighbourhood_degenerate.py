@@ -54,7 +54,7 @@ def rectangular(a, b):
 @pytest.mark.parametrize(
     "lattice", [oblique(0.05), oblique(179.99), rectangular(1.0, 9e-4), rectangular(1e100, 1e-100)]
 )
-def test_nearly_degenerate_lattices_are_refused_at_once(lattice):
+def test_nearly_degenerate_lattices_are_refused_quickly(lattice):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         scene_of(lattice=lattice)
     assert str(caught.value).startswith("lattice: the cell vectors (")
@@ -63,7 +63,7 @@ def test_nearly_degenerate_lattices_are_refused_at_once(lattice):
 
 
 @pytest.mark.parametrize(("angle", "said"), [(2.8, True), (2.9, False), (177.2, True)])
-def test_flat_lattices_are_warned_of(angle, said):
+def test_flat_lattices_give_a_warning(angle, said):
     warnings = scene_of(lattice=oblique(angle), neighbours="chebyshev-1").warnings
     closer = 1 / math.sin(math.radians(angle))
     expected = (
@@ -87,13 +87,13 @@ def test_flat_lattices_are_warned_of(angle, said):
         ),
     ],
 )
-def test_cells_that_are_no_lattice_are_refused(lattice, said):
+def test_cells_that_form_no_lattice_are_refused(lattice, said):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         scene_of(lattice=Given(of=lattice))
     assert str(caught.value) == said
 
 
-def test_a_long_cell_with_as_many_sites_is_not_flat():
+def test_long_cell_with_many_sites_is_not_flat():
     assert flatness(CELLS["twenty in a row"]) == pytest.approx(1.0, abs=1e-15)
     assert scene_of(lattice=Given(of="twenty in a row")).warnings == ()
 
@@ -135,7 +135,7 @@ class Mute(pbdkit.FramePolicy):
         return pbdkit.plugin.FrameMap(point, body, np.where(point == 2, 0.0, 1.0))
 
 
-def test_a_frame_point_whose_weights_are_all_zero_copies_nobody():
+def test_frame_point_with_zero_weights_is_refused():
     with pytest.raises(pbdkit.ExperimentError) as caught:
         scene_of(frame=Mute())
     assert str(caught.value) == (

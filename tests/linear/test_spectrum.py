@@ -49,7 +49,7 @@ def roots(eigenvalue, w, b):
 
 @pytest.mark.parametrize("kind", EIGENVALUES)
 @given(data=st.data())
-def test_the_closed_form_of_the_region_against_the_roots(kind, data):
+def test_closed_form_of_the_region_matches_the_roots(kind, data):
     eigenvalue = data.draw(EIGENVALUES[kind])
     b = data.draw(st.floats(-1.2, 1.2))
     bound = largest_stable_relaxation(np.array([eigenvalue]), b)
@@ -79,7 +79,7 @@ def test_modes_are_the_roots(eigenvalues, w, b):
 @given(
     st.lists(st.floats(-1.0, 0.999), min_size=1, max_size=6), st.floats(0.1, 1.0), st.floats(0, 1)
 )
-def test_the_slowest_swing_is_that_of_the_largest_eigenvalue_that_swings(some, w, b):
+def test_slowest_oscillation_is_that_of_the_largest_oscillating_eigenvalue(some, w, b):
     eigenvalues = np.array(some, complex)
     s = 1.0 + b - w * (1.0 - eigenvalues.real)
     assume((np.abs(s * s - 4.0 * b) > 1e-9).all())
@@ -104,7 +104,7 @@ def test_the_slowest_swing_is_that_of_the_largest_eigenvalue_that_swings(some, w
         for m, memory in enumerate(MEMORIES)
     ],
 )
-def test_two_percent_inside_the_region_settles_and_outside_diverges(rule, lattice, memory):
+def test_two_percent_inside_the_region_converges_and_outside_diverges(rule, lattice, memory):
     parts = {"columns": 6, "rows": 5, "rule": rule, "lattice": lattice, "leaders": BOTH_ENDS_HELD}
     analysis = pbdkit.analyse(experiment(**parts, solver=stepping(0.3, memory)))
     bound = analysis.largest_stable_relaxation
@@ -115,7 +115,7 @@ def test_two_percent_inside_the_region_settles_and_outside_diverges(rule, lattic
 
 
 @pytest.mark.parametrize(("memory", "stable"), [(0.98, True), (-0.98, True), (1.02, False)])
-def test_memory_is_bounded_by_1(memory, stable):
+def test_momentum_is_bounded_by_1(memory, stable):
     w = 0.49 * (1 + memory)
     assert pbdkit.analyse(sheet(4, 3)).stable_at(w, memory) == stable
     growth = growth_of(columns=4, rows=3, leaders=BOTH_ENDS_HELD, solver=stepping(w, memory))
@@ -141,7 +141,7 @@ def noise_of(scene):
     return start
 
 
-def test_memory_settles_the_distance_weighted_rule_as_printed():
+def test_momentum_stabilises_the_distance_weighted_rule_as_printed():
     """λ_min = -2 on the square lattice: relaxation 1 is inside where 3 < 2 (1 + b), b > ½."""
     bound = wave_bound(scene_of(rule="distance-weighted"))
     assert bound.largest_stable_relaxation(0.5) == pytest.approx(1.0, rel=1e-9)
@@ -167,7 +167,7 @@ def period_of(x):
 
 
 @pytest.mark.parametrize(("memory", "period"), [(1.0, 76.07), (0.99, None), (0.95, None)])
-def test_the_slowest_mode_of_a_sheet_swings_with_its_period_and_decay(memory, period):
+def test_slowest_mode_of_a_sheet_has_the_predicted_period_and_decay(memory, period):
     swing = pbdkit.analyse(sheet(20, 20)).swing(1.0, memory)
     assert period is None or swing.period == pytest.approx(period, abs=0.01)
     assert swing.decay == pytest.approx(math.sqrt(memory))
@@ -181,7 +181,7 @@ def test_the_slowest_mode_of_a_sheet_swings_with_its_period_and_decay(memory, pe
     np.testing.assert_allclose(y[2:] - s * y[1:-1] + swing.decay**2 * y[:-2], 0, atol=1e-9)
 
 
-def test_the_shipped_experiment_swings_with_the_period_of_the_closed_form():
+def test_shipped_experiment_has_the_period_of_the_closed_form():
     ds = pbdkit.run("stability/oscillation", progress=False)
     b, largest = 0.98, (1 + math.cos(math.pi / 21)) / 2
     closed = 2 * math.pi / math.acos((largest + b) / (2 * math.sqrt(b)))
@@ -194,7 +194,7 @@ def test_the_shipped_experiment_swings_with_the_period_of_the_closed_form():
     assert shrinks == pytest.approx(b ** (closed / 4), rel=0.02)
 
 
-def test_check_says_the_period(call):
+def test_check_prints_the_period(call):
     figures = json.loads(call("check", "stability/oscillation", "--json").out)
     assert figures["period"] == pytest.approx(84.4, abs=0.01)
     assert figures["decay"] == pytest.approx(math.sqrt(0.98))
@@ -203,7 +203,7 @@ def test_check_says_the_period(call):
 
 
 @pytest.mark.parametrize("memory", [0.0, -0.5, 0.01])
-def test_check_says_nothing_where_nothing_swings(call, memory):
+def test_check_prints_no_period_without_oscillation(call, memory):
     arguments = [
         "check",
         "e.json",
@@ -218,7 +218,7 @@ def test_check_says_nothing_where_nothing_swings(call, memory):
 
 
 @pytest.mark.parametrize("memory", [0.9, 0.999])
-def test_the_slowest_swing_of_large_sheets_against_the_closed_form(memory):
+def test_slowest_oscillation_of_large_sheets_matches_the_closed_form(memory):
     """If the slowest modes creep back, the first that oscillates lies inside the spectrum."""
     n = 40
     analysis = pbdkit.analyse(sheet(n, n, solver=stepping(1.0, memory)))
@@ -235,14 +235,14 @@ def test_the_slowest_swing_of_large_sheets_against_the_closed_form(memory):
 
 @pytest.mark.parametrize("lattice", LATTICES)
 @pytest.mark.parametrize("rule", RULES)
-def test_without_memory_nothing_swings_whatever_the_relaxation(rule, lattice):
+def test_without_momentum_nothing_oscillates_at_any_relaxation(rule, lattice):
     """Behind copying frames; overshooting makes short waves alternate, or diverge."""
     analysis = pbdkit.analyse(sheet(rule=rule, lattice=lattice))
     for relaxation in (0.5, 1.0, 1.3, 2.0):
         assert analysis.swing(relaxation, 0.0) is None
 
 
-def test_nothing_is_claimed_of_frames_that_lag():
+def test_delayed_frames_have_no_prediction():
     analysis = pbdkit.analyse(sheet(frame="lag"))
     assert analysis.stable_at(1.0, 0.5) is None
     assert analysis.swing(1.0, 0.5) is None
@@ -254,7 +254,7 @@ def test_nothing_is_claimed_of_frames_that_lag():
         LATTICES, ["coordination-1", "chebyshev-1"], ["mean", "first", "lag", {"type": "none"}]
     ),
 )
-def test_what_turns_without_memory_is_gone_before_it_is_seen(lattice, neighbours, frame):
+def test_rotating_modes_without_momentum_decay_within_a_period(lattice, neighbours, frame):
     """Frames that lag or lean make some eigenvalues complex; all of them are looked at."""
     found = [
         pbdkit.analyse(

@@ -78,7 +78,7 @@ def test_the_steps_to_a_tolerance_are_predicted_within_5_percent(columns):
 
 
 @pytest.mark.parametrize(("columns", "period"), [(20, 76.07), (10, None)])
-def test_memory_1_oscillates_with_the_predicted_period(columns, period):
+def test_momentum_1_oscillates_with_the_predicted_period(columns, period):
     predicted = 2 * np.pi / np.arccos((1 + slowest(columns)) / 2)
     assert period is None or predicted == pytest.approx(period, abs=0.005)
     solver = {"type": "stepping", "memory": 1.0}
@@ -95,7 +95,7 @@ def test_memory_1_oscillates_with_the_predicted_period(columns, period):
     assert measured == pytest.approx(predicted, abs=1e-3)
 
 
-def test_with_memory_every_mode_obeys_its_quadratic():
+def test_with_momentum_every_mode_satisfies_its_quadratic():
     columns, rows, b = 6, 4, 0.6
     solver = {"type": "stepping", "memory": b}
     scene = scene_of(columns, rows, leaders=BOTH_ENDS_HELD, solver=solver)
@@ -110,7 +110,7 @@ def test_with_memory_every_mode_obeys_its_quadratic():
         np.testing.assert_allclose(u[t + 1], expected, rtol=0, atol=1e-13)
 
 
-def test_the_body_lags_behind_moving_leaders_by_the_formula():
+def test_lag_behind_moving_leaders_matches_the_formula():
     columns, v = 20, 0.0035
     steps = 1500  # ten relaxation times of 147 steps
     u = displacements(columns, 3, leaders=[HOLD_LEFT, pull_right(v, 0.0, steps)], steps=steps)
@@ -171,7 +171,7 @@ def test_without_leaders_the_left_eigenvector_gives_the_invariant_mean(lattice, 
 
 
 @pytest.mark.filterwarnings("ignore:leaders. all particles are leaders")
-def test_a_released_translation_runs_out_as_a_geometric_series_of_the_memory():
+def test_released_translation_is_a_geometric_series_of_the_momentum():
     v, b = np.array([0.25, -0.5]), 0.5
     motion = {"type": "velocity", "velocity": v.tolist(), "steps": 3}
     everyone = {"select": {"box": [0, 0, 5, 4]}, "motion": motion, "until": 3}

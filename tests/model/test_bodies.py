@@ -28,7 +28,7 @@ def body_sites(body, **parts):
     return {tuple(site) for site in raster.site_of(raster.body_rows).tolist()}
 
 
-def test_sites_on_an_outline_belong():
+def test_sites_on_an_outline_belong_to_the_body():
     for shift in (0.0, 5e-10, -5e-10):
         assert len(body_sites({"type": "disc", "radius": 2.0 + shift, "centre": [0, 0]})) == 13
     assert len(body_sites({"type": "disc", "radius": 2.0 - 1e-8, "centre": [0, 0]})) == 9
@@ -37,7 +37,7 @@ def test_sites_on_an_outline_belong():
     assert len(body_sites(triangle)) == 15
 
 
-def test_what_is_cut_out_leaves_its_outline():
+def test_outline_of_a_cutout_stays_in_the_body():
     disc = {"type": "disc", "radius": 2.0, "centre": [5.0, 5.0]}
     whole = {"type": "rectangle", "width": 10.0, "height": 10.0}
     cut = body_sites({"type": "difference", "of": [whole, disc]})
@@ -61,7 +61,7 @@ GRID = {"type": "grid", "columns": 5, "rows": 4}
 @pytest.mark.parametrize("frame", ["natural", "none"])
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
 @pytest.mark.parametrize("made", ["grid", "difference", "union", "intersection"])
-def test_a_grid_is_the_same_body_in_all_units_and_wherever_it_lies(made, lattice, frame):
+def test_grid_is_the_same_body_in_all_units_and_positions(made, lattice, frame):
     def sites(a, origin):
         x, y = (n * a + shift for n, shift in zip((1.5, 1.5), origin, strict=True))
         disc = {"type": "disc", "radius": 0.9 * a, "centre": [x, y]}
@@ -100,7 +100,7 @@ def test_a_dogbone_is_narrow_in_the_middle():
 
 
 @pytest.mark.parametrize(("gap", "narrow"), [(1.0, True), (2.0, True), (3.0, False)])
-def test_a_slot_too_narrow_for_the_frame_is_warned_of(gap, narrow):
+def test_slot_too_narrow_for_the_frame_gives_a_warning(gap, narrow):
     """One frame layer wants three empty sites between two faces."""
     left = {"type": "rectangle", "width": 4.0, "height": 8.0}
     right = left | {"origin": [5.0 + gap, 0.0]}
@@ -187,7 +187,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("parts", "message"), REFUSED.values(), ids=REFUSED)
-def test_refused_with_the_reason(parts, message):
+def test_invalid_bodies_are_refused_with_the_reason(parts, message):
     with pytest.raises(pbdkit.ExperimentError, match=message):
         pbdkit.run(scene(**parts), progress=False)
 
@@ -228,13 +228,13 @@ def test_a_released_leader_keeps_its_broken_bonds():
     np.testing.assert_allclose(ds.position.values[-1, right, 0], 8.0, atol=1e-12)
 
 
-def test_groups_that_agree_may_overlap():
+def test_consistent_groups_may_overlap():
     leaders = [{"select": {"edge": e}} | HOLD for e in ("left", "bottom", "right", "top")]
     ds = pbdkit.run(scene(leaders=leaders), progress=False)
     assert (ds.kind[-1] == 0).sum() == 2 * 6 + 2 * 3
 
 
-def test_whether_leaders_overlap_is_told_of_the_groups_that_a_scene_has():
+def test_overlaps_are_found_after_groups_are_replaced():
     """Overlaps are also found if the groups are replaced, as in interactive sessions."""
     held = build_scene(pbdkit.load("paper/a"))
     assert not held.leaders_overlap

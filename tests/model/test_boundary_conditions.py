@@ -48,7 +48,7 @@ def crossed(ds):
     return parted & ((a + b)[:, 0] / 2 <= 3.2)
 
 
-def test_bonds_that_cross_are_broken_in_their_step_and_no_others():
+def test_only_crossing_bonds_are_cut_in_their_step():
     ds = run(cuts=cut(20))
     assert np.array_equal(ds.broken_step.values, np.where(crossed(ds), 20, -1))
     assert np.isnan(ds.broken_strain.values).all()
@@ -72,7 +72,7 @@ def test_a_cut_before_the_first_step_is_a_crack(fracture):
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_kernels_cut_as_numpy_does(precision, compiled_at_length):
+def test_kernels_cut_like_numpy(precision, compiled_at_length):
     pytest.importorskip("numba")
     some = {"engine": "compiled", "precision": precision, "threads": 2}
     pulled = [moved("bottom", -0.9), moved("top", 0.9)]
@@ -87,7 +87,7 @@ def test_kernels_cut_as_numpy_does(precision, compiled_at_length):
     assert np.isfinite(known.broken_strain.values).any()
 
 
-def test_kernels_cut_where_nothing_tears():
+def test_kernels_cut_without_a_fracture_model():
     pytest.importorskip("numba")
     rule = {"type": "barycentre"}
     parts = {"rule": rule, "frame": {"type": "mean"}, "cuts": cut(20)}
@@ -103,7 +103,7 @@ def test_kernels_cut_where_nothing_tears():
     ("rule", "at"),
     [(ELASTIC, 1), ({"type": "springs"}, 5), (ELASTIC, 11), ({"type": "springs"}, 40)],
 )
-def test_the_equilibrium_of_an_elastic_body_forgets_when_it_was_cut(rule, at):
+def test_equilibrium_of_an_elastic_body_is_independent_of_the_cut_time(rule, at):
     before, later = (run(rule=rule, cuts=cut(n), solver=STRAIGHT) for n in (0, at))
     assert later.status == "complete"
     assert set(later.broken_step.values) == {-1, at}
@@ -112,7 +112,7 @@ def test_the_equilibrium_of_an_elastic_body_forgets_when_it_was_cut(rule, at):
     assert np.abs(steps.u.values[-1] - later.u.values[-1]).max() < 1e-9
 
 
-def test_a_loaded_body_goes_on_tearing_from_its_cut():
+def test_fracture_of_a_loaded_body_continues_from_its_cut():
     """Under a load that the whole plate bears, and the cut one does not."""
     parts = {"fracture": {"type": "strain", "failure": 0.007}, "rule": ELASTIC}
     parts["leaders"] = SLOWLY
@@ -128,7 +128,7 @@ def test_a_loaded_body_goes_on_tearing_from_its_cut():
         assert (ds.broken_strain.values[torn] > 0.007).all()
 
 
-def test_a_part_that_is_cut_off_stays_where_it_is():
+def test_detached_part_stays_in_place():
     """Nothing holds it from then on; the rest relaxes."""
     off = [{"from": [-1.0, 3.5], "to": [9.0, 3.5], "at": 30}]
     held = [PLATE["leaders"][0] | {"motion": {"type": "hold"}},
@@ -142,7 +142,7 @@ def test_a_part_that_is_cut_off_stays_where_it_is():
         assert ds.u.values[-1, ~lower, 1].mean() > 0.005
 
 
-def test_runs_settle_after_their_last_cut():
+def test_runs_converge_after_their_last_cut():
     solver = {"type": "stepping", "settle": {"tolerance": 1e-6}}
     ds = run(cuts=cut(900), steps=3000, solver=solver, record={"every": 3000})
     assert ds.status == "settled"
@@ -150,7 +150,7 @@ def test_runs_settle_after_their_last_cut():
     assert run(steps=3000, solver=solver, record={"every": 3000}).time.values[-1] < 900
 
 
-def test_explain_tells_cut_from_torn(call, tmp_path):
+def test_explain_distinguishes_cut_from_broken_bonds(call, tmp_path):
     file = tmp_path / "plate.json"
     parts = {"fracture": {"type": "strain", "failure": 0.007}, "cuts": [*cut(200)], "steps": 800,
              "leaders": SLOWLY}  # fmt: skip
@@ -167,7 +167,7 @@ def test_explain_tells_cut_from_torn(call, tmp_path):
     assert "cut at the beginning of step 200" in call("explain", "out.nc", "--bond", *ends).out
 
 
-def test_a_run_goes_on_before_and_after_its_cut(call, tmp_path):
+def test_run_resumes_before_and_after_its_cut(call, tmp_path):
     file = tmp_path / "plate.json"
     file.write_text(json.dumps(PLATE | {"cuts": cut(20), "steps": 19}))
     whole = run(cuts=cut(20))
@@ -182,7 +182,7 @@ def test_a_run_goes_on_before_and_after_its_cut(call, tmp_path):
             assert np.array_equal(ds.broken_step.values, whole.broken_step.values)
 
 
-def test_it_runs_again_from_its_dataset():
+def test_run_with_a_cut_reruns_from_its_dataset():
     ds = run(cuts=cut(20))
     again = pbdkit.rerun(ds, progress=False)
     assert np.array_equal(again.u.values, ds.u.values)
@@ -203,12 +203,12 @@ def test_it_runs_again_from_its_dataset():
          "which is incompatible with this setting of cuts; use cuts: "),
     ],
 )  # fmt: skip
-def test_wrong_cuts_are_told(parts, words):
+def test_invalid_cuts_are_refused(parts, words):
     with pytest.raises(pbdkit.ExperimentError) as error:
         run(**parts)
     assert words in str(error.value)
 
 
-def test_a_cut_that_misses_the_body_is_warned_of():
+def test_cut_that_misses_the_body_gives_a_warning():
     with pytest.warns(pbdkit.PbdkitWarning, match=r"cuts\.0: it crosses no bond of the body"):
         run(cuts=[{"from": [20.0, 0.0], "to": [21.0, 0.0]}], steps=1)

@@ -38,7 +38,7 @@ STEPS = "step, ux, uy\n0, 0, 0\n2, 0.2, 0\n4, 0.2, -0.1\n"
 SPELT = "{type: path, steps: [2, 4], displacements: [[0.2, 0.0], [0.2, -0.1]]}"
 
 
-def test_a_table_is_the_path_that_it_holds(tmp_path):
+def test_table_is_the_path_in_the_file(tmp_path):
     named = pbdkit.load(written(tmp_path, "{type: table, file: data.csv}", STEPS))
     ds = pbdkit.run(named, progress=False)
     other = tmp_path / "spelt"
@@ -54,7 +54,7 @@ def test_a_table_is_the_path_that_it_holds(tmp_path):
     assert motion == {"type": "table", "steps": [2, 4], "displacements": [[0.2, 0.0], [0.2, -0.1]]}
 
 
-def test_who_changes_the_file_changes_the_member_of_a_sweep(tmp_path):
+def test_changing_the_file_changes_the_member_of_a_sweep(tmp_path):
     def key():
         experiment = pbdkit.load(str(tmp_path / "experiment.yaml"))
         return job_of(experiment, Keep(), {}).key
@@ -86,7 +86,7 @@ LINE = [(4.0, 3.0), (4.0, 0.0), (4.0, 1.3)]
     [(SCATTER, "{box: [0, 0, 4, 3]}"), (CORNERS, "{box: [0, 0, 4, 3]}"), (LINE, "{edge: right}")],
     ids=["scattered", "corners", "a line"],
 )
-def test_what_is_linear_is_interpolated_exactly(tmp_path, points, select):
+def test_linear_motion_is_interpolated_exactly(tmp_path, points, select):
     """Also where particles lie on the outermost points, and where all points lie on a line."""
     motion = "{type: measured, file: data.csv, ramp: 4}"
     ds = pbdkit.run(written(tmp_path, motion, measured(points), select), progress=False)
@@ -97,7 +97,7 @@ def test_what_is_linear_is_interpolated_exactly(tmp_path, points, select):
     assert np.array_equal(pbdkit.rerun(ds, progress=False).u, ds.u)
 
 
-def test_a_measured_motion_starts_where_the_particle_then_is(tmp_path):
+def test_measured_motion_starts_at_the_current_position(tmp_path):
     """The motion is that of every other motion; the displacement is that of the place at rest."""
     path = written(tmp_path, "{type: measured, file: data.csv}", measured(SCATTER))
     given = pbdkit.load(path).model_dump(by_alias=True, mode="json")
@@ -111,7 +111,7 @@ def test_a_measured_motion_starts_where_the_particle_then_is(tmp_path):
     np.testing.assert_allclose(u[-1], u[3] + exact, atol=1e-15)
 
 
-def test_many_points_travel_in_the_result(tmp_path):
+def test_many_points_are_stored_in_the_result(tmp_path):
     """An attribute of some megabytes."""
     points = np.random.default_rng(0).uniform(-1.0, 6.0, (30_000, 2)).round(12)
     content = measured([*points.tolist(), (-9, -9), (9, -9), (9, 9), (-9, 9)])
@@ -155,6 +155,6 @@ TABLE, MEASURED = "{type: table, file: data.csv}", "{type: measured, file: data.
         ("{type: measured, points: [[0, 0], [1, 1]], displacements: [[1, 1]]}", "", "at least 2"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_in_a_file_is_said_with_place_and_remedy(tmp_path, motion, content, text):
+def test_errors_in_a_file_have_place_and_remedy(tmp_path, motion, content, text):
     with pytest.raises(pbdkit.ExperimentError, match=text):
         pbdkit.run(written(tmp_path, motion, content), progress=False)

@@ -67,23 +67,23 @@ NO_RESULT = {
 
 
 @pytest.mark.parametrize("command", TAKES_EXPERIMENTS)
-def test_where_an_experiment_is_wanted(told: Any, command: str) -> None:
+def test_other_files_instead_of_an_experiment_are_refused(told: Any, command: str) -> None:
     for file, message in NO_EXPERIMENT.items():
         assert told(command, file).startswith(message)
 
 
-def test_where_a_sweep_is_wanted(told: Any) -> None:
+def test_other_files_instead_of_a_sweep_are_refused(told: Any) -> None:
     for file, message in NO_SWEEP.items():
         assert told("sweep", file).startswith(message)
 
 
 @pytest.mark.parametrize("command", TAKES_RESULTS)
-def test_where_a_result_is_wanted(told: Any, command: str) -> None:
+def test_other_files_instead_of_a_result_are_refused(told: Any, command: str) -> None:
     for file, message in NO_RESULT.items():
         assert told(command, file).startswith(message)
 
 
-def test_plot_takes_an_experiment_by_any_name_and_refuses_what_is_neither(told: Any) -> None:
+def test_plot_accepts_any_experiment_name_and_refuses_other_files(told: Any) -> None:
     for file in ("sweep.nc", "fit.nc", "other.yaml"):
         assert told("plot", file).startswith(NO_RESULT[file])
     assert told("plot", "picture.yaml").startswith(NO_EXPERIMENT["picture.yaml"])
@@ -95,11 +95,11 @@ def test_plot_takes_an_experiment_by_any_name_and_refuses_what_is_neither(told: 
 
 
 @pytest.mark.parametrize("command", ["plot", "animate", "curve", "export", "report", "explain"])
-def test_a_folder_is_no_result(call: Any, command: str) -> None:
+def test_directory_is_no_result(call: Any, command: str) -> None:
     assert call(command, ".").err == "pbdkit: .: is a folder, not a result of pbdkit\n"
 
 
-def test_a_result_is_one_under_any_name(call: Any) -> None:
+def test_result_may_have_any_name(call: Any) -> None:
     call("run", "e.json", "-o", "result.yaml", "--quiet")
     assert call("verify", "result.yaml").out == "result.yaml: unchanged since it was written\n"
     assert pbdkit.open("result.yaml").attrs["status"] == "complete"
@@ -111,7 +111,7 @@ def test_the_store_of_a_run_names_its_output(told: Any, command: str) -> None:
     assert told(command, "left.nc.run") == message
 
 
-def test_the_folder_of_a_sweep_names_its_dataset(call: Any) -> None:
+def test_directory_of_a_sweep_names_its_dataset(call: Any) -> None:
     Path("sweep").mkdir()
     Path("sweep/sweep.nc").touch()
     for command in TAKES_RESULTS:
@@ -132,7 +132,7 @@ def test_a_sweep_of_a_sweep_is_refused(call: Any) -> None:
     assert "one.yaml: is a sweep, not an experiment" in call("sweep", "two.yaml").err
 
 
-def test_what_a_file_with_faults_is_meant_to_be() -> None:
+def test_intended_kind_of_a_faulty_file_is_recognised() -> None:
     assert {kind_of(read_experiment(name).data) for name in shipped_names()} == {EXPERIMENT}
     assert kind_of({"latice": {}, "body": {}}) == EXPERIMENT
     assert kind_of({"name": "begun"}) == EXPERIMENT
@@ -141,5 +141,5 @@ def test_what_a_file_with_faults_is_meant_to_be() -> None:
     assert kind_of(json.loads('{"name": "x", "version": "1", "jobs": []}')) == ""
 
 
-def test_every_key_of_an_experiment_is_known() -> None:
+def test_every_key_of_an_experiment_is_listed() -> None:
     assert {*pbdkit.Experiment.known_keys()} == PARTS

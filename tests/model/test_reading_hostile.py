@@ -39,7 +39,7 @@ def grid(columns: int, rows: int) -> dict[str, Any]:
     return {"type": "grid", "columns": columns, "rows": rows}
 
 
-def test_messages_are_bounded_and_do_not_reach_the_terminal_raw() -> None:
+def test_messages_are_bounded_and_escaped() -> None:
     error = pbdkit.ExperimentError("e.yaml:1:1: \x1b[31mred\ud800 " + "x" * 100_000 + "; remedy")
     assert len(str(error)) < 1100
     assert str(error).startswith(r"e.yaml:1:1: \x1b[31mred\ud800 xxx")
@@ -68,7 +68,7 @@ def test_an_unknown_type_is_shortened_and_escaped(field: str, name: str) -> None
     ['"\\ud800": 1', 'name: "\\udfff"', 'rule: {type: "\\ud800"}'],
     ids=["key", "value", "in"],
 )
-def test_half_a_character_is_refused_in_files(text: str) -> None:
+def test_unpaired_surrogates_are_refused_in_files(text: str) -> None:
     with pytest.raises(pbdkit.ExperimentError, match=r"^e:1:\d+: an unpaired surrogate"):
         read_text(text, "e")
 
@@ -82,7 +82,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
-def test_a_file_as_large_as_may_be_is_read_soon(text: str) -> None:
+def test_largest_accepted_file_is_read_quickly(text: str) -> None:
     """In half the time that two looks at every event took."""
     begun = time.process_time()
     with pytest.raises(pbdkit.ExperimentError):
@@ -91,7 +91,7 @@ def test_a_file_as_large_as_may_be_is_read_soon(text: str) -> None:
 
 
 @pytest.mark.parametrize("opening", ["[", "{a: ", "[ {x: "])
-def test_deep_brackets_cost_no_more_the_deeper_they_are(opening: str, monkeypatch: Any) -> None:
+def test_cost_of_nested_brackets_is_bounded(opening: str, monkeypatch: Any) -> None:
     """At each character ruamel goes through the keys that may have begun."""
     noted, original = [0], Scanner.stale_possible_simple_keys
 
@@ -120,7 +120,7 @@ def test_too_many_neighbours_are_refused_before_they_are_listed(lattice, radius,
 
 
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
-def test_thirty_two_shells_are_the_most_neighbours(lattice: str) -> None:
+def test_thirty_two_shells_are_the_maximum(lattice: str) -> None:
     scene = build_scene(
         Experiment(
             name="many",
@@ -136,7 +136,7 @@ def test_thirty_two_shells_are_the_most_neighbours(lattice: str) -> None:
 
 
 @pytest.mark.parametrize("a", [1e-20, 1e-60, 1e-100, 1e100])
-def test_the_unit_of_length_decides_nothing(a: float) -> None:
+def test_check_is_independent_of_the_unit_of_length(a: float) -> None:
     select = {"nearest": [[7.1 * a, 3.9 * a]]}
     leaders = [{"select": select, "motion": {"type": "displace", "displacement": [0.1 * a, 0.0]}}]
     found, took = checked(lattice={"type": "square", "a": a}, leaders=leaders)
@@ -178,7 +178,7 @@ BODIES = {
 
 
 @pytest.mark.parametrize(("parts", "said"), BODIES.values(), ids=BODIES)
-def test_what_would_take_long_is_left_out_with_a_word(parts: Any, said: str) -> None:
+def test_slow_analyses_are_omitted_with_a_warning(parts: Any, said: str) -> None:
     found, took = checked(diagnostics=[], **parts)
     assert took < 2 * SOON_S
     assert found.spectral_radius is found.lag is None
@@ -202,12 +202,12 @@ def group(number: int, begin: int) -> dict[str, Any]:
     ],
     ids=["alike", "one after the other"],
 )
-def test_hundreds_of_leader_groups_are_compared_soon(groups: Any) -> None:
+def test_hundreds_of_leader_groups_are_compared_quickly(groups: Any) -> None:
     _, took = checked(leaders=groups, steps=1800)
     assert took < SOON_S
 
 
-def test_a_path_of_thousands_of_knots_is_looked_at_soon() -> None:
+def test_path_of_thousands_of_knots_is_checked_quickly() -> None:
     steps = list(range(1, 5001))
     path = {"type": "path", "steps": steps, "displacements": [[1e-4 * n, 0.0] for n in steps]}
     _, took = checked(leaders=[{"select": {"edge": "right"}, "motion": path}], steps=5000)
@@ -222,19 +222,19 @@ PLAIN = {
 
 
 @pytest.mark.parametrize("parts", PLAIN.values(), ids=PLAIN)
-def test_numbers_beyond_all_bounds_are_refused(parts: Any) -> None:
+def test_numbers_out_of_range_are_refused(parts: Any) -> None:
     with pytest.raises(pbdkit.ExperimentError, match="should be less than"):
         checked(**parts)
 
 
-def test_sites_that_double_precision_does_not_tell_apart_are_refused() -> None:
+def test_sites_indistinguishable_in_double_precision_are_refused() -> None:
     with pytest.raises(pbdkit.ExperimentError, match=r"^e.yaml: lattice.origin: at 1e\+17 double"):
         checked(lattice={"type": "square", "a": 1.0, "origin": [1e17, 0.0]})
     far, _ = checked(lattice={"type": "square", "a": 1.0, "origin": [1e12, 0.0]})
     assert far.particles == 144
 
 
-def test_a_gauge_of_no_length_is_refused_by_check_too(call: Call) -> None:
+def test_gauge_of_zero_length_is_refused_by_check(call: Call) -> None:
     parts = {
         "neighbours": {"type": "chebyshev"},
         "rule": {"type": "elastic", "poisson_ratio": 0.3},
@@ -254,7 +254,7 @@ def test_a_gauge_of_no_length_is_refused_by_check_too(call: Call) -> None:
     assert "the gauge has no length along x" in result.err
 
 
-def test_points_far_from_the_body_are_warned_of() -> None:
+def test_points_far_from_the_body_give_a_warning() -> None:
     far = {"select": {"nearest": [[100.0, 100.0], [9.4, 3.0]]}, "motion": {"type": "hold"}}
     (warning,) = [w for w in checked(leaders=[far])[0].warnings if "nearest" in w]
     assert warning == (
@@ -263,7 +263,7 @@ def test_points_far_from_the_body_are_warned_of() -> None:
     )
 
 
-def test_files_in_the_place_of_others_are_recognised(call: Call, tmp_path: Path) -> None:
+def test_files_of_another_kind_are_recognised(call: Call, tmp_path: Path) -> None:
     assert call("run", "paper/e", "-o", "m3.nc").code == 0
     result = call("run", "m3.nc")
     assert result.code == 2
@@ -298,7 +298,7 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("engine", ["numpy", "compiled"])
-def test_what_a_rule_raises_names_the_rule(engine: str, kind: str, monkeypatch: Any) -> None:
+def test_exception_in_a_rule_names_the_rule(engine: str, kind: str, monkeypatch: Any) -> None:
     monkeypatch.setattr(Raising, "kind", kind)
     given = json.loads(pbdkit.load("paper/a").model_dump_json(by_alias=True))
     given |= {"rule": Raising(), "solver": {"type": "stepping", "engine": engine}}
@@ -309,7 +309,7 @@ def test_what_a_rule_raises_names_the_rule(engine: str, kind: str, monkeypatch: 
 
 
 @pytest.mark.parametrize("engine", ["numpy", "compiled"])
-def test_an_interrupt_in_a_rule_says_where(engine: str, monkeypatch: Any) -> None:
+def test_interrupt_in_a_rule_names_the_place(engine: str, monkeypatch: Any) -> None:
     monkeypatch.setattr(Raising, "kind", "interrupt")
     monkeypatch.setitem(KINDS, "interrupt", KeyboardInterrupt())
     given = json.loads(pbdkit.load("paper/a").model_dump_json(by_alias=True))
@@ -318,7 +318,7 @@ def test_an_interrupt_in_a_rule_says_where(engine: str, monkeypatch: Any) -> Non
         pbdkit.run(given, progress=False)
 
 
-def test_an_import_that_goes_elsewhere_or_is_interrupted(install: Any, call: Call) -> None:
+def test_import_that_changes_directory_or_is_interrupted(install: Any, call: Call) -> None:
     install("zz-wanders", "import os\nos.chdir('/')\n")
     before = Path.cwd()
     call("plugins", "list")
@@ -335,7 +335,7 @@ BASES = ["paper/a", "paper/d1", "paper/f2", "paper/e", "paper/c-chebyshev"]
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_mutants_of_experiments_are_checked_or_refused(seed: int) -> None:
+def test_mutated_experiments_are_checked_or_refused(seed: int) -> None:
     """Whatever is written into an experiment, `check` answers soon, with a message of its own."""
     bases = [json.loads(pbdkit.load(name).model_dump_json(by_alias=True)) for name in BASES]
     for n in range(15):

@@ -67,7 +67,7 @@ def test_the_schema_refuses_what_the_program_refuses(path, value):
         pbdkit.Experiment(**data)
 
 
-def test_the_schema_of_sweeps_describes_what_is_taken():
+def test_schema_of_sweeps_describes_the_accepted_keys():
     shipped = SCHEMAS.parent / "docs" / "stability-map.yaml"
     sweep = read_file(shipped).data
     jsonschema.validate(sweep, SWEEP)
@@ -85,7 +85,7 @@ def test_shipped_fits_are_described(name):
             jsonschema.validate(data | wrong, FIT)
 
 
-def test_one_measurement_or_several_are_described():
+def test_one_or_several_measurements_are_described():
     data = read_file(Path(pbdkit.__file__).parent / "fits" / "plate-with-hole.yaml").data
     several = [data["measured"], {"type": "curve", "file": "f", "group": 1}]
     jsonschema.validate(data | {"measured": several}, FIT)

@@ -123,7 +123,7 @@ EDITS = {
 
 
 @pytest.mark.parametrize(("old", "new", "expected"), EDITS.values(), ids=EDITS)
-def test_a_fault_has_its_place(refused: Refused, old: str, new: str, expected: str) -> None:
+def test_error_has_its_place(refused: Refused, old: str, new: str, expected: str) -> None:
     message = refused(edited(old, new))
     assert agrees(message, expected), message
 
@@ -146,7 +146,9 @@ TEXTS = {
 
 
 @pytest.mark.parametrize(("text", "expected"), TEXTS.values(), ids=TEXTS)
-def test_a_file_is_refused_at_once(refused: Refused, text: str | bytes, expected: str) -> None:
+def test_invalid_file_is_refused_quickly(
+    refused: Refused, text: str | bytes, expected: str
+) -> None:
     gc.freeze()  # what other tests have left behind is not gone through
     begun = time.process_time()  # a busy machine does not decide
     message = refused(text)
@@ -165,7 +167,7 @@ READ = {
 
 
 @pytest.mark.parametrize(("text", "holds"), READ.values(), ids=READ)
-def test_what_is_right_is_read(build: Build, text: str, holds: Callable[[Any], bool]) -> None:
+def test_valid_values_are_read(build: Build, text: str, holds: Callable[[Any], bool]) -> None:
     assert holds(build(text).experiment)
 
 
@@ -173,7 +175,7 @@ NAMES = ["../x", "a/../b", "/x", "..", "a..b", "a//b", "a/", "''", "a b", r"a\b"
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_name_cannot_leave_its_folder(refused: Refused, name: str) -> None:
+def test_name_cannot_leave_its_directory(refused: Refused, name: str) -> None:
     message = refused(edited("name: tensile", f"name: {name}"))
     assert agrees(
         message, "e.yaml:2:1: name: may contain letters, digits, '.', '_', '-' and '/', ..."
@@ -190,7 +192,7 @@ JARGON = {
 
 
 @pytest.mark.parametrize(("old", "new"), JARGON.values(), ids=JARGON)
-def test_messages_speak_of_lists_and_maps(refused: Refused, old: str, new: str) -> None:
+def test_messages_use_lists_and_maps(refused: Refused, old: str, new: str) -> None:
     message = refused(edited(old, new)).lower()
     assert not [word for word in ("tuple", "dictionary", "instance", "validat") if word in message]
 
@@ -205,19 +207,19 @@ def test_messages_speak_of_lists_and_maps(refused: Refused, old: str, new: str) 
     }.items(),
     ids=["missing file", "misspelt shipped name", "folder", "long name"],
 )
-def test_what_is_no_experiment_file(name: str, expected: str) -> None:
+def test_files_without_an_experiment(name: str, expected: str) -> None:
     with pytest.raises(pbdkit.ExperimentError) as caught:
         pbdkit.load(name)
     assert agrees(str(caught.value), expected)
 
 
-def test_a_threshold_below_the_largest_rest_length_warns(build: Build) -> None:
+def test_threshold_below_the_largest_rest_length_gives_a_warning(build: Build) -> None:
     text = edited("none}", "threshold, thresholds: [1.2]}").replace("coordination", "chebyshev")
     (warning,) = build(text).warnings
     assert warning.startswith("fracture.thresholds.0: 1.2 is below the largest rest length 1.41421")
 
 
-def test_a_huge_lattice_is_refused_before_anything_is_allocated(build: Build) -> None:
+def test_huge_lattice_is_refused_before_allocation(build: Build) -> None:
     experiment = build(TENSILE).experiment.model_dump(by_alias=True)
     huge = experiment | {"body": {"type": "grid", "columns": 10**9, "rows": 10**9}}
     tracemalloc.start()
@@ -260,7 +262,7 @@ GROUPS = {
 
 
 @pytest.mark.parametrize(("first", "second", "step"), GROUPS.values(), ids=GROUPS)
-def test_groups_may_not_contradict(
+def test_contradictory_groups_are_refused(
     tensile: dict[str, Any], first: Any, second: Any, step: int
 ) -> None:
     experiment = pbdkit.Experiment(**tensile | {"leaders": [first, second]})
@@ -269,7 +271,7 @@ def test_groups_may_not_contradict(
         assert len(build_scene(experiment).leading) == 2
 
 
-def test_long_equal_motions_are_compared_at_once(tensile: dict[str, Any]) -> None:
+def test_long_equal_motions_are_compared_quickly(tensile: dict[str, Any]) -> None:
     long = velocity(1e-9, 300_000)
     groups = [group(LEFT, long), group(CORNER, long)]
     experiment = pbdkit.Experiment(**tensile | {"leaders": groups, "steps": 300_000})

@@ -114,7 +114,7 @@ def test_random_scenes(tmp_path_factory, given_, size):
     experiments(leaders=pulled_apart(), fracturing=st.just(True)).filter(still_neighbours),
     st.integers(2, 3),
 )
-def test_torn_scenes(tmp_path_factory, given_, size):
+def test_broken_scenes(tmp_path_factory, given_, size):
     compare(given_ | {"solver": NUMPY}, tmp_path_factory.mktemp("ranks"), size)
 
 
@@ -255,7 +255,7 @@ class AheadBefore(pbdkit.Diagnostic):
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.3])
-def test_authors_look_at_where_others_were(memory, tmp_path):
+def test_rules_read_the_positions_of_distant_ranks(memory, tmp_path):
     """After several steps without an exchange a part has little of that right beyond its own."""
     parts = {
         "body": {"type": "grid", "columns": 200, "rows": 3},
@@ -268,13 +268,13 @@ def test_authors_look_at_where_others_were(memory, tmp_path):
     compare(sheet(**parts), tmp_path, 3)
 
 
-def test_sums_over_cells_have_one_order(tmp_path, monkeypatch):
+def test_sums_over_cells_have_a_fixed_order(tmp_path, monkeypatch):
     monkeypatch.setattr("pbdkit.lattice.cells.CELLS_AT_ONCE", 30)  # so that bodies are cut
     compare(sheet(**OTHERS["every diagnostic of cells"]), tmp_path, 3)
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_more_kinds_of_scenes(name, tmp_path):
+def test_further_kinds_of_scenes(name, tmp_path):
     compare(sheet(**OTHERS[name]), tmp_path, 3)
 
 
@@ -326,7 +326,7 @@ def test_resumed_on_another_number_of_processes(sizes, tmp_path, monkeypatch):
     assert_same(one, several)
 
 
-def test_what_is_damaged_of_a_state_is_said_in_all_processes(tmp_path):
+def test_damaged_state_is_reported_in_all_processes(tmp_path):
     """Also where the first process comes upon it while others wait for their parts."""
     path = tmp_path / "out.nc"
     begin = partial(written, sheet(), path, watch=stopping_after(3))
@@ -348,7 +348,7 @@ def on(size, work):
     return on_ranks(size, work) if size > 1 else [work(Execution())]
 
 
-def test_a_lattice_with_too_few_rows_says_so(tmp_path):
+def test_lattice_with_too_few_rows_is_refused(tmp_path):
     small = sheet(body={"type": "grid", "columns": 3, "rows": 7})
     with pytest.raises(pbdkit.ExperimentError, match="too few for 9 processes; start fewer"):
         on_ranks(9, lambda ranks: written(small, tmp_path / "out.nc", ranks))
@@ -356,7 +356,7 @@ def test_a_lattice_with_too_few_rows_says_so(tmp_path):
 
 
 @given(st.integers(2, 6), st.integers(30, 200))
-def test_parts_are_all_of_the_rows_once_and_about_equal(parts, columns):
+def test_partition_covers_all_rows_once_and_is_balanced(parts, columns):
     scene = build_scene(
         pbdkit.Experiment.model_validate(
             sheet(body={"type": "grid", "columns": columns, "rows": 2})
@@ -390,7 +390,7 @@ def test_mpiexec_gives_the_file_of_one_process(tmp_path):
 
 
 @needs_mpi
-def test_what_is_wrong_is_said_once(tmp_path):
+def test_errors_are_printed_once(tmp_path):
     done = pbdkit_on(2, "run", "paper/f2", "--set", "rule.K=1", folder=tmp_path)
     assert done.returncode == 2
     assert done.stderr.count("pbdkit: ") == 1
@@ -402,7 +402,7 @@ def test_what_is_wrong_is_said_once(tmp_path):
 
 
 @pytest.mark.parametrize("names", [("PMI_SIZE",), ("OMPI_COMM_WORLD_SIZE", "PMIX_RANK")])
-def test_processes_that_do_not_find_each_other_are_refused(names, monkeypatch, call):
+def test_unconnected_processes_are_refused(names, monkeypatch, call):
     """The launcher belongs to one MPI and mpi4py to another."""
     for name in names:
         monkeypatch.setenv(name, "2")
@@ -442,7 +442,7 @@ def test_a_sample_of_the_long_trial_on_random_scenes(compiled_at_length):
 
 
 @needs_mpi
-def test_where_one_process_is_killed_all_end_and_the_run_goes_on(tmp_path):
+def test_killing_one_process_ends_all_and_the_run_resumes(tmp_path):
     settings = ["--set", "steps=1000000", "--set", "record.every=1000000", "--quiet"]
     arguments = ["run", "paper/a", *settings, "-o", "out.nc"]
     command = [MPIEXEC, "-n", "2", sys.executable, "-m", "pbdkit", *arguments]

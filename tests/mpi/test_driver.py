@@ -106,7 +106,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_several_processes_find_what_one_does(name, tmp_path):
+def test_several_processes_agree_with_one(name, tmp_path):
     given_ = strip(**CASES[name])
     compare(given_, tmp_path, 3)
 
@@ -150,7 +150,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_parts_of_every_shape(name, tmp_path):
+def test_partitions_of_every_shape(name, tmp_path):
     given_, size = SHAPES[name]
     compare(given_, tmp_path, size)
 
@@ -163,7 +163,7 @@ def certified(path):
     return found.u.values[-1], json.loads(found.attrs["certificate"])
 
 
-def test_what_the_certificate_says_is_true(tmp_path):
+def test_error_bound_holds(tmp_path):
     """The result by factors of a matrix is more accurate."""
     given_ = strip(body=RING, leaders=ENDS)
     exact = {"type": "equilibrium", "method": "lu", "tolerance": 1e-11}
@@ -204,7 +204,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("text", REFUSED)
-def test_what_is_not_shared_is_refused_in_one_message(text, tmp_path):
+def test_undistributed_features_are_refused_in_one_message(text, tmp_path):
     given_ = strip(**REFUSED[text])
     refused = on_ranks(2, lambda ranks: ended(given_, tmp_path / "out.nc", ranks))
     assert refused[0] == refused[1]
@@ -213,7 +213,7 @@ def test_what_is_not_shared_is_refused_in_one_message(text, tmp_path):
     assert not (tmp_path / "out.nc").exists()
 
 
-def test_where_the_iteration_gets_nowhere_one_process_is_asked_for(tmp_path, monkeypatch):
+def test_stalled_iteration_recommends_one_process(tmp_path, monkeypatch):
     def stuck(*given):
         raise StuckError
 
@@ -287,7 +287,7 @@ def ended(given_, path, processes=None):
         return str(error)
 
 
-def test_strips_cut_every_grid():
+def test_strips_divide_every_grid():
     """The parts have no gaps; each process has its own rows there, and some around them."""
     scene = build_scene(pbdkit.Experiment.model_validate(strip()))
     for parts in (2, 3, 5, 9):
@@ -320,7 +320,7 @@ def test_interrupted_and_resumed_on_another_number_of_processes(sizes, tmp_path)
     assert_same(one, several)
 
 
-def test_no_process_holds_the_whole(monkeypatch):
+def test_no_process_stores_the_whole_body(monkeypatch):
     """Three processes together take about as much as one, not three times as much."""
     monkeypatch.setattr(parted_grids, "SMALL", 20_000)
     body = {"type": "grid", "columns": 900, "rows": 130}
@@ -362,7 +362,7 @@ def test_mpiexec_gives_the_file_of_one_process(tmp_path):
         ("paper/a", ["neighbours={type: euclidean, radius: 1.2, reevaluate: true}", "steps=20"]),
     ],
 )
-def test_what_cannot_be_shared_the_first_process_runs_alone(name, settings, tmp_path):
+def test_first_process_runs_undistributed_work_alone(name, settings, tmp_path):
     how = [word for setting in settings for word in ("--set", setting)]
     done = pbdkit_on(2, "run", name, *how, "-o", "two.nc", folder=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -374,7 +374,7 @@ def test_what_cannot_be_shared_the_first_process_runs_alone(name, settings, tmp_
 
 
 @needs_mpi
-def test_what_the_first_process_alone_refuses_ends_all(tmp_path):
+def test_refusal_by_the_first_process_ends_all(tmp_path):
     nobody = "leaders.0.select={box: [-9, -9, -8, -8]}"
     done = pbdkit_on(2, "run", "material/bar", "--set", nobody, "-o", "two.nc", folder=tmp_path)
     assert done.returncode == 2
@@ -382,7 +382,7 @@ def test_what_the_first_process_alone_refuses_ends_all(tmp_path):
 
 
 @needs_mpi
-def test_an_end_that_is_no_equilibrium_is_said_once(tmp_path):
+def test_end_without_equilibrium_is_reported_once(tmp_path):
     how = ["--set", "solver.tolerance=1e-17", "--set", "solver.method=multigrid"]
     done = pbdkit_on(2, "run", "modelling/strip", *how, "-o", "out.nc", folder=tmp_path)
     assert done.returncode == 4

@@ -111,11 +111,11 @@ EQUILIBRIUM = {
 }
 
 
-def test_parts_with_deep_halos():
+def test_partitions_with_deep_halos():
     assert_built_as_cut(sheet(**EQUILIBRIUM), 2)
 
 
-def test_selections_find_their_particles_wherever_they_are():
+def test_selections_find_their_particles_on_any_rank():
     leaders = [
         {"select": select, "motion": {"type": "hold"}}
         for select in (
@@ -142,7 +142,7 @@ def test_outlines_far_from_the_origin():
     assert_built_as_cut(sheet(body=body, lattice=lattice, leaders=leaders), 3)
 
 
-def test_each_process_has_its_rows_alone():
+def test_each_process_stores_only_its_rows():
     experiment = pbdkit.Experiment.model_validate(
         sheet(body={"type": "grid", "columns": 400, "rows": 3})
     )
@@ -183,7 +183,7 @@ class SaysItIsLocal(FramePolicy):
 
 
 @pytest.mark.parametrize("frame", [Copied(), SaysItIsLocal()])
-def test_where_frame_points_follow_particles_far_away_all_build_the_whole(frame):
+def test_frames_with_distant_particles_are_built_whole_everywhere(frame):
     experiment = pbdkit.Experiment(
         **sheet(body={"type": "grid", "columns": 400, "rows": 3}) | {"frame": frame}
     )
@@ -210,7 +210,7 @@ def test_a_body_larger_than_the_memory_of_one_process_runs_on_several(tmp_path, 
     assert_same(one, several)
 
 
-def test_what_is_wrong_is_said_where_the_whole_cannot_be_built(tmp_path, monkeypatch):
+def test_errors_are_reported_if_the_whole_cannot_be_built(tmp_path, monkeypatch):
     bounded(monkeypatch, 11)
     nobody = {"leaders": [{"select": {"box": [-9, -9, -8, -8]}, "motion": {"type": "hold"}}]}
     with pytest.raises(pbdkit.ExperimentError, match="selects no particle"):

@@ -141,7 +141,7 @@ TRIED += [("ring", "a field or dots"), ("ring", "two in a given size")]
 
 
 @pytest.mark.parametrize(("name", "look"), TRIED)
-def test_nothing_is_clipped_or_overprinted(bodies, name, look, monkeypatch):
+def test_nothing_is_clipped_or_overlaps(bodies, name, look, monkeypatch):
     axes = plot(bodies(name), **LOOKS[look], dpi=100)
     assert faults(figure_of(axes), monkeypatch) == []
     for ax in axes if isinstance(axes, list) else [axes]:  # a body's shape is that of its panel
@@ -149,7 +149,7 @@ def test_nothing_is_clipped_or_overprinted(bodies, name, look, monkeypatch):
         assert box.width / (right - left) == pytest.approx(box.height / (high - low), rel=0.02)
 
 
-def test_units_make_labels_no_longer_than_there_is_room(monkeypatch):
+def test_labels_with_units_fit_the_space(monkeypatch):
     strip = pbdkit.run("modelling/strip", progress=False)
     axes = plot(strip, "stress_xx")
     assert faults(figure_of(axes), monkeypatch) == []
@@ -161,7 +161,7 @@ def test_units_make_labels_no_longer_than_there_is_room(monkeypatch):
     assert "stress, xx component (MPa)" in said
 
 
-def test_pictures_are_in_the_units_of_the_user():
+def test_plots_are_in_the_units_of_the_user():
     plate = pbdkit.run(pbdkit.load("modelling/composite-plate", settings=["units.length=0.5 mm"]),
                        progress=False)  # fmt: skip
     drawn, again = (
@@ -202,7 +202,7 @@ def test_fields_of_both_signs_are_neutral_at_zero(bodies):
     assert above.cmap(0.0) == below.cmap(1.0)
 
 
-def test_all_panels_have_one_scale_and_one_place(torn):
+def test_all_panels_share_scale_and_extent(torn):
     axes = plot(torn, "pe1_intact", [0, 10, 400])
     assert len({ax.collections[-1].get_clim() for ax in axes}) == 1
     assert len({(ax.get_xlim(), ax.get_ylim()) for ax in axes}) == 1
@@ -212,7 +212,7 @@ def test_all_panels_have_one_scale_and_one_place(torn):
     assert {ax.collections[-1].get_cmap().name for ax in given} == {"magma"}
 
 
-def test_every_panel_shows_something():
+def test_every_panel_has_contents():
     """At the last step of a sheet that came to rest there is next to nothing to see in colour."""
     sheet = pbdkit.run("paper/a", progress=False)
     for ax in plot(sheet, "pe1", [10, 400], contours=True):
@@ -231,7 +231,7 @@ def test_every_panel_shows_something():
         ("pe1", lambda ds: ds.pe1, "pseudo-energy PE1"),
     ],
 )
-def test_colours_are_values(bodies, color, expected, said):
+def test_colours_match_values(bodies, color, expected, said):
     ds = bodies("50 x 50")
     ax = plot(ds, color, 6, filled=False)
     dots = next(c for c in ax.collections if isinstance(c, PathCollection))
@@ -243,7 +243,7 @@ def test_colours_are_values(bodies, color, expected, said):
     assert said in " ".join(label.split())
 
 
-def test_bonds_show_when_they_broke_and_those_that_did_are_dashed(torn):
+def test_bonds_show_their_step_of_breaking_and_broken_ones_are_dashed(torn):
     shown = int(((torn.broken_step >= 0) & (torn.broken_step <= 8)).sum())
     ax = plot(torn, "broken_step", 8)
     whole_lines, values = (c for c in ax.collections if isinstance(c, LineCollection))
@@ -256,7 +256,7 @@ def test_bonds_show_when_they_broke_and_those_that_did_are_dashed(torn):
     assert dashed.get_linestyle()[0][1] is not None
 
 
-def test_numbers_are_thinned_where_they_would_overprint(bodies, monkeypatch):
+def test_overlapping_numbers_are_thinned(bodies, monkeypatch):
     few = {t for t, _ in drawn_texts(plot(bodies("few"), numbers=True).figure, monkeypatch)}
     assert {str(n) for n in bodies("few").number.values} <= few
     ax = plot(bodies("200 x 6"), numbers=True, figsize=(7.0, 2.0))
@@ -299,34 +299,34 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_makes_no_picture_is_refused(torn, name):
+def test_unplottable_data_are_refused(torn, name):
     look, message = REFUSED[name]
     with pytest.raises(ExperimentError) as refused:
         plot(torn, **look)
     assert message in str(refused.value)
 
 
-def test_bonds_that_are_not_there_are_refused(tensile):
+def test_missing_bonds_are_refused(tensile):
     ds = pbdkit.run(tensile | {"fracture": {"type": "none"}, "diagnostics": []}, progress=False)
     for look in ({"bonds": True}, {"broken": True}):
         with pytest.raises(ExperimentError, match="the dataset has no bonds to draw"):
             plot(ds, **look)
 
 
-def test_what_has_no_places_is_refused(torn):
+def test_data_without_positions_are_refused(torn):
     with pytest.raises(ExperimentError, match="keep the variable `position`"):
         torn.drop_vars(["position", "reference"]).pbd.plot()
     with pytest.raises(ExperimentError, match="there are no positions to draw: all are NaN"):
         torn.assign(position=torn.position * np.nan).pbd.plot()
 
 
-def test_a_variable_that_says_nothing_of_itself_has_its_name(torn):
+def test_variable_without_attributes_is_labelled_with_its_name(torn):
     silent = torn.assign(pe1=torn.pe1.assign_attrs(long_name="", units=""))
     bar = silent.pbd.plot(color="pe1", vmin=0.0, vmax=1.0).figure.axes[1]
     assert bar.get_ylabel() == "pe1"
 
 
-def test_one_of_several_runs_is_picked_by_who_draws(tensile):
+def test_one_of_several_runs_must_be_selected(tensile):
     swept = pbdkit.sweep(tensile, vary={"rule.type": ["barycentre", "mean-displacement"]})
     with pytest.raises(ExperimentError) as refused:
         swept.pbd.plot()
@@ -336,7 +336,7 @@ def test_one_of_several_runs_is_picked_by_who_draws(tensile):
     assert swept.isel({dimension: 1}).pbd.plot().get_title().endswith(f"step {swept.time[-1]:d}")
 
 
-def test_part_of_a_dataset_is_drawn(torn):
+def test_part_of_a_dataset_is_plotted(torn):
     left = torn.isel(particle=torn.reference.sel(axis="x").values < 5, time=[3, 8])
     ax = left.pbd.plot(color="pe1")
     assert ax.get_title() == "paper/f2, step 8"
@@ -344,7 +344,7 @@ def test_part_of_a_dataset_is_drawn(torn):
     assert torn.isel(time=8).pbd.plot(color="broken_step").get_title() == "paper/f2, step 8"
 
 
-def test_fields_end_at_the_outline_and_scales_are_of_what_lies_inside():
+def test_fields_end_at_the_outline_and_scales_exclude_the_outside():
     """Cells that the outline cuts are drawn, with the mean of the corners that have a value."""
     hole = {"type": "disc", "radius": 2.6, "centre": [5.0, 4.0]}
     plate = {"type": "rectangle", "width": 10.0, "height": 8.0}
@@ -453,7 +453,7 @@ def test_the_outline_at_rest_is_that_of_the_body(name):
     assert length == pytest.approx(LENGTHS[name], rel=0.02)
 
 
-def test_a_value_that_is_missing_beyond_the_outline_has_no_jumps_between_cells():
+def test_missing_values_outside_the_outline_cause_no_jumps():
     ds, _ = cut_body("hole")
     values = np.where(ds.inside, ds.reference[:, 0], np.nan)
     ds = ds.isel(time=[0]).assign(seen=("particle", values))
@@ -462,7 +462,7 @@ def test_a_value_that_is_missing_beyond_the_outline_has_no_jumps_between_cells()
     assert np.nanmax(jumps) < 0.1
 
 
-def test_axes_are_drawn_into(torn):
+def test_plots_draw_into_given_axes(torn):
     figure = Figure((8, 4), layout="constrained")
     axes = figure.subplots(1, 2)
     assert plot(torn, "pe1", [0, 400], ax=axes)[0] is axes[0]
@@ -470,7 +470,7 @@ def test_axes_are_drawn_into(torn):
     assert isinstance(torn.pbd.plot(time=[0, 8]), Figure)
 
 
-def test_two_runs_side_by_side_have_one_scale_and_one_place(torn):
+def test_two_runs_side_by_side_share_scale_and_extent(torn):
     other = pbdkit.run("paper/f1", progress=False)
     one, two = compare(torn, other, "pe1_intact", 8)
     assert one.get_xlim() == two.get_xlim()
@@ -478,7 +478,7 @@ def test_two_runs_side_by_side_have_one_scale_and_one_place(torn):
     assert [ax.get_title() for ax in (one, two)] == ["paper/f2, step 8", "paper/f1, step 8"]
 
 
-def test_a_difference_is_of_particles_of_one_number(bodies):
+def test_difference_matches_particles_by_number(bodies):
     ds = bodies("50 x 50")
     more = ds.assign(pe1=ds.pe1 + ds.reference.sel(axis="x"))
     some = ds.isel(particle=ds.reference.sel(axis="x").values < 30)
@@ -496,7 +496,7 @@ def test_a_difference_is_of_particles_of_one_number(bodies):
         compare(ds, ds, color="broken_step", difference=True)
 
 
-def test_a_field_has_the_value_of_its_place_and_holes_stay_holes():
+def test_field_has_the_value_of_its_place_and_holes_stay_empty():
     """Test a linear quantity, on cells larger and smaller than pixels; a cell is left out."""
     for count in (4, 9, 60, 300):
         site = np.stack(np.meshgrid(*2 * [np.arange(count + 1)], indexing="ij"), -1).reshape(-1, 2)
@@ -542,7 +542,7 @@ def test_no_pixel_within_a_sheared_cell_is_missed(corners):
     assert np.isfinite(field[inside]).all()
 
 
-def test_cells_with_a_broken_side_are_left_out_and_the_outline_goes_around_the_rest():
+def test_cells_with_a_broken_side_are_excluded_from_field_and_outline():
     site = np.stack(np.meshgrid(*2 * [np.arange(4)], indexing="ij"), -1).reshape(-1, 2)
     cells = cells_of(site, site.astype(float))
     kept = cells[whole(cells, np.array([[5, 6]]), 16)]
@@ -553,7 +553,7 @@ def test_cells_with_a_broken_side_are_left_out_and_the_outline_goes_around_the_r
     assert len(cells_of(site, leaning)) == 18
 
 
-def test_a_file_is_read_as_far_as_it_is_drawn(tmp_path, call, monkeypatch):
+def test_only_plotted_parts_of_a_file_are_read(tmp_path, call, monkeypatch):
     """Draw one step of five and one field of three."""
     given = {"name": "some", "lattice": SQUARE, "body": {"type": "grid", "columns": 30, "rows": 30}}
     more = {"rule": {"type": "barycentre"}, "steps": 4, "leaders": [HOLD], "neighbours": WHOLE}
@@ -574,7 +574,7 @@ def test_a_file_is_read_as_far_as_it_is_drawn(tmp_path, call, monkeypatch):
     assert names == {"position", "kind", "u"}
 
 
-def test_where_pyplot_is_in_use_figures_are_its_own(tmp_path):
+def test_figures_belong_to_pyplot_if_it_is_in_use(tmp_path):
     """So that scripts and notebooks show them; a movie leaves none behind."""
     plt = pytest.importorskip("matplotlib.pyplot")
     ds = pbdkit.run(pbdkit.load("paper/a", settings=["steps=3"]), progress=False)
@@ -587,7 +587,7 @@ def test_where_pyplot_is_in_use_figures_are_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("verb", [plot, compare, animate, animation], ids=lambda v: v.__name__)
-def test_pictures_share_their_options_as_documented_keywords(verb):
+def test_plots_share_documented_keyword_options(verb):
     """An editor completes them, with types; `numbers` is not legible in movies."""
     options = {part.name: part.type for part in fields(Look)}
     if verb in (animate, animation):

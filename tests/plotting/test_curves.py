@@ -105,7 +105,7 @@ def refuse_bad_layout(ax):
 # Histories
 
 
-def test_a_history_is_that_of_the_dataset(torn):
+def test_history_matches_the_dataset(torn):
     ax = torn.pbd.history("pe1", particle=[19, 20])
     for line, number in zip(drawn(ax), (19, 20), strict=True):
         np.testing.assert_array_equal(line, [torn.time, torn.pe1.sel(particle=number)])
@@ -119,7 +119,7 @@ def test_a_history_is_that_of_the_dataset(torn):
     )
 
 
-def test_displacements_are_there_whether_recorded_or_not(torn, pulled):
+def test_displacements_are_available_whether_recorded_or_not(torn, pulled):
     for ds in (torn, pulled):
         u = ds.position - ds.reference
         ax = ds.pbd.history(particle=20)
@@ -142,7 +142,7 @@ def test_tracks_have_every_step():
     np.testing.assert_array_equal(one[1], ds.track.sel(tracked=10, axis="x"))
 
 
-def test_lines_of_particles_have_a_colour_each_and_a_scale_where_they_are_many(torn):
+def test_lines_of_particles_have_colours_and_a_colorbar_if_many(torn):
     few = torn.pbd.history("pe1", j=2)
     assert len({line.get_color() for line in few.lines}) == len(few.lines) > 5
     many = torn.pbd.history("pe1", particle=torn.number.values[10:40])
@@ -163,7 +163,7 @@ def test_bonds_have_a_history(torn):
     np.testing.assert_array_equal(line[1], damaged.damage_left.isel(bond=row))
 
 
-def test_the_crack_of_a_part_of_a_body_is_that_between_its_particles(torn):
+def test_crack_of_a_part_of_a_body_is_between_its_particles(torn):
     part = torn.isel(particle=np.flatnonzero(torn.i.values > 1))
     ends = torn.bond_ends.values[torn.broken_step.values >= 0]
     there = np.isin(ends, part.number.values).all(axis=1)
@@ -193,7 +193,7 @@ def test_the_crack_of_a_part_of_a_body_is_that_between_its_particles(torn):
         ({"name": "track"}, "add {type: track, numbers: ...} to `diagnostics`"),
     ],
 )
-def test_what_has_no_history_is_said(torn, asked, said):
+def test_variables_without_history_are_refused(torn, asked, said):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         torn.pbd.history(**asked)
     assert said in str(caught.value)
@@ -202,7 +202,7 @@ def test_what_has_no_history_is_said(torn, asked, said):
 # Curves
 
 
-def test_force_over_displacement_of_a_leader_group(pulled):
+def test_force_against_displacement_of_a_leader_group(pulled):
     ax = pulled.pbd.curve(kind="load-displacement")
     (line,) = drawn(ax)
     np.testing.assert_allclose(line[0], 0.02 * np.minimum(pulled.time, 4), atol=1e-14)
@@ -212,7 +212,7 @@ def test_force_over_displacement_of_a_leader_group(pulled):
     np.testing.assert_array_equal(other[0], 0.0)
 
 
-def test_force_over_displacement_of_a_load():
+def test_force_against_displacement_of_a_load():
     loaded = run(
         **CALIBRATED, leaders=[HELD], steps=5,
         loads=[{"select": {"edge": "right"}, "force": [1e-3, 0.0]}],
@@ -224,7 +224,7 @@ def test_force_over_displacement_of_a_load():
     np.testing.assert_array_equal(line[1], loaded.load_resultant.sel(across))
 
 
-def test_force_over_depth_of_an_obstacle():
+def test_force_against_depth_of_an_obstacle():
     """It stays where it was last once it is gone."""
     disc = {"type": "disc", "radius": 4.0, "centre": [2.5, 8.0]}
     motion = {"type": "velocity", "velocity": [0.0, -0.01], "steps": 9}
@@ -238,14 +238,14 @@ def test_force_over_depth_of_an_obstacle():
     np.testing.assert_array_equal(line[1], -pressed.contact_force.sel(obstacle=0, axis="y"))
 
 
-def test_stress_over_strain(pulled):
+def test_stress_against_strain(pulled):
     ax = pulled.pbd.curve()
     (line,) = drawn(ax)
     np.testing.assert_array_equal(line, [pulled.nominal_strain, pulled.nominal_stress])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("nominal strain", "nominal stress (stress unit)")
 
 
-def test_curves_are_in_physical_units_where_they_are_known():
+def test_curves_are_in_physical_units_if_known():
     pytest.importorskip("pint")
     strip = pbdkit.run("modelling/strip", progress=False)
     ax = strip.pbd.curve(kind="load-displacement")
@@ -266,7 +266,7 @@ def test_energies_are_sums_over_the_body(torn, pulled):
     np.testing.assert_array_equal(energy[1], pulled.strain_energy)
 
 
-def test_any_number_over_another(torn, pulled):
+def test_any_number_against_another(torn, pulled):
     (line,) = drawn(torn.pbd.curve(y="broken_bonds"))
     np.testing.assert_array_equal(line, [torn.time, torn.broken_bonds])
     (alone,) = drawn(torn.pbd.curve("broken_bonds"))
@@ -277,7 +277,7 @@ def test_any_number_over_another(torn, pulled):
     np.testing.assert_array_equal(line[1], pulled.reaction.sel(leader_group=1, axis="x"))
 
 
-def test_what_is_summed_is_read_in_blocks(torn, monkeypatch):
+def test_summed_variables_are_read_in_blocks(torn, monkeypatch):
     whole = drawn(torn.pbd.curve(y="pe1"))
     monkeypatch.setattr(series, "BLOCK_BYTES", 1)
     np.testing.assert_allclose(drawn(torn.pbd.curve(y="pe1")), whole, rtol=1e-14)
@@ -291,7 +291,7 @@ def test_curves_draw_into_given_axes(pulled):
     plt.close(figure)
 
 
-def test_maps_of_cracks_keep_their_legend_within_given_axes(torn):
+def test_crack_maps_keep_their_legend_within_given_axes(torn):
     figure, ax = plt.subplots()
     assert torn.pbd.crack(ax=ax) is ax
     assert told(ax) == ["broken from the start"]
@@ -313,13 +313,13 @@ def test_maps_of_cracks_keep_their_legend_within_given_axes(torn):
         ({"y": "reaction_x"}, "add {type: reaction, youngs_modulus: ...} to `diagnostics`"),
     ],
 )
-def test_what_is_no_curve_is_said(torn, asked, said):
+def test_data_without_a_curve_are_refused(torn, asked, said):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         torn.pbd.curve(**asked)
     assert said in str(caught.value)
 
 
-def test_which_group_is_meant_is_asked(pulled):
+def test_ambiguous_group_must_be_selected(pulled):
     with pytest.raises(
         pbdkit.ExperimentError, match="leader groups 0, 1: several are recorded; select one by grou"
     ):
@@ -341,7 +341,7 @@ def test_without_matplotlib_the_extra_is_named(torn, draw, monkeypatch):
 # Sweeps
 
 
-def test_a_sweep_has_a_line_a_member(swept):
+def test_sweep_has_one_line_per_member(swept):
     ax = swept.pbd.curve(kind="energies")
     assert told(ax) == ["relaxation 0.4", "relaxation 0.7", "relaxation 1"]
     for line, relaxation in zip(drawn(ax), swept.relaxation, strict=True):
@@ -354,7 +354,7 @@ def test_a_sweep_has_a_line_a_member(swept):
     assert ax.figure.axes[1].get_ylabel() == "relaxation"
 
 
-def test_loads_of_a_sweep_have_a_line_a_member():
+def test_loads_of_a_sweep_have_one_line_per_member():
     loaded = experiment(
         **CALIBRATED, leaders=[HELD], steps=5,
         loads=[{"select": {"edge": "right"}, "force": [0.0, -1e-3]}],
@@ -367,7 +367,7 @@ def test_loads_of_a_sweep_have_a_line_a_member():
     np.testing.assert_array_equal(drawn(ax)[0][1], -found.load_resultant.sel(across))
 
 
-def test_who_leads_is_not_known_of_sweeps():
+def test_leader_curve_of_a_sweep_requires_one_member():
     led = experiment(**CALIBRATED, leaders=[HELD, pull_right(0.01, 0.0)], steps=2,
                      diagnostics=[{"type": "reaction", "youngs_modulus": 2.0}])  # fmt: skip
     found = pbdkit.sweep(led, vary={"solver.relaxation": [0.5, 1.0]}, workers=1, progress=False)
@@ -375,7 +375,7 @@ def test_who_leads_is_not_known_of_sweeps():
         found.pbd.curve()
 
 
-def test_members_are_named_by_the_types_of_their_parts():
+def test_members_are_labelled_by_the_types_of_their_components():
     rules = [{"type": "barycentre"}, {"type": "mean-displacement"}]
     found = pbdkit.sweep(
         experiment(leaders=[HELD, pull_right(0.1, 0.0)], diagnostics=[{"type": "pe1"}], steps=2),
@@ -387,7 +387,7 @@ def test_members_are_named_by_the_types_of_their_parts():
 # Cracks
 
 
-def test_a_crack_is_its_broken_bonds(torn):
+def test_crack_is_drawn_as_its_broken_bonds(torn):
     ax = torn.pbd.crack()
     old, new = sorted(ax.collections, key=lambda c: c.get_array() is not None)
     body = (torn.role.sel(particle=torn.bond_ends) == 0).all("end")
@@ -400,7 +400,7 @@ def test_a_crack_is_its_broken_bonds(torn):
     np.testing.assert_array_equal(np.sort(new.get_array()), np.sort(steps))
 
 
-def test_the_length_of_a_crack_and_its_bonds_over_steps(torn):
+def test_crack_length_and_broken_bonds_over_steps(torn):
     body = (torn.role.sel(particle=torn.bond_ends) == 0).all("end").values
     steps = torn.broken_step.values[body]
     (count,), (length,) = (drawn(torn.pbd.crack(kind)) for kind in ("bonds", "length"))
@@ -411,7 +411,7 @@ def test_the_length_of_a_crack_and_its_bonds_over_steps(torn):
         assert length[1][at] == pytest.approx(0.0 if step < 5 else 4.0)
 
 
-def test_far_cracks_are_not_added_up():
+def test_lengths_of_separate_cracks_are_not_added():
     cracks = [[[2.5, -0.5], [2.5, 1.5]], [[12.5, 3.4], [12.5, 4.6]]]
     two = run(columns=16, steps=1, fracture={"type": "threshold", "thresholds": [9.0],
                                              "cracks": cracks})  # fmt: skip
@@ -426,13 +426,13 @@ def test_far_cracks_are_not_added_up():
         ("torn", "paths", "'paths' is not a picture of a crack; use one of map, length, bonds"),
     ],
 )
-def test_what_has_no_crack_is_said(of, kind, said, request):
+def test_data_without_a_crack_are_refused(of, kind, said, request):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         request.getfixturevalue(of).pbd.crack(kind)
     assert said in str(caught.value)
 
 
-def test_where_nothing_broke_nothing_is_drawn():
+def test_without_broken_bonds_nothing_is_drawn():
     whole = run(steps=1, fracture={"type": "threshold", "thresholds": [9.0]})
     with pytest.raises(pbdkit.ExperimentError, match="there is no crack to draw: no bond broke"):
         whole.pbd.crack()
@@ -457,7 +457,7 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_no_text_lies_on_another_or_is_cut(name, request):
+def test_no_text_overlaps_or_is_clipped(name, request):
     of, draw = LAYOUTS[name]
     refuse_bad_layout(draw(request.getfixturevalue(of)))
 
@@ -470,7 +470,7 @@ def test_cracks_of_long_bodies_keep_their_text_apart(columns, rows):
     refuse_bad_layout(long.pbd.crack())
 
 
-def test_labels_are_wrapped_and_never_formulas():
+def test_labels_are_wrapped_outside_formulas():
     long = label("force of leader group 1", "stress unit * thickness unit * lattice unit", width=34)
     assert max(map(len, long.splitlines())) <= 34
     assert "stress unit × thickness unit" in long
@@ -482,7 +482,7 @@ def test_labels_are_wrapped_and_never_formulas():
 # The command
 
 
-def test_one_command_draws_them_all(call, tmp_path, monkeypatch):
+def test_one_command_draws_all_of_them(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert call("run", "paper/d1", "--set", "steps=20", "-o", "d.nc", "--quiet").code == 0
     named = {

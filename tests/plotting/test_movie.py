@@ -46,7 +46,7 @@ def frames_of(path):
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
-def test_every_recorded_step_is_there(torn, tmp_path, suffix):
+def test_every_recorded_step_has_a_frame(torn, tmp_path, suffix):
     shares, path = [], tmp_path / f"torn{suffix}"
     torn.pbd.animate("pe1_intact", path, show=lambda what, share: shares.append(share), **SMALL)
     frames = frames_of(path).astype(int)
@@ -61,7 +61,7 @@ def test_every_recorded_step_is_there(torn, tmp_path, suffix):
     assert np.median(frames) > 235  # on a white page
 
 
-def test_a_frame_is_the_picture_of_its_step(torn):
+def test_frame_equals_the_plot_of_its_step(torn):
     recording = Trajectory(torn, "pe1_intact")
     moving = MovieSheet(recording, range(25), Look(**SMALL), lambda what, share: None)
     frames = [*moving.frames(range(25))]
@@ -72,7 +72,7 @@ def test_a_frame_is_the_picture_of_its_step(torn):
     assert (low, high) == (0.0, pytest.approx(float(torn.pe1_intact.max())))
 
 
-def test_some_steps_only_and_the_last_in_any_case(torn, tmp_path):
+def test_selected_steps_always_include_the_last(torn, tmp_path):
     torn.pbd.animate(file=tmp_path / "some.gif", every=10, **SMALL)
     assert len(frames_of(tmp_path / "some.gif")) == 4  # 0, 10, 20 and 24
 
@@ -86,7 +86,7 @@ def test_some_steps_only_and_the_last_in_any_case(torn, tmp_path):
         ("torn.mp4", {"color": "pe3"}, "'pe3' cannot be drawn; did you mean"),
     ],
 )
-def test_what_makes_no_movie_is_refused(torn, name, look, message, tmp_path, monkeypatch):
+def test_data_without_a_movie_are_refused(torn, name, look, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ExperimentError) as refused:
         torn.pbd.animate(file=name, **look)
@@ -94,7 +94,7 @@ def test_what_makes_no_movie_is_refused(torn, name, look, message, tmp_path, mon
     assert [*tmp_path.iterdir()] == []
 
 
-def test_what_is_missing_is_named_with_its_extra(torn, tmp_path, monkeypatch):
+def test_missing_package_is_named_with_its_extra(torn, tmp_path, monkeypatch):
     monkeypatch.setattr("pbdkit.errors.find_spec", lambda name: None)
     for name, missing in {"torn.mp4": "imageio-ffmpeg", "torn.gif": "pillow"}.items():
         with pytest.raises(ExperimentError) as refused:
@@ -102,7 +102,7 @@ def test_what_is_missing_is_named_with_its_extra(torn, tmp_path, monkeypatch):
         assert f"need {missing}: pip install 'pbdkit[movie]'" in str(refused.value)
 
 
-def test_a_movie_that_cannot_be_written_leaves_nothing(torn, tmp_path, monkeypatch):
+def test_failed_movie_leaves_no_file(torn, tmp_path, monkeypatch):
     with pytest.raises(StorageError, match="there is no folder"):
         torn.pbd.animate(file=tmp_path / "none" / "torn.gif", **SMALL)
     shown = []
@@ -120,7 +120,7 @@ def test_a_movie_that_cannot_be_written_leaves_nothing(torn, tmp_path, monkeypat
     assert path.read_text() == "mine"
 
 
-def test_the_command_makes_movies_and_replaces_none(call, tmp_path, monkeypatch):
+def test_command_makes_movies_and_overwrites_none(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert call("run", "paper/f2", "--set", "steps=9", "-o", "f2.nc").code == 0
     look = ["--size", "3", "2", "--dpi", "60", "--color", "pe1", "--contours"]
@@ -134,7 +134,7 @@ def test_the_command_makes_movies_and_replaces_none(call, tmp_path, monkeypatch)
     assert (wrong.code, "the name of a movie must end in .mp4 or .gif" in wrong.err) == (2, True)
 
 
-def test_notebooks_have_an_animation_of_no_more_than_sixty_steps(torn):
+def test_notebooks_show_an_animation_of_at_most_sixty_steps(torn):
     from matplotlib.animation import FuncAnimation
 
     many = torn.isel(time=np.repeat(np.arange(25), 3)).assign_coords(time=np.arange(75))

@@ -40,7 +40,7 @@ def numbers(element):
 
 
 @pytest.mark.parametrize("name", [n for n in shipped_names() if n != "paper/e-40"])
-def test_pictures_of_shipped_experiments_lie_within_their_edges(name):
+def test_figures_of_shipped_experiments_are_within_their_edges(name):
     drawn = picture_of(build_scene(pbdkit.load(name)))
     picture = ElementTree.fromstring(drawn.svg)
     width, height = float(picture.get("width")), float(picture.get("height"))
@@ -54,7 +54,7 @@ def test_pictures_of_shipped_experiments_lie_within_their_edges(name):
     assert {"body", "edge of the body"} & {said for _, said in drawn.legend}
 
 
-def test_what_the_scene_has_is_in_the_legend():
+def test_legend_lists_the_contents_of_the_scene():
     whole = scene_of(
         neighbours={"type": "chebyshev", "shells": 1},
         rule={"type": "elastic", "poisson_ratio": 0.3, "stiffness": {"otherwise": 1, "core": 2}},
@@ -74,7 +74,7 @@ def test_what_the_scene_has_is_in_the_legend():
 UNITS = {"units": {"length": "2 mm"}}
 
 
-def test_the_set_up_is_drawn_on_axes_in_mm():
+def test_setup_is_drawn_on_axes_in_mm():
     ring = {"type": "ring", "inner": 0.5, "outer": 1.0, "centre": [2.5, -2.0]}
     whole = pbdkit.Experiment(
         **experiment(
@@ -117,14 +117,14 @@ def test_a_notebook_and_the_axes_show_the_same(name):
     assert {w for text in words for w in text.split("; ")} == {*named}
 
 
-def test_the_set_up_is_drawn_into_axes_that_are_given():
+def test_setup_is_drawn_into_given_axes():
     given = Figure().subplots()
     assert plot_experiment(pbdkit.load("paper/a"), ax=given) is given
     assert given.get_title() == "paper/a"
     assert given.get_legend() is not None
 
 
-def test_arrows_point_where_leaders_go():
+def test_arrows_point_along_the_leader_motion():
     drawn = ElementTree.fromstring(picture_of(scene_of()).svg)
     shafts = [s for s in drawn if s.get("stroke") == "#D55E00" and "L" in s.get("d")]
     assert shafts
@@ -144,14 +144,14 @@ def test_arrows_point_where_leaders_go():
         ({"type": "oscillation", "amplitude": [1.0, 0.5], "period": 8}, [1.0, 0.5]),
     ],
 )
-def test_a_motion_is_shown_where_it_goes_farthest(motion, way):
+def test_motion_is_shown_at_its_largest_displacement(motion, way):
     made = scene_of(leaders=[{"select": {"edge": "right"}, "motion": motion}])
     (leading,) = made.leading
     found = extreme(leading.group.motion, leading.reference, made.experiment.steps)
     np.testing.assert_allclose(found, np.broadcast_to(way, found.shape), rtol=1e-12)
 
 
-def test_turns_are_shown_by_their_first_step():
+def test_rotations_are_shown_by_their_first_step():
     motion = {"type": "rotation", "centre": [0.0, 0.0], "angle": 90.0, "steps": 4}
     made = scene_of(leaders=[{"select": {"nearest": [[5.0, 0.0]]}, "motion": motion}])
     (leading,) = made.leading
@@ -171,19 +171,19 @@ def test_the_edge_of_a_large_body_is_its_own(lattice):
         assert (np.isclose(X[rows], end).any(axis=0)).all()
 
 
-def test_large_bodies_are_small_pages():
+def test_large_bodies_give_small_pages():
     made = pbdkit.load("paper/a", settings=["body.columns=300", "body.rows=300"])
     page = made._repr_html_()
     assert len(page) < 60_000
     assert "edge of the body" in page
 
 
-def test_what_takes_long_is_said_to_be_left_out(monkeypatch):
+def test_omitted_slow_analyses_are_reported(monkeypatch):
     monkeypatch.setattr(notebook, "LARGEST", 10)
     assert "not computed for" in pbdkit.load("paper/a")._repr_html_()
 
 
-def test_pages_say_what_check_says(call):
+def test_pages_agree_with_check(call):
     page = pbdkit.load("paper/a")._repr_html_()
     told = call("check", "paper/a", "--verbose").out
     text = "".join(ElementTree.fromstring(page).itertext())
@@ -192,7 +192,7 @@ def test_pages_say_what_check_says(call):
         assert said in text
 
 
-def test_a_scene_that_cannot_be_built_is_a_page_with_the_reason():
+def test_invalid_scene_is_a_page_with_the_reason():
     made = pbdkit.Experiment(
         **experiment(leaders=[{"select": {"box": [90, 90, 91, 91]}, "motion": {"type": "hold"}}])
     )
@@ -208,11 +208,11 @@ def test_text_is_escaped():
     assert "<script>" not in Svg(np.zeros(2), np.ones(2), (90.0, 90.0), 9.0).text(hostile)
 
 
-def test_space_has_no_picture():
+def test_three_dimensional_scenes_have_no_figure():
     assert picture_of(SimpleNamespace(axes=3)) is None
 
 
-def test_analyses_give_their_verdict():
+def test_analyses_show_their_verdict():
     found = pbdkit.analyse("paper/a")
     text = "".join(ElementTree.fromstring(found._repr_html_()).itertext())
     assert f"stable: spectral radius {found.spectral_radius:.9g}" in text
@@ -221,19 +221,19 @@ def test_analyses_give_their_verdict():
     assert "not stable" in "".join(ElementTree.fromstring(wild._repr_html_()).itertext())
 
 
-def test_identities_say_what_the_rule_is():
+def test_identities_describe_the_rule():
     found = pbdkit.identify("paper/f2")
     text = "".join(ElementTree.fromstring(found._repr_html_()).itertext())
     for said in ("isotropic diffusion", "stable below 1.5", *found.notes):
         assert said in text
 
 
-def test_a_colour_stands_once_in_the_legend():
+def test_each_colour_is_once_in_the_legend():
     text = "".join(pbdkit.load("modelling/composite-plate")._repr_html_())
     assert "held along x; held along y" in text
 
 
-def test_at_an_equilibrium_no_steps_are_told():
+def test_equilibrium_page_has_no_number_of_steps():
     page = pbdkit.load("material/bar")._repr_html_()
     text = "".join(ElementTree.fromstring(page).itertext())
     assert "computes the equilibrium directly" in text
@@ -241,17 +241,17 @@ def test_at_an_equilibrium_no_steps_are_told():
 
 
 @pytest.mark.parametrize("of", [pbdkit.analyse, pbdkit.identify])
-def test_without_a_notebook_they_are_short(of):
+def test_without_a_notebook_representations_are_short(of):
     assert len(repr(of("paper/a"))) < 1500
 
 
-def test_nothing_of_it_is_a_field_of_the_experiment():
+def test_representations_add_no_field_to_the_experiment():
     made = pbdkit.load("paper/a")
     assert "_repr_html_" not in str(made.model_dump())
     assert not any("repr" in name for name in type(made).model_fields)
 
 
-def test_progress_in_a_notebook_is_a_line_that_changes(monkeypatch, recwarn):
+def test_progress_in_a_notebook_is_an_updated_line(monkeypatch, recwarn):
     shown = io.StringIO()
     kernel = SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=1))
     monkeypatch.setitem(sys.modules, "IPython", kernel)
@@ -269,7 +269,7 @@ def test_progress_in_a_notebook_is_a_line_that_changes(monkeypatch, recwarn):
     assert not recwarn.list
 
 
-def test_elsewhere_progress_is_a_bar(monkeypatch, capsys):
+def test_progress_elsewhere_is_a_bar(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: None))
     monkeypatch.setattr(progress, "DELAY_S", 0.0)
     with progress.progress_bar(True) as show:

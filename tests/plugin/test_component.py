@@ -45,7 +45,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("old", "new", "reason"), WRONG.values(), ids=WRONG)
-def test_run_and_check_name_the_rule_that_fails(
+def test_run_and_check_name_the_failing_rule(
     install: Install, call: Call, old: str, new: str, reason: str
 ) -> None:
     source = rule("odd")
@@ -67,7 +67,7 @@ NOT_REAL = {
 
 
 @pytest.mark.parametrize(("old", "new", "reason"), NOT_REAL.values(), ids=NOT_REAL)
-def test_what_is_no_move_is_caught_before_it_moves_anything(
+def test_invalid_displacement_is_refused_before_it_is_applied(
     install: Install, call: Call, old: str, new: str, reason: str
 ) -> None:
     install("pbdkit-odd", rule("odd").replace(old, new), "0.3")
@@ -77,7 +77,7 @@ def test_what_is_no_move_is_caught_before_it_moves_anything(
     assert any(found)
 
 
-def test_a_move_that_is_not_finite(install: Install, call: Call) -> None:
+def test_displacement_that_is_not_finite(install: Install, call: Call) -> None:
     source = rule("odd").replace(APPLY, "return float('nan') * total[0]")
     install("pbdkit-odd", source, "0.3")
     result = call("check", "e.json", ODD)
@@ -90,7 +90,7 @@ def test_a_move_that_is_not_finite(install: Install, call: Call) -> None:
     )
 
 
-def test_a_default_that_does_not_fit_is_the_plugins_fault(install: Install, call: Call) -> None:
+def test_invalid_default_is_an_error_of_the_plugin(install: Install, call: Call) -> None:
     source = rule("odd").replace("strength: float = 1.0", "strength: float = 'x'")
     install("pbdkit-odd", source, "0.3")
     result = call("run", "e.json", ODD)
@@ -109,7 +109,7 @@ NOBODYS_FAULT = {
 
 
 @pytest.mark.parametrize(("new", "message"), NOBODYS_FAULT.values(), ids=NOBODYS_FAULT)
-def test_what_a_component_refuses_is_about_the_experiment(
+def test_refusal_by_a_component_is_an_experiment_error(
     install: Install, call: Call, new: str, message: str
 ) -> None:
     install("pbdkit-odd", rule("odd").replace("strength: float = 1.0", new), "0.3")
@@ -129,7 +129,9 @@ RAISING = {
 
 
 @pytest.mark.parametrize("body", RAISING.values(), ids=RAISING)
-def test_a_component_that_raises_is_no_bug_of_ours(install: Install, call: Call, body: str) -> None:
+def test_exception_in_a_component_is_no_bug_of_pbdkit(
+    install: Install, call: Call, body: str
+) -> None:
     source = rule("raising").replace("strength: float = 1.0", f"strength: float = 1.0\n    {body}")
     install("pbdkit-raising", source, "0.3")
     result = call("run", "e.json", "--set=rule={type: raising}")
@@ -139,7 +141,7 @@ def test_a_component_that_raises_is_no_bug_of_ours(install: Install, call: Call,
     assert call("schema").code == 0
 
 
-def test_a_diagnostic_that_cannot_tell_its_variables_leaves_the_schema_open(
+def test_diagnostic_with_unknown_variables_leaves_the_schema_open(
     probing: Callable[..., None], call: Call
 ) -> None:
     probing(dims="1 / 0")

@@ -54,7 +54,7 @@ class Given(pbdkit.Diagnostic):
         "broken_step",
     ],
 )  # fmt: skip
-def test_a_diagnostic_that_writes_into_what_it_is_given_is_named(what):
+def test_diagnostic_that_modifies_its_input_is_named(what):
     parts = CALIBRATED | {"fracture": CRACKED, "leaders": BOTH_ENDS_HELD}
     given = experiment(**parts, diagnostics=[Given(what=what)], steps=2)
     with pytest.raises(pbdkit.PluginError, match=r"'given' failed at step 0: .*read-only"):
@@ -75,7 +75,7 @@ class Centred(pbdkit.Diagnostic):
         return (np.hypot(*X.T).max(),)
 
 
-def test_no_diagnostic_moves_what_is_recorded():
+def test_no_diagnostic_changes_the_records():
     settings = ["steps=5", "diagnostics=[{type: centred}]"]
     given = pbdkit.load("paper/a", components=[Centred], settings=settings)
     with pytest.raises(pbdkit.PluginError, match="'centred' failed at step 0"):
@@ -101,7 +101,7 @@ class Named(pbdkit.Diagnostic):
 
 
 @pytest.mark.parametrize("name", sorted(reserved_names()))
-def test_a_dimension_with_a_name_of_ours_is_refused(name):
+def test_dimension_with_a_reserved_name_is_refused(name):
     class OwnLength(Named):
         type: Literal["own-length"] = "own-length"
         own_dimension: ClassVar[str] = name
@@ -117,7 +117,7 @@ def test_a_dimension_with_a_name_of_ours_is_refused(name):
             pbdkit.run(experiment(diagnostics=[kind(dimension=name)], steps=1), progress=False)
 
 
-def test_a_dimension_and_a_variable_of_others_have_names_of_their_own_too():
+def test_dimension_or_variable_of_another_diagnostic_is_refused():
     for other in (Named(dimension="mine"), Named(dimension="named", variable="mine")):
         given = experiment(diagnostics=[Named(dimension="named", variable="other"), other], steps=1)
         if other.dimension == "named":
@@ -141,7 +141,7 @@ class Coordination(pbdkit.Diagnostic):
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_a_diagnostic_is_told_which_rows_are_body(lattice):
+def test_diagnostic_gets_the_body_rows(lattice):
     asked = [Coordination(), {"type": "pe1"}, {"type": "pe1-intact"}, {"type": "strain"}]
     given = experiment(lattice=lattice, diagnostics=[*asked, {"type": "rotation"}], steps=2)
     ds = pbdkit.run(given, progress=False)
@@ -167,7 +167,7 @@ class Holed(pbdkit.Diagnostic):
         return (np.stack([np.where(now.body == self.of_body, np.nan, 0.0)] * 2),)
 
 
-def test_nan_goes_into_the_dataset_at_frame_points_only():
+def test_nan_is_stored_at_frame_points_only():
     ds = pbdkit.run(experiment(diagnostics=[Holed(of_body=False)], steps=1), progress=False)
     assert np.array_equal(np.isnan(ds.holed[0, 0]), ds.kind[0] == FRAME)
     with pytest.raises(pbdkit.DivergedError, match="holed of the run at step 0"):
@@ -188,7 +188,7 @@ def test_a_file_of_version_1_opens_and_reruns(tmp_path):
         assert np.array_equal(again.pe1.fillna(0.0), opened.pe1)
 
 
-def test_smallest_cell_area_is_the_area_of_a_concave_cell():
+def test_smallest_cell_area_of_a_concave_cell():
     """A square with a corner at (.4, .4) has .4 of its area."""
     corner = {"select": {"nearest": [[1.0, 1.0]]}}
     leaders = [corner | {"motion": {"type": "displace", "displacement": [-0.6, -0.6]}}]

@@ -41,7 +41,7 @@ def twins(install: Install) -> None:
 
 
 @pytest.mark.usefixtures("twins")
-def test_a_clash_names_both_distributions_and_the_way_out(call: Call) -> None:
+def test_conflict_names_both_distributions_and_the_remedy(call: Call) -> None:
     found = listed(call)
     assert found["pbdkit-one"]["reason"] == (
         "'twin' is offered by pbdkit-two 0.2 too; write 'pbdkit-one:twin'"
@@ -59,7 +59,7 @@ def test_a_clash_names_both_distributions_and_the_way_out(call: Call) -> None:
 
 
 @pytest.mark.usefixtures("twins")
-def test_a_thief_chosen_by_name_stays_chosen(tensile: dict[str, Any]) -> None:
+def test_overriding_distribution_chosen_by_name_stays_chosen(tensile: dict[str, Any]) -> None:
     ds = pbdkit.run(tensile | {"rule": {"type": "pbdkit-thief:barycentre"}}, progress=False)
     assert json.loads(ds.attrs["experiment"])["rule"]["type"] == "pbdkit-thief:barycentre"
     assert "pbdkit-thief" in json.loads(ds.attrs["plugins"])
@@ -67,7 +67,7 @@ def test_a_thief_chosen_by_name_stays_chosen(tensile: dict[str, Any]) -> None:
 
 @pytest.mark.usefixtures("twins")
 @pytest.mark.parametrize("name", ["pbdkit-one:twin", "pbdkit-two:twin", "pbdkit-thief:barycentre"])
-def test_the_schema_takes_the_names_that_the_program_takes(
+def test_schema_accepts_the_names_that_the_program_accepts(
     tensile: dict[str, Any], name: str
 ) -> None:
     schema = experiment_schema(Registry())
@@ -103,7 +103,7 @@ def test_two_distributions_with_one_entry_point_name(install: Install, tmp_path:
     ]
 
 
-def test_a_distribution_asked_for_by_name_is_imported_alone(install: Install, call: Call) -> None:
+def test_requested_distribution_alone_is_imported(install: Install, call: Call) -> None:
     install("pbdkit-loud", "open('imported', 'w').close()")
     install("zz-healthy", rule("zz-healthy"))
     assert call("run", "e.json", "--set=rule={type: 'zz-healthy:zz-healthy'}").code == 0
@@ -130,13 +130,15 @@ def test_a_disabled_plugin_is_not_imported(
 
 
 @pytest.mark.usefixtures("twins")
-def test_disabling_one_of_two_settles_a_clash(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disabling_one_of_two_resolves_a_conflict(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(DISABLE, "pbdkit-one")
     assert call("run", "e.json", "--set=rule={type: twin}").code == 0
 
 
 @pytest.mark.usefixtures("twins")
-def test_a_misspelt_name_to_disable_is_said(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_misspelt_name_to_disable_is_reported(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(DISABLE, "pbdkit-tow")
     expected = "warning: PBDKIT_DISABLE_PLUGINS contains 'pbdkit-tow', which is not installed; "
     assert call("plugins", "list").err == f"{expected}did you mean 'pbdkit-two'?\n"
@@ -154,7 +156,7 @@ def commands(command: click.Command, *names: str) -> Iterator[tuple[str, ...]]:
             yield from commands(inner, *names, name)
 
 
-def test_every_command_can_go_without_plugins(call: Call) -> None:
+def test_every_command_can_run_without_plugins(call: Call) -> None:
     found = list(commands(program))
     assert ("plugins", "list") in found
     assert [name for name in found if "--no-plugins" not in call(*name, "--help").out] == []
@@ -189,9 +191,7 @@ print([name for name in sys.modules if name.startswith("pbdkit_unused")])
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
-def test_of_fifty_plugins_that_no_part_needs_none_is_looked_at(
-    install: Install, call: Call, command: str
-) -> None:
+def test_fifty_unused_plugins_are_not_inspected(install: Install, call: Call, command: str) -> None:
     for n in range(50):
         install(f"pbdkit-unused-{n}", "raise ImportError")
     assert len(installed_plugins()) == 50
@@ -201,7 +201,7 @@ def test_of_fifty_plugins_that_no_part_needs_none_is_looked_at(
     assert done.stdout.endswith("\n[]\n")
 
 
-def test_order_is_by_name_whatever_the_path_says(install: Install) -> None:
+def test_order_is_by_name_independent_of_the_path(install: Install) -> None:
     for name in ("c", "a", "b"):
         install(f"pbdkit-{name}", hook("return []"))
     assert [p.distribution for p in Registry().installed] == ["pbdkit-a", "pbdkit-b", "pbdkit-c"]

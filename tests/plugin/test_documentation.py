@@ -75,7 +75,7 @@ def in_code(text):
 
 
 @EVERY
-def test_a_page_tells_every_method_and_declaration(interface):
+def test_page_lists_every_method_and_declaration(interface):
     annotations = inspect.get_annotations(interface, eval_str=True)
     declared = {n for n, kind in annotations.items() if get_origin(kind) is ClassVar}
     methods = {
@@ -88,7 +88,7 @@ def test_a_page_tells_every_method_and_declaration(interface):
 
 
 @EVERY
-def test_a_page_tells_what_only_some_can_do(interface):
+def test_page_lists_optional_methods(interface):
     text = text_of(interface)
     for capability in CAPABILITIES.get(interface.__name__, ()):
         assert re.search(rf"`(pbdkit\.plugin\.)?{capability.__name__}`", text)
@@ -117,7 +117,7 @@ def reports_on(interface, code, tmp_path, monkeypatch):
 
 
 @EVERY
-def test_the_smallest_example_conforms(interface, tmp_path, monkeypatch):
+def test_smallest_example_passes_conformance(interface, tmp_path, monkeypatch):
     code = blocks(text_of(interface))[0]
     has_functions = interface in (pbdkit.FollowerRule, pbdkit.FractureModel)
     with nullcontext() if has_functions else interpreting():
@@ -129,7 +129,7 @@ def test_the_smallest_example_conforms(interface, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("interface", [pbdkit.FollowerRule, pbdkit.FractureModel])
-def test_the_example_that_remembers_conforms(interface, tmp_path, monkeypatch, interpreted):
+def test_example_with_state_passes_conformance(interface, tmp_path, monkeypatch, interpreted):
     (code,) = (block for block in blocks(text_of(interface)) if "Remembered(" in block)
     for report in reports_on(interface, code, tmp_path, monkeypatch):
         assert report.holds, str(report)
@@ -146,7 +146,7 @@ def test_a_page_lists_the_properties_of_its_interface(interface):
     assert {word for word in told if "-" in word} <= known
 
 
-def test_the_table_of_properties_is_whole():
+def test_table_of_properties_is_complete():
     rows = re.findall(
         r"^\| `([a-z-]+)` \| (.*?) \| (.*?) \|$", (PAGES / "testing.md").read_text(), re.M
     )
@@ -157,7 +157,7 @@ def test_the_table_of_properties_is_whole():
         assert asked.description.startswith(told)
 
 
-def test_authors_names_left_pbdkit_for_the_place_that_the_error_names():
+def test_moved_names_raise_an_error_with_their_new_place():
     for name in {*pbdkit.plugin.__all__} - {*pbdkit.__all__}:
         with pytest.raises(AttributeError, match=rf"from pbdkit.plugin import {name}`$"):
             getattr(pbdkit, name)
@@ -167,7 +167,7 @@ def test_authors_names_left_pbdkit_for_the_place_that_the_error_names():
         _ = pbdkit.nothing
 
 
-def test_the_public_names_are_one_list():
+def test_public_names_are_listed_once():
     """That of the stub, for type checkers and at run time."""
     tree = ast.parse(Path(pbdkit.__file__).with_suffix(".pyi").read_text())
     imports = (node for node in tree.body if isinstance(node, ast.ImportFrom))
@@ -178,7 +178,7 @@ def test_the_public_names_are_one_list():
         assert getattr(pbdkit, name) is getattr(importlib.import_module(module), name)
 
 
-def test_every_hook_is_told_with_its_signature():
+def test_every_hook_is_documented_with_its_signature():
     hooks = {n: v for n, v in vars(Hooks).items() if not n.startswith("_")}
     assert hooks
     for name, hook in hooks.items():
@@ -186,7 +186,7 @@ def test_every_hook_is_told_with_its_signature():
         assert f"def {name}({arguments}):" in (PAGES / "api.md").read_text()
 
 
-def test_every_page_is_reached_from_the_first():
+def test_every_page_is_linked_from_the_first():
     index = (PAGES / "README.md").read_text()
     assert {p.name for p in PAGES.glob("*.md")} - {"README.md"} == set(
         re.findall(r"\]\(([^)#]+)", index)

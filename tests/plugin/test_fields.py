@@ -36,7 +36,7 @@ def with_rule(**rule: Any) -> dict[str, Any]:
     return GIVEN | {"rule": GIVEN["rule"] | rule}
 
 
-def test_what_is_written_is_read_again(tmp_path):
+def test_written_field_is_read_back(tmp_path):
     grid = {"x": [-1.0, 9.0], "y": [0.0], "values": [[1.0], [2.0]]}
     fields = (
         {"stiffness": {"otherwise": 1.0, "disc": 10.0}},
@@ -60,7 +60,7 @@ def schema() -> str:
     return json.dumps(experiment_schema(Registry(), installed=False))
 
 
-def test_a_variable_of_a_file_is_read_from_beside_the_experiment(tmp_path):
+def test_variable_file_is_read_beside_the_experiment(tmp_path):
     values = xarray.DataArray(
         [[1.0, 2.0, 3.0], [2.0, 3.0, 4.0]],
         coords={"y": [-2.0, 6.0], "x": [-2.0, 4.0, 10.0]},
@@ -86,7 +86,7 @@ def field_file(tmp_path):
     return path
 
 
-def test_a_damaged_field_file_is_refused_by_name_and_in_silence(field_file, monkeypatch):
+def test_damaged_field_file_is_refused_by_name_without_output(field_file, monkeypatch):
     """Whatever the libraries below make of it: bytes changed by chance, the end missing."""
     noise: list[Any] = []
     monkeypatch.setattr(sys, "unraisablehook", noise.append)
@@ -109,7 +109,7 @@ def test_a_damaged_field_file_is_refused_by_name_and_in_silence(field_file, monk
 
 
 @pytest.mark.parametrize("fault", [RuntimeError, OSError])
-def test_what_reading_a_field_raises_names_the_file(field_file, fault, monkeypatch):
+def test_exception_while_reading_a_field_names_the_file(field_file, fault, monkeypatch):
     library = f"raise {fault.__name__}('Unspecified error in\\n  H5DSget_num_scales')"
     (field_file.parent / "h5netcdf.py").write_text(library)
     monkeypatch.syspath_prepend(field_file.parent)
@@ -123,7 +123,7 @@ def test_what_reading_a_field_raises_names_the_file(field_file, fault, monkeypat
     )
 
 
-def test_a_grid_is_bilinear_and_nowhere_else():
+def test_grid_is_bilinear_inside_and_undefined_outside():
     field = Gridded([0.0, 1.0, 3.0], [0.0, 2.0], [[1.0, 3.0], [2.0, 4.0], [4.0, 6.0]])
     x, y = np.meshgrid(np.linspace(0.0, 3.0, 7), np.linspace(0.0, 2.0, 5))
     np.testing.assert_allclose(field.at(x, y, {}), 1.0 + x + y)
@@ -155,7 +155,7 @@ def test_a_grid_is_bilinear_and_nowhere_else():
         ({"plane": {"otherwise": "stress"}}, "rule.plane", "should be 'stress' or 'strain'"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_place(rule, place, text):
+def test_errors_are_reported_with_their_place(rule, place, text):
     with pytest.raises(pbdkit.ExperimentError, match="^" + place.replace(".", r"\.")) as caught:
         pbdkit.Experiment(**with_rule(**rule))
     assert text in str(caught.value)
@@ -169,7 +169,7 @@ def test_a_place_outside_the_data_is_an_error():
         pbdkit.run(with_rule(stiffness=field), progress=False)
 
 
-def test_regions_are_places_with_names_of_their_own():
+def test_regions_are_named_places():
     for regions, text in (
         ({"file": DISC}, "and must not be one of otherwise, file, steps"),
         ({"grid": {"type": "grid", "columns": 3, "rows": 3}}, "use a rectangle"),
@@ -201,7 +201,7 @@ def test_each_material_is_identified():
 
 
 @pytest.mark.parametrize("given", [1.0, 3, None, "0.3", [1.0]])
-def test_what_is_no_field_is_left_to_the_parameter(given):
+def test_other_values_are_left_to_the_parameter(given):
     assert as_varying(given) is None
 
 
@@ -238,6 +238,6 @@ def test_what_is_no_field_is_left_to_the_parameter(given):
         ),
     ],
 )
-def test_what_no_field_goes_with_is_refused(parts, text):
+def test_unsupported_uses_of_fields_are_refused(parts, text):
     with pytest.raises(pbdkit.ExperimentError, match=text):
         build_scene(pbdkit.Experiment(**GIVEN | parts))

@@ -84,7 +84,7 @@ def standard(values):
     return (np.log(values / MEAN) + variance / 2) / np.sqrt(variance)
 
 
-def test_mean_and_scatter_are_those_asked_for(samples):
+def test_mean_and_scatter_match_the_specification(samples):
     """The kurtosis of a lognormal variable, on which the error of its variance depends, is
     q⁴ + 2q³ + 3q² - 3 with q = 1 + scatter²."""
     values, q = samples[:, :, 0], 1.0 + SCATTER**2
@@ -104,7 +104,7 @@ def test_values_are_lognormal(samples):
     assert distance < np.sqrt(np.log(2 / 1e-4) / (2 * len(g)))
 
 
-def test_the_covariance_falls_with_the_distance_as_documented(samples):
+def test_covariance_decays_with_distance_as_documented(samples):
     """exp(-(r/ℓ)²); nothing is left between groups and rows. The product of two Gaussian variables
     with correlation ρ has the variance 1 + ρ²."""
     g = standard(samples)
@@ -115,7 +115,7 @@ def test_the_covariance_falls_with_the_distance_as_documented(samples):
         assert abs(found.mean() - expected) < ENOUGH * np.sqrt((1 + expected**2) / found.size)
 
 
-def test_the_seed_alone_tells_fields_apart():
+def test_fields_depend_on_the_seed_alone():
     first = drawn()
     noise = {"type": "noise", "amplitude": 0.01}
     assert first == drawn(initial=noise) == drawn(**STIFFNESS) == drawn(steps=3)
@@ -123,14 +123,14 @@ def test_the_seed_alone_tells_fields_apart():
     assert all(one != other for n, one in enumerate(others) for other in [first, *others[:n]])
 
 
-def test_a_place_has_its_strength_whatever_the_spacing_and_the_body():
+def test_strength_at_a_place_is_independent_of_spacing_and_body():
     coarse, fine = drawn(), drawn(lattice={"type": "square", "a": 0.5})
     assert np.array_equal(coarse.values[:9, :5], fine.values[::2, ::2])
     part = drawn(body={"type": "rectangle", "width": 2.0, "height": 1.0})
     assert np.array_equal(coarse.values[:5, :3], part.values)
 
 
-def test_numbers_of_one_part_rise_and_fall_together_and_parts_by_themselves():
+def test_fields_are_correlated_within_a_part_and_independent_between():
     damage = {"type": "damage", "onset": ASKED, "failure": ASKED | {"mean": 2 * MEAN}}
     onset, failure = (drawn(name=n, fracture=damage).values for n in ("onset", "failure"))
     np.testing.assert_allclose(failure, 2 * onset, rtol=1e-14)
@@ -159,7 +159,7 @@ COHESIVE = {"type": "cohesive", "energy": ASKED | {"mean": 4e-6}, "onset": ASKED
     ],
     ids=["stiffness", "damage", "hexagonal", "poisson ratio", "cohesive", "equilibrium"],
 )  # fmt: skip
-def test_what_was_drawn_does_what_a_grid_of_its_values_does(parts):
+def test_random_field_equals_a_grid_of_its_values(parts):
     written = pbdkit.Experiment(**GIVEN | parts).model_dump(mode="json")
     of_parts = [(part, name) for part in (written["rule"], written["fracture"]) for name in part]
     fields = [(part, name) for part, name in of_parts if isinstance(part[name], dict)]
@@ -172,7 +172,7 @@ def test_what_was_drawn_does_what_a_grid_of_its_values_does(parts):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_kernels_and_numpy_give_the_same_bits(threads):
+def test_kernels_and_numpy_agree_bitwise(threads):
     solver = {"type": "stepping", "threads": threads}
     scene = build_scene(pbdkit.Experiment(**GIVEN | STIFFNESS | {"solver": solver}))
     with interpreting():
@@ -180,7 +180,7 @@ def test_kernels_and_numpy_give_the_same_bits(threads):
     assert (reached.broken_step > 0).any()
 
 
-def test_bonds_break_above_the_strength_at_their_middle():
+def test_bonds_break_above_the_strength_at_their_midpoint():
     experiment = pbdkit.Experiment(**GIVEN)
     ds = pbdkit.run(experiment, progress=False)
     middle = ds.reference.values[ds.bond_ends.values - 1].mean(axis=1)
@@ -190,7 +190,7 @@ def test_bonds_break_above_the_strength_at_their_middle():
     assert (ds.broken_strain.values[torn] > strength[torn]).all()
 
 
-def test_results_repeat_to_the_bit_without_gstools(monkeypatch, call):
+def test_results_are_bitwise_reproducible_without_gstools(monkeypatch, call):
     """From the dataset alone, and from its file: few values, as numbers, and many, as bytes."""
     for body in (GIVEN["body"], {"type": "grid", "columns": 18, "rows": 16}):
         given = GIVEN | STIFFNESS | {"body": body}
@@ -209,7 +209,7 @@ def test_results_repeat_to_the_bit_without_gstools(monkeypatch, call):
         assert "strip.json:1:" in refused.err
 
 
-def test_what_was_drawn_holds_as_long_as_it_answers_what_is_asked(monkeypatch):
+def test_sampled_field_is_reused_while_its_specification_is_unchanged(monkeypatch):
     written = pbdkit.Experiment(**GIVEN).model_dump(mode="json")
     changes = (
         {"seed": 8},
@@ -229,7 +229,7 @@ def test_what_was_drawn_holds_as_long_as_it_answers_what_is_asked(monkeypatch):
         pbdkit.Experiment(**written | {"seed": 8})
 
 
-def test_members_of_a_sweep_draw_anew_and_are_known_by_what_was_drawn(tmp_path):
+def test_members_of_a_sweep_sample_independently(tmp_path):
     asked = {
         "vary": {"fracture.failure.scatter": [0.1, 0.3]},
         "replicates": 2,
@@ -275,7 +275,7 @@ def rows(folder):
         ({"drawn": ASKED | {"seed": 0, "x": [0], "y": [0], "values": "?"}}, "drawn: .* base 64"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_place(change, text):
+def test_errors_are_reported_with_their_place(change, text):
     with pytest.raises(pbdkit.ExperimentError, match="^" + text if "fra" in text[:3] else text):
         pbdkit.Experiment(**GIVEN | {"fracture": {"type": "strain", "failure": ASKED | change}})
 
@@ -295,18 +295,18 @@ def test_what_is_wrong_is_named_with_its_place(change, text):
          r"^fracture\.failure: 4e\+18 values exceed 16777216; use a smaller body"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(parts, text):
+def test_invalid_values_are_refused(parts, text):
     with pytest.raises(pbdkit.ExperimentError, match=text):
         build_scene(pbdkit.Experiment(**GIVEN | parts))
 
 
-def test_the_length_may_have_a_unit():
+def test_correlation_length_may_have_a_unit():
     failure = ASKED | {"correlation_length": "0.5 mm"}
     fracture = {"type": "strain", "failure": failure}
     assert drawn(units={"length": "0.25 mm"}, fracture=fracture) == drawn()
 
 
-def test_the_schema_describes_what_is_asked_and_what_came_of_it():
+def test_schema_describes_specification_and_sampled_values():
     schema = Draft202012Validator(experiment_schema(Registry(), installed=False))
     schema.validate(GIVEN)
     schema.validate(pbdkit.Experiment(**GIVEN).model_dump(mode="json"))
@@ -315,7 +315,7 @@ def test_the_schema_describes_what_is_asked_and_what_came_of_it():
         assert not schema.is_valid(GIVEN | {"fracture": fracture})
 
 
-def test_gstools_is_imported_where_something_is_drawn_only():
+def test_gstools_is_imported_only_if_a_field_is_sampled():
     look = "pbdkit.load('modelling/{}'); print('gstools' in sys.modules)"
     looks = [look.format(name) for name in ("graded-bar", "weakest-place")]
     command = [sys.executable, "-c", "\n".join(["import sys, pbdkit", *looks])]
@@ -323,7 +323,7 @@ def test_gstools_is_imported_where_something_is_drawn_only():
     assert found.stdout.split() == ["False", "True"]
 
 
-def test_a_strip_breaks_where_it_is_weakest():
+def test_strip_breaks_at_its_weakest_place():
     """Its column of least strength lies in the crack, which crosses it from side to side."""
     experiment = pbdkit.load("modelling/weakest-place")
     ds = pbdkit.run(experiment, progress=False)

@@ -83,7 +83,7 @@ def scene(engine, threshold, *, moves=True):
 
 @pytest.mark.parametrize("engine", ["numpy", "compiled"])
 @pytest.mark.parametrize("threshold", [None, 1.2])
-def test_a_cubic_lattice_steps_as_plain_loops_do(engine, threshold, request):
+def test_cubic_lattice_steps_like_plain_loops(engine, threshold, request):
     if threshold is None:  # what tears is compiled
         request.getfixturevalue("interpreted")
     block = scene(engine, threshold)
@@ -102,7 +102,7 @@ def test_a_cubic_lattice_steps_as_plain_loops_do(engine, threshold, request):
         assert np.unique(state.broken_step).tolist() == [-1, *sorted(set(broken.values()))]
 
 
-def test_its_dataset_has_three_axes():
+def test_dataset_has_three_axes():
     block = scene("numpy", None, moves=False)
     ds = pbdkit.run(block.experiment, progress=False)
     assert ds.axis.values.tolist() == ["x", "y", "z"]
@@ -111,7 +111,7 @@ def test_its_dataset_has_three_axes():
     assert (ds.site.values == np.stack([ds.i, ds.j, ds.k], axis=1)).all()
 
 
-def test_its_spectrum_is_the_closed_form():
+def test_spectrum_matches_the_closed_form():
     # Ends held, copying frame: λ = (cos a + cos b + cos c) / 3, a = pπ/(n - 1), b, c = qπ/n.
     ends = (SIZES[0] - 1, SIZES[0] - 1), (SIZES[1], SIZES[1]), (SIZES[2], SIZES[2])
     a, b, c = (np.pi * np.arange(count) / parts for count, parts in ends)

@@ -34,7 +34,7 @@ def test_a_broken_plugin_stops_no_other(install: Install, source: str, reason: s
     assert str(caught.value).startswith(expected)
 
 
-def test_a_hook_that_returns_nothing_is_said_to(install: Install) -> None:
+def test_hook_that_returns_nothing_is_reported(install: Install) -> None:
     install("pbdkit-empty", hook("return None"))
     (plugin,) = Registry().installed
     assert plugin.state == "broken"
@@ -76,7 +76,7 @@ def test_order_does_not_choose_a_distribution(install: Install, tensile: Any) ->
     assert chosen.distributions() == {"pbdkit": pbdkit.__version__, "pbdkit-two": "1.0"}
 
 
-def test_the_dataset_keeps_the_distribution_chosen(install: Install, tensile: Any) -> None:
+def test_dataset_stores_the_chosen_distribution(install: Install, tensile: Any) -> None:
     install("pbdkit-one", rule("twin"))
     install("pbdkit-two", rule("twin"))
     ds = pbdkit.run(tensile | {"rule": {"type": "pbdkit-two:twin"}}, progress=False)
@@ -84,7 +84,7 @@ def test_the_dataset_keeps_the_distribution_chosen(install: Install, tensile: An
     assert again.attrs["plugins"] == ds.attrs["plugins"]
 
 
-def test_what_is_offered_twice_is_in_conflict(install: Install, tensile: Any) -> None:
+def test_type_provided_twice_is_in_conflict(install: Install, tensile: Any) -> None:
     install("pbdkit-one", rule("twin"))
     install("pbdkit-two", rule("twin"))
     install("pbdkit-thief", rule("barycentre"))
@@ -180,7 +180,7 @@ def test_two_components_of_one_type_are_refused(tensile: Any) -> None:
         ),
     ],
 )
-def test_a_component_that_breaks_the_model_is_refused(
+def test_component_with_an_invalid_model_is_refused(
     tensile: Any, part: str, component: Any, expected: str
 ) -> None:
     given = tensile | {part: {"type": component.type_name()}}

@@ -55,7 +55,7 @@ def plate(frame, *settings):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_a_step_is_two_steps_of_the_inner_rule(frame):
+def test_step_equals_two_steps_of_the_inner_rule(frame):
     scene = build_scene(plate(frame, "initial={type: noise, amplitude: 0.1}", "steps=1"))
     state = initial_state(scene)
     u = scene.raster.table(state.u)
@@ -91,7 +91,7 @@ def membrane_moves(scene, u):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_steps_lead_where_the_equilibrium_is(frame):
+def test_steps_converge_to_the_equilibrium(frame):
     stepped = pbdkit.run(plate(frame, *SMALL, "steps=4000", "record.at=[0, 4000]"), progress=False)
     straight = pbdkit.run(
         plate(frame, *SMALL, "steps=20", "solver={type: equilibrium}"), progress=False
@@ -102,7 +102,7 @@ def test_steps_lead_where_the_equilibrium_is(frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_the_operator_is_the_step(frame):
+def test_operator_equals_the_step(frame):
     experiment = plate(frame, "initial={type: noise, amplitude: 0.1}", "steps=1", "leaders=[]")
     scene, analysis = build_scene(experiment), pbdkit.analyse(experiment)
     start = initial_state(scene)
@@ -124,7 +124,7 @@ def test_the_operator_is_the_step(frame):
         ),
     ],
 )
-def test_what_does_not_go_is_refused_with_the_remedy(setting, remedy):
+def test_incompatible_parts_are_refused_with_the_remedy(setting, remedy):
     with pytest.raises(pbdkit.ExperimentError, match=NESTED) as told:
         pbdkit.run(plate("{type: none}", setting, "steps=1"), progress=False)
     assert remedy in str(told.value)

@@ -125,7 +125,7 @@ knots = st.lists(
 
 
 @given(knots)
-def test_a_course_is_linear_between_its_steps_and_kept_beyond(known):
+def test_schedule_is_linear_between_steps_and_constant_beyond(known):
     steps, values = zip(*known, strict=True)
     course = Course[float](steps=steps, values=values)
     assert [course.at(step) for step in steps] == list(values)
@@ -151,7 +151,7 @@ def test_the_next_change_is_the_next_step_with_another_value(known, step):
 
 
 @pytest.mark.parametrize("name", CHANGING)
-def test_each_step_is_that_of_a_scene_with_the_numbers_at_its_end(name):
+def test_each_step_equals_a_scene_with_the_values_at_its_end(name):
     parts = CHANGING[name]
     given_ = sheet(**parts)
     scene = build_scene(pbdkit.Experiment(**given_))
@@ -165,7 +165,7 @@ def test_each_step_is_that_of_a_scene_with_the_numbers_at_its_end(name):
 
 
 @pytest.mark.parametrize("name", COMPILED)
-def test_kernels_follow_courses_to_the_bit(name, compiled_at_length):
+def test_kernels_follow_schedules_bit_for_bit(name, compiled_at_length):
     """`stepping/numba_engine/test_engine` compiles one that has several."""
     parts = CHANGING[name]
     one = pbdkit.run(sheet(**parts), progress=False)
@@ -174,7 +174,7 @@ def test_kernels_follow_courses_to_the_bit(name, compiled_at_length):
 
 
 @pytest.mark.parametrize("name", ["both", "memory"])
-def test_kernels_follow_courses_in_single_precision(name, request):
+def test_kernels_follow_schedules_in_single_precision(name, request):
     """The agreement is approximate: kernels and numpy round differently there. One is compiled, the
     other interpreted."""
     parts = CHANGING[name]
@@ -192,7 +192,7 @@ def test_kernels_follow_courses_in_single_precision(name, request):
 
 
 @pytest.mark.parametrize("name", sorted(set(CHANGING) - set(COMPILED)))
-def test_where_kernels_cannot_numpy_steps_and_says_why(name):
+def test_numpy_replaces_kernels_with_a_reason(name):
     given_ = sheet(engine="auto", **CHANGING[name]) | {"steps": 10**9}
     choice = choose(build_scene(pbdkit.Experiment(**given_)))
     assert choice.engine == "numpy"
@@ -202,7 +202,7 @@ def test_where_kernels_cannot_numpy_steps_and_says_why(name):
 
 
 @pytest.mark.parametrize("name", CHANGING)
-def test_results_repeat_from_the_dataset_alone(name, tmp_path):
+def test_results_are_reproducible_from_the_dataset_alone(name, tmp_path):
     ds = pbdkit.run(sheet(**CHANGING[name]), progress=False)
     ds.to_netcdf(tmp_path / "out.nc")
     with xr.open_dataset(tmp_path / "out.nc") as kept:
@@ -210,7 +210,7 @@ def test_results_repeat_from_the_dataset_alone(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["both", "force", "weights"])
-def test_continued_runs_are_those_of_one_go(name, call, tmp_path, monkeypatch):
+def test_resumed_runs_equal_uninterrupted_ones(name, call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for file, steps in (("half", 14), ("whole", 30)):
         (tmp_path / f"{file}.yaml").write_text(
@@ -228,7 +228,7 @@ def aged():
     return pbdkit.run("modelling/ageing", progress=False)
 
 
-def test_a_bar_that_ages_breaks_when_its_strength_has_come_down_to_its_strain(aged):
+def test_bar_that_ages_breaks_when_its_strength_equals_its_strain(aged):
     """Held at a strain of 4.05 %, while the strain at failure falls from 20 % to 2 %."""
     experiment = json.loads(aged.experiment)
     falls = experiment["fracture"]["failure"]
@@ -237,7 +237,7 @@ def test_a_bar_that_ages_breaks_when_its_strength_has_come_down_to_its_strain(ag
     assert first == math.floor(at) + 1
 
 
-def test_equilibria_are_those_of_the_last_numbers():
+def test_equilibria_use_the_last_numbers():
     bar = SHEET | {
         "rule": {"type": "elastic", "poisson_ratio": 0.0,
                  "stiffness": course([0, 20], [1.0, 0.5])},
@@ -253,7 +253,7 @@ def test_equilibria_are_those_of_the_last_numbers():
     assert ds.reaction.values[-1, 0] == pytest.approx([-0.1, 0.0], abs=1e-11)
 
 
-def test_increments_of_an_equilibrium_follow_courses():
+def test_increments_of_an_equilibrium_follow_schedules():
     """Bonds that age under a steady strain break within the increment in which the strength is
     reached, in step 898; then nothing holds the parts, and the last equilibrium is that before."""
     smaller = ["body.columns=11", "solver={type: equilibrium}"]
@@ -267,7 +267,7 @@ def test_increments_of_an_equilibrium_follow_courses():
     assert {100, 1000} <= set(moments(build_scene(given_), 10))
 
 
-def test_loads_that_grow_lead_along_the_way_that_they_grow():
+def test_increasing_loads_follow_their_path():
     """Springs under a pull that comes in one go and over the steps end where one way leads."""
     given_ = SHEET | {"frame": NATURAL, "leaders": [HELD], "solver": {"type": "equilibrium"}}
     ends = [
@@ -280,7 +280,7 @@ def test_loads_that_grow_lead_along_the_way_that_they_grow():
     np.testing.assert_allclose(ends[0].position[-1], ends[1].position[-1], atol=1e-7)
 
 
-def test_what_is_measured_of_a_step_is_measured_with_its_numbers():
+def test_measurements_of_a_step_use_its_values():
     """The force of the same displacements is half as large once the stiffness has come down to
     half."""
     stretched = SHEET | {
@@ -299,7 +299,7 @@ def test_what_is_measured_of_a_step_is_measured_with_its_numbers():
     np.testing.assert_allclose(energy, energy[0] * share, rtol=1e-9)
 
 
-def test_a_mass_is_pushed_by_the_force_of_each_step():
+def test_mass_is_accelerated_by_the_force_of_each_step():
     """So heavy that what neighbours exert counts for nothing: u = Σ Σ F / m."""
     force = course([1, 9], [0.0, 0.8])
     mass = {"type": "newton", "mass": 1e9, "force": [force, 0.0]}
@@ -310,7 +310,7 @@ def test_a_mass_is_pushed_by_the_force_of_each_step():
     assert u.sum() == pytest.approx(np.cumsum(np.cumsum(pushes))[-1], rel=1e-6)
 
 
-def test_check_warns_of_numbers_on_the_way_that_diverge(call, tmp_path):
+def test_check_warns_of_values_that_diverge_during_the_run(call, tmp_path):
     bad = SHEET | {
         "solver": {
             "type": "stepping",
@@ -323,7 +323,7 @@ def test_check_warns_of_numbers_on_the_way_that_diverge(call, tmp_path):
     assert any("at step 10 steps diverge, with solver.relaxation 5" in w for w in said["warnings"])
 
 
-def test_runs_do_not_settle_before_the_last_change():
+def test_runs_do_not_converge_before_the_last_change():
     settling = {"type": "stepping", "settle": {"tolerance": 1e-3}}
     late = {"select": {"edge": "right"}, "force": [course([0, 400], [0, 0.1]), 0]}
     given_ = SHEET | {"frame": NATURAL, "leaders": [HELD], "loads": [late], "solver": settling}
@@ -334,7 +334,7 @@ def test_runs_do_not_settle_before_the_last_change():
     assert ds.time[-1] > 400
 
 
-def test_members_of_a_sweep_are_told_apart_by_their_courses():
+def test_members_of_a_sweep_are_distinguished_by_their_schedules():
     rises = [course([0, 10], [0.5, last]) for last in (0.8, 0.9)]
     vary = {"solver.relaxation": rises}
     found = pbdkit.sweep(sheet(solver={"relaxation": 1.0}), vary=vary, workers=1, progress=False)
@@ -372,20 +372,20 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_wrong_courses_are_told_with_their_place(name):
+def test_invalid_schedules_are_refused_with_their_place(name):
     parts, said = WRONG[name]
     with pytest.raises(pbdkit.ExperimentError, match=said):
         pbdkit.run(SHEET | parts, progress=False)
 
 
-def test_explain_says_the_limit_of_the_step_in_which_a_bond_broke(aged):
+def test_explain_gives_the_limit_at_the_step_of_breaking(aged):
     found = BondRecords(aged, build_scene(pbdkit.load("modelling/ageing")))
     broken = found.steps > 0
     limits = np.interp(found.steps[broken], [100, 1000], [0.2, 0.02])
     np.testing.assert_allclose(found.limits[broken], limits, rtol=1e-12)
 
 
-def test_what_changes_nothing_is_warned_of():
+def test_schedule_without_effect_gives_a_warning():
     far = {"type": "disc", "radius": 1.0, "centre": [50.0, 50.0]}
     soft = {"type": "elastic", "stiffness": {"otherwise": 1.0, "far": 2.0}, "poisson_ratio": 0.3}
     scene = build_scene(
@@ -403,7 +403,7 @@ def test_what_changes_nothing_is_warned_of():
         assert sum(warning.startswith(said) for warning in scene.warnings) == 1
 
 
-def test_check_warns_where_loads_have_no_time_to_come_to_rest(call, tmp_path):
+def test_check_warns_of_loads_without_time_to_converge(call, tmp_path):
     given_ = SHEET | {"leaders": [HELD], "loads": FORCE, "frame": NATURAL}
     (tmp_path / "hasty.yaml").write_text(json.dumps(given_))
     said = json.loads(call("check", str(tmp_path / "hasty.yaml"), "--json").out)["warnings"]
@@ -448,7 +448,7 @@ def leaning(**parts):
 
 
 @pytest.mark.parametrize("name", FOLLOWING)
-def test_a_frame_that_reads_the_rule_follows_its_course(name):
+def test_frame_that_depends_on_the_rule_follows_its_schedule(name):
     parts = FOLLOWING[name]
     scene = build_scene(leaning(**parts))
     stepper = Stepper(scene)
@@ -459,14 +459,14 @@ def test_a_frame_that_reads_the_rule_follows_its_course(name):
         np.testing.assert_array_equal(state.u, plain.u)
 
 
-def test_a_frame_that_reads_no_number_is_made_once(monkeypatch):
+def test_independent_frame_is_built_once(monkeypatch):
     scene = build_scene(pbdkit.Experiment(**sheet(**CHANGING["weights"])))
     assert scene.at(3).frame is scene.frame
     scene = build_scene(leaning(**FOLLOWING["weights"]))
     assert scene.at(3).frame is not scene.frame
 
 
-def test_kernels_leave_frames_that_follow_a_course_to_numpy():
+def test_kernels_leave_scheduled_frames_to_numpy():
     scene = build_scene(leaning(engine="auto", **FOLLOWING["parameter"]))
     assert "the weights of the frame are time-dependent" in what_kernels_lack(scene)
 
@@ -480,13 +480,13 @@ class Behind(StrainGradient):
         return Elastic(poisson_ratio=self.length, plane=self.plane)
 
 
-def test_kernels_leave_inner_rules_whose_weights_change_to_numpy():
+def test_kernels_leave_inner_rules_with_scheduled_weights_to_numpy():
     rule = Behind(poisson_ratio=0.2, length=course([2, 15], [0.1, 0.4]))
     scene = build_scene(pbdkit.Experiment(**sheet(rule=rule)))
     assert what_kernels_lack(scene) == "constants of kernels are time-dependent"
 
 
-def test_the_spectrum_on_the_way_is_that_of_the_frame_on_the_way():
+def test_spectrum_during_the_run_uses_the_current_frame():
     parts = FOLLOWING["weights"]
     on_the_way = Analysis(build_scene(leaning(**parts)).at(5))
     anew = Analysis(build_scene(leaning(**now(parts, 5))))
@@ -494,7 +494,7 @@ def test_the_spectrum_on_the_way_is_that_of_the_frame_on_the_way():
 
 
 @pytest.mark.parametrize("fracture", ["none", "strain"])
-def test_an_equilibrium_is_that_of_the_frame_in_the_end(fracture):
+def test_equilibrium_uses_the_final_frame(fracture):
     """Numbers still change when the run ends, in increments where bonds can break."""
     parts = {
         "rule": {"type": "elastic", "poisson_ratio": course([0, 60], [0.1, 0.4])},
@@ -509,7 +509,7 @@ def test_an_equilibrium_is_that_of_the_frame_in_the_end(fracture):
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-11)
 
 
-def test_turns_of_a_live_session_move_the_frame_too(tmp_path):
+def test_changes_in_a_live_session_update_the_frame(tmp_path):
     session = Session(leaning(**now(FOLLOWING["weights"], 0)), tmp_path / "live.yaml")
     session.advance(5)
     session.turn("rule.poisson_ratio", 0.4)
@@ -520,7 +520,7 @@ def test_turns_of_a_live_session_move_the_frame_too(tmp_path):
     np.testing.assert_array_equal(session.state.u, last)
 
 
-def test_several_processes_leave_frames_that_follow_a_course_to_one():
+def test_several_processes_leave_scheduled_frames_to_one():
     def begun(ranks):
         scene = ranks.scene(leaning(**FOLLOWING["parameter"]))
         with pytest.raises(NotSharedError, match=r"^frame: a frame that depends on time-dependent"):
@@ -530,7 +530,7 @@ def test_several_processes_leave_frames_that_follow_a_course_to_one():
     assert all(on_ranks(2, begun))
 
 
-def test_parameters_move_the_frame_too():
+def test_parameters_update_the_frame():
     one = leaning(**now(FOLLOWING["weights"], 30))
     other = Parameter("rule.poisson_ratio").put(one, 0.2)
     found, anew = scene_like(build_scene(one), other), build_scene(other)
@@ -538,7 +538,7 @@ def test_parameters_move_the_frame_too():
 
 
 @pytest.mark.parametrize("frame", ["natural", "mean"])
-def test_sensitivities_are_those_of_the_numbers_in_the_last_step(frame):
+def test_sensitivities_use_the_values_of_the_last_step(frame):
     """The body responds to leaders that continue to move, with numbers that still change when the
     run ends."""
     moved = {"type": "displace", "displacement": [0.1, 0.2]}
@@ -556,7 +556,7 @@ def test_sensitivities_are_those_of_the_numbers_in_the_last_step(frame):
     np.testing.assert_allclose(resting.answer(led), expected, rtol=0, atol=1e-11)
 
 
-def test_parameters_of_selections_select_anew():
+def test_parameters_of_selections_update_the_selection():
     boxed = {"select": {"box": [7.5, -1.0, 9.0, 9.0]}, "motion": PULLED["motion"]}
     one = pbdkit.Experiment(**sheet(leaders=[HELD, boxed]))
     other = Parameter("leaders.1.select.box.0").put(one, 6.5)
@@ -568,7 +568,7 @@ def experiment_of(parts):
     return pbdkit.Experiment(**sheet(**parts))
 
 
-def test_check_looks_at_no_moment_after_the_run():
+def test_check_evaluates_no_time_after_the_run():
     late = {"solver": {"relaxation": course([0, 20, 60, 80], [0.5, 0.8, 5.0, 0.5])}}
     assert not any("diverge" in w for w in forecast(build_scene(experiment_of(late))).warnings)
     late["solver"]["relaxation"] = course([0, 60], [5.0, 0.5])
@@ -605,7 +605,7 @@ MEASURED = [
 ]
 
 
-def test_every_number_that_ships_and_may_change_is_among_those_compared():
+def test_every_shipped_scheduled_parameter_is_compared():
     kinds = (FollowerRule, FractureModel)
     components = [c for kind in kinds for c in Registry().spellings(kind, installed=False)]
     known = {c.type_name(): sorted(c.numbers() - {"scatter"}) for c in components}
@@ -618,7 +618,7 @@ def test_every_number_that_ships_and_may_change_is_among_those_compared():
 @pytest.mark.parametrize(
     ("kind", "number"), [(kind, number) for kind, own in SHIPPED.items() for number in own]
 )
-def test_states_and_measurements_of_each_step_are_those_of_its_numbers(kind, number):
+def test_states_and_measurements_of_each_step_use_its_values(kind, number):
     """Compare every number that ships, with masses, guides and an obstacle, with a scene built
     again for each step."""
     part = {"type": kind} | GIVEN.get(kind, {})

@@ -85,7 +85,7 @@ def test_a_bar_has_the_stress_the_force_and_the_energy_of_the_textbook(bar: Any)
     assert [*units.values()] == ["MPa", "N", "mJ", "mm"]
 
 
-def test_a_load_and_its_way_are_those_of_the_textbook() -> None:
+def test_load_and_its_displacement_match_the_textbook() -> None:
     load = {"select": {"edge": "right"}, "force": [1.0e-3, 0.0]}
     held = BAR["leaders"][:1]
     ds = run(BAR, leaders=held, loads=[load], diagnostics=[{"type": "load-displacement"}])
@@ -97,7 +97,7 @@ def test_a_load_and_its_way_are_those_of_the_textbook() -> None:
     assert (ds.load_resultant.units, ds.load_displacement_mm.units) == ("N", "mm")
 
 
-def test_the_shipped_strip_gives_back_its_modulus_and_its_force() -> None:
+def test_shipped_strip_recovers_its_modulus_and_force() -> None:
     ds = run(json.loads(pbdkit.load("modelling/strip").model_dump_json())).isel(time=-1)
     stress = ds.nominal_stress.item()
     assert stress / ds.nominal_strain.item() == pytest.approx(206e3, rel=1e-6)
@@ -106,7 +106,7 @@ def test_the_shipped_strip_gives_back_its_modulus_and_its_force() -> None:
     assert ds.stress_xx.values[middle] == pytest.approx(stress, rel=1e-6)
 
 
-def test_numbers_of_the_lattice_are_those_without_units_to_the_bit(bar: Any) -> None:
+def test_lattice_values_equal_those_without_units_bit_for_bit(bar: Any) -> None:
     plain = json.loads(pbdkit.Experiment(**BAR).model_dump_json())
     del plain["units"]
     moduli = {"youngs_modulus": 206e3}, {"youngs_modulus": 206e3, "thickness": 3.05}
@@ -121,7 +121,7 @@ def test_numbers_of_the_lattice_are_those_without_units_to_the_bit(bar: Any) -> 
     assert "physical_factor" not in other.position.attrs
 
 
-def test_variables_say_both_scales(bar: Any) -> None:
+def test_variables_have_both_scales(bar: Any) -> None:
     assert bar.position.attrs["units"] == "lattice unit"
     said = bar.pe1.attrs
     assert (said["physical_units"], said["physical_factor"]) == ("mm^2", 0.0625)
@@ -132,7 +132,7 @@ def test_variables_say_both_scales(bar: Any) -> None:
     jsonschema.validate(bar.to_dict(data=False), dataset_schema(Registry()))
 
 
-def test_the_accessor_turns_all_that_says_its_scale(bar: Any) -> None:
+def test_accessor_converts_all_variables_with_a_scale(bar: Any) -> None:
     physical = bar.pbd.physical()
     assert physical.position.units == "mm"
     np.testing.assert_array_equal(physical.position, 0.25 * bar.position)
@@ -142,14 +142,14 @@ def test_the_accessor_turns_all_that_says_its_scale(bar: Any) -> None:
     assert {*physical.coords} == {*bar.coords} - {"reference_mm"}
 
 
-def test_a_dataset_runs_again_and_records_in_single_precision(bar: Any) -> None:
+def test_dataset_reruns_and_records_in_single_precision(bar: Any) -> None:
     assert pbdkit.rerun(bar, progress=False).equals(bar)
     single = run(BAR, record={"dtype": "float32"})
     assert single.u_mm.dtype == np.float32
     assert single.reference_mm.dtype == np.float64
 
 
-def test_a_file_is_continued_to_the_bit(tmp_path: Any) -> None:
+def test_file_is_continued_bit_for_bit(tmp_path: Any) -> None:
     def made(steps: int) -> Any:
         path, scene = (
             tmp_path / f"{steps}.nc",
@@ -163,13 +163,13 @@ def test_a_file_is_continued_to_the_bit(tmp_path: Any) -> None:
         assert ds.u_mm.equals(0.25 * ds.u)
 
 
-def test_check_says_how_large_the_body_is(call: Any) -> None:
+def test_check_prints_the_size_of_the_body(call: Any) -> None:
     Path("bar.json").write_text(json.dumps(BAR))
     assert "size       4 × 2 mm" in call("check", "bar.json").out
     assert json.loads(call("check", "bar.json", "--json").out)["size_mm"] == [4.0, 2.0]
 
 
-def test_a_sweep_over_the_lattice_unit_refines_what_is_written_in_mm() -> None:
+def test_sweep_over_the_lattice_unit_refines_lengths_in_mm() -> None:
     vary = {"units.length": ["0.25 mm", "0.5 mm"], "units.youngs_modulus": ["206 GPa", "70 GPa"]}
     bar = changed(lattice={"type": "square", "a": 2.0}, diagnostics=BAR["diagnostics"][:3])
     ds = pbdkit.sweep(bar, vary=vary, keep={"times": "last"}, workers=1, progress=False).isel(
@@ -182,7 +182,7 @@ def test_a_sweep_over_the_lattice_unit_refines_what_is_written_in_mm() -> None:
     assert ds.position.attrs["physical_units"] == "mm"
 
 
-def test_a_sweep_of_an_experiment_in_lattice_units_changes_the_scale_alone() -> None:
+def test_sweep_in_lattice_units_changes_only_the_scale() -> None:
     numbers = pbdkit.Experiment(**json.loads(pbdkit.Experiment(**BAR).model_dump_json()))
     vary = {"units.youngs_modulus": ["206 GPa", "103 GPa"]}
     kept = {"times": "last", "variables": ["u_mm", "stress_xx"]}
@@ -202,7 +202,7 @@ def test_a_sweep_of_an_experiment_in_lattice_units_changes_the_scale_alone() -> 
         (ENERGY, "2 N mm", 2 / (206e3 * 3.05 * 0.0625)),
     ],
 )
-def test_a_component_of_anybody_takes_units(quantity: Any, text: str, number: float) -> None:
+def test_third_party_component_takes_units(quantity: Any, text: str, number: float) -> None:
     class Pulled(pbdkit.FollowerRule):
         type: Literal["pulled"] = "pulled"
         by: Annotated[float, quantity]
@@ -260,26 +260,26 @@ STRESS_OF = [{"type": "stress", "youngs_modulus": 70e3}]
         ),
     ],
 )
-def test_what_is_wrong_is_said_with_its_place(parts: dict[str, Any], message: str) -> None:
+def test_errors_have_their_place(parts: dict[str, Any], message: str) -> None:
     with pytest.raises(pbdkit.ExperimentError) as caught:
         pbdkit.Experiment(**changed(**parts))
     assert message in str(caught.value)
 
 
-def test_a_diagnostics_own_modulus_counts_where_units_say_none() -> None:
+def test_modulus_of_a_diagnostic_is_used_without_one_in_units() -> None:
     ds = run(changed(units={"length": "0.25 mm"}, diagnostics=STRESS_OF))
     assert ds.stress_xx.attrs["units"] == "stress unit"
     assert ds.stress_xx.isel(time=-1).values == pytest.approx(70.0)
 
 
-def test_a_force_needs_a_modulus() -> None:
+def test_force_requires_a_modulus() -> None:
     with pytest.raises(
         ValueError, match=r"a force requires units.youngs_modulus, which is missing"
     ):
         Units(length="1 mm").scale(FORCE)
 
 
-def test_the_schema_takes_numbers_and_texts() -> None:
+def test_schema_accepts_numbers_and_strings() -> None:
     schema = experiment_schema(Registry(), installed=False)
     jsonschema.validate(BAR, schema)
     with pytest.raises(jsonschema.ValidationError):
@@ -288,21 +288,21 @@ def test_the_schema_takes_numbers_and_texts() -> None:
         jsonschema.validate(changed(lattice={"type": "square", "a": -1.0}), schema)
 
 
-def test_without_pint_it_is_said_what_to_install(monkeypatch: Any) -> None:
+def test_without_pint_the_message_names_the_package(monkeypatch: Any) -> None:
     units_module._registry.cache_clear()
     monkeypatch.setitem(sys.modules, "pint", None)
     with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[units\]'"):
         pbdkit.Experiment(**BAR)
 
 
-def test_pint_is_imported_where_an_experiment_has_units_only() -> None:
+def test_pint_is_imported_only_for_experiments_with_units() -> None:
     look = "import sys, pbdkit; pbdkit.load('{}'); print('pint' in sys.modules)"
     for name, there in (("material/bar", "False"), ("modelling/strip", "True")):
         command = [sys.executable, "-c", look.format(name)]
         assert subprocess.run(command, capture_output=True, text=True).stdout.strip() == there
 
 
-def test_check_says_forces_as_the_file_does(call: Any) -> None:
+def test_check_prints_forces_as_in_the_file(call: Any) -> None:
     for load, told in {
         "{select: {edge: right}, force: [2 kN, 0.0]}": "force [2, 0] kN",
         "{select: {edge: right}, force: [20 N, 0.0]}": "force [20, 0] N",
@@ -311,7 +311,7 @@ def test_check_says_forces_as_the_file_does(call: Any) -> None:
         assert told in call("check", "modelling/composite-plate", "--set", f"loads.0={load}").out
 
 
-def test_the_lag_behind_leaders_is_told_in_mm(call: Any) -> None:
+def test_lag_behind_leaders_is_printed_in_mm(call: Any) -> None:
     given = ["paper/a", "--set", "units={length: 2 mm}"]
     told = call("check", *given, "--verbose").out
     assert "moves by 0.7 mm per step, which brings the body 4.09 mm from equilibrium" in told
@@ -319,7 +319,7 @@ def test_the_lag_behind_leaders_is_told_in_mm(call: Any) -> None:
     assert "mm from equilibrium if the leaders continue at their fastest" in told
 
 
-def test_units_that_are_those_wanted_are_read_without_pint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quantities_in_target_units_are_read_without_pint(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pbdkit.plugin.units._registry", lambda: pytest.fail("pint is used"))
     assert Units(length="2.5 mm", youngs_modulus="3000 MPa").length_mm == 2.5
 
@@ -364,19 +364,19 @@ class Tough(pbdkit.FractureModel):
     "energy",
     ["6.6 N/mm", "6600 J/m^2", "6.6 kJ/m**2", "2 um", 0.004, "{otherwise: 6.6 N/mm}"],
 )
-def test_a_fracture_energy_is_one_of_an_area_or_a_length(energy: Any) -> None:
+def test_fracture_energy_is_per_area_or_per_length(energy: Any) -> None:
     settings = ["units.length=0.5 mm", f"fracture={{type: tough, energy: {energy}}}"]
     loaded = pbdkit.load("modelling/dogbone-to-failure", components=[Tough], settings=settings)
     assert loaded.fracture.energy == pytest.approx(0.004)
 
 
-def test_cohesive_takes_what_is_measured_of_a_material() -> None:
+def test_cohesive_takes_measured_material_properties() -> None:
     given = "fracture={type: cohesive, energy: 0.5 N/mm, onset: 66 MPa}"
     fracture = dogbone("units.length=0.5 mm", given).fracture
     assert (fracture.energy, fracture.onset) == pytest.approx((0.5 / 3300 / 0.5, 66 / 3300))
 
 
-def test_what_is_no_fracture_energy_is_told_what_one_is() -> None:
+def test_invalid_fracture_energy_is_refused_with_the_expected_unit() -> None:
     with pytest.raises(
         pbdkit.ExperimentError, match="'3 kg' is not a fracture energy; write for instance N/mm"
     ):
@@ -387,7 +387,7 @@ def test_what_is_no_fracture_energy_is_told_what_one_is() -> None:
         )
 
 
-def test_fields_and_courses_take_units_as_numbers_do() -> None:
+def test_fields_and_schedules_take_units_like_numbers() -> None:
     steel = "regions={neck: {type: disc, radius: 3.0, centre: [30 mm, 10 mm]}}"
     field = "fracture={type: strain, failure: {otherwise: 66 MPa, neck: 0.01}}"
     (varying,) = dogbone(steel, field).fracture.varying.values()

@@ -63,7 +63,7 @@ def bits(answer):
 
 @SPACES
 @EVERY
-def test_plain_numbers_are_the_definition(space, name):
+def test_scalars_match_the_definition(space, name):
     of_vectors, of_numbers = OPERATIONS[name]
 
     @given(in_space(space))
@@ -79,7 +79,7 @@ def test_plain_numbers_are_the_definition(space, name):
 @SPACES
 @EVERY
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
-def test_arrays_are_calculated_place_by_place_in_their_precision(space, name, precision):
+def test_arrays_are_computed_elementwise_in_their_precision(space, name, precision):
     of_vectors, of_numbers = OPERATIONS[name]
     drawn = np.random.default_rng(space).normal(size=(2 * space + 1, 4, 3)).astype(precision)
     a, b, s = drawn[:space], drawn[space:-1], np.abs(drawn[-1]) + precision(0.5)
@@ -92,7 +92,7 @@ def test_arrays_are_calculated_place_by_place_in_their_precision(space, name, pr
 
 
 @SPACES
-def test_a_vector_stays_of_its_kind_and_has_as_many_components(space):
+def test_vector_keeps_its_type_and_number_of_components(space):
     kind, a = KINDS[space], vector(range(space))
     s = np.array([2.0, 3.0])
     made = [a + a, a - a, -a, 2.0 * a, a * 2.0, a / 2.0, s * a, a * s, np.float64(2.0) * a]

@@ -34,7 +34,7 @@ def warnings_of(**parts: Any) -> list[str]:
     return [*build_scene(pbdkit.Experiment(**whole | parts)).warnings]
 
 
-def test_a_point_far_from_the_body_is_named_with_group_particle_and_distance() -> None:
+def test_distant_point_is_named_with_group_particle_and_distance() -> None:
     nearest = {"nearest": [[4.0, 2.0], [7.0, 6.0]]}
     select = [{"select": nearest, "motion": HOLD}]
     # The corner (4, 2) is a 3-4-5 triangle away, and the last of 9 columns of 5.
@@ -50,12 +50,12 @@ def test_a_point_far_from_the_body_is_named_with_group_particle_and_distance() -
 
 
 @pytest.mark.parametrize(("spacings", "warned"), [(0.0, 0), (1.0, 0), (1.9, 0), (2.1, 1), (9.0, 1)])
-def test_two_spacings_are_near(spacings: float, warned: int) -> None:
+def test_two_spacings_count_as_near(spacings: float, warned: int) -> None:
     select = {"nearest": [[4.0 + 0.5 * spacings, 1.0]]}
     assert len(warnings_of(leaders=[{"select": select, "motion": HOLD}])) == warned
 
 
-def test_few_of_many_points_are_named() -> None:
+def test_only_some_of_many_points_are_named() -> None:
     select = {"nearest": [[50.0 + n, 0.0] for n in range(20)]}
     assert len(warnings_of(leaders=[{"select": select, "motion": HOLD}])) == 5
 
@@ -65,7 +65,7 @@ def turned(angle: float, steps: int = 10) -> list[str]:
     return warnings_of(leaders=[{"select": {"edge": "left"}, "motion": motion}])
 
 
-def test_an_angle_in_radians_is_warned_of_with_its_degrees() -> None:
+def test_angle_in_radians_gives_a_warning_with_degrees() -> None:
     assert turned(0.7854) == [
         "leaders.0.motion.angle: 0.7854 degrees look like radians, which would be 45.0001 degrees; "
         "angles are in degrees"
@@ -81,7 +81,7 @@ def test_an_angle_in_radians_is_warned_of_with_its_degrees() -> None:
     )
 
 
-def test_the_motion_of_an_obstacle_is_looked_at_too() -> None:
+def test_motion_of_an_obstacle_is_checked_too() -> None:
     motion = {"type": "rotation", "centre": [9.0, 9.0], "angle": 1.5708, "steps": 1}
     disc = {"type": "disc", "radius": 1.0, "centre": [9.0, 9.0]}
     (warning,) = warnings_of(obstacles=[{"shape": disc, "motion": motion}])
@@ -89,7 +89,7 @@ def test_the_motion_of_an_obstacle_is_looked_at_too() -> None:
 
 
 @pytest.mark.parametrize("multiple", range(1, 25))
-def test_every_multiple_of_15_degrees_is_known_in_radians(multiple: int) -> None:
+def test_every_multiple_of_15_degrees_is_recognised_in_radians(multiple: int) -> None:
     degrees = 15.0 * multiple
     assert round_in_radians(round(math.radians(degrees), 4))
     assert round_in_radians(-math.radians(degrees))
@@ -97,12 +97,12 @@ def test_every_multiple_of_15_degrees_is_known_in_radians(multiple: int) -> None
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.05, 0.1, 0.225, 0.5, 1.0, 1.5, 2.88, 4.45, 5.76, 9.0])
-def test_small_and_plain_degrees_are_degrees(angle: float) -> None:
+def test_small_and_round_degrees_are_degrees(angle: float) -> None:
     assert not round_in_radians(angle)
 
 
 @pytest.mark.parametrize("name", shipped_names())
-def test_no_shipped_experiment_is_doubted_so(name: str) -> None:
+def test_no_shipped_experiment_gives_these_warnings(name: str) -> None:
     if name.startswith(("paper", "modelling")):
         warnings = build_scene(pbdkit.load(name)).warnings
         assert not [w for w in warnings if "radians" in w or ".nearest: " in w]
@@ -140,7 +140,7 @@ def pulled_cloth(columns: int, rows: int, soft: float) -> dict[str, Any]:
     }
 
 
-def test_cells_of_cloth_along_the_diagonals_lock_and_the_cure_is_named() -> None:
+def test_locking_of_diagonal_cloth_is_named_with_the_remedy() -> None:
     """The predicted order of accuracy is that of the result, against a lattice four times as
     fine."""
 
@@ -166,7 +166,7 @@ def test_cells_of_cloth_along_the_diagonals_lock_and_the_cure_is_named() -> None
         {"type": "orthotropic", "poisson_ratio": 0.3, "modulus_ratio": 0.05, "shear_ratio": 0.4},
     ],
 )
-def test_other_materials_are_not_said_to_lock(rule: dict[str, Any]) -> None:
+def test_other_materials_give_no_locking_warning(rule: dict[str, Any]) -> None:
     assert not [text for text in warnings_of(rule=rule) if "lock" in text]
 
 
@@ -189,7 +189,7 @@ def doubted(**more: Any) -> list[str]:
     return [*build_scene(pbdkit.Experiment(**bar(**more))).warnings]
 
 
-def test_a_crack_that_crosses_nothing_is_warned_of() -> None:
+def test_crack_that_crosses_no_bond_gives_a_warning() -> None:
     crack = {"type": "strain", "failure": 0.02, "cracks": [[[6.5, 0.0], [6.5, 2.5]]]}
     assert doubted(fracture=crack) == []
     crack["cracks"] = [[[6.5, 0.0], [6.5, 2.5]], [[60.5, 0.0], [60.5, 2.5]]]
@@ -212,13 +212,13 @@ IN_PERCENT = [
 
 
 @pytest.mark.parametrize(("fracture", "fields"), IN_PERCENT)
-def test_strains_in_per_cent_are_warned_of(fracture: dict[str, Any], fields: list[str]) -> None:
+def test_strains_in_percent_give_a_warning(fracture: dict[str, Any], fields: list[str]) -> None:
     found = doubted(fracture=fracture)
     assert len(found) == len(fields)
     assert all(w.startswith(field) for w, field in zip(found, fields, strict=True))
 
 
-def test_a_load_on_leaders_alone_is_warned_of() -> None:
+def test_load_on_leaders_alone_gives_a_warning() -> None:
     told = "loads.0: acts only on leaders, so that it has no effect on the body"
     on_the_left = [{"select": {"edge": "left"}, "force": [1e-3, 0.0]}]
     assert doubted(loads=on_the_left) == [told]
@@ -235,7 +235,7 @@ PLACES = [(60.0, 0.0, True), (60.0, -2.0, False), (14.0, 0.0, False)]
 
 
 @pytest.mark.parametrize(("x", "velocity", "far"), PLACES)
-def test_an_obstacle_that_never_comes_near_is_warned_of(
+def test_obstacle_that_never_approaches_gives_a_warning(
     x: float, velocity: float, far: bool
 ) -> None:
     motion = {"type": "velocity", "velocity": [velocity, 0.0], "steps": 20}
@@ -263,7 +263,7 @@ HELD = {
 
 
 @pytest.mark.parametrize(("leaders", "force", "is_held"), HELD.values(), ids=HELD)
-def test_check_refuses_what_has_no_equilibrium_as_run_does(
+def test_check_and_run_refuse_scenes_without_equilibrium(
     call: Any, leaders: Any, force: list[float], is_held: bool
 ) -> None:
     loads = [{"select": {"edge": "right"}, "force": force}]
@@ -278,7 +278,7 @@ def test_check_refuses_what_has_no_equilibrium_as_run_does(
     assert ("loads: a part of" in steps.out) == (not is_held)
 
 
-def test_of_two_bodies_the_one_that_is_not_held_is_named() -> None:
+def test_unsupported_one_of_two_bodies_is_named() -> None:
     apart = [{"type": "rectangle", "width": 4.0, "height": 4.0},
              {"type": "rectangle", "width": 4.0, "height": 4.0, "origin": [10.0, 0.0]}]  # fmt: skip
     given = bar(body={"type": "union", "of": apart}, solver={"type": "equilibrium"})
@@ -286,7 +286,7 @@ def test_of_two_bodies_the_one_that_is_not_held_is_named() -> None:
         refuse_unheld_loads(build_scene(pbdkit.Experiment(**given)))
 
 
-def test_run_warns_of_leaders_that_are_too_fast_as_check_does(call: Any) -> None:
+def test_run_and_check_warn_of_too_fast_leaders(call: Any) -> None:
     fast = {"type": "velocity", "velocity": [0.3, 0.0], "steps": 10}
     leaders = [*bar()["leaders"], {"select": {"edge": "right"}, "motion": fast}]
     Path("bar.json").write_text(json.dumps(bar(leaders=leaders, loads=[])))
@@ -298,7 +298,7 @@ def test_run_warns_of_leaders_that_are_too_fast_as_check_does(call: Any) -> None
     assert call("run", "bar.json", "--force", "--quiet").err == ""
 
 
-def test_large_bodies_are_run_without_a_look_at_their_spectrum(
+def test_large_bodies_run_without_spectrum(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scene = build_scene(pbdkit.load("paper/a"))

@@ -196,12 +196,12 @@ class Writing(pbdkit.plugin.RenewsBonds, Keeping):
         (Writing, "failed at step 1.*read-only"),
     ],
 )
-def test_a_part_that_does_not_keep_to_the_interface(model, message):
+def test_component_that_violates_the_interface(model, message):
     with pytest.raises(pbdkit.PluginError, match=f"(?s){message}"):
         pbdkit.run(SHEET | {"fracture": model()}, progress=False)
 
 
-def test_a_number_that_leaves_all_bounds_ends_the_run():
+def test_overflow_ends_the_run():
     with pytest.raises(pbdkit.DivergedError, match="age at step 2") as caught:
         pbdkit.run(SHEET | {"fracture": Exploding()}, progress=False)
     assert np.isfinite(caught.value.dataset.age).all()
@@ -217,7 +217,7 @@ class Aged(pbdkit.Diagnostic):
         return (now.remembered("age").max(),)
 
 
-def test_a_diagnostic_measures_what_is_remembered_under_a_name_of_its_own():
+def test_diagnostic_records_state_variables_under_its_own_name():
     with pytest.raises(
         pbdkit.ExperimentError, match=("adds the variable 'age'; so does fracture; remove one")
     ):
@@ -239,19 +239,19 @@ class Odd(pbdkit.Diagnostic):
         return np.zeros(3), np.zeros(4)
 
 
-def test_a_dimension_of_its_own_has_one_length():
+def test_own_dimension_has_one_length():
     with pytest.raises(pbdkit.PluginError, match=r"'other' has the shape \(4,\), expected \(3,\)"):
         pbdkit.run(SHEET | {"diagnostics": [Odd()]}, progress=False)
 
 
-def test_a_rule_that_remembers_has_no_equilibrium():
+def test_rule_with_state_has_no_equilibrium():
     given = SHEET | {"rule": Tiring(), "solver": {"type": "equilibrium"}}
     message = "the rule 'tiring' depends on the history, so that there is no equilibrium that is"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         pbdkit.run(given, components=[Tiring], progress=False)
 
 
-def test_nothing_is_kept_where_nothing_is_remembered():
+def test_without_state_variables_nothing_is_stored():
     whole = initial_state(build_scene(pbdkit.Experiment(**SHEET)))
     assert (whole.broken_step, whole.broken_length) == (None, None)
     assert whole.bond_values == whole.particle_values == ()
@@ -260,7 +260,7 @@ def test_nothing_is_kept_where_nothing_is_remembered():
     assert state.bond_values == state.particle_values == ()
 
 
-def test_bonds_that_never_come_to_rest_are_no_equilibrium(monkeypatch, interpreted):
+def test_bonds_that_keep_changing_are_no_equilibrium(monkeypatch, interpreted):
     class Restless(Weakest):
         type: Literal["restless"] = "restless"
 

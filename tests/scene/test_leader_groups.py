@@ -56,7 +56,7 @@ BARYCENTRES = {
         {"type": "equilibrium", "method": "multigrid"},
     ],
 )
-def test_a_calibrated_rule_without_a_material_is_guided_as_a_plain_one(solver, request):
+def test_calibrated_rule_without_a_material_is_guided_like_a_plain_one(solver, request):
     """With ν = -1 nothing is left on the diagonals, and no force is known."""
     if solver.get("engine") == "compiled":
         request.getfixturevalue("compiled_at_length")
@@ -110,7 +110,7 @@ def quarters(part):
 
 
 @pytest.mark.parametrize("rule", ["elastic", "springs"])
-def test_a_quarter_between_planes_of_symmetry_is_the_quarter_of_the_whole(rule):
+def test_quarter_with_symmetry_planes_equals_a_quarter_of_the_whole(rule):
     """In every step: also where the outline meets a plane, at corners of the quarter."""
     chosen = {"type": rule} | ({"poisson_ratio": 0.3} if rule == "elastic" else {})
     solver = {"type": "stepping", "memory": 0.4}
@@ -131,7 +131,7 @@ PLAIN = {
 @pytest.mark.parametrize(
     ("parts", "precision", "threads"), [({}, "float64", 2), (PLAIN, "float32", 1)]
 )
-def test_both_engines_agree_to_the_bit(parts, precision, threads, request):
+def test_both_engines_agree_bit_for_bit(parts, precision, threads, request):
     """At the upper left corner too, where what pushes at the guide adds to the move. Single
     precision is compiled: Python would round otherwise."""
     if precision == "float64":
@@ -162,7 +162,7 @@ CUT = {
 
 
 @pytest.mark.parametrize("parts", [LAGGING, CUT], ids=["lag", "cut cells"])
-def test_the_step_operator_is_the_step(parts):
+def test_step_operator_equals_the_step(parts):
     data = sheet(initial={"type": "noise", "amplitude": 0.1}, **parts)
     for group in data["leaders"]:
         group["motion"] = HOLD
@@ -187,7 +187,7 @@ def test_the_step_operator_is_the_step(parts):
 
 
 @pytest.mark.parametrize("method", ["matrix", "stencils"])
-def test_rollers_cost_no_more_iterations_than_clamps(method, monkeypatch):
+def test_rollers_need_no_more_iterations_than_clamps(method, monkeypatch):
     if method == "matrix":
         monkeypatch.setattr("pbdkit.equilibrium.linearise.find_spec", lambda _: None)
 
@@ -199,7 +199,7 @@ def test_rollers_cost_no_more_iterations_than_clamps(method, monkeypatch):
     assert iterations() <= iterations(axes=["x", "y"]) + 4
 
 
-def test_check_knows_the_step_of_a_sheet_on_rollers():
+def test_check_predicts_the_step_of_a_sheet_on_rollers():
     """Its modes are those of the whole sheet, of twice the size, that are symmetric."""
     moving = {"type": "velocity", "velocity": [0.02, 0.0], "steps": 100}
     data = sheet(5, 4, steps=100)
@@ -213,7 +213,7 @@ def test_check_knows_the_step_of_a_sheet_on_rollers():
     assert found.lag_reached == pytest.approx(behind, rel=1e-6)
 
 
-def test_a_run_settles_on_rollers():
+def test_run_converges_on_rollers():
     settle = {"tolerance": 1e-6}
     solver = {"type": "stepping", "memory": 0.6, "settle": settle}
     ds = run(sheet(steps=5000, record={"every": 5000}, solver=solver))
@@ -221,7 +221,7 @@ def test_a_run_settles_on_rollers():
     assert np.abs(ds.u.values[-1, :, 0] - STRETCH * ds.reference.values[:, 0]).max() < 1e-7
 
 
-def test_what_no_roller_holds_stays_where_steps_leave_it():
+def test_free_direction_keeps_its_mean():
     data = sheet(solver={"type": "equilibrium"})
     data["leaders"] = [data["leaders"][0], data["leaders"][2]]
     u = run(data).u.values[-1]
@@ -230,7 +230,7 @@ def test_what_no_roller_holds_stays_where_steps_leave_it():
     assert np.ptp(u[:, 1]) == pytest.approx(0.3 * STRETCH * y)
 
 
-def test_groups_on_one_axis_contradict_each_other_and_on_two_do_not():
+def test_groups_contradict_each_other_only_on_a_common_axis():
     data = sheet()
     data["leaders"][1]["axes"] = ["x"]
     data["leaders"][1]["motion"] = {"type": "displace", "displacement": [0.1, 0.0]}
@@ -254,14 +254,14 @@ def test_groups_on_one_axis_contradict_each_other_and_on_two_do_not():
         ("x", "should be a list"),
     ],
 )
-def test_axes_are_told_apart(axes, text):
+def test_invalid_axes_are_refused(axes, text):
     data = sheet()
     data["leaders"][0]["axes"] = axes
     with pytest.raises(pbdkit.ExperimentError, match=text):
         pbdkit.Experiment(**data)
 
 
-def test_a_group_without_axes_says_nothing_of_them():
+def test_group_without_axes_omits_them():
     data = sheet()
     del data["leaders"][0]["axes"]
     groups = pbdkit.Experiment(**data).model_dump(mode="json")["leaders"]

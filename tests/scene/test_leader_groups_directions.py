@@ -71,7 +71,7 @@ def by_hand(ds, steps):
     return np.array(x), np.array(e)
 
 
-def test_neighbours_see_what_was_remembered_before_the_step():
+def test_neighbours_see_the_state_before_the_step():
     ds = run(solver={"type": "stepping", "engine": "numpy"})
     x, e = by_hand(ds, 8)
     np.testing.assert_allclose(ds.position.values[-1], x, atol=1e-13)
@@ -92,7 +92,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_kernels_agree_to_the_last_bit(case):
+def test_kernels_agree_bit_for_bit(case):
     scene = build_scene(pbdkit.Experiment(**vanes(**CASES[case])))
     with interpreting():
         found = list(states(scene, CompiledStepper(scene), (1, 2, 5)))
@@ -101,7 +101,7 @@ def test_the_kernels_agree_to_the_last_bit(case):
             np.testing.assert_array_equal(values, expected)
 
 
-def test_clamped_leaders_turn_with_their_motion_and_others_freely():
+def test_clamped_leaders_rotate_with_their_motion_and_others_freely():
     free = HOLD_LEFT | {"clamped": False}
     ds = run(leaders=[free, TURNED], solver={"type": "stepping", "engine": "numpy"})
     angle = np.degrees(np.arctan2(ds.vane_sin, ds.vane_cos)).values
@@ -115,7 +115,7 @@ def test_clamped_leaders_turn_with_their_motion_and_others_freely():
     assert (np.abs(np.diff(angle[:, left], axis=0)) > 0.0).all()
 
 
-def test_a_clamped_run_goes_on_from_a_copy_of_its_state():
+def test_clamped_run_continues_from_a_copy_of_its_state():
     scene = build_scene(pbdkit.Experiment(**vanes(leaders=[TURNED])))
     *_, half, _ = states(scene, Stepper(scene), (3, 5))
     *_, whole = states(scene, Stepper(scene), (8,))
@@ -150,7 +150,7 @@ class Misnamed(Vanes):
         ),
     ],
 )
-def test_what_does_not_go_together_is_refused(parts, told):
+def test_incompatible_parts_are_refused(parts, told):
     with pytest.raises(pbdkit.PbdkitError, match=told):
         build_scene(pbdkit.Experiment(**vanes(**parts)))
 
@@ -163,6 +163,6 @@ class Unaware(Vanes):
         return d, 1.0, 0.0, 0.0
 
 
-def test_a_gather_that_is_not_given_what_it_asked_for_is_named():
+def test_gather_without_its_declared_inputs_is_named():
     with pytest.raises(pbdkit.ExperimentError, match=r"called as gather\(d, r, w, p, own, there\)"):
         pbdkit.run(vanes(rule={"type": "unaware"}), components=[Unaware], progress=False)

@@ -89,7 +89,7 @@ def test_a_hanging_bar_of_triangles_converges():
     assert math.log2(off(16) / off(32)) > 1.8
 
 
-def test_a_cantilever_sags_as_finite_elements_say():
+def test_deflection_of_a_cantilever_matches_finite_elements():
     rule, elements = (
         [error(*found(n)) for n in weight.SIZES]
         for error, found in (
@@ -125,7 +125,7 @@ def shares(select, key="force", **parts):
     return scene.loads.each[0].share
 
 
-def test_a_force_is_shared_by_tributary_length_on_a_line():
+def test_force_is_distributed_by_tributary_length_on_a_line():
     assert shares({"edge": "right"}) == pytest.approx([1 / 6, 1 / 3, 1 / 3, 1 / 6])
     along = {"nearest": [[0, 0], [1, 1], [3, 3]]}
     assert shares(along) == pytest.approx([1 / 6, 1 / 2, 1 / 3])
@@ -133,7 +133,7 @@ def test_a_force_is_shared_by_tributary_length_on_a_line():
     assert shares({"numbers": [9]}) == [1.0]
 
 
-def test_a_body_force_counts_the_area_of_cells():
+def test_body_force_is_weighted_by_cell_area():
     whole = shares(ALL, "body_force")
     assert sorted(set(whole)) == [0.25, 0.5, 1.0]
     assert whole.sum() == 15.0
@@ -144,7 +144,7 @@ def test_a_body_force_counts_the_area_of_cells():
         assert area == pytest.approx(9 * math.pi, rel=2e-3)
 
 
-def test_loads_act_from_and_until():
+def test_loads_act_between_from_and_until():
     """Before the load no particle has moved, exactly; after it, the body comes back to rest."""
     given = loaded(TIP | {"from": 4, "until": 9}, steps=900, solver=QUICK)
     ds = ran(given | {"record": {"at": [3, 4, 9, 10]}})
@@ -156,7 +156,7 @@ def test_loads_act_from_and_until():
 
 
 @pytest.mark.parametrize("rule", [ELASTIC, SPRINGS], ids=["elastic", "springs"])
-def test_steps_settle_at_the_equilibrium(rule):
+def test_steps_converge_to_the_equilibrium(rule):
     parts = {"rule": rule, "steps": 5000, "record": {"at": [1]}, "diagnostics": []}
     there = ran(loaded(TIP, WEIGHT, **parts)).position.values[-1]
     ds = ran(loaded(TIP, WEIGHT, solver=QUICK | {"settle": {"tolerance": 1e-4}}, **parts))
@@ -165,7 +165,7 @@ def test_steps_settle_at_the_equilibrium(rule):
     assert abs(ds.position.values[-1] - there).max() < 1e-4 * way
 
 
-def test_shares_are_of_the_way_that_loads_make():
+def test_tolerance_is_relative_to_the_displacement_of_loads():
     """A thousandth of the load converges as the load does."""
     solver = QUICK | {"settle": {"tolerance": 1e-3}}
     found = []
@@ -177,7 +177,7 @@ def test_shares_are_of_the_way_that_loads_make():
     np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-3 * abs(found[0][0]).max())
 
 
-def test_a_released_body_is_where_its_steps_are():
+def test_released_body_rests_where_its_steps_end():
     """If nothing holds the body, its displacement under the load counts."""
     push = TIP | {"until": 20}
     free = loaded(push, steps=600, **FREE)
@@ -189,7 +189,7 @@ def test_a_released_body_is_where_its_steps_are():
 
 
 @pytest.mark.parametrize("rule", [ELASTIC, SPRINGS], ids=["elastic", "springs"])
-def test_what_nothing_holds_has_no_equilibrium(rule):
+def test_unsupported_body_has_no_equilibrium(rule):
     with pytest.raises(
         pbdkit.ExperimentError,
         match=r"a part of 24 particles \(with number .* is loaded, but not constrained",
@@ -197,7 +197,7 @@ def test_what_nothing_holds_has_no_equilibrium(rule):
         ran(loaded(TIP, rule=rule, **FREE))
 
 
-def test_forces_in_balance_need_no_leader():
+def test_balanced_forces_need_no_leader():
     back = {"select": {"edge": "left"}, "force": [-0.03, 0.0]}
     forth = {"select": {"edge": "right"}, "force": [0.03, 0.0]}
     ds = ran(loaded(back, forth, **FREE))
@@ -207,7 +207,7 @@ def test_forces_in_balance_need_no_leader():
 
 
 @pytest.mark.parametrize("frame", [NATURAL, Turning(), {"type": "mean", "lag": 1}])
-def test_the_step_operator_knows_loads(frame):
+def test_step_operator_includes_loads(frame):
     solver = {"type": "stepping", "relaxation": 0.7, "memory": 0.2}
     start = {"type": "noise", "amplitude": 0.1}
     parts = {"frame": frame, "solver": solver, "initial": start, "diagnostics": []}
@@ -224,7 +224,7 @@ def test_the_step_operator_knows_loads(frame):
     np.testing.assert_allclose(after, expected, atol=1e-13)
 
 
-def test_compiled_moves_are_the_same_at_any_moment(monkeypatch):
+def test_compiled_displacements_are_the_same_at_any_time(monkeypatch):
     scene = scene_of(loaded(TIP | {"from": 2}, WEIGHT, rule=SPRINGS, steps=5))
     state, plain = initial_state(scene), moves_of.Moves(scene)
     monkeypatch.setattr(moves_of, "LARGEST_BY_NUMPY", 0)
@@ -236,7 +236,7 @@ def test_compiled_moves_are_the_same_at_any_moment(monkeypatch):
     assert scene.loads.held_at is None
 
 
-def test_multigrid_finds_the_same():
+def test_multigrid_gives_the_same_solution():
     parts = {"body": {"type": "grid", "columns": 30, "rows": 20}, "diagnostics": []}
     one, other = (
         ran(loaded(TIP, WEIGHT, **parts, solver={"type": "equilibrium", "method": method}))
@@ -246,7 +246,7 @@ def test_multigrid_finds_the_same():
     assert abs(one.position - other.position).max() < 1e-7 * way
 
 
-def test_loads_come_in_increments_where_bonds_can_break():
+def test_loads_are_applied_in_increments_if_bonds_can_break():
     breaking = {"type": "strain", "failure": 0.05}
     given = loaded(TIP | {"from": 2, "until": 3}, rule=SPRINGS, fracture=breaking, steps=6)
     found = moments(scene_of(given), 10)
@@ -265,7 +265,7 @@ def test_a_load_is_linear_between_steps():
     assert [load.amplitude(m) for m in moments_] == [0, 0, 0.5, 1, 1, 0.75, 0, 0]
 
 
-def test_a_dataset_runs_again_and_tells_of_its_loads():
+def test_dataset_reruns_and_describes_its_loads():
     ds = ran(loaded(TIP | {"from": 2}, steps=8, solver={"type": "stepping"}))
     again = pbdkit.rerun(ds, progress=False)
     np.testing.assert_array_equal(ds.position, again.position)
@@ -302,13 +302,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("parts", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_is_refused(parts, message):
+def test_invalid_loads_are_refused(parts, message):
     with pytest.raises(pbdkit.ExperimentError, match=message):
         scene_of(loaded(TIP) | {"diagnostics": MEASURED[:2]} | parts)
 
 
 @pytest.mark.filterwarnings("ignore:loads.0. begins to act")
-def test_a_load_after_the_end_is_warned_of():
+def test_load_after_the_end_gives_a_warning():
     from pbdkit.stability.forecast import forecast
 
     found = forecast(scene_of(loaded(TIP | {"from": 9})))

@@ -90,7 +90,7 @@ def test_a_graded_bar_converges_at_second_order():
     assert np.log2(np.divide(errors[:-1], errors[1:])).min() > 1.9
 
 
-def test_layers_at_an_angle_are_layers():
+def test_inclined_layers_are_layers():
     """Turned layers have the turned stiffness; equal layers are one material; and by themselves
     they have the harmonic mean across and the arithmetic one along."""
     one, other = (np.diag([e, e, e / 2])[None] for e in (1.0, 4.0))
@@ -173,7 +173,7 @@ FIELDS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("parts", FIELDS.values(), ids=FIELDS)
-def test_engines_agree_and_the_dataset_says_all(parts):
+def test_engines_agree_and_the_dataset_is_complete(parts):
     given = {
         "name": "composite",
         "regions": REGIONS,
@@ -217,7 +217,7 @@ EVERYWHERE = {"all": {"type": "disc", "radius": 40.0, "centre": [3.0, 2.0]}}
 
 
 @pytest.mark.parametrize("parts", FIELDS.values(), ids=FIELDS)
-def test_a_region_that_holds_all_is_as_one_number(parts):
+def test_region_of_the_whole_body_equals_a_constant(parts):
     """Whatever stands for `otherwise`."""
     given: dict[str, Any] = {
         "name": "composite",
@@ -241,7 +241,7 @@ def test_a_region_that_holds_all_is_as_one_number(parts):
     np.testing.assert_allclose(found.values, expected.values, rtol=0.0, atol=1e-12)
 
 
-def test_a_crack_takes_its_energy_whatever_the_material():
+def test_crack_consumes_its_energy_in_any_material():
     """A cell n times as stiff is torn at an nth of the strain: its strength is n times as large."""
     rule = bar(8.0, 4.0)["rule"] | {
         "stiffness": {"x": [0.0, 8.0], "y": [0.0], "values": [[1.0], [3.0]]}
@@ -259,7 +259,7 @@ def test_a_crack_takes_its_energy_whatever_the_material():
     assert inside.max() == pytest.approx(2e-2, rel=0.05)
 
 
-def test_a_round_inclusion_is_that_of_the_exact_solution():
+def test_circular_inclusion_matches_the_exact_solution():
     """Goodier's: the strain of the inclusion, and the stress of the plate beside its pole."""
     assert max(jumps()) < 1e-12
     rough, fine = plate(10), plate(20)
@@ -301,7 +301,7 @@ def loaded_sheet(rule: dict[str, Any], force: float) -> Any:
 
 @pytest.mark.parametrize("stiffness", [4.0, "field", "course"])
 @pytest.mark.parametrize("name", MIXED_RULES)
-def test_a_stiffness_is_that_of_every_cell_whatever_else_differs(name, stiffness):
+def test_stiffness_applies_to_every_cell_beside_other_variations(name, stiffness):
     """Four times the stiffness under a load is the stiffness under a quarter of it."""
     fourfold = {
         "field": {"otherwise": 4.0},
@@ -348,7 +348,7 @@ def pulled_along(axis: int, region: dict[str, Any]) -> Any:
 @pytest.mark.parametrize("middle", [2.5, 2.53, 2.0])
 @pytest.mark.parametrize("height", [0.8, 0.4, 0.02])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_layer_thinner_than_a_cell_is_in_series_wherever_it_lies_in_it(axis, height, middle):
+def test_layer_thinner_than_a_cell_is_in_series_at_any_position(axis, height, middle):
     region = layer(middle, height)
     u = pulled_along(axis, region if axis == 1 else transposed(region))
     stretched = 5.0 - height + height * 1e3
@@ -357,7 +357,7 @@ def test_a_layer_thinner_than_a_cell_is_in_series_wherever_it_lies_in_it(axis, h
 
 
 @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 90.0])
-def test_thin_layers_are_the_same_with_the_axes_exchanged(angle):
+def test_thin_layers_are_symmetric_under_exchange_of_axes(angle):
     region = layer(2.5, 0.3, np.radians(angle))
     across, along = pulled_along(1, region), pulled_along(0, transposed(region))
     np.testing.assert_allclose(
@@ -367,7 +367,7 @@ def test_thin_layers_are_the_same_with_the_axes_exchanged(angle):
 
 @pytest.mark.parametrize("height", [0.9, 0.3, 0.02])
 @pytest.mark.parametrize("angle", [0.0, 30.0, 45.0, 90.0, 160.0])
-def test_the_share_of_a_layer_in_a_cell_and_its_direction_are_exact(angle, height):
+def test_volume_fraction_and_direction_of_a_layer_in_a_cell_are_exact(angle, height):
     """In all cells that it passes through wholly, side by side, with its middle anywhere."""
     body = pbdkit.Experiment(**bar(8.0, 3.0) | {"body": layer(0.3, height, np.radians(angle))}).body
     outline = Polygon(body.vertices)
@@ -387,7 +387,7 @@ def test_the_share_of_a_layer_in_a_cell_and_its_direction_are_exact(angle, heigh
         np.testing.assert_allclose(each, length * np.outer(normal, normal), atol=1e-3 * length)
 
 
-def test_a_square_within_a_cell_is_as_stiff_along_either_axis():
+def test_square_within_a_cell_has_equal_stiffness_along_both_axes():
     one, other = (np.diag([e, e, e / 2])[None] for e in (1.0, 100.0))
     found = layered(one, other, np.array([0.3]), np.eye(2)[None])[0]
     assert found[0, 0] == pytest.approx(found[1, 1], rel=1e-12)

@@ -25,7 +25,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES, ids=str)
-def test_memory_and_output_are_what_check_says(change, tmp_path):
+def test_memory_and_output_match_the_estimate_of_check(change, tmp_path):
     settings = ["body.columns=400", "body.rows=300", "steps=4", "record.every=2", "diagnostics=[]"]
     scene = build_scene(pbdkit.load("start", settings=[*settings, *CHANGES[change]]))
     said = forecast(scene)
@@ -41,7 +41,7 @@ def test_memory_and_output_are_what_check_says(change, tmp_path):
 
 
 @pytest.mark.parametrize("change", ["plain", "fracture"])
-def test_small_files_are_as_large_as_check_says(change, tmp_path):
+def test_sizes_of_small_files_match_the_estimate_of_check(change, tmp_path):
     """Columns take whole chunks of some MiB, of which the last is padded."""
     settings = ["body.columns=40", "body.rows=30", "steps=60", "record.every=1", "diagnostics=[]"]
     scene = build_scene(pbdkit.load("start", settings=[*settings, *CHANGES[change]]))
@@ -50,7 +50,7 @@ def test_small_files_are_as_large_as_check_says(change, tmp_path):
     assert path.stat().st_size / MIB == pytest.approx(forecast(scene).output_mib, rel=0.05)
 
 
-def test_counts_are_those_of_the_dataset():
+def test_counts_match_the_dataset():
     experiment = pbdkit.load("paper/f2", settings=["steps=2"])
     said, ds = forecast(build_scene(experiment)), pbdkit.run(experiment, progress=False)
     assert (said.particles, said.bonds) == (ds.sizes["particle"], ds.sizes["bond"])
@@ -95,7 +95,7 @@ TAKING_MORE = {
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system tells no peak")
 @pytest.mark.parametrize(("side", "settings"), TAKING_MORE.values(), ids=TAKING_MORE)
-def test_the_peak_of_the_process_is_what_check_says(side, settings, tmp_path):
+def test_peak_memory_matches_the_estimate_of_check(side, settings, tmp_path):
     settings = ["steps=3", "record.every=3", "diagnostics=[]", *settings]
     call = [sys.executable, "-c", PEAK, str(tmp_path / "out.nc"), str(side), *settings]
     used, said = json.loads(subprocess.run(call, capture_output=True, check=True).stdout)
@@ -131,7 +131,7 @@ EQUILIBRIA = {"factors": (80, [*CALIBRATED, "solver.method=lu"]), "grids": (800,
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system tells no peak")
 @pytest.mark.parametrize(("side", "settings"), EQUILIBRIA.values(), ids=EQUILIBRIA)
-def test_an_equilibrium_takes_what_check_says(side, settings, tmp_path):
+def test_memory_of_an_equilibrium_matches_the_estimate_of_check(side, settings, tmp_path):
     """The peak of a fresh process above that of its imports, within 30 %."""
     sides = [f"body.columns={side}", f"body.rows={side}", "solver={type: equilibrium}"]
     few = ["steps=3", "record.every=3", "diagnostics=[]", "leaders.1.until=3"]

@@ -101,7 +101,7 @@ def outline(name: str) -> Outline:
 
 
 @pytest.mark.parametrize("name", ["polygon", "rectangle", "star", "clockwise"])
-def test_polygons_are_those_of_geometry(name: str) -> None:
+def test_polygons_match_analytic_geometry(name: str) -> None:
     """Distance, side and nearest point of the boundary as shapely has them."""
     angles, radii = np.arange(10) * np.pi / 5, np.tile([9.0, 3.0], 5)
     star = (10.0 + radii * [np.cos(angles), np.sin(angles)]).T
@@ -120,7 +120,7 @@ def test_polygons_are_those_of_geometry(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["disc", "ring", "half-plane"])
-def test_round_and_flat_outlines_have_their_formulas(name: str) -> None:
+def test_round_and_flat_outlines_match_their_formulas(name: str) -> None:
     x, y = places()
     gap, nx, ny = outline(name).facing(x, y)
     to_disc, r = np.hypot(x - 7.0, y - 14.01) - 6.0, np.hypot(x - 7.0, y - 4.0)
@@ -130,7 +130,7 @@ def test_round_and_flat_outlines_have_their_formulas(name: str) -> None:
     np.testing.assert_allclose(back, 0.0, atol=1e-12)
 
 
-def test_followers_do_not_enter_and_leaders_are_not_touched() -> None:
+def test_followers_do_not_penetrate_and_leaders_are_unaffected() -> None:
     ds = run(block())
     leads = ds.kind.values[-1] == 0
     assert np.array_equal(ds.position.values[-1, leads], ds.reference.values[leads])
@@ -218,18 +218,18 @@ def test_both_engines_agree_to_the_last_bit(case: str) -> None:
 
 
 @pytest.mark.parametrize("case", ["between obstacles, springs", "on rollers"])
-def test_several_steps_in_a_pass_to_the_last_bit(case: str) -> None:
+def test_several_steps_per_pass_agree_bit_for_bit(case: str) -> None:
     scene = build_scene(pbdkit.Experiment(**CASES[case]))
     with small_passes():
         assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2))
 
 
-def test_threads_agree_to_the_last_bit(compiled_at_length: None) -> None:
+def test_threads_agree_bit_for_bit(compiled_at_length: None) -> None:
     scene = build_scene(pbdkit.Experiment(**CASES["memory"]))
     assert_bitwise_equal(scene, CompiledStepper(scene, 2))
 
 
-def test_neighbours_found_anew_meet_obstacles_too() -> None:
+def test_changing_neighbours_meet_obstacles_too() -> None:
     near = {"type": "euclidean", "radius": 1.5, "reevaluate": True}
     given = block(**MEAN | {"neighbours": near, "frame": {"type": "none"}})
     scene = build_scene(pbdkit.Experiment(**given))
@@ -237,7 +237,7 @@ def test_neighbours_found_anew_meet_obstacles_too() -> None:
         assert_bitwise_equal(scene, CompiledStepper(scene))
 
 
-def test_scenes_without_obstacles_have_kernels_without(monkeypatch: Any) -> None:
+def test_scenes_without_obstacles_have_kernels_without_contact(monkeypatch: Any) -> None:
     sources = []
     write = emitter.write_module
     monkeypatch.setattr(
@@ -252,7 +252,7 @@ def test_scenes_without_obstacles_have_kernels_without(monkeypatch: Any) -> None
     assert "leave" in held
 
 
-def test_who_rests_far_away_stays_exactly() -> None:
+def test_distant_particles_stay_exactly_at_rest() -> None:
     """Whatever an obstacle does elsewhere; the compiled engine does not look there."""
     scene = build_scene(pbdkit.Experiment(**block(**MEAN, obstacles=COME[:1])))
     state = Stepper(scene).advance(initial_state(scene), 3)
@@ -262,7 +262,7 @@ def test_who_rests_far_away_stays_exactly() -> None:
 
 
 @pytest.mark.parametrize("shape", ["half-plane", "disc", "wedge"])
-def test_the_equilibrium_is_where_steps_lead(shape: str) -> None:
+def test_equilibrium_is_the_limit_of_the_steps(shape: str) -> None:
     straight = run(pressed(shape, 0.4, solver={"type": "equilibrium"}))
     settle = {"type": "stepping", "memory": 0.75, "settle": {"tolerance": 1e-6}}
     stepped = run(pressed(shape, 0.4, solver=settle, steps=5000, record={"at": [0]}))
@@ -274,7 +274,7 @@ def test_the_equilibrium_is_where_steps_lead(shape: str) -> None:
     assert force[1] < -0.1
 
 
-def test_rules_that_are_not_linear_come_to_rest_on_obstacles() -> None:
+def test_nonlinear_rules_reach_equilibrium_on_obstacles() -> None:
     springs = {"rule": {"type": "springs"}, "body": {"type": "grid", "columns": 9, "rows": 9}}
     straight = run(pressed("wedge", 0.4, **springs, solver={"type": "equilibrium"}))
     stepping = {"solver": {"type": "stepping", "memory": 0.8}, "record": {"at": [0]}}
@@ -329,7 +329,7 @@ def half_widths(cells: int) -> tuple[float, float]:
     return float(np.sqrt(-fit[0] / fit[1])), float(hertz)
 
 
-def test_a_disc_on_a_block_is_hertz() -> None:
+def test_disc_on_a_block_matches_hertz() -> None:
     """At 40 cells within 3 % (docs/validation/accuracy.md); here coarser, and quicker."""
     fitted, hertz = half_widths(14)
     assert fitted == pytest.approx(hertz, rel=0.06)
@@ -349,12 +349,12 @@ def bending() -> tuple[float, float, float]:
     return float(((left + right) / 2 - middle) / force), beam, shear / beam
 
 
-def test_three_point_bending_is_timoshenko() -> None:
+def test_three_point_bending_matches_timoshenko() -> None:
     found, beam, _ = bending()
     assert found == pytest.approx(beam, rel=0.015)
 
 
-def test_what_nothing_holds_yet_is_led_to_its_supports() -> None:
+def test_unsupported_body_moves_to_its_supports() -> None:
     """A beam that hangs at one particle, a little above two discs, has no equilibrium of its own
     before it lies on them."""
     nose = {"type": "displace", "displacement": [0.0, -0.2]}
@@ -369,7 +369,7 @@ def test_what_nothing_holds_yet_is_led_to_its_supports() -> None:
     np.testing.assert_allclose(force[0], force[1] * [-1.0, 1.0], atol=1e-9)
 
 
-def test_an_obstacle_that_is_not_there_yet_may_lie_in_the_body() -> None:
+def test_future_obstacle_may_lie_in_the_body() -> None:
     shape = {"type": "disc", "radius": 2.5, "centre": [7.0, 4.0]}
     ds = run(block(obstacles=[{"shape": shape, "from": 3, "until": 4}], steps=5))
     closest = np.hypot(*(ds.position.values - [7.0, 4.0]).transpose(2, 0, 1)).min(axis=1)
@@ -420,7 +420,7 @@ MESSAGES: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("fault", MESSAGES)
-def test_what_is_refused_names_place_and_remedy(fault: str) -> None:
+def test_refusals_name_place_and_remedy(fault: str) -> None:
     obstacle, text = MESSAGES[fault]
     steps = 10**11 if fault == "infinite" else 30
     given = block(obstacles=[obstacle], solver={"type": "equilibrium"}, steps=steps)
@@ -429,7 +429,7 @@ def test_what_is_refused_names_place_and_remedy(fault: str) -> None:
     assert text in str(error.value)
 
 
-def test_contact_needs_obstacles() -> None:
+def test_contact_diagnostic_requires_obstacles() -> None:
     contact = {"type": "contact", "youngs_modulus": 1.0}
     with pytest.raises(
         pbdkit.ExperimentError, match="'contact' requires obstacles; the experiment has none"
@@ -437,7 +437,7 @@ def test_contact_needs_obstacles() -> None:
         build_scene(pbdkit.Experiment(**block(obstacles=[], diagnostics=[contact])))
 
 
-def test_what_slides_has_no_unique_equilibrium() -> None:
+def test_sliding_body_has_no_unique_equilibrium() -> None:
     """Two plates hold a block between them, and nothing holds it along them."""
     sides = ((0.0, 1.0), (8.0, -1.0))
     plates = [{"shape": {"half_plane": {"point": [0.0, y], "normal": [0.0, n]}},
@@ -447,7 +447,7 @@ def test_what_slides_has_no_unique_equilibrium() -> None:
         run(block(obstacles=plates, leaders=[], solver={"type": "equilibrium"}))
 
 
-def test_leaders_that_are_driven_into_an_obstacle_are_warned_of() -> None:
+def test_leaders_driven_into_an_obstacle_give_a_warning() -> None:
     into = {"type": "velocity", "velocity": [0.0, 0.5], "steps": 4}
     given = block(leaders=[{"select": {"edge": "top"}, "motion": into}])
     warnings = build_scene(pbdkit.Experiment(**given)).warnings
@@ -455,13 +455,13 @@ def test_leaders_that_are_driven_into_an_obstacle_are_warned_of() -> None:
     assert any(known in warning for warning in warnings)
 
 
-def test_a_dataset_alone_repeats_the_run() -> None:
+def test_run_is_reproduced_from_the_dataset_alone() -> None:
     ds = run(pressed("wedge", 0.4))
     again = pbdkit.rerun(ds)
     assert again.drop_attrs().identical(ds.drop_attrs())
 
 
-def test_the_indentation_is_drawn_back_to_rest() -> None:
+def test_indentation_recovers_to_rest() -> None:
     ds = pbdkit.run(pbdkit.load("modelling/indentation"), progress=False)
     force = -ds.contact_force.values[:, 0, 1]
     deepest = int(force.argmax())

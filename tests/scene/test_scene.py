@@ -69,7 +69,7 @@ LATTICES = [
 
 
 @pytest.mark.parametrize("lattice", LATTICES, ids=["square", "hexagonal", "at zero"])
-def test_rule_draws_and_bonds_agree_on_places(lattice):
+def test_rule_random_draws_and_bonds_agree_on_places(lattice):
     given = {
         "name": "places",
         "lattice": lattice,
@@ -109,7 +109,7 @@ class Soft(pbdkit.FollowerRule):
 
 
 @pytest.mark.parametrize("engine", ["numpy", "compiled"])
-def test_a_rule_of_two_phases_parts_them_where_the_experiment_says(engine):
+def test_two_phase_rule_has_its_interface_at_the_specified_place(engine):
     """Against the mean displacement, of which it makes half to the right of x = 102."""
     given = {
         "name": "phases",

@@ -41,7 +41,7 @@ def unknowns(scene, u, rows):
 
 @samples(40)
 @given(st.one_of(experiments(), calibrated_experiments()))
-def test_the_operator_makes_the_steps_that_the_stepper_makes(experiment):
+def test_operator_reproduces_the_steps_of_the_stepper(experiment):
     """On random scenes, torn ones too; a nonlinear rule at the state where it is linearised."""
     try:
         scene = build_scene(pbdkit.Experiment(**experiment | {"steps": 10}))
@@ -97,7 +97,7 @@ def test_chebyshev_spectrum():
 
 
 @pytest.mark.parametrize("columns", [12, 20])
-def test_steps_to_a_tolerance_are_those_counted(columns):
+def test_predicted_steps_to_a_tolerance_match_the_count(columns):
     experiment = sheet(columns, columns, initial={"type": "noise", "amplitude": 0.1}, steps=5000)
     scene = build_scene(pbdkit.Experiment(**experiment))
     predicted = Analysis(scene).steps_to["1e-6"]
@@ -175,7 +175,7 @@ def test_the_distance_weighted_rule_is_reported_unstable_with_its_bound(parts, b
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_one_percent_inside_the_bound_settles_and_outside_diverges(lattice, rule):
+def test_one_percent_inside_the_bound_converges_and_outside_diverges(lattice, rule):
     parts = {"lattice": LATTICES[lattice], "rule": RULES[rule]}
     start = {"type": "noise", "amplitude": 1e-9}
     bound = pbdkit.analyse(sheet(7, 6, **parts)).largest_stable_relaxation
@@ -193,7 +193,7 @@ def test_one_percent_inside_the_bound_settles_and_outside_diverges(lattice, rule
     assert not moved[1.01] < 1e-6
 
 
-def test_best_memory_settles_fastest():
+def test_optimal_momentum_converges_fastest():
     analysis = pbdkit.analyse(sheet())
     best = analysis.best_memory
     radii = [
@@ -219,7 +219,7 @@ def test_parts_without_a_leader_are_named():
     assert warning.startswith("leaders: a part of 16 particles (with number ")
 
 
-def test_a_mode_that_never_decays_is_found():
+def test_undamped_mode_is_found():
     """Two particles that only see each other change places for ever (hard case 13)."""
     given = sheet(2, 1, rule={"type": "mean-displacement"}, frame={"type": "none"}, leaders=[])
     assert any("use a relaxation below 1" in w for w in pbdkit.analyse(given).warnings())
@@ -228,7 +228,7 @@ def test_a_mode_that_never_decays_is_found():
 @pytest.mark.parametrize(
     "name", in_turn([n for n in shipped_names() if "to-failure" not in n], 2, first=1)
 )
-def test_predictions_for_shipped_experiments_are_borne_out(name):
+def test_predictions_for_shipped_experiments_hold(name):
     """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are that
     are made of steps, and those that go straight to equilibrium stay there too. Bodies that are
     torn in steps of equilibria have tests of their own."""
@@ -245,7 +245,7 @@ def test_predictions_for_shipped_experiments_are_borne_out(name):
     assert straight or predicted.get("stable") is not False
 
 
-def test_a_run_that_can_diverge_is_warned_of_and_says_so_in_the_dataset(tmp_path, monkeypatch):
+def test_possible_divergence_gives_a_warning_and_an_attribute(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     changes = ["solver.relaxation=1.2", "rule={type: barycentre}", "steps=5"]
     arguments = [word for change in changes for word in ("--set", change)]
@@ -285,7 +285,7 @@ class Absolute(Hypotenuse):
 
 
 @pytest.mark.parametrize("rule", [Hypotenuse(type="hypotenuse"), Absolute(type="absolute")])
-def test_functions_that_take_no_complex_step_are_found_out(rule):
+def test_functions_without_complex_step_are_detected(rule):
     given = sheet(rule=rule)
     assert wave_bound(build_scene(pbdkit.Experiment(**given))).smallest == pytest.approx(
         -2, abs=1e-6
@@ -297,7 +297,7 @@ def test_functions_that_take_no_complex_step_are_found_out(rule):
 
 @pytest.mark.parametrize("rule", ["springs", "distance-weighted", "elastic"])
 @pytest.mark.parametrize("a", [2.0**-40, 2.0**60])
-def test_a_step_is_linearised_alike_in_all_units(rule, a):
+def test_step_is_linearised_equally_in_all_units(rule, a):
     """Lengths are all of the lattice: the matrices are the same, to rounding, and what broken
     bonds push is as much longer as lengths are."""
 
@@ -325,7 +325,7 @@ def test_a_step_is_linearised_alike_in_all_units(rule, a):
 
 
 @pytest.mark.parametrize("memory", [1.5, -1.5])
-def test_no_bound_is_promised_where_there_is_none(memory):
+def test_unstable_rule_has_no_relaxation_bound(memory):
     given = sheet(solver={"type": "stepping", "memory": memory})
     analysis = pbdkit.analyse(given)
     assert analysis.stable is False
@@ -333,13 +333,13 @@ def test_no_bound_is_promised_where_there_is_none(memory):
     assert any("no relaxation makes it stable" in w for w in analysis.warnings())
 
 
-def test_frames_with_lag_are_left_to_the_spectrum():
+def test_delayed_frames_use_the_spectrum():
     scene = build_scene(pbdkit.Experiment(**sheet(frame={"type": "mean", "lag": 1})))
     assert wave_bound(scene) is None
     assert Analysis(scene).stable
 
 
-def test_where_everybody_leads_there_is_nothing_to_analyse():
+def test_without_followers_there_is_nothing_to_analyse():
     leaders = [{"select": {"box": [-1, -1, 99, 99]}, "motion": {"type": "hold"}}]
     analysis = pbdkit.analyse(sheet(leaders=leaders))
     assert analysis.stable
@@ -347,7 +347,7 @@ def test_where_everybody_leads_there_is_nothing_to_analyse():
     assert analysis.warnings() == []
 
 
-def test_a_particle_without_neighbours_stays_whatever_the_memory():
+def test_isolated_particle_stays_at_any_momentum():
     """It has the eigenvalue 1 of the rule's own step, and no other."""
     body = {
         "type": "union",
@@ -366,7 +366,7 @@ def test_a_particle_without_neighbours_stays_whatever_the_memory():
     assert remembering.parts_without_leader == plain.parts_without_leader
 
 
-def test_a_mirror_frame_holds_a_body_that_no_leader_reaches():
+def test_mirror_frame_fixes_a_body_without_leaders():
     loose = pbdkit.analyse(sheet(leaders=[], frame={"type": "mean"}))
     assert any(w.startswith("leaders: a part of") for w in loose.warnings())
     mirrored = pbdkit.analyse(sheet(leaders=[], frame={"type": "mirror"}))
@@ -384,5 +384,5 @@ def test_a_mirror_frame_holds_a_body_that_no_leader_reaches():
         ({"neighbours": {"type": "euclidean", "radius": 1.2, "reevaluate": True}}, False),
     ],
 )
-def test_predictions_are_exact_where_a_linear_rule_keeps_its_neighbours(parts, exact):
+def test_predictions_are_exact_for_a_linear_rule_with_fixed_neighbours(parts, exact):
     assert pbdkit.analyse(sheet(**parts)).exact is exact

@@ -37,7 +37,7 @@ def body(columns=48, rows=40, **parts):
 
 
 @pytest.mark.parametrize("parts", BODIES.values(), ids=BODIES)
-def test_estimates_are_near_what_is_exact(parts):
+def test_estimates_are_close_to_exact_values(parts):
     """1 - λ of the slowest mode within 1 %, the smallest eigenvalue within 2 % of the width of the
     spectrum, the lag within 2 %."""
     scene = body(**parts)
@@ -51,7 +51,7 @@ def test_estimates_are_near_what_is_exact(parts):
     assert lag.steady == pytest.approx(exact.trailing.steady, rel=0.02)
 
 
-def test_of_large_bodies_coarser_grids_are_enough(monkeypatch):
+def test_coarse_grids_suffice_for_large_bodies(monkeypatch):
     """1 - λ = ½ (1 - cos(π/N)) within 1 %, without a turn on the finest grid."""
     monkeypatch.setattr("pbdkit.stability.analysis.LARGE_BODY", 0)
     scene = body(240, 60)
@@ -59,7 +59,7 @@ def test_of_large_bodies_coarser_grids_are_enough(monkeypatch):
     assert 1 - StabilityEstimate(scene).spectrum.largest == pytest.approx(exact, rel=0.01)
 
 
-def test_waves_that_change_their_sign_do_not_outlast_the_slowest_mode():
+def test_sign_changing_waves_decay_before_the_slowest_mode():
     """The barycentre on the square lattice: waves have -1, held bodies nothing beyond -ρ."""
     found = StabilityEstimate(body()).spectrum
     assert found.smallest == -found.largest
@@ -95,12 +95,12 @@ LEFT_OUT = {
 
 
 @pytest.mark.parametrize(("parts", "said"), LEFT_OUT.values(), ids=LEFT_OUT)
-def test_what_an_estimate_leaves_open_is_said(parts, said, monkeypatch):
+def test_limits_of_an_estimate_are_reported(parts, said, monkeypatch):
     (found,) = [w for w in estimated(monkeypatch, **parts).warnings() if said in w]
     assert found
 
 
-def test_a_lag_without_a_hold_is_left_out_with_a_word(monkeypatch):
+def test_lag_of_an_unsupported_body_is_omitted_with_a_message(monkeypatch):
     """At first one particle moves, around which an elastic body turns freely."""
     pull = {"type": "velocity", "velocity": [0.01, 0.0], "steps": 9}
     first = {"select": {"numbers": [30]}, "motion": pull, "until": 9}
@@ -115,13 +115,13 @@ def test_a_lag_without_a_hold_is_left_out_with_a_word(monkeypatch):
     )
 
 
-def test_neighbours_found_anew_are_not_analysed_and_check_says_so():
+def test_changing_neighbours_are_not_analysed_and_check_reports_it():
     anew = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
     (said,) = [w for w in pbdkit.analyse(experiment(neighbours=anew)).warnings() if "omitted" in w]
     assert said.endswith("are omitted, neighbours are re-evaluated at every step")
 
 
-def test_check_answers_for_a_body_that_is_too_large_for_a_matrix(call):
+def test_check_estimates_for_a_body_too_large_for_a_matrix(call):
     sheet = ["body.columns=231", "body.rows=220", "leaders.1.motion.velocity=[0.01, 0.0]"]
     options = [word for setting in sheet for word in ("--set", setting)]
     figures = json.loads(call("check", "paper/a", *options, "--json").out)

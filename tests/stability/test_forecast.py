@@ -163,7 +163,7 @@ thoroughly = settings(
 
 @thoroughly
 @given(scenes(), st.integers(0, 9))
-def test_runs_settle_and_diverge_at_the_predicted_rate(parts, seed):
+def test_runs_converge_and_diverge_at_the_predicted_rate(parts, seed):
     scene = built(parts)
     analysis = Analysis(scene)
     assume(len(analysis.operator.followers) and analysis.spectral_radius > 1e-3)
@@ -175,14 +175,14 @@ def test_runs_settle_and_diverge_at_the_predicted_rate(parts, seed):
 
 @settings(thoroughly, max_examples=15)
 @given(scenes())
-def test_bodies_are_stable_where_run_says_that_waves_are(parts):
+def test_bodies_are_stable_if_the_wave_bound_is(parts):
     """Compare the estimate of `run`, in milliseconds, with that of `check`."""
     scene = built(parts)
     assume(prediction(scene, wave_bound(scene)).get("stable"))
     assert Analysis(scene).stable
 
 
-def test_run_promises_nothing_where_waves_do_not_bound_the_body():
+def test_run_predicts_nothing_if_waves_do_not_bound_the_body():
     """Six neighbours on a centred sheet, no frame: it diverges, and no wave grows."""
     parts = {
         "lattice": {"type": "centred-rectangular", "a": 1.0, "b": 1.2},

@@ -44,12 +44,12 @@ def closed_form(speed, length):
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(20, 20), (30, 8), (41, 5)])
-def test_lag_is_the_closed_form(columns, rows):
+def test_lag_matches_the_closed_form(columns, rows):
     analysis = pbdkit.analyse(experiment(**pulled(columns, rows, 0.0035)))
     assert analysis.lag == pytest.approx(closed_form(0.0035, columns - 1), rel=0.02)
 
 
-def test_lag_is_what_a_run_shows():
+def test_lag_matches_a_run():
     """Case a's sheet, long enough on its way for the lag to become steady."""
     parts = pulled(20, 20, 0.0035, steps=2200)
     measured, lag = trailing(**parts), pbdkit.analyse(experiment(**parts)).trailing
@@ -63,7 +63,7 @@ def test_lag_is_what_a_run_shows():
     ("lattice", "neighbours", "frame"),
     all_pairs(LATTICES, NEIGHBOURS, ["mean", "first", "lag", "wide", {"type": "none"}]),
 )
-def test_what_is_reached_is_what_runs_show_on_every_lattice(lattice, neighbours, frame):
+def test_reached_stretch_matches_runs_on_every_lattice(lattice, neighbours, frame):
     """Frame points that follow leaders are late, in every neighbourhood and frame its own way."""
     parts = pulled(
         7, 6, 0.2, -0.1, steps=6, lattice=lattice, neighbours=neighbours, frame=frame,
@@ -84,7 +84,7 @@ def test_what_is_reached_is_what_runs_show_on_every_lattice(lattice, neighbours,
         ["barycentre", "mixed-coordinate"], [(0.7, 0.0), (1.0, 0.9), (0.5, -0.4)], ["mean", "lag"]
     ),
 )
-def test_relaxation_and_memory_have_their_share(rule, weights, frame):
+def test_relaxation_and_momentum_affect_the_lag(rule, weights, frame):
     relaxation, memory = weights
     solver = {"type": "stepping", "relaxation": relaxation, "memory": memory}
     for steps in (2, 9, 2000):
@@ -95,7 +95,7 @@ def test_relaxation_and_memory_have_their_share(rule, weights, frame):
     assert lag.steady == pytest.approx(measured, rel=1e-6)
 
 
-def test_large_sheets_are_looked_at_sparsely():
+def test_large_sheets_use_sparse_matrices():
     parts = pulled(50, 12, 0.01, steps=40, neighbours="chebyshev-1")
     assert pbdkit.analyse(experiment(**parts)).trailing.reached == pytest.approx(
         trailing(**parts), rel=1e-7
@@ -137,14 +137,14 @@ def test_without_steady_motion_and_stable_steps_there_is_no_lag(parts):
     assert not any("behind its equilibrium" in w for w in analysis.warnings())
 
 
-def test_a_long_motion_that_is_not_followed_to_its_end_is_estimated():
+def test_long_motion_is_estimated():
     lag = pbdkit.analyse(experiment(**pulled(60, 60, 1e-4, steps=100_000))).trailing
     assert lag.reached == pytest.approx(lag.steady, rel=1e-6)
     assert lag.size == pytest.approx(closed_form(1e-4, 59), rel=0.02)
 
 
 @pytest.mark.parametrize("steps", [3, 60, 400, 3000])
-def test_what_is_reached_is_estimated_within_10_percent(steps, monkeypatch):
+def test_reached_stretch_is_estimated_within_10_percent(steps, monkeypatch):
     parts = pulled(40, 12, 0.01, steps=steps)
     followed = pbdkit.analyse(experiment(**parts)).trailing
     monkeypatch.setattr("pbdkit.stability.lag.MAX_PRODUCTS", 0.0)
@@ -153,7 +153,7 @@ def test_what_is_reached_is_estimated_within_10_percent(steps, monkeypatch):
     assert estimated.reached == pytest.approx(followed.reached, rel=0.1)
 
 
-def test_what_is_reached_is_not_estimated_where_the_step_has_a_memory(monkeypatch):
+def test_reached_stretch_is_not_estimated_with_momentum(monkeypatch):
     monkeypatch.setattr("pbdkit.stability.lag.MAX_PRODUCTS", 0.0)
     solver = {"type": "stepping", "memory": 0.5}
     lag = pbdkit.analyse(experiment(**pulled(8, 6, 0.01, solver=solver))).trailing
@@ -165,7 +165,7 @@ FAST, SLOW = "0.35", "0.04"
 
 
 @pytest.mark.parametrize(("speed", "warned"), [(FAST, True), (SLOW, False)])
-def test_check_says_the_lag_and_warns_of_a_large_one(call, speed, warned):
+def test_check_prints_the_lag_and_warns_if_it_is_large(call, speed, warned):
     arguments = ["check", "paper/a", "--set", f"leaders.1.motion.velocity=[{speed}, 0.0]"]
     figures = json.loads(call(*arguments, "--json").out)
     steady, reached = (float(speed) / 0.35 * x for x in (7.0648, 2.0426))
@@ -185,20 +185,20 @@ def test_check_says_the_lag_and_warns_of_a_large_one(call, speed, warned):
     assert (expected in said) == warned
 
 
-def test_the_speed_that_is_advised_keeps_the_lag_below_a_bond():
+def test_recommended_speed_keeps_the_lag_below_a_bond():
     fast = pbdkit.analyse("paper/a").trailing
     slow = fast.speed / fast.steady
     lag = pbdkit.analyse(experiment(**pulled(10, 10, slow, steps=4000))).trailing
     assert lag.reached == pytest.approx(1.0, rel=1e-6)
 
 
-def test_check_says_nothing_of_lag_where_there_is_none(call):
+def test_check_prints_no_lag_where_there_is_none(call):
     figures = json.loads(call("check", "stability/oscillation", "--json").out)
     assert figures["lag"] is figures["lag_reached"] is None
     assert "behind equilibrium" not in call("check", "stability/oscillation", "--verbose").out
 
 
-def test_case_22_bonds_of_a_fast_test_stretch_nine_times_as_far_as_in_equilibrium():
+def test_case_22_bonds_of_a_fast_test_stretch_nine_times_the_equilibrium():
     parts = pulled(20, 20, 0.35, steps=10)
     scene = scene_of(**parts)
     u = body_of(scene, Stepper(scene).advance(initial_state(scene), 10)).reshape(20, 20, 2)

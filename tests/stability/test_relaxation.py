@@ -47,7 +47,7 @@ def rate(scene: Scene) -> float:
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_the_choice_settles_every_rule_on_every_lattice_under_every_frame(lattice):
+def test_choice_converges_for_every_rule_lattice_and_frame(lattice):
     frames = dict(OTHERS, mirror={"type": "mirror"}) if lattice in MIRRORED else OTHERS
     pairs = [("barycentre", frame) for frame in frames] + [(rule, "mean") for rule in RULES]
     for rule, frame in pairs:
@@ -57,12 +57,12 @@ def test_the_choice_settles_every_rule_on_every_lattice_under_every_frame(lattic
 
 
 @pytest.mark.parametrize(("lattice", "rule", "neighbours", "frame"), CALIBRATED)
-def test_the_choice_settles_calibrated_rules(lattice, rule, neighbours, frame):
+def test_choice_converges_for_calibrated_rules(lattice, rule, neighbours, frame):
     parts = {"lattice": lattice, "rule": rule, "neighbours": neighbours}
     assert rate(tuned(scene_of(**parts, frame={"type": frame}))) < 1.0
 
 
-def test_the_choice_is_that_of_the_heavy_ball():
+def test_choice_equals_the_heavy_ball_optimum():
     """λ of a sheet with held ends is known: m and M are 1 - λ at the ends."""
     scene = tuned(scene_of(12, 12))
     slowest = (1 + math.cos(math.pi / 11)) / 2
@@ -72,7 +72,7 @@ def test_the_choice_is_that_of_the_heavy_ball():
     assert rate(scene) == pytest.approx(root, abs=1e-6)
 
 
-def test_no_numbers_nearby_are_better():
+def test_nearby_weights_are_not_better():
     for z in (np.linspace(0.01, 1.9, 60), np.linspace(0.01, 1.5, 60) + 0.02j):
         modes = np.concatenate([1 - z, 1 - z.conj()])
         best = best_weights(modes)
@@ -81,7 +81,7 @@ def test_no_numbers_nearby_are_better():
             assert near.rate(modes) > best.rate(modes) - 1e-5
 
 
-def test_a_number_that_is_given_stays():
+def test_given_number_is_kept():
     modes = 1 - np.linspace(0.01, 1.9, 60).astype(complex)
     relaxed = scene_of(solver=AUTO | {"memory": 0.25})
     assert tuned(relaxed).experiment.stepping.memory == 0.25
@@ -93,7 +93,7 @@ def test_a_number_that_is_given_stays():
 
 
 @pytest.mark.parametrize("parts", [{}, {"rule": SPRINGS, "neighbours": EIGHT}])
-def test_of_large_bodies_the_ends_are_found_by_iteration(parts):
+def test_spectral_ends_of_large_bodies_are_found_by_iteration(parts):
     """The modes of 24 × 24 with four neighbours have a closed form; those of the springs come from
     the analysis of the choice."""
     scene = tuned(scene_of(24, 24, **parts))
@@ -104,7 +104,7 @@ def test_of_large_bodies_the_ends_are_found_by_iteration(parts):
         assert (1 - math.sqrt(b)) ** 2 / w == pytest.approx(m, rel=3 * MARGIN)
 
 
-def test_a_result_holds_the_numbers_and_is_made_again_from_them():
+def test_result_contains_the_weights_and_reruns_with_them():
     noise = {"type": "noise", "amplitude": 0.1}
     given = experiment(solver=AUTO, leaders=BOTH_ENDS_HELD, initial=noise)
     first = pbdkit.run(given, progress=False)
@@ -128,14 +128,14 @@ def test_a_result_holds_the_numbers_and_is_made_again_from_them():
          "4; give numbers, or omit them (relaxation 1, memory 0)"),
     ],
 )  # fmt: skip
-def test_where_there_is_no_choice_the_remedy_is_named(parts, text):
+def test_impossible_choice_names_the_remedy(parts, text):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         tuned(scene_of(**parts))
     assert caught.value.where == ("solver",)
     assert text in str(caught.value)
 
 
-def test_check_says_what_is_chosen_and_of_what(call):
+def test_check_prints_the_choice_and_its_basis(call):
     auto = ["--set", "solver.memory=auto", "--set", "solver.relaxation=auto"]
     linear = call("check", "paper/a", *auto).out
     assert "  chosen     relaxation 1.83, memory 0.789057\n" in linear
@@ -146,18 +146,18 @@ def test_check_says_what_is_chosen_and_of_what(call):
 
 
 @pytest.mark.parametrize("name", ["memory", "threads"])
-def test_a_word_that_is_none_is_answered_once(name, call):
+def test_invalid_word_gives_one_message(name, call):
     told = call("check", "paper/a", "--set", f"solver.{name}=aut").err
     assert f"solver.{name}: should be a number or 'auto', got 'aut'; did you mean 'auto'?" in told
     assert "literal" not in told
 
 
-def test_numbers_that_are_yet_to_be_chosen_are_none():
+def test_weights_not_yet_chosen_have_no_value():
     with pytest.raises(pbdkit.ExperimentError, match="has no value yet"):
         _ = scene_of().experiment.stepping.memory
 
 
-def test_rows_that_can_be_made_symmetric_have_real_eigenvalues():
+def test_symmetrisable_rows_have_real_eigenvalues():
     from scipy.sparse import csr_array
 
     even = np.array([[0.0, 2.0, 0.0], [0.5, 0.0, 3.0], [0.0, 1.0, 1.0]])

@@ -57,7 +57,7 @@ def step_sizes(lattice, neighbours, shells, rule, relaxation, steps, columns):
     ("case", "rule"),
     [(case, ("barycentre", "mean-displacement")[n % 2]) for n, case in enumerate(AVERAGING)],
 )
-def test_averaging_settles_1_percent_inside_its_bound_and_diverges_1_percent_outside(case, rule):
+def test_averaging_converges_1_percent_inside_its_bound_and_not_outside(case, rule):
     *where, bound = AVERAGING[case]
     inside, outside = (
         step_sizes(*where, rule, bound * factor, 600, columns=32) for factor in (0.99, 1.01)
@@ -67,7 +67,7 @@ def test_averaging_settles_1_percent_inside_its_bound_and_diverges_1_percent_out
 
 
 @pytest.mark.parametrize("case", DISTANCE_WEIGHTED)
-def test_distance_weights_settle_1_percent_inside_their_bound_and_not_1_percent_outside(case):
+def test_distance_weights_converge_1_percent_inside_their_bound_only(case):
     *where, bound = DISTANCE_WEIGHTED[case]
     inside, outside = (
         step_sizes(*where, "distance-weighted", bound * factor, 400, columns=24)
@@ -77,7 +77,7 @@ def test_distance_weights_settle_1_percent_inside_their_bound_and_not_1_percent_
     assert outside[-1] > 1.2 * outside[200]
 
 
-def test_the_distance_weighted_rule_breaks_up_as_printed_and_settles_at_relaxation_0_6():
+def test_distance_weighted_rule_diverges_and_is_stable_at_relaxation_0_6():
     # Hard case 15: λ_min = -2 on the infinite lattice, so that noise grows by nearly 2 a step.
     printed = step_sizes(SQUARE, "coordination", 1, "distance-weighted", 1.0, 60, columns=10)
     assert printed[:50].max() > 0.1
@@ -97,7 +97,7 @@ def test_the_distance_weighted_rule_breaks_up_as_printed_and_settles_at_relaxati
     ],
     ids=["square-4", "chebyshev-8", "chebyshev-24", "hexagonal-6", "hexagonal-18"],
 )
-def test_neighbourhoods_have_the_diffusivity_and_smallest_eigenvalue_of_the_table(
+def test_neighbourhoods_match_the_table_of_diffusivity_and_eigenvalues(
     lattice, metric, d, lambda_min
 ):
     cell = scene_of(lattice=lattice).experiment.lattice.cell()
@@ -111,7 +111,7 @@ def test_neighbourhoods_have_the_diffusivity_and_smallest_eigenvalue_of_the_tabl
     assert symbol.min() == pytest.approx(lambda_min, abs=1e-3)
 
 
-def test_an_equilibrium_that_smaller_steps_reach_is_not_warned_of():
+def test_no_warning_for_an_equilibrium_that_smaller_steps_reach():
     """It makes no steps; where no relaxation leads there, it is."""
     gradient = {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 2.0}
     parts = {

@@ -91,7 +91,7 @@ def test_springs_between_plates_are_compressed_uniformly(kind: Any, solver: Any)
 
 
 @pytest.mark.parametrize("kind", [SQUARE, TRIANGLES], ids=["square", "hexagonal"])
-def test_an_oblique_plate_pushes_along_its_normal(kind: Any) -> None:
+def test_inclined_plate_pushes_along_its_normal(kind: Any) -> None:
     """The obstacle is on a corner, where springs and elastic bodies deform equally."""
     corner, found = [9.0, 4.0] if kind is SQUARE else [9.5, 5.0 * math.sqrt(0.75)], []
     for rule in (SPRINGS, THIRD):
@@ -152,7 +152,7 @@ INTO_A_CORNER = {
 @pytest.mark.parametrize(
     ("rule", "slant"), [(SPRINGS, 0.0), (ELASTIC, 0.2), (SPRINGS, 0.5), (ELASTIC, 0.5)]
 )
-def test_a_corner_between_obstacles_is_held_by_both(rule: Any, slant: float) -> None:
+def test_corner_between_obstacles_constrains_both_normals(rule: Any, slant: float) -> None:
     """A symmetric block that is pushed into it, whatever their order and however it gets there."""
     normals = [[1.0, slant], [slant, 1.0]]
     found = []
@@ -175,7 +175,7 @@ def test_a_corner_between_obstacles_is_held_by_both(rule: Any, slant: float) -> 
 
 
 @pytest.mark.parametrize("rule", [SPRINGS, ELASTIC], ids=["springs", "elastic"])
-def test_a_groove_of_one_obstacle_holds_as_two_obstacles_do(rule: Any) -> None:
+def test_groove_of_one_obstacle_acts_like_two_obstacles(rule: Any) -> None:
     """A particle in the corner of a polygon that is not convex touches both sides of it."""
     groove = [[0.0, 0.0], [-2.0, 10.0], [-9.0, 10.0], [-9.0, -9.0], [10.0, -9.0], [10.0, -2.0]]
     one = [{"shape": {"type": "polygon", "vertices": groove}}]
@@ -187,7 +187,7 @@ def test_a_groove_of_one_obstacle_holds_as_two_obstacles_do(rule: Any) -> None:
     assert max(map(imbalance, found)) < 1e-10
 
 
-def test_an_obstacle_given_twice_is_the_same_obstacle() -> None:
+def test_duplicate_obstacle_has_no_effect() -> None:
     once = [plane([0.0, 0.0], [1.0, 0.2]), plane([0.0, 0.0], [0.2, 1.0])]
     one, two = (at_rest(**INTO_A_CORNER, obstacles=each) for each in (once, [*once, once[0]]))
     np.testing.assert_allclose(moved(one), moved(two), atol=1e-13)
@@ -218,7 +218,7 @@ def on_rollers(half: bool, **parts: Any) -> Any:
     [(SPRINGS, {"solver": EQUILIBRIUM}), (ELASTIC, stepping(0.9, 0.6, 300))],
     ids=["springs, equilibrium", "elastic, stepping"],
 )
-def test_half_a_body_on_rollers_rests_as_the_whole(rule: Any, solver: Any) -> None:
+def test_half_a_body_on_rollers_equals_the_whole(rule: Any, solver: Any) -> None:
     whole, half = (on_rollers(half, rule=rule, **solver) for half in (False, True))
     some = whole.reference.values[:, 0] > -0.1
     np.testing.assert_allclose(moved(whole)[some], moved(half), atol=1e-12)
@@ -228,7 +228,7 @@ def test_half_a_body_on_rollers_rests_as_the_whole(rule: Any, solver: Any) -> No
         assert max(imbalance(whole), imbalance(half)) < 1e-9
 
 
-def test_a_run_on_rollers_settles_before_obstacles() -> None:
+def test_run_on_rollers_converges_at_obstacles() -> None:
     solver = stepping(0.9, 0.6)["solver"] | {"settle": {"tolerance": 1e-6}}
     settled = on_rollers(True, solver=solver, steps=500, record={"at": [0]})
     assert settled.status == "settled"
@@ -237,7 +237,7 @@ def test_a_run_on_rollers_settles_before_obstacles() -> None:
 
 
 @pytest.mark.parametrize("rule", [SPRINGS, ELASTIC], ids=["springs", "elastic"])
-def test_what_is_led_beneath_an_oblique_plate_goes_along_it(rule: Any) -> None:
+def test_particle_guided_under_an_inclined_plate_slides_along_it(rule: Any) -> None:
     """Wherever steps come from; what the plate exerts across the guide is a reaction of it."""
     corner = {"select": {"nearest": [[6.0, 4.0]]}, **displaced(0.0, 0.4), "axes": ["y"]}
     given = {
@@ -256,7 +256,7 @@ def test_what_is_led_beneath_an_oblique_plate_goes_along_it(rule: Any) -> None:
     assert imbalance(found[0]) < 1e-10
 
 
-def test_guided_particles_are_warned_of_where_no_way_is_left() -> None:
+def test_blocked_guided_particles_give_a_warning() -> None:
     """A plate across the axis along which they are led; one beneath which they can go is none."""
     right = {"select": {"edge": "right"}, **displaced(0.5, 0.0), "axes": ["x"]}
     hold = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
@@ -274,7 +274,7 @@ PRESSING = {"disc": displaced(0.2, -1.4), "ring": displaced(-0.1, -0.15)}
 
 
 @pytest.mark.parametrize("shape", CURVED)
-def test_before_round_outlines_the_way_does_not_matter(shape: str) -> None:
+def test_contact_at_round_outlines_is_path_independent(shape: str) -> None:
     """Cells are cut, so that the compliance of particles depends on the direction."""
     given = {
         **TRIANGLES, "rule": ELASTIC,
@@ -291,7 +291,7 @@ def test_before_round_outlines_the_way_does_not_matter(shape: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["disc", "ring", "polygon"])
-def test_the_way_out_is_linearised_exactly(shape: str) -> None:
+def test_projection_is_linearised_exactly(shape: str) -> None:
     """Compare T with differences of the final positions of particles, which do not move along the
     normal."""
     parts = HEXAGONAL | {"obstacles": [{"shape": SHAPES[shape]}], "leaders": []}
@@ -318,7 +318,7 @@ def test_the_way_out_is_linearised_exactly(shape: str) -> None:
     np.testing.assert_allclose(turned, np.stack(columns).transpose(2, 1, 0), atol=1e-8)
 
 
-def test_the_contact_of_a_disc_is_found_quadratically() -> None:
+def test_contact_of_a_disc_converges_quadratically() -> None:
     """Few sets are tried, since each is that of an exact linearisation."""
     disc = {"shape": {"type": "disc", "radius": 2.0, "centre": [7.0, 10.0]}, **displaced(0, -0.8)}
     held = [{"select": {"edge": "bottom"}, "motion": {"type": "hold"}}]
@@ -334,7 +334,7 @@ def test_a_body_that_loses_contact_is_not_pulled_back() -> None:
     assert np.array_equal(ds.contact_force.values[:, 0], 0.0 * ds.contact_force.values[:, 0])
 
 
-def test_what_obstacles_press_may_buckle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_body_pressed_by_obstacles_may_buckle(monkeypatch: pytest.MonkeyPatch) -> None:
     """A strip before a plate has a straight equilibrium, which is not stable."""
     monkeypatch.setattr(increments, "MOST_ROUNDS", 2)
     ends = [{"select": {"edge": "left"}, "motion": {"type": "hold"}}]
@@ -348,7 +348,7 @@ def test_what_obstacles_press_may_buckle(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize("rule", [SPRINGS, ELASTIC], ids=["springs", "elastic"])
 @pytest.mark.parametrize("select", [{"edge": "bottom"}, {"nearest": [[14.0, 0.0]]}], ids=str)
-def test_loads_that_press_on_a_floor_that_just_touches(rule: Any, select: Any) -> None:
+def test_loads_on_a_just_touching_floor(rule: Any, select: Any) -> None:
     """Nothing moves, and the floor bears all that leaders do not."""
     loads = [*FORCES, {"type": "load-displacement", "youngs_modulus": 1.0}]
     ds = at_rest(
@@ -439,7 +439,7 @@ def test_masses_are_stopped_by_obstacles() -> None:
     assert (np.diff(y[:5], axis=0) > 0.0).all()
 
 
-def test_an_obstacle_drives_masses_before_it() -> None:
+def test_obstacle_pushes_masses() -> None:
     """A plate that comes has them go with it; one that appears where they are flings none away."""
     plate = plane([5.2, 0.0], [-1.0, 0.0], **moving([-0.02, 0.0], 10))
     ds = run(masses(obstacles=[plate], steps=10))
@@ -452,7 +452,7 @@ def test_an_obstacle_drives_masses_before_it() -> None:
     assert late.position.values[5:, -1, 0].max() <= 4.5 + 1e-12
 
 
-def test_masses_before_obstacles_step_alike_in_kernels() -> None:
+def test_kernels_step_masses_at_obstacles_identically() -> None:
     from interpreted_kernels import interpreting
 
     scene = build_scene(pbdkit.Experiment(**masses()))
@@ -461,7 +461,7 @@ def test_masses_before_obstacles_step_alike_in_kernels() -> None:
     assert np.abs(state.u).max() > 0.05
 
 
-def test_two_plates_that_meet_leave_particles_least_deep() -> None:
+def test_colliding_plates_leave_particles_at_least_depth() -> None:
     """If no place is free there is no other result, and no particle flies off."""
     plates = [plane([0.0, 8.0 - d], [0.0, -n]) for n, d in ((1.0, 0.1), (-1.0, 0.0))]
     plates = [plates[0] | {"from": 2}, plane([0.0, 8.0], [0.0, 1.0], **{"from": 2})]

@@ -25,7 +25,7 @@ from tests.stepping.numba_engine.test_engine import ANEW, sheet
 ASKED = {"solver": {"type": "stepping", "engine": "gpu"}}
 
 
-def test_every_kind_of_scene_is_stepped_as_by_numpy():
+def test_every_kind_of_scene_matches_numpy():
     """In one process of the simulator: each takes seconds to begin."""
     script = [sys.executable, "-W", "ignore", str(Path(__file__).parents[1] / "gpu_cases.py")]
     places = os.pathsep.join(sys.path)
@@ -73,13 +73,13 @@ def assert_rounds_every_operation(text):
 
 
 @pytest.mark.parametrize("rule", gpu_cases.SHIPPED)
-def test_what_is_shipped_compiles_without_calls(rule, device):
+def test_shipped_components_compile_without_calls(rule, device):
     text = text_of(gpu_cases.shipped(rule), device)
     assert_rounds_every_operation(text)
     assert "call" not in text
 
 
-def test_between_them_is_all_that_is_shipped():
+def test_cases_cover_all_shipped_components():
     interfaces = {"rule": FollowerRule, "fracture": FractureModel, "frame": FramePolicy}
     for field, interface in interfaces.items():
         built_in = {c.type_name() for c in pbdkit_components() if issubclass(c, interface)}
@@ -94,7 +94,7 @@ def test_other_kinds_of_kernels_compile_too(name, device):
     assert "call" not in text
 
 
-def test_several_blocks_call_what_makes_them_wait_and_nothing_else(device, monkeypatch):
+def test_several_blocks_call_only_synchronisation(device, monkeypatch):
     monkeypatch.setattr(program, "ALONE", 0)
     text = text_of(gpu_cases.scene_of(sheet()), device)
     assert_rounds_every_operation(text)
@@ -117,13 +117,11 @@ class Various(pbdkit.FollowerRule):
         return total[1] * np.exp(-np.abs(total[0])) / (1.0 + np.hypot(total[0], 1.0))
 
 
-def test_functions_of_numpy_compile(device):
+def test_numpy_functions_compile(device):
     assert "call" not in text_of(gpu_cases.scene_of(sheet(rule=Various())), device)
 
 
-def test_without_the_option_products_and_sums_are_contracted_and_that_is_refused(
-    device, monkeypatch
-):
+def test_products_contracted_without_the_option_are_refused(device, monkeypatch):
     from pbdkit.stepping import cuda_engine as kernel
 
     monkeypatch.setattr(kernel, "_uncontracted", nullcontext)
@@ -146,7 +144,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("why", REFUSED)
-def test_what_it_cannot_do_is_refused_with_a_reason(why, monkeypatch):
+def test_unsupported_features_are_refused_with_a_reason(why, monkeypatch):
     monkeypatch.setattr(choice, "what_is_missing", str)
     scene = gpu_cases.scene_of(REFUSED[why] | ASKED)
     assert what_gpus_lack(scene) == why
@@ -157,7 +155,7 @@ def test_what_it_cannot_do_is_refused_with_a_reason(why, monkeypatch):
     assert refused.value.where == ("solver", "engine")
 
 
-def test_what_is_missing_is_said(monkeypatch):
+def test_missing_requirement_is_reported(monkeypatch):
     """The package here or elsewhere, the device on machines that have the package."""
     monkeypatch.setattr(limits, "find_spec", lambda name: None)
     scene = gpu_cases.scene_of(sheet(**ASKED))
@@ -168,7 +166,7 @@ def test_what_is_missing_is_said(monkeypatch):
         assert re.search("no GPU|compiler is missing", what_is_missing())
 
 
-def test_auto_never_takes_it(monkeypatch):
+def test_auto_never_selects_it(monkeypatch):
     monkeypatch.setattr(choice, "what_is_missing", str)
     body = {"type": "grid", "columns": 400, "rows": 400}
     assert choose(gpu_cases.scene_of(sheet(body=body, steps=5000))).engine == "compiled"

@@ -32,9 +32,7 @@ BLOWN = {
 
 
 @pytest.mark.parametrize(("engine", "every"), [("numpy", 1), ("compiled", 7), ("numpy", 5000)])
-def test_a_run_that_diverges_is_stopped_within_a_hundred_steps_or_a_record(
-    engine, every, compiled_at_length
-):
+def test_diverging_run_is_stopped_within_100_steps_or_a_record(engine, every, compiled_at_length):
     solver = {"type": "stepping", "relaxation": 1.5, "engine": engine}
     given = BLOWN | {"solver": solver, "record": {"every": every}}
     with pytest.raises(pbdkit.DivergedError, match=r"particle \d+, found at step (\d+)") as caught:
@@ -71,7 +69,7 @@ class Poisoned(pbdkit.FollowerRule):
 
 
 @pytest.mark.parametrize("every", [1, 5000])
-def test_not_a_number_is_found(every):
+def test_nan_is_detected(every):
     given = BLOWN | {"rule": Poisoned(type="poisoned"), "record": {"every": every}}
     with pytest.raises(pbdkit.DivergedError, match="under rule 'poisoned'") as caught:
         pbdkit.run(given, progress=False)
@@ -88,7 +86,7 @@ def test_a_far_start_and_a_released_leader_are_no_divergence():
         assert ds.attrs["status"] == "complete"
 
 
-def test_groups_that_contradict_each_other_from_where_they_stand_are_refused():
+def test_groups_contradictory_at_their_current_position_are_refused():
     start = {"type": "affine", "gradient": [[0.0, 0.0], [0.0, 0.0]], "shift": [1.0, 0.0]}
     turn = {"type": "rotation", "centre": [0.0, 0.0], "angle": 5.0, "steps": 3}
     one = {"numbers": [10]}
@@ -110,7 +108,7 @@ def diverged(**parts):
 @pytest.mark.parametrize(
     ("growth", "kept_every"), [(1.5, 5000), (1.07, 100)], ids=["from the start", "from a copy"]
 )
-def test_the_last_good_state_of_a_run_that_diverges_is_kept(
+def test_last_good_state_of_a_diverging_run_is_kept(
     engine, growth, kept_every, monkeypatch, compiled_at_length
 ):
     """From the start again where the guard has copied no state yet."""
@@ -143,7 +141,7 @@ def test_the_last_good_state_of_a_run_that_diverges_is_kept(
     assert (sparse.broken_step <= 0).all()
 
 
-def test_nothing_is_stepped_again_where_every_step_is_recorded(monkeypatch):
+def test_no_step_is_repeated_if_every_step_is_recorded(monkeypatch):
     def again(*_):
         raise AssertionError("stepped again")
 
@@ -153,7 +151,7 @@ def test_nothing_is_stepped_again_where_every_step_is_recorded(monkeypatch):
     assert "kept is" not in ds.stop_reason
 
 
-def test_who_stops_the_run_while_the_last_good_state_is_looked_for_keeps_what_was_recorded():
+def test_stop_during_the_search_for_the_last_good_state_keeps_records():
     given = BLOWN | {"solver": {"type": "stepping", "relaxation": 1.5}, "record": {"every": 5000}}
     calls = iter(range(10**6))
     sink = MemorySink()
@@ -174,14 +172,14 @@ class Vanishing(pbdkit.Diagnostic):
         return (np.inf if now.step else 0.0,)
 
 
-def test_a_state_whose_diagnostic_is_not_finite_is_not_kept():
+def test_state_with_a_diagnostic_that_is_not_finite_is_not_kept():
     solver = {"type": "stepping", "relaxation": 1.5}
     ds = diverged(diagnostics=[Vanishing()], solver=solver, record={"every": 5000})
     assert ds.time.values.tolist() == [0]
     assert "kept is" not in ds.stop_reason
 
 
-def test_a_divergence_with_neighbours_found_anew_keeps_its_records():
+def test_divergence_with_changing_neighbours_keeps_its_records():
     neighbours = {"type": "euclidean", "radius": 1.5, "reevaluate": True}
     solver = {"type": "stepping", "relaxation": 50.0, "memory": 3.0}
     given = BLOWN | {"neighbours": neighbours, "solver": solver, "record": {"every": 1}}

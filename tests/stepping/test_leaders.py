@@ -42,7 +42,7 @@ def way_of_mass(data):
     return x - x[0]
 
 
-def test_a_mass_on_a_bar_is_the_chain_of_columns():
+def test_mass_on_a_bar_equals_the_chain_of_columns():
     """Each column goes to the mean of both beside it; the mass moves by m v' = F - c v."""
     mass, damping, force = 8.0, 0.7, 0.02
     data = bar(mass, damping=damping, force=[force, 5.0], velocity=[0.01, 3.0])
@@ -56,7 +56,7 @@ def test_a_mass_on_a_bar_is_the_chain_of_columns():
     assert np.abs(way_of_mass(data) - found).max() < 1e-13
 
 
-def test_period_and_decay_of_a_mass_on_a_bar_that_settles_fast():
+def test_period_and_decay_of_a_mass_on_a_fast_bar():
     """A spring EA/L: s² M + s C + EA/L = 0."""
     period, damping, length, height = 2000.0, 100.0, 2, 1
     mass = (period / (2 * math.pi)) ** 2 * height / length
@@ -79,7 +79,7 @@ def talbot(transform, t, terms=28):
     return float(r / terms * (0.5 * np.exp(r * t) * transform(r) + terms_of_s.real.sum()))
 
 
-def test_a_mass_on_a_bar_that_is_as_slow_as_its_swing():
+def test_mass_on_a_slow_bar_matches_the_continuum():
     """u_t = D u_xx in the bar and m a = -EA u_x at its end: s² M + EA q coth(qL), q² = s/D. What
     resists the mass in a bar and not in the steps is given to it as damping: half a column that
     relaxes, EA/2D, and the step by which forces come late, EA/h."""
@@ -98,7 +98,7 @@ def test_a_mass_on_a_bar_that_is_as_slow_as_its_swing():
     assert np.abs(found[times] - exact).max() < 0.03 * np.abs(exact).max()
 
 
-def test_both_engines_agree_to_the_bit_and_resume_from_the_state():
+def test_both_engines_agree_bit_for_bit_and_resume_from_the_state():
     data = bar(3.0, damping=0.1, force=[0.01, 0.02], axes=["x", "y"])
     found = []
     for name, parts in (("numpy", (50,)), ("compiled", (20, 30))):
@@ -114,7 +114,7 @@ def test_both_engines_agree_to_the_bit_and_resume_from_the_state():
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
-def test_check_knows_the_lightest_mass(damping):
+def test_check_reports_the_smallest_mass(damping):
     """The stiffness of a particle between its held neighbours: k = 4 m - 2 c, from which steps grow
     or fade."""
 
@@ -158,13 +158,13 @@ def particle_5(data):
         ),
     ],
 )
-def test_what_does_not_go_with_masses_is_refused(parts, text):
+def test_incompatible_use_of_masses_is_refused(parts, text):
     with pytest.raises(pbdkit.ExperimentError, match=text):
         pbdkit.Experiment(**bar(1.0) | parts)
 
 
 @pytest.mark.parametrize("newton", [{"mass": 0.0}, {"mass": 1.0, "damping": -1.0}, {}])
-def test_masses_are_positive_and_damping_is_none_that_pushes(newton):
+def test_masses_are_positive_and_damping_is_not_negative(newton):
     data = bar(1.0)
     data["leaders"][1]["motion"] = {"type": "newton", **newton}
     with pytest.raises(pbdkit.ExperimentError, match=r"leaders\.1\.motion\.(mass|damping)"):

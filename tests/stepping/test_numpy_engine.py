@@ -71,7 +71,7 @@ def test_mean_displacement_rests_exactly_without_a_frame(lattice, neighbours):
 
 @every_lattice
 @every_rule
-def test_relaxation_memory_and_unbroken_bonds_leave_rest_exact(lattice, rule):
+def test_relaxation_momentum_and_unbroken_bonds_keep_rest_exact(lattice, rule):
     solver = {"type": "stepping", "relaxation": 0.7, "memory": 0.5}
     fracture = {"type": "threshold", "thresholds": [3.0]}
     u = displacements(lattice=lattice, rule=rule, solver=solver, fracture=fracture, steps=4)
@@ -88,7 +88,7 @@ def test_translating_every_particle_translates_the_step(lattice, neighbours, rul
 
 
 @combinations
-def test_a_body_whose_leaders_all_translate_ends_translated(lattice, neighbours):
+def test_body_with_translated_leaders_ends_translated(lattice, neighbours):
     shift = (0.5, -0.25)
     motion = {"type": "displace", "displacement": shift}
     leaders = [{"select": {"edge": edge}, "motion": motion} for edge in EDGES]
@@ -99,7 +99,7 @@ def test_a_body_whose_leaders_all_translate_ends_translated(lattice, neighbours)
 
 
 @with_some_rules
-def test_the_origin_does_not_matter_to_a_single_bit(lattice, neighbours, rule):
+def test_results_are_bitwise_independent_of_the_origin(lattice, neighbours, rule):
     parts = {"neighbours": neighbours, "rule": rule, "leaders": [HOLD_LEFT, pull_right(0.3, 0.1)]}
     parts |= {"steps": 12}
     here = displacements(lattice=LATTICES[lattice], **parts)
@@ -108,7 +108,7 @@ def test_the_origin_does_not_matter_to_a_single_bit(lattice, neighbours, rule):
 
 
 @every_lattice
-def test_the_origin_does_not_matter_to_mixed_coordinates(lattice):
+def test_mixed_coordinates_are_independent_of_the_origin(lattice):
     parts = {"rule": "mixed-coordinate", "leaders": [HOLD_LEFT, pull_right(0.3, 0.1)]}
     here = displacements(lattice=LATTICES[lattice], **parts)
     far = displacements(lattice=LATTICES[lattice] | {"origin": [1e8, -1e8]}, **parts)
@@ -158,7 +158,7 @@ def test_mirrored_loading_gives_mirrored_displacements(lattice, neighbours, flip
 @pytest.mark.parametrize(
     ("lattice", "neighbours", "frame"), all_pairs(LATTICES, NEIGHBOURS, ["mean", "first", "wide"])
 )
-def test_a_particle_k_layers_away_moves_at_step_k_and_not_before(lattice, neighbours, frame):
+def test_particle_k_layers_away_moves_first_at_step_k(lattice, neighbours, frame):
     parts = {"lattice": lattice, "neighbours": neighbours, "frame": frame, "columns": 8, "rows": 6}
     scene = scene_of(**parts)
     leader = int(scene.raster.body_rows[0])
@@ -173,7 +173,7 @@ def test_a_particle_k_layers_away_moves_at_step_k_and_not_before(lattice, neighb
 
 @every_lattice
 @every_frame
-def test_the_frame_copies_the_body_of_this_step_or_with_lag_of_the_last(lattice, frame):
+def test_frame_copies_the_current_step_or_with_delay_the_previous(lattice, frame):
     parts = {"lattice": lattice, "frame": frame, "neighbours": "chebyshev-1"}
     scene = scene_of(**parts)
     u = displacements(leaders=[HOLD_LEFT, pull_right(0.3, 0.1)], steps=10, **parts)
@@ -219,7 +219,7 @@ FRACTURE = {"type": "threshold", "thresholds": [2.4]}
 @pytest.mark.parametrize(
     ("lattice", "rule", "fracture"), all_pairs(LATTICES, RULES, [None, FRACTURE])
 )
-def test_two_runs_and_any_cut_into_row_blocks_agree_bitwise(lattice, rule, fracture, monkeypatch):
+def test_repeated_runs_and_any_row_blocks_agree_bitwise(lattice, rule, fracture, monkeypatch):
     leaders = [HOLD_LEFT, pull_right(0.7, 0.1)]
     given = experiment(
         columns=7, rows=6, lattice=lattice, rule=rule, leaders=leaders, neighbours="chebyshev-1"
@@ -236,7 +236,7 @@ def test_two_runs_and_any_cut_into_row_blocks_agree_bitwise(lattice, rule, fract
 
 
 @every_lattice
-def test_the_order_and_division_of_leader_groups_does_not_matter(lattice):
+def test_order_and_division_of_leader_groups_do_not_matter(lattice):
     scene = scene_of(lattice=lattice)
     edges = [
         [int(r) + 1 for r in scene.raster.body_rows[part]] for part in (slice(5), slice(-5, None))

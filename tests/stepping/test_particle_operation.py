@@ -51,7 +51,7 @@ def scene_of(**parts):
     return build_scene(pbdkit.Experiment(**sheet(**parts)))
 
 
-def test_a_drag_takes_its_share_of_each_step():
+def test_drag_reduces_each_step_by_its_fraction():
     free, dragged = scene_of(), scene_of(**CASES["drag"])
     state, other = (Stepper(s).advance(initial_state(s), 3) for s in (free, dragged))
     before = other.copy()
@@ -73,27 +73,27 @@ def test_kernels_agree_to_the_last_bit(parts):
 
 
 @EVERY
-def test_several_steps_go_in_a_pass(parts):
+def test_several_steps_per_pass_are_possible(parts):
     with small_passes():
         scene = scene_of(**{"body": {"type": "grid", "columns": 36, "rows": 7}} | parts)
         assert single_steps(scene) == ""
         assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 3))
 
 
-def test_it_compiles():
+def test_operation_compiles():
     scene = scene_of(**CASES["drag"])
     assert_bitwise_equal(scene, CompiledStepper(scene))
     assert what_gpus_lack(scene) == ""
 
 
-def test_ranks_share_it(tmp_path):
+def test_operation_is_distributed_over_ranks(tmp_path):
     parts = sheet(**CASES["drag on all, torn"]) | {"steps": 12}
     written(parts, tmp_path / "one.nc")
     on_ranks(3, lambda ranks: written(parts, tmp_path / "three.nc", ranks))
     assert_same(tmp_path / "one.nc", tmp_path / "three.nc")
 
 
-def test_a_run_in_parts_is_the_whole_run(install, tensile, tmp_path):
+def test_run_in_parts_equals_the_whole_run(install, tensile, tmp_path):
     install("pbdkit-drag", Path(particle_operations.__file__).read_text())
     where = {"select": {"box": [1.0, 0.0, 2.0, 2.0]}}
     given = tensile | {"operations": [{"type": "drag", "factor": 0.3} | where]}
@@ -105,7 +105,7 @@ def test_a_run_in_parts_is_the_whole_run(install, tensile, tmp_path):
     assert_same_file(whole, parts)
 
 
-def test_an_equilibrium_stays_where_it_is():
+def test_equilibrium_is_unchanged():
     dragged = CASES["drag on all, torn"]["operations"]
     at_rest = {"solver": {"type": "equilibrium", "tolerance": 1e-9}}
     alone, with_drag = (
@@ -120,12 +120,12 @@ def test_an_equilibrium_stays_where_it_is():
 
 
 @pytest.mark.parametrize("solver", [{"type": "equilibrium"}, {"type": "stepping", "settle": {}}])
-def test_what_may_move_at_rest_has_no_equilibrium(solver):
+def test_operation_that_moves_at_rest_has_no_equilibrium(solver):
     with pytest.raises(pbdkit.ExperimentError, match="solver: 'wind' can move particles"):
         pbdkit.Experiment(**sheet(operations=[Wind(select={"edge": "top"})], solver=solver))
 
 
-def test_the_analysis_leaves_it_out_and_says_so():
+def test_analysis_omits_it_with_a_warning():
     experiment = pbdkit.Experiment(**sheet(**CASES["drag"]))
     analysis = pbdkit.analyse(experiment)
     assert not analysis.exact
@@ -133,13 +133,13 @@ def test_the_analysis_leaves_it_out_and_says_so():
     assert analysis.spectral_radius == pbdkit.analyse(pbdkit.Experiment(**sheet())).spectral_radius
 
 
-def test_it_selects_somebody():
+def test_empty_selection_is_refused():
     nobody = Drag(select={"box": [90.0, 90.0, 91.0, 91.0]})
     with pytest.raises(pbdkit.ExperimentError, match=r"operations.0.select: selects no particle"):
         scene_of(operations=[nobody])
 
 
-def test_it_returns_a_vector():
+def test_operation_must_return_a_vector():
     class Odd(Drag):
         type: Literal["odd"] = "odd"
 
@@ -152,7 +152,7 @@ def test_it_returns_a_vector():
         Stepper(scene).advance(initial_state(scene))
 
 
-def test_a_file_names_it_and_is_written_as_it_was(tmp_path):
+def test_file_names_it_and_round_trips(tmp_path):
     (tmp_path / "e.json").write_text(
         json.dumps(sheet(operations=[{"type": "drag", "select": {"edge": "top"}, "factor": 0.5}]))
     )

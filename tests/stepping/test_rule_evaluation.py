@@ -150,7 +150,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("part", MISTAKES, ids=lambda part: part.__name__)
-def test_a_run_names_place_cause_and_remedy(part):
+def test_error_in_a_run_names_place_cause_and_remedy(part):
     named = {"type": part.type_name()}
     settings = {"diagnostics": [named]} if issubclass(part, Measured) else {"rule": named}
     with pytest.raises(pbdkit.PbdkitError) as caught:

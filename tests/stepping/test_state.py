@@ -81,7 +81,7 @@ def test_a_chain_with_a_weak_bond_follows_the_exact_law(extension, way):
     assert not (ds.broken_step >= 0).any()
 
 
-def test_damage_stays_when_the_load_goes():
+def test_damage_remains_after_unloading():
     motion = {"type": "path", "steps": [1000, 2000, 3000],
               "displacements": [[0.7, 0.0], [0.1, 0.0], [0.1, 0.0]]}  # fmt: skip
     leaders = [LEFT, {"select": {"edge": "right"}, "motion": motion}]
@@ -120,7 +120,7 @@ def test_a_state_is_a_checkpoint(store):
     assert (whole.broken_step > 7).any()
 
 
-def test_the_draw_depends_on_the_seed_alone():
+def test_random_draw_depends_on_the_seed_alone():
     one, same = run(sheet(seed=7)), run(sheet(seed=7))
     other = run(sheet(seed=8))
     assert one.drop_attrs().identical(same.drop_attrs())
@@ -138,13 +138,13 @@ def test_the_draw_depends_on_the_seed_alone():
     assert crowded.zeal[~body].isnull().all()
 
 
-def test_rerunning_a_dataset_draws_the_same():
+def test_rerunning_a_dataset_draws_the_same_numbers():
     ds = run(sheet(seed=3))
     again = pbdkit.rerun(ds, components=PARTS, progress=False)
     assert ds.drop_attrs().identical(again.drop_attrs())
 
 
-def test_what_is_remembered_is_recorded_with_its_units(tmp_path):
+def test_state_variables_are_recorded_with_units(tmp_path):
     ds = run(sheet(rule=Tiring()))
     assert ds.onset.dims == ds.broken_step.dims == ("bond",)
     assert ds.damage.dims == ds.visits.dims == ("time", "bond")
@@ -162,14 +162,14 @@ def test_what_is_remembered_is_recorded_with_its_units(tmp_path):
     assert narrow.damage.dtype == np.float32
 
 
-def test_spared_bonds_keep_what_they_start_with():
+def test_unbreakable_bonds_keep_their_initial_values():
     ds = run(sheet(fracture=Weakest(spread=0.3, frame_bonds=False), frame={"type": "mean"}))
     frame = (ds.role.values == 1)[ds.bond_ends.values - 1].any(axis=1)
     assert not ds.damage[:, frame].any()
     assert ds.damage[:, ~frame].any()
 
 
-def test_a_rule_reads_what_it_remembers_however_neighbours_are_found():
+def test_rule_reads_its_state_with_any_neighbour_search():
     near = {"type": "euclidean", "radius": 1.2}
     plain = {"type": "none"}
     leaders = [LEFT, pull_right(0.01, 0.0, 5)]
@@ -193,7 +193,7 @@ def test_single_precision_keeps_single_numbers():
     assert 0.0 < abs(single.damage - exact.damage).max() < 5e-6
 
 
-def test_the_operator_of_a_softened_state_is_the_step():
+def test_operator_of_a_softened_state_equals_the_step():
     """Linear in u at given damage: the operator makes the steps, to rounding."""
     from pbdkit.linear.operator import step_operator
 

@@ -55,7 +55,7 @@ def test_parameters_have_names_units_and_their_paths(swept):
         (["rule.type", "fracture.type"], ["rule", "fracture"]),
     ],
 )
-def test_automatic_names_are_the_shortest_that_mean_something(paths, names):
+def test_automatic_names_are_the_shortest_meaningful_ones(paths, names):
     from pbdkit.sweeps.specification import names_of
 
     assert [*names_of(paths, {"time"}).values()] == names
@@ -73,13 +73,13 @@ def test_automatic_names_are_the_shortest_that_mean_something(paths, names):
         ({"body.width": "w", "rule.poisson_ratio.steel": "w"}, "two parameters have the same name"),
     ],
 )
-def test_wrong_names_are_refused(names, said):
+def test_invalid_names_are_refused(names, said):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         pbdkit.sweep(PLATE, vary=VARY, names=names, workers=1, progress=False)
     assert said in str(caught.value)
 
 
-def test_a_member_is_the_run_that_its_parameters_make(swept):
+def test_member_equals_the_run_of_its_parameters(swept):
     one = swept.pbd.member(poisson_ratio=0.3, steel=0.2, span=7)
     again = pbdkit.rerun(one, progress=False)
     last = again.u.isel(time=-1)
@@ -88,7 +88,7 @@ def test_a_member_is_the_run_that_its_parameters_make(swept):
     assert swept.pbd.member(steel=0.2).status.dims == ("poisson_ratio", "span")
 
 
-def test_maps_are_drawn_at_rest_where_positions_were_not_kept(swept):
+def test_maps_are_drawn_at_rest_without_recorded_positions(swept):
     ax = swept.pbd.member(poisson_ratio=0.3, steel=0.2, span=8).pbd.plot("u_x")
     assert "drawn at rest" in ax.get_title()
 
@@ -103,13 +103,13 @@ def test_maps_are_drawn_at_rest_where_positions_were_not_kept(swept):
         ),
     ],
 )
-def test_what_no_member_has_is_said(swept, choice, said):
+def test_invalid_member_selection_is_refused(swept, choice, said):
     with pytest.raises(pbdkit.ExperimentError) as caught:
         swept.pbd.member(**choice)
     assert said in str(caught.value)
 
 
-def test_commands_choose_a_member(swept, call, tmp_path, monkeypatch):
+def test_commands_select_a_member(swept, call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     swept.to_netcdf("s.nc")
     refused = call("plot", "s.nc", "--color", "u_x")

@@ -65,7 +65,7 @@ def same(one, other):
             assert one[name].values.tobytes() == other[name].values.tobytes()
 
 
-def test_serial_processes_and_dask_give_the_same_bits(small):
+def test_serial_processes_and_dask_agree_bitwise(small):
     from distributed import Client
 
     asked = {"vary": VARY, "replicates": 2}
@@ -77,7 +77,7 @@ def test_serial_processes_and_dask_give_the_same_bits(small):
         same(serial, pbdkit.sweep(small, **asked, client=client, progress=False))
 
 
-def test_members_are_the_runs_of_their_experiments(small):
+def test_members_equal_the_runs_of_their_experiments(small):
     found = swept(small, vary=VARY)
     assert found.position.dims == ("relaxation", "columns", "time", "particle", "axis")
     for w in (0.5, 1.0):
@@ -123,7 +123,7 @@ def test_dimensions_and_their_names(small):
     assert found.time.values.tolist() == [10]
 
 
-def test_a_range_by_equal_factors_and_one_of_whole_numbers(small):
+def test_geometric_and_integer_ranges(small):
     vary = {"solver.relaxation": {"from": 0.1, "to": 1.0, "count": 3, "scale": "log"},
             "steps": {"from": 4, "to": 8, "count": 3}}  # fmt: skip
     found = swept(small, vary=vary, keep={"variables": ["position"], "times": [0, 6]})
@@ -133,7 +133,7 @@ def test_a_range_by_equal_factors_and_one_of_whole_numbers(small):
     assert found.position.sel(steps=4, time=6).isnull().all()
 
 
-def test_replicates_have_the_seeds_that_are_promised(small):
+def test_replicates_have_the_documented_seeds(small):
     found = swept(small | {"seed": 7}, replicates=3, keep={"variables": ["position"]})
     spawned = np.random.SeedSequence(7).spawn(3)
     assert found.seed.values.tolist() == [int(s.generate_state(1)[0]) for s in spawned]
@@ -143,7 +143,7 @@ def test_replicates_have_the_seeds_that_are_promised(small):
     assert "replicate" not in swept(small, vary={"steps": [2]}).dims
 
 
-def test_repeating_runs_nothing_again_and_more_runs_the_rest(small, tmp_path, run_only):
+def test_repeating_runs_nothing_and_extending_runs_only_new_members(small, tmp_path, run_only):
     vary = {"solver.relaxation": [0.5, 1.0]}
     first = swept(small, vary=vary, folder=tmp_path)
     assert len(run_only) == 2
@@ -153,7 +153,7 @@ def test_repeating_runs_nothing_again_and_more_runs_the_rest(small, tmp_path, ru
     assert len(run_only) == len(set(run_only)) == 3
 
 
-def test_failures_stop_nobody_and_are_told(call, small):
+def test_failures_are_reported_and_stop_no_other_member(call, small):
     sweep = {"experiment": small | {"steps": 3000},
              "vary": {"solver.relaxation": [0.5, 5.0, 1.0]}, "keep": {"times": "last"}}  # fmt: skip
     Path("s.json").write_text(json.dumps(sweep))
@@ -176,7 +176,7 @@ def test_failures_stop_nobody_and_are_told(call, small):
     assert "contains all members of a sweep" in call("plot", "s/sweep.nc").err
 
 
-def test_what_a_member_raises_is_its_own_fault(small, probing):
+def test_exception_in_a_member_is_attributed_to_it(small, probing):
     probing("raise ValueError('no luck')")
     small["diagnostics"] = [{"type": "probe"}]
     with pytest.warns(
@@ -187,7 +187,7 @@ def test_what_a_member_raises_is_its_own_fault(small, probing):
     assert "no luck" in str(found.message.values[1])
 
 
-def test_who_kills_its_worker_is_given_up_and_the_others_run(small, probing):
+def test_member_that_kills_its_worker_is_lost_and_others_run(small, probing):
     probing("os.kill(os.getpid(), signal.SIGKILL)")
     small["diagnostics"] = [{"type": "probe"}]
     with pytest.warns(pbdkit.PbdkitWarning, match="steps=5: its process was killed"):
@@ -195,14 +195,14 @@ def test_who_kills_its_worker_is_given_up_and_the_others_run(small, probing):
     assert found.status.values.tolist() == ["lost", "complete", "complete"]
 
 
-def test_a_second_sweep_into_the_same_folder_is_refused(small, tmp_path):
+def test_second_sweep_into_the_same_directory_is_refused(small, tmp_path):
     running = pytest.raises(pbdkit.StorageError, match="another sweep is running in this folder")
     with stores.Store(tmp_path), running:
         swept(small, vary={"steps": [2]}, folder=tmp_path)
     swept(small, vary={"steps": [2]}, folder=tmp_path)
 
 
-def test_a_flipped_bit_is_named_and_that_member_runs_again(small, tmp_path, run_only):
+def test_flipped_bit_is_named_and_that_member_reruns(small, tmp_path, run_only):
     asked = {"vary": {"steps": [5, 6, 7]}, "folder": tmp_path}
     first = swept(small, **asked)
     for column in ("content", "message", "status", "key", "digest"):
@@ -226,9 +226,7 @@ def flip(path, column):
     database.close()
 
 
-def test_large_members_are_files_and_a_flipped_bit_in_one_is_named(
-    small, tmp_path, run_only, monkeypatch
-):
+def test_large_members_are_files_and_a_flipped_bit_is_named(small, tmp_path, run_only, monkeypatch):
     monkeypatch.setattr(stores, "LARGE_BYTES", 1000)
     asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
     first = swept(small, **asked)
@@ -246,7 +244,7 @@ def test_large_members_are_files_and_a_flipped_bit_in_one_is_named(
     assert len(run_only) == 4
 
 
-def test_the_store_of_somebody_else_is_left_alone(small, tmp_path):
+def test_store_of_another_program_is_kept(small, tmp_path):
     path = tmp_path / stores.DATABASE
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE ours (x)")
@@ -261,7 +259,7 @@ def test_the_store_of_somebody_else_is_left_alone(small, tmp_path):
     assert path.read_bytes() == b"words " * 1000
 
 
-def test_a_database_that_is_cut_gives_no_member_the_values_of_another(small, tmp_path):
+def test_truncated_database_mixes_no_members(small, tmp_path):
     """SQLite reads zeros there, and takes what follows for row 0."""
     asked = {"vary": {"solver.relaxation": [0.4, 0.7, 1.0]}, "folder": tmp_path}
     small["body"] = {"type": "grid", "columns": 6, "rows": 4}
@@ -281,7 +279,7 @@ def test_a_database_that_is_cut_gives_no_member_the_values_of_another(small, tmp
             same(first, swept(small, **asked))
 
 
-def test_of_a_damaged_database_what_is_sound_stays_held(small, tmp_path, run_only):
+def test_intact_part_of_a_damaged_database_is_kept(small, tmp_path, run_only):
     asked = {"vary": {"steps": [5, 6, 7]}, "folder": tmp_path}
     first, path = swept(small, **asked), tmp_path / stores.DATABASE
     data = bytearray(path.read_bytes())
@@ -293,7 +291,7 @@ def test_of_a_damaged_database_what_is_sound_stays_held(small, tmp_path, run_onl
     assert run_only == []
 
 
-def test_members_whose_log_was_lost_are_said_to_be(small, tmp_path, run_only):
+def test_members_with_a_lost_log_are_reported(small, tmp_path, run_only):
     asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
     with stores.Store(tmp_path):
         empty = (tmp_path / stores.DATABASE).read_bytes()
@@ -308,7 +306,7 @@ def test_members_whose_log_was_lost_are_said_to_be(small, tmp_path, run_only):
         assert len(run_only) == 2
 
 
-def test_a_database_that_was_never_whole_is_in_nobodys_way(small, tmp_path):
+def test_incomplete_database_blocks_no_sweep(small, tmp_path):
     """The disk was full, or the power failed, while it was written."""
     path = tmp_path / stores.DATABASE
     with sqlite3.connect(path) as database:
@@ -325,7 +323,7 @@ def test_a_database_that_was_never_whole_is_in_nobodys_way(small, tmp_path):
 
 
 @pytest.mark.parametrize("call_fails", range(1, 9))
-def test_a_fault_while_the_database_is_made_leaves_a_folder_to_go_on_with(
+def test_failed_database_creation_leaves_a_resumable_directory(
     small, tmp_path, monkeypatch, call_fails
 ):
     """At each statement of its making, and at its new name."""
@@ -350,7 +348,7 @@ def test_a_fault_while_the_database_is_made_leaves_a_folder_to_go_on_with(
     assert {path.name for path in tmp_path.iterdir()} == {"lock", "sweep.nc", "sweep.sqlite"}
 
 
-def test_what_killed_sweeps_were_writing_is_removed(small, tmp_path):
+def test_leftovers_of_killed_sweeps_are_removed(small, tmp_path):
     (tmp_path / stores.LARGE_FOLDER).mkdir()
     left = [f".host.17.{'0f' * 16}.nc", f"{stores.LARGE_FOLDER}/.host.17.{'0f' * 16}"]
     for name in (*left, ".notes"):
@@ -360,7 +358,7 @@ def test_what_killed_sweeps_were_writing_is_removed(small, tmp_path):
     assert (tmp_path / ".notes").exists()
 
 
-def test_a_locked_database_is_waited_for_and_said_to_be_locked(small, tmp_path, monkeypatch):
+def test_locked_database_is_awaited_and_reported(small, tmp_path, monkeypatch):
     asked = {"vary": {"steps": [2]}, "folder": tmp_path}
     swept(small, **asked).close()
     assert sqlite_file.PATIENCE_S == 60.0
@@ -387,7 +385,7 @@ def meanwhile(monkeypatch, act):
     monkeypatch.setattr(SerialExecutor, "work", working)
 
 
-def test_a_database_that_is_removed_while_a_sweep_runs_is_said_to_be(small, tmp_path, monkeypatch):
+def test_removed_database_is_reported_during_a_sweep(small, tmp_path, monkeypatch):
     asked = {"vary": {"steps": [2, 3]}, "folder": tmp_path}
     meanwhile(monkeypatch, lambda: (tmp_path / stores.DATABASE).unlink())
     with pytest.warns(pbdkit.PbdkitWarning, match="was removed or replaced during the sweep"):
@@ -398,7 +396,7 @@ def test_a_database_that_is_removed_while_a_sweep_runs_is_said_to_be(small, tmp_
         same(first, swept(small, **asked))
 
 
-def test_a_folder_that_is_moved_while_a_sweep_runs_is_said_to_be(small, tmp_path, monkeypatch):
+def test_moved_directory_is_reported_during_a_sweep(small, tmp_path, monkeypatch):
     asked = {"vary": {"steps": [2, 3]}, "folder": tmp_path / "here"}
     meanwhile(monkeypatch, lambda: (tmp_path / "here").rename(tmp_path / "there"))
     with pytest.raises(pbdkit.StorageError, match="here: was moved or removed during"):
@@ -440,7 +438,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("change", "message"), WRONG, ids=[str(n) for n in range(len(WRONG))])
-def test_what_is_wrong_is_one_message_before_anything_runs(call, small, run_only, change, message):
+def test_errors_are_one_message_before_anything_runs(call, small, run_only, change, message):
     Path("../e.json").write_text(json.dumps(small))
     Path("link.json").symlink_to("../e.json")
     Path("s.json").write_text(json.dumps({"experiment": small} | change))
@@ -461,7 +459,7 @@ def test_the_experiment_is_a_file_beside_the_sweep_or_a_shipped_one(call, tmp_pa
         assert call("sweep", "s.json", "-o", f"out{n}", "--workers", "1").code == 0
 
 
-def test_a_stopped_sweep_goes_on_where_it_was(small, tmp_path):
+def test_stopped_sweep_resumes(small, tmp_path):
     """Ctrl-C reaches the program and its workers, as from a terminal."""
     path = tmp_path / "s.json"
     sweep = {"experiment": small | {"steps": 4000}, "vary": {"seed": [*range(30)]},
@@ -481,7 +479,7 @@ def test_a_stopped_sweep_goes_on_where_it_was(small, tmp_path):
     assert not (tmp_path / "out" / "sweep.nc").exists()
 
 
-def test_a_worker_that_hangs_before_it_begins_is_ended(small, tmp_path, monkeypatch):
+def test_worker_that_hangs_before_it_begins_is_terminated(small, tmp_path, monkeypatch):
     """The process is stopped, or its disk does not respond."""
     (tmp_path / "sitecustomize.py").write_text("import time\ntime.sleep(60)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
@@ -504,7 +502,7 @@ def jobs_of(experiment, count):
     ]
 
 
-def test_a_sweep_is_stopped_while_its_members_are_validated(small, tmp_path, monkeypatch):
+def test_sweep_can_be_stopped_during_validation(small, tmp_path, monkeypatch):
     asked = []
 
     def stopping():
@@ -537,12 +535,12 @@ class Lost:
         raise CancelledError("scheduler-connection-lost")
 
 
-def test_a_scheduler_that_is_lost_is_named_with_how_to_go_on(small):
+def test_lost_scheduler_is_named_with_the_way_to_resume(small):
     with pytest.raises(pbdkit.StorageError, match=r"the scheduler is lost.*is held, and the same"):
         [*ClusterExecutor(Lost()).work(jobs_of(small, 2), lambda: False)]
 
 
-def test_the_wait_for_a_worker_of_a_cluster_can_be_stopped(small):
+def test_wait_for_a_cluster_worker_can_be_stopped(small):
     from distributed import Client
 
     with Client(processes=False, n_workers=0, dashboard_address=None) as client:
@@ -596,7 +594,7 @@ def test_a_class_from_python_is_swept_in_this_process(small, tmp_path):
             pbdkit.sweep(given, vary={"rule.share": [0.3]}, progress=False, **wrong)
 
 
-def test_a_cluster_that_does_not_answer_is_one_message(call, small, monkeypatch):
+def test_unresponsive_cluster_is_one_message(call, small, monkeypatch):
     monkeypatch.setattr("pbdkit.cli.sweep.CONNECT_S", 0.5)
     Path("s.json").write_text(json.dumps({"experiment": small}))
     done = call("sweep", "s.json", "--dask", "tcp://127.0.0.1:1")
@@ -604,7 +602,7 @@ def test_a_cluster_that_does_not_answer_is_one_message(call, small, monkeypatch)
     assert "no scheduler responds" in done.err
 
 
-def test_the_log_is_written_ahead_on_local_file_systems_only(small, tmp_path, monkeypatch):
+def test_write_ahead_log_is_used_only_on_local_file_systems(small, tmp_path, monkeypatch):
     for local, journal in ((True, "wal"), (False, "truncate")):
         monkeypatch.setattr(sqlite_file, "is_local", lambda path, local=local: local)
         with stores.Store(tmp_path / journal) as store:
@@ -613,14 +611,14 @@ def test_the_log_is_written_ahead_on_local_file_systems_only(small, tmp_path, mo
         assert (found, synchronous) == (journal, 2)
 
 
-def test_members_that_record_in_different_precision_lose_no_digits(small):
+def test_members_of_different_precision_lose_no_digits(small):
     found = swept(small, vary={"record.dtype": ["float32", "float64"]})
     alone = pbdkit.run(small, progress=False)
     np.testing.assert_array_equal(found.position.isel(dtype=1), alone.position)
     assert found.position.dtype == np.float64
 
 
-def test_bonds_and_what_is_measured_at_every_step_are_joined(small):
+def test_bonds_and_measurements_of_every_step_are_joined(small):
     small["diagnostics"] = [{"type": "track", "numbers": [9]}, {"type": "broken"}]
     small["fracture"] = {"type": "threshold", "thresholds": [1.05]}
     found = swept(small, vary={"body.columns": [4, 5], "steps": [4, 6]})
@@ -635,7 +633,7 @@ def test_bonds_and_what_is_measured_at_every_step_are_joined(small):
         np.testing.assert_array_equal(member.broken_bonds, alone.broken_bonds)
 
 
-def test_what_only_some_members_have_is_theirs_alone(small):
+def test_variables_of_some_members_stay_theirs(small):
     """Though it is the same in all that have it."""
     none, torn = {"type": "none"}, {"type": "threshold", "thresholds": [1.05]}
     small["diagnostics"] = []
@@ -648,6 +646,6 @@ def test_what_only_some_members_have_is_theirs_alone(small):
     assert found.shell.dims == ("bond",)
 
 
-def test_under_fire(tmp_path):
+def test_stress_test(tmp_path):
     found = under_fire(tmp_path, members=16, kills=1, workers=2)
     assert found == {"exit": 0, "killed": 1, "right": 16, "wrong": 0, "run again": 0}

@@ -203,7 +203,7 @@ def made(faulty):
 
 
 @pytest.mark.parametrize("component", SOUND, ids=lambda c: c.type)
-def test_the_faulty_ones_are_sound_but_for_their_fault(component):
+def test_faulty_examples_without_their_fault_pass(component):
     report = examine(component, **ONE_SITE_AND_TWO)
     assert report.holds, str(report)
 
@@ -211,24 +211,24 @@ def test_the_faulty_ones_are_sound_but_for_their_fault(component):
 @pytest.mark.parametrize(
     ("faulty", "name", "words"), FAULTS, ids=lambda v: getattr(v, "__name__", "")
 )
-def test_every_fault_is_found_and_named(faulty, name, words):
+def test_every_fault_is_detected_and_named(faulty, name, words):
     report = examine(made(faulty), **ONE_SITE_AND_TWO, **NEAREST)
     assert [outcome.property for outcome in report.failed] == [name], str(report)
     assert words in report.failed[0].reason
 
 
-def test_every_property_finds_a_fault():
+def test_every_property_detects_a_fault():
     assert {p.name for p in PROPERTIES} == {name for _, name, _ in FAULTS}
 
 
-def test_every_property_says_what_it_asks_and_of_whom():
+def test_every_property_has_a_description_and_interfaces():
     for asked in PROPERTIES:
         assert len(asked.description) > 30, asked.name
         assert asked.interfaces
         assert set(asked.interfaces) <= set(INTERFACES.values())
 
 
-def test_nobody_is_excused():
+def test_no_component_is_excused():
     """Every property of an interface is tested on every component; the built-in ones are tested
     above."""
     for component in pbdkit_components():
@@ -237,7 +237,7 @@ def test_nobody_is_excused():
             assert [p.name for p in properties_of(type(example))] == asked
 
 
-def test_a_report_tells_what_ran_and_why_not():
+def test_report_lists_run_and_skipped_properties():
     text = str(examine(rules.Sound()))
     assert text.startswith(
         "FollowerRule sound: 21 properties ran, 0 failed; 3 skipped: it remembers nothing"
@@ -245,7 +245,7 @@ def test_a_report_tells_what_ran_and_why_not():
     assert "  held     rests" in text
 
 
-def test_after_a_fault_nothing_is_judged_that_means_nothing():
+def test_properties_that_depend_on_a_failed_one_are_skipped():
     report = examine(rules.WritesInput())
     assert {o.reason for o in report.skipped} == {
         "not tested, since changes-no-input fails",
@@ -268,7 +268,7 @@ def test_examples_come_from_defaults_and_from_fields():
         (Field(1.0, examples=["a"]), "Needy rejects its examples {'k': 'a'}: k: Input should be"),
     ],
 )
-def test_a_class_without_usable_examples_is_told(field, words):
+def test_class_without_usable_examples_is_reported(field, words):
     annotations = {"type": Literal["needy"], "k": float}
     needy = type(
         "Needy", (rules.Sound,), {"type": "needy", "k": field, "__annotations__": annotations}
@@ -290,7 +290,7 @@ class Unfinished(pbdkit.FollowerRule):
         return (1.0,)
 
 
-def test_a_class_that_lacks_a_method_is_told():
+def test_class_that_lacks_a_method_is_reported():
     for report in (examine(Unfinished), *examine_all([Unfinished])):
         assert [outcome.property for outcome in report.failed] == ["has-examples"]
         assert "Unfinished cannot be created: " in report.failed[0].reason
@@ -299,18 +299,18 @@ def test_a_class_that_lacks_a_method_is_told():
         conformance(Unfinished)
 
 
-def test_a_class_stands_for_its_first_example():
+def test_class_is_tested_by_its_first_example():
     assert examine(rules.Sound) == examine(rules.Sound())
 
 
-def test_what_goes_with_its_own_lattice_alone_is_tried_on_that():
+def test_component_of_its_own_lattice_is_tested_on_that():
     reports = list(examine_all([Kagome, OnKagome]))
     assert [report.holds for report in reports] == [True, True], "\n".join(map(str, reports))
     assert "takes-part" in [outcome.property for outcome in examine(OnKagome()).failed]
     assert examine(OnKagome(), lattice=Kagome()).holds
 
 
-def test_without_a_component_there_is_nothing_to_conform():
+def test_without_a_component_there_is_nothing_to_test():
     with pytest.raises(ValueError, match="given no component"):
         conformance()
 
@@ -344,7 +344,7 @@ def pbdkit_components():
 
 
 @pytest.mark.parametrize(("share", "code"), [("0.5", 0), ("1e-9 + 0.5", 1)])
-def test_one_line_is_enough_for_pytest(tmp_path, share, code):
+def test_one_line_suffices_for_pytest(tmp_path, share, code):
     source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "pbdkit.plugin.Vector(1e-9, 0.0) +")
     (tmp_path / "my_rules.py").write_text(source.replace("SHARE", share))
     (tmp_path / "test_mine.py").write_text(ONE_LINE)
@@ -357,7 +357,7 @@ def test_one_line_is_enough_for_pytest(tmp_path, share, code):
         assert "FollowerRule mine: rests: a body at rest moves by 1e-09" in done.stdout
 
 
-def test_plugins_check_tries_a_distribution(install, call):
+def test_plugins_check_tests_a_distribution(install, call):
     install("pbdkit-good", SOURCE.replace("SHARE", "0.5"))
     install(
         "pbdkit-bad",
@@ -381,7 +381,7 @@ def test_plugins_check_as_json_and_in_full(install, call):
     assert "  held     rests" in call("plugins", "check", "pbdkit-good", "--verbose").out
 
 
-def test_plugins_check_tells_what_cannot_be_tried(install, call):
+def test_plugins_check_reports_untestable_plugins(install, call):
     nothing = call("plugins", "check")
     assert (nothing.code, "no plugin is installed" in nothing.err) == (3, True)
     unknown = call("plugins", "check", "pbdkot")

@@ -81,7 +81,7 @@ def hole(tmp_path_factory):
     return dataset, written(dataset, tmp_path_factory.mktemp("hole"))
 
 
-def test_a_page_holds_where_the_outline_is_if_it_cuts_cells(hole, sheet):
+def test_page_contains_the_outline_if_it_cuts_cells(hole, sheet):
     held = RunContent(hole[0]).within(LIMIT)["run"]["lattice"]
     away = 0.5 - np.hypot(*(hole[0].reference.values - 1.0).T)
     edges = np.abs(hole[0].reference.values - 1.0).max(axis=1) - 1.0
@@ -170,7 +170,7 @@ def test_a_click_on_a_particle_shows_its_history(page, sheet):
     assert [len(re.findall("[ML]", line)) for line in lines] == [401, 401, 401]
 
 
-def test_a_click_on_a_bond_tells_its_story(page, torn):
+def test_click_on_a_bond_shows_its_events(page, torn):
     dataset, path = torn
     known = BondRecords(dataset, build_scene(pbdkit.load("paper/d1")))
     opened(page, path)
@@ -201,7 +201,7 @@ def test_a_click_on_a_bond_tells_its_story(page, torn):
     assert page.locator("aside").inner_text() == "No bond between these is shown."
 
 
-def test_the_ledger_has_what_broke_in_its_order(page, torn, monkeypatch, tmp_path):
+def test_list_has_the_broken_bonds_in_order(page, torn, monkeypatch, tmp_path):
     monkeypatch.setattr(bonds, "LISTED", 3)
     dataset, _ = torn
     opened(page, written(dataset, tmp_path))
@@ -237,7 +237,7 @@ def test_nothing_is_wider_than_the_window(page, torn, width):
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
-def test_prediction_and_what_happened(page, sheet):
+def test_predicted_and_measured_spectral_radius(page, sheet):
     dataset, path = sheet
     predicted = pbdkit.analyse("paper/a").spectral_radius
     measured = moves_of(dataset).decay
@@ -251,7 +251,7 @@ def test_pages_are_small(sheet, torn):
     assert all(path.stat().st_size < LIMIT for _, path in (sheet, torn))
 
 
-def test_a_large_body_is_thinned_and_the_page_says_so(page, tmp_path, monkeypatch):
+def test_large_body_is_thinned_with_a_note(page, tmp_path, monkeypatch):
     monkeypatch.setattr(report, "FIRST", 200_000)
     monkeypatch.setattr(report, "MOST_BYTES", 200_000)
     settings = ["body.columns=60", "body.rows=60", "steps=80"]
@@ -309,7 +309,7 @@ def test_members_of_different_bodies(page, tmp_path):
         assert f"{x:.6g}, {y:.6g}" in page.locator("aside table").inner_text()
 
 
-def test_members_that_failed_and_sweeps_without_positions(page, tmp_path):
+def test_failed_members_and_sweeps_without_positions(page, tmp_path):
     found = pbdkit.sweep(
         "paper/a",
         vary={"solver.relaxation": [1.0, 9.0]},
@@ -324,7 +324,7 @@ def test_members_that_failed_and_sweeps_without_positions(page, tmp_path):
     assert "diverged" in page.locator("section").nth(2).inner_text()
 
 
-def test_texts_of_the_file_are_texts(page, sheet, tmp_path):
+def test_texts_of_the_file_are_escaped(page, sheet, tmp_path):
     dataset = sheet[0].copy()
     dataset.attrs |= {"title": HOSTILE, "stop_reason": HOSTILE}
     dataset["pe1"] = dataset.pe1.assign_attrs(long_name=HOSTILE, units=HOSTILE)
@@ -335,7 +335,7 @@ def test_texts_of_the_file_are_texts(page, sheet, tmp_path):
     assert page.locator("img, b").count() == 0
 
 
-def test_an_equilibrium_and_its_certificate(page, tmp_path):
+def test_equilibrium_and_its_error_bound(page, tmp_path):
     dataset = pbdkit.run("modelling/inclusion", progress=False)
     opened(page, written(dataset, tmp_path))
     page.get_by_label("Colour").select_option("stress_xx")
@@ -352,7 +352,7 @@ def test_an_equilibrium_and_its_certificate(page, tmp_path):
     assert number_beside(page, "stress_xx") == pytest.approx(told, rel=1e-5)
 
 
-def test_what_was_benched_and_what_cannot_be_built_here(page, sheet, tmp_path):
+def test_benchmarks_and_scenes_that_cannot_be_built(page, sheet, tmp_path):
     dataset = sheet[0].copy()
     parts = json_attribute(dataset, "experiment") | {"rule": {"type": "of-nobody"}}
     dataset.attrs["experiment"] = json.dumps(parts)
@@ -367,7 +367,7 @@ def test_what_was_benched_and_what_cannot_be_built_here(page, sheet, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["paper/f2", "modelling/composite-plate", "stability/oscillation"])
-def test_the_experiment_shown_is_the_one_that_was_run(name):
+def test_displayed_experiment_is_that_of_the_run(name):
     whole = pbdkit.load(name).model_dump(mode="json", by_alias=True)
     text = experiment_text(whole)
     assert pbdkit.Experiment.build(read_text(text, "page")) == pbdkit.load(name)
@@ -375,7 +375,7 @@ def test_the_experiment_shown_is_the_one_that_was_run(name):
 
 
 @given(st.lists(st.floats(-(2.0**90), 2.0**90, width=32)))
-def test_packed_arrays_are_the_arrays(values):
+def test_packed_arrays_equal_the_arrays(values):
     np.testing.assert_array_equal(unpacked(packed(values, "f4")), np.float32(values))
 
 
@@ -384,13 +384,13 @@ def unpacked(made, kind="<f4"):
     return places.reshape(np.dtype(kind).itemsize, -1).T.copy().view(kind).ravel()
 
 
-def test_scripts_need_nothing_else():
+def test_scripts_have_no_imports():
     text = script("view", exports=True)
     assert not re.search(r"^\s*import\b", text, re.M)
     assert text.endswith("export const { LatticeView } = view_js;")
 
 
-def test_files_that_are_no_result(call):
+def test_other_files_are_refused(call):
     assert call("run", "e.json", "--quiet").code == 0
     made = call("report", "tensile.nc")
     assert made.code == 0
@@ -436,7 +436,7 @@ def test_a_body_of_one_particle_has_no_bonds(page, tmp_path):
     assert page.locator("h1").inner_text() == "alone"
 
 
-def test_a_dataset_that_is_cut(page, torn, tmp_path):
+def test_part_of_a_dataset(page, torn, tmp_path):
     some = torn[0].isel(particle=slice(20, 60), time=slice(0, 9))
     opened(page, written(some, tmp_path))
     assert ("the dataset does not contain all particles of the run") in page.locator(

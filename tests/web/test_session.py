@@ -106,7 +106,7 @@ def something(session, dice):
 
 
 @pytest.mark.parametrize("name", in_turn(shipped_names(), 3))
-def test_what_is_saved_repeats_what_was_seen_bit_for_bit(name, tmp_path):
+def test_saved_session_is_reproduced_bit_for_bit(name, tmp_path):
     session, said = session_of(name, tmp_path, CHANGED.get(name, ()))
     at_random(session, name, 40 if session.camera.rows.size < 300 else 8)
     assert session.script.groups[-1].hand
@@ -115,7 +115,7 @@ def test_what_is_saved_repeats_what_was_seen_bit_for_bit(name, tmp_path):
     assert_same(session.state, run_of(tmp_path / "made.yaml"))
 
 
-def test_a_part_of_what_was_done_is_saved_too(tmp_path):
+def test_part_of_a_session_is_saved(tmp_path):
     session, _ = session_of("paper/d1", tmp_path)
     at_random(session, 8)
     for n, step in enumerate((session.end // 3, session.end // 2, 1)):
@@ -125,7 +125,7 @@ def test_a_part_of_what_was_done_is_saved_too(tmp_path):
         assert_same(session.state, run_of(file))
 
 
-def test_kernels_repeat_it_too(interpreted, tmp_path, monkeypatch):
+def test_kernels_reproduce_the_session(interpreted, tmp_path, monkeypatch):
     monkeypatch.setattr(stage, "SMALL", 0)
     session, _ = session_of("paper/a", tmp_path, ["solver.engine=compiled"])
     assert session.stage.choice.engine == "compiled"
@@ -134,7 +134,7 @@ def test_kernels_repeat_it_too(interpreted, tmp_path, monkeypatch):
     assert_same(session.state, run_of(tmp_path / "made.yaml"))
 
 
-def test_who_goes_back_finds_the_same_states(tmp_path):
+def test_rewinding_gives_the_same_states(tmp_path):
     session, _ = session_of("paper/d1", tmp_path)
     at_random(session, 5)
     seen = {}
@@ -148,7 +148,7 @@ def test_who_goes_back_finds_the_same_states(tmp_path):
         np.testing.assert_array_equal(session.state.u, seen[step].u)
 
 
-def test_who_goes_back_and_does_something_forgets_what_came_after(tmp_path):
+def test_action_after_a_rewind_discards_later_ones(tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     session.advance(5)
     do(session, do="turn", name="solver.relaxation", value=0.5)
@@ -163,7 +163,7 @@ def test_who_goes_back_and_does_something_forgets_what_came_after(tmp_path):
     assert found["memory"] == {"steps": [3, 4], "values": [0.0, 0.25]}
 
 
-def test_a_turn_at_the_step_that_one_goes_back_to_is_forgotten(tmp_path):
+def test_parameter_change_at_the_rewound_step_is_discarded(tmp_path):
     """It holds from the step after that one on, and was made after it."""
     session, _ = session_of("paper/a", tmp_path)
     session.advance(5)
@@ -179,7 +179,7 @@ def test_a_turn_at_the_step_that_one_goes_back_to_is_forgotten(tmp_path):
     assert_same(session.state, run_of(tmp_path / "made.yaml"))
 
 
-def test_steps_that_cannot_be_made_forget_the_states_after_them(tmp_path, monkeypatch):
+def test_failed_steps_discard_later_states(tmp_path, monkeypatch):
     session, said = session_of("paper/a", tmp_path)
     for _ in range(10):
         session.advance(1)
@@ -195,7 +195,7 @@ def test_steps_that_cannot_be_made_forget_the_states_after_them(tmp_path, monkey
     assert session.step == session.end == max(session.history.steps) == 4
 
 
-def test_a_group_goes_where_the_mouse_leads_it_within_a_picture(tmp_path):
+def test_dragged_group_follows_the_mouse_within_one_frame(tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     session.advance(3)
     left = int(session.stage.scene.leading[0].rows[4])
@@ -211,7 +211,7 @@ def test_a_group_goes_where_the_mouse_leads_it_within_a_picture(tmp_path):
     assert session.stage.scene.leading[-1].group.leads(session.step + 1)
 
 
-def test_a_follower_follows_again_once_it_is_let_go(tmp_path):
+def test_released_follower_follows_again(tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     follower = 67
     do(session, do="grab", row=follower)
@@ -227,7 +227,7 @@ def test_a_follower_follows_again_once_it_is_let_go(tmp_path):
     assert (group["from"], group["until"]) == (1, 4)
 
 
-def test_a_line_across_a_moved_body_cuts_what_it_crosses(tmp_path):
+def test_line_across_a_moved_body_cuts_crossing_bonds(tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     session.advance(12)
     ends = session.camera.positions(session.state)[session.camera.bonds.astype(int)]
@@ -240,7 +240,7 @@ def test_a_line_across_a_moved_body_cuts_what_it_crosses(tmp_path):
     np.testing.assert_array_equal(np.flatnonzero(broken), np.flatnonzero(across & level))
 
 
-def test_one_bond_is_cut_and_none_that_crosses_it(tmp_path):
+def test_one_bond_is_cut_without_crossing_ones(tmp_path):
     session, _ = session_of("paper/a-chebyshev", tmp_path)
     for row in (3, 40, 131, 200):
         do(session, do="cut-bond", row=row)
@@ -248,7 +248,7 @@ def test_one_bond_is_cut_and_none_that_crosses_it(tmp_path):
     np.testing.assert_array_equal(np.flatnonzero(session.frame().broken), [3, 40, 131, 200])
 
 
-def test_long_ways_of_the_mouse_stand_in_a_table(tmp_path, monkeypatch):
+def test_long_mouse_paths_are_stored_in_a_table(tmp_path, monkeypatch):
     monkeypatch.setattr(saving, "INLINE", 10)
     session, said = session_of("paper/a", tmp_path)
     do(session, do="grab", row=int(session.stage.scene.leading[0].rows[0]))
@@ -265,7 +265,7 @@ def test_long_ways_of_the_mouse_stand_in_a_table(tmp_path, monkeypatch):
     assert_same(session.state, run_of(tmp_path / "made-2.yaml"))
 
 
-def test_nothing_is_overwritten(tmp_path):
+def test_no_file_is_overwritten(tmp_path):
     session, said = session_of("paper/a", tmp_path)
     with pytest.raises(pbdkit.ExperimentError, match="no step has been made yet"):
         do(session, do="save")
@@ -275,7 +275,7 @@ def test_nothing_is_overwritten(tmp_path):
     assert [Path(message["path"]).name for message in said] == ["made.yaml", "made-2.yaml"]
 
 
-def test_leaders_that_cannot_go_there_stay_and_it_is_said(tmp_path):
+def test_leaders_without_a_possible_position_stay_with_a_message(tmp_path):
     overlap = {
         "leaders": [
             {"select": {"edge": "left"}, "motion": {"type": "hold"}},
@@ -313,7 +313,7 @@ def test_leaders_that_cannot_go_there_stay_and_it_is_said(tmp_path):
         ([], "invalid command"),
     ],
 )
-def test_what_cannot_be_is_refused_with_nothing_done(command, told, tmp_path):
+def test_invalid_actions_are_refused_without_effect(command, told, tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     with pytest.raises(pbdkit.ExperimentError, match=re.escape(told)):
         execute(session, command_of(json.dumps(command)))
@@ -334,7 +334,7 @@ REFUSED = [
 
 @pytest.mark.parametrize("command", REFUSED)
 @pytest.mark.parametrize("back", [False, True])
-def test_what_is_refused_undoes_nothing_else(command, back, tmp_path, monkeypatch):
+def test_refused_action_keeps_earlier_ones(command, back, tmp_path, monkeypatch):
     """Neither what was done at this step before, nor what came after it."""
     session, _ = session_of("paper/a", tmp_path)
     session.advance(4)
@@ -372,14 +372,14 @@ def test_what_is_refused_undoes_nothing_else(command, back, tmp_path, monkeypatc
     assert_same(session.state, run_of(tmp_path / "made.yaml"))
 
 
-def test_numbers_from_which_others_are_drawn_are_not_turned(tmp_path):
+def test_parameters_of_random_draws_cannot_be_changed(tmp_path):
     session, _ = session_of("modelling/ageing", tmp_path)
     assert "fracture.failure" in session.script.numbers
     with pytest.raises(pbdkit.ExperimentError, match=r"no parameter 'fracture\.scatter'"):
         do(session, do="turn", name="fracture.scatter", value=0.1)
 
 
-def test_cuts_are_refused_where_the_rule_takes_none(tmp_path):
+def test_cuts_are_refused_for_rules_without_cuts(tmp_path):
     session, _ = session_of("material/gradient-layer", tmp_path)
     line = {"from": [0.3, -1.0], "to": [0.3, 5.0]}
     with pytest.raises(pbdkit.ExperimentError, match="is incompatible with this setting of cuts"):
@@ -388,7 +388,7 @@ def test_cuts_are_refused_where_the_rule_takes_none(tmp_path):
     assert not session.script.cuts
 
 
-def test_states_that_are_kept_take_no_more_room_than_they_may(tmp_path, monkeypatch):
+def test_number_of_stored_states_is_bounded(tmp_path, monkeypatch):
     session, _ = session_of("paper/a", tmp_path)
     monkeypatch.setattr(history, "MOST", 16)
     kept = history.History(session.state)
@@ -414,7 +414,7 @@ def test_states_that_are_kept_take_no_more_room_than_they_may(tmp_path, monkeypa
         (["neighbours={type: euclidean, radius: 1.1, reevaluate: true}"], "unknown", "spectrum"),
     ],
 )
-def test_the_judgement_says_why(settings, word, told):
+def test_verdict_has_a_reason(settings, word, told):
     found = judged(pbdkit.load("paper/a", settings=settings))
     assert (found.word, told in found.why) == (word, True), found
 
@@ -521,12 +521,12 @@ def strange(address, query, headers):
 
 
 @pytest.mark.parametrize("who", STRANGERS)
-def test_strangers_get_no_page(address, who):
+def test_requests_without_token_get_no_page(address, who):
     assert asked(*strange(address, *STRANGERS[who])) == 403
 
 
 @pytest.mark.parametrize("who", [*STRANGERS, "no page at all"])
-def test_strangers_get_no_socket(address, who):
+def test_requests_without_token_get_no_socket(address, who):
     query, headers = STRANGERS.get(who, ("token={token}", {}))
     there, headers = strange(address, query, headers)
     if who != "no page at all":
@@ -558,7 +558,7 @@ def raw_socket(address, headers):
         client.ClientProtocol = before
 
 
-def test_who_knows_the_address_gets_the_page_and_nothing_else(address):
+def test_request_with_token_gets_the_page_and_nothing_else(address):
     with urllib.request.urlopen(address, timeout=10) as answer:
         text, policy = answer.read().decode(), answer.headers["Content-Security-Policy"]
     assert "http" not in re.sub(r"http://www.w3.org/2000/svg", "", text)
@@ -569,7 +569,7 @@ def test_who_knows_the_address_gets_the_page_and_nothing_else(address):
     assert asked(address.replace("/?", "/etc/passwd?")) == 404
 
 
-def test_the_end_waits_for_no_page(tmp_path):
+def test_shutdown_waits_for_no_page(tmp_path):
     """Neither for requests of which half has come, nor for pages that read nothing."""
     session, _ = session_of("paper/a", tmp_path)
     with ExitStack() as lines:
@@ -591,13 +591,13 @@ def test_the_end_waits_for_no_page(tmp_path):
         assert time.monotonic() - begin < 6.0
 
 
-def test_a_port_that_is_taken_is_said(address, tmp_path):
+def test_occupied_port_is_reported(address, tmp_path):
     port = int(re.search(r":(\d+)/", address)[1])
     with pytest.raises(pbdkit.ExperimentError, match=f"--port {port}: cannot be served at"):
         live.main(["paper/a", "--no-browser", "--port", str(port)], standalone_mode=False)
 
 
-def test_nobody_looks_on_and_the_body_rests(tmp_path):
+def test_stepping_pauses_without_viewers(tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     with served(session) as there:
         with Onlooker(there) as page:
@@ -613,7 +613,7 @@ class Gone:
         raise ConnectionClosed(None, None)
 
 
-def test_who_is_gone_is_told_nothing_and_nobody_minds():
+def test_messages_to_closed_pages_are_ignored():
     async def told():
         page = SocketViewer(asyncio.get_running_loop())
         page.tell({"is": "note"})
@@ -625,7 +625,7 @@ def test_who_is_gone_is_told_nothing_and_nobody_minds():
     assert page._waiting.empty()
 
 
-def test_tokens_are_never_the_same():
+def test_tokens_are_unique():
     tokens = {Access(1).token for _ in range(20)}
     assert len(tokens) == 20
     assert min(map(len, tokens)) >= 43
@@ -640,12 +640,12 @@ FAR = [
 
 
 @pytest.mark.parametrize("command", FAR)
-def test_places_that_no_body_reaches_are_no_commands(command):
+def test_coordinates_out_of_range_are_refused(command):
     with pytest.raises(pbdkit.ExperimentError, match=r"invalid command: .* 1000000000000"):
         command_of(json.dumps(command))
 
 
-def test_cuts_as_far_as_commands_reach_cut_or_miss(tmp_path):
+def test_cuts_at_the_coordinate_limits_are_safe(tmp_path):
     session, _ = session_of("paper/d1", tmp_path)
     for end in ([FARTHEST, FARTHEST], [-FARTHEST, 0.0], [0.0, 0.0]):
         with suppress(pbdkit.ExperimentError):
@@ -654,7 +654,7 @@ def test_cuts_as_far_as_commands_reach_cut_or_miss(tmp_path):
     assert np.isfinite(session.state.u).all()
 
 
-def test_pages_that_say_nonsense_are_told_so_and_the_session_goes_on(address):
+def test_invalid_messages_are_answered_and_the_session_continues(address):
     with Onlooker(address) as page, Onlooker(address) as other:
         assert page.hear("scene")["count"] == 144
         for nonsense in (
@@ -677,7 +677,7 @@ def test_pages_that_say_nonsense_are_told_so_and_the_session_goes_on(address):
         assert len(page.hear("picture")) >= 48 + 8 * 144
 
 
-def test_a_page_gets_the_newest_picture_and_only_when_it_is_ready(tmp_path):
+def test_page_gets_the_newest_picture_when_it_is_ready(tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     with served(session) as there, Onlooker(there) as page:
         first = page.hear("picture")
@@ -689,7 +689,7 @@ def test_a_page_gets_the_newest_picture_and_only_when_it_is_ready(tmp_path):
         assert made[1] - made[0] > 5
 
 
-def test_a_notebook_sends_and_hears_what_a_page_does(monkeypatch, tmp_path):
+def test_notebook_exchanges_the_messages_of_a_page(monkeypatch, tmp_path):
     sent = []
     monkeypatch.setattr(
         LiveWidget, "send", lambda self, message, buffers=None: sent.append((message, buffers))
@@ -736,7 +736,7 @@ CELL = """async ([esm, messages, picture]) => {
 }"""
 
 
-def test_the_module_of_a_notebook_shows_a_body_and_goes_again(page, tmp_path):
+def test_notebook_module_shows_a_body_and_is_removed(page, tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     session.advance(7)
     messages = json.loads(json.dumps([scenery(session), standing(session)]))
@@ -745,7 +745,7 @@ def test_the_module_of_a_notebook_shows_a_body_and_goes_again(page, tmp_path):
     assert found == [["join", "seen"], "step 7", 0]
 
 
-def test_what_is_missing_is_said_with_the_remedy(monkeypatch):
+def test_missing_requirement_is_reported_with_the_remedy(monkeypatch):
     monkeypatch.setattr("pbdkit.errors.find_spec", lambda name: None)
     for call in (lambda: pbdkit.live("paper/a"), lambda: live.main(["paper/a", "--no-browser"])):
         with pytest.raises(pbdkit.ExperimentError, match=re.escape("pip install 'pbdkit[live]'")):
@@ -756,7 +756,7 @@ PLACE = """row => { const { view } = pbdkitLive;
   return view.toClient(...view.positions.subarray(2 * row, 2 * row + 2)); }"""
 
 
-def test_a_page_in_a_browser_leads_turns_cuts_and_saves(page, tmp_path):
+def test_page_in_a_browser_drags_changes_cuts_and_saves(page, tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     with served(session) as address:
         page.goto(address)

@@ -41,7 +41,7 @@ def displacements(lattice, **parts):
 
 @BOTH
 @pytest.mark.parametrize("a", [1.0, 0.7, 13.0])
-def test_sites_have_as_many_bonds_as_they_should_all_of_length_a(lattice, a):
+def test_coordination_number_and_bond_length_of_each_site(lattice, a):
     cell = lattice(a=a).cell()
     for sublattice in range(len(cell.sites)):
         near = cell.offsets(sublattice, 1.7 * a)
@@ -60,7 +60,7 @@ def test_area_of_a_site(lattice, area):
 
 
 @BOTH
-def test_sites_are_those_of_the_hexagonal_lattice_with_the_same_index(lattice):
+def test_sites_match_the_hexagonal_lattice_at_equal_index(lattice):
     whole = pbdkit.run(experiment({"type": "hexagonal", "a": 0.7}), progress=False)
     place = dict(zip(map(tuple, whole.site.values), whole.reference.values, strict=True))
     ours = pbdkit.run(experiment(lattice(a=0.7)), components=COMPONENTS, progress=False)
@@ -80,7 +80,7 @@ def test_shells_of_bond_steps_are_the_coordination_sequence(lattice):
         assert [len(shell) for shell in shells] == expected
 
 
-def test_bond_steps_tell_apart_what_is_equally_far_on_the_kagome_lattice():
+def test_bond_steps_separate_equal_distances_on_the_kagome_lattice():
     near, beyond, far = BondSteps(shells=3).shells_around(Kagome().cell(), 0)
     lengths = [sorted(round(o.length, 9) for o in shell) for shell in (near, beyond, far)]
     assert lengths[0] == [1.0] * 4
@@ -99,7 +99,7 @@ def test_on_the_hexagonal_lattice_bond_steps_are_rings():
 
 
 @BOTH
-def test_neighbours_that_surround_a_site_unevenly_are_refused(lattice):
+def test_asymmetric_neighbourhoods_are_refused(lattice):
     """Index distance means nothing to a lattice without centres of inversion."""
     asked = experiment(lattice(), neighbours={"type": "chebyshev", "shells": 2})
     if lattice is Kagome:
@@ -135,7 +135,7 @@ def led_all_round(depth, columns=18, rows=16):
     return [{"select": {"box": box}, "motion": {"type": "hold"}} for box in boxes]
 
 
-def test_on_the_kagome_lattice_they_are_of_every_rule():
+def test_on_the_kagome_lattice_they_are_equilibria_of_every_rule():
     """Its sites are centres of inversion: what opposite neighbours do cancels."""
     X, u = displacements(
         Kagome(),
@@ -149,7 +149,7 @@ def test_on_the_kagome_lattice_they_are_of_every_rule():
     np.testing.assert_allclose(u, X @ GRADIENT.T, atol=1e-12)
 
 
-def test_on_the_honeycomb_the_sublattices_shift_against_each_other():
+def test_honeycomb_sublattices_shift_relative_to_each_other():
     """Under strain E the distance-weighted mean vanishes where sublattice B has shifted against A.
 
     To first order Σ (n·E n) n + Σ ((n·s) n + s) = 0 over the three bonds n of A, so that
@@ -181,7 +181,7 @@ def test_on_the_honeycomb_the_sublattices_shift_against_each_other():
 
 @BOTH
 @pytest.mark.parametrize("shells", [1, 2])
-def test_the_barycentre_diffuses_with_a_quarter_of_the_mean_squared_bond(lattice, shells):
+def test_barycentre_diffusivity_is_a_quarter_of_the_mean_squared_bond(lattice, shells):
     """Steps to neighbours with their barycentre at the site are those of an unbiased walk."""
     neighbours = {"type": "bond-steps", "shells": shells}
     around = BondSteps(shells=shells).shells_around(lattice(a=2.0).cell(), 0)
@@ -205,7 +205,7 @@ def test_the_flat_band_of_the_kagome_lattice_bounds_its_spectrum():
     )
 
 
-def test_the_honeycomb_is_bipartite_so_that_its_spectrum_is_symmetric():
+def test_bipartite_honeycomb_has_a_symmetric_spectrum():
     asked = experiment(Honeycomb())
     found = pbdkit.identify(asked, components=COMPONENTS).spectrum
     assert (found.smallest, found.largest) == pytest.approx((-1.0, 1.0), abs=1e-9)
@@ -213,7 +213,7 @@ def test_the_honeycomb_is_bipartite_so_that_its_spectrum_is_symmetric():
     assert own.smallest_eigenvalue == pytest.approx(-own.spectral_radius, abs=1e-9)
 
 
-def test_every_side_gets_an_exact_triangle():
+def test_each_side_gives_an_exact_triangle():
     """The bonds of the honeycomb add up to zero exactly, and have one length."""
     for a in np.random.default_rng(1).lognormal(0.0, 5.0, 500):
         rests = [offset.rest for offset in Honeycomb(a=a).cell().offsets(0, 1.1 * a)]

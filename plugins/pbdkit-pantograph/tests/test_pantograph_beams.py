@@ -46,7 +46,7 @@ def shown(ds):
 
 
 @pytest.mark.parametrize("rows", [1, 3])
-def test_a_cantilever_is_exact_and_fibres_with_perfect_pivots_share_its_load(rows):
+def test_cantilever_is_exact_and_fibres_on_perfect_pivots_share_its_load(rows):
     """F = n · 3 EI w/L³ of n fibres: perfect pivots carry no shear from one to the next."""
     tip, length = 1e-5, 1.5
     motion = {"type": "displace", "displacement": [0.0, tip]}
@@ -77,7 +77,7 @@ def arc(links, turn):
     return body(links + 1, 1, 40 + 50 * links, 0.85 if links > 2 else 0.5, leaders=ends), corners
 
 
-def test_a_beam_between_turned_grips_is_an_arc_and_its_energy_of_second_order():
+def test_beam_between_rotated_grips_is_an_arc_with_second_order_energy():
     """The points lie on a circle; the energy tends to EI θ²/(2 L)."""
     turn, off = np.pi / 2, []
     for links in (2, 4):
@@ -113,7 +113,7 @@ def plain_energy(x, angles, X, bending, pivot):
     return total
 
 
-def test_force_and_energy_are_those_of_the_formula_and_the_energy_never_rises():
+def test_force_and_energy_match_the_formula_and_energy_never_increases():
     rule = {"type": "pantograph-beams", "stretching": 1.0, "bending": 0.1, "pivot": 0.05}
     grid = {"type": "grid", "columns": 3, "rows": 4}
     ds = pantograph(25, 0.0, body=grid, rule=rule, record={"every": 1}, seed=5,
@@ -132,7 +132,7 @@ def test_force_and_energy_are_those_of_the_formula_and_the_energy_never_rises():
             assert found.values[5, n] == pytest.approx((behind - ahead) / 2e-5, abs=1e-8)
 
 
-def test_the_one_mechanism_of_a_pantograph_costs_nothing():
+def test_mechanism_of_a_pantograph_has_zero_energy():
     """Drawn at two pivots on its axis, a sheet of rigid straight fibres gets narrower: its cells
     are rhombi of side 1, and no energy is left."""
     pulled, length = 0.3, 3 * ROOT
@@ -154,7 +154,7 @@ def test_the_one_mechanism_of_a_pantograph_costs_nothing():
     assert ds.energy.values[-1].sum() < 1e-13
 
 
-def test_elastic_pivots_resist_the_angle_between_the_fibres_alone():
+def test_elastic_pivots_resist_only_the_angle_between_fibres():
     """Second fibres turned by γ: ½ k t² a pivot, t = 2 tan(γ/2), where fibres hardly bend."""
     angle, spring = 0.4, 0.05
     shear = [[0.0, np.sin(angle)], [0.0, np.cos(angle) - 1]]
@@ -172,7 +172,7 @@ def test_elastic_pivots_resist_the_angle_between_the_fibres_alone():
     assert ds.energy.values[-1].sum() == pytest.approx(energy, rel=1e-3)
 
 
-def test_fibres_that_are_too_slender_are_refused():
+def test_too_slender_fibres_are_refused():
     with pytest.raises(pbdkit.ExperimentError, match=r"bending: is less than 1e-10 · stretching"):
         body(3, 3, 1, 0.0, rule={"type": "pantograph-beams", "bending": 1e-12})
 

@@ -84,7 +84,7 @@ RULE = {"type": "pantograph", "bending": BENDING, "shear": SHEAR}
 NOISE = {"type": "noise", "amplitude": 0.2}
 
 
-def test_pivots_go_to_the_average_of_what_both_fibres_propose():
+def test_pivots_move_to_the_mean_of_both_fibre_proposals():
     """(Σ springs + k_b (4 Σ D_1 - Σ D_2)) / (2 + 8 k_b), spelled out for a pivot in the middle."""
     ds = sheet(RULE | {"shear": 0.0}, 1, initial=NOISE, seed=3)
     before, after = ds.position.values
@@ -102,7 +102,7 @@ def test_pivots_go_to_the_average_of_what_both_fibres_propose():
         np.testing.assert_allclose(after[n], before[n] + np.mean(proposals, axis=0), atol=1e-13)
 
 
-def test_every_pivot_moves_along_the_force_at_the_ends_of_fibres_too():
+def test_every_pivot_moves_along_the_force_including_fibre_ends():
     ds = sheet(RULE, 1, initial=NOISE, seed=4)
     before, after = ds.position.values
     plain = Plain(ds)
@@ -115,7 +115,7 @@ def test_every_pivot_moves_along_the_force_at_the_ends_of_fibres_too():
 
 @pytest.mark.filterwarnings("ignore:the last state has inverted cells")
 @pytest.mark.parametrize("bending", [0.0, BENDING, 20.0])
-def test_the_energy_never_rises(bending):
+def test_energy_never_increases(bending):
     for seed in range(5):
         rough = {"type": "noise", "amplitude": 0.9}
         ds = sheet(RULE | {"bending": bending}, 150, initial=rough, seed=seed)
@@ -126,14 +126,14 @@ def test_the_energy_never_rises(bending):
 
 
 @pytest.mark.parametrize("angle", [30.0, 90.0, 180.0])
-def test_a_turned_sheet_stays(angle):
+def test_rotated_sheet_stays_at_rest(angle):
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     turn = [[c - 1, -s], [s, c - 1]]
     ds = sheet(RULE, 20, initial={"type": "affine", "gradient": turn})
     np.testing.assert_allclose(ds.position[-1], ds.position[0], atol=1e-12)
 
 
-def test_scissoring_costs_nothing_where_pivots_turn_freely_and_is_undone_by_shear():
+def test_scissoring_has_zero_energy_for_free_pivots():
     """Both families turned, by ±15°: the one mechanism of a pantograph."""
     half = np.radians(45 - 15)
     opening = [[ROOT * np.cos(half) - 1, 0], [0, ROOT * np.sin(half) - 1]]
@@ -146,7 +146,7 @@ def test_scissoring_costs_nothing_where_pivots_turn_freely_and_is_undone_by_shea
     assert found == pytest.approx(90.0, abs=0.1)
 
 
-def test_fibres_run_at_45_degrees_where_the_lattice_stands_on_its_corner():
+def test_fibres_are_at_45_degrees_on_a_rotated_lattice():
     lattice = sheet(RULE, 1).attrs["experiment"]
     cell = pbdkit.Experiment(**json.loads(lattice)).lattice.cell()
     for sublattice in (0, 1):
@@ -157,7 +157,7 @@ def test_fibres_run_at_45_degrees_where_the_lattice_stands_on_its_corner():
             assert [o.length for o in shell] == pytest.approx([length] * 4)
 
 
-def test_what_a_fibre_lacks_is_named():
+def test_missing_neighbours_of_a_fibre_are_named():
     with pytest.raises(
         pbdkit.ExperimentError, match=r"fibres need a neighbour at \(1\.414, 1\.414\); use a latt"
     ):

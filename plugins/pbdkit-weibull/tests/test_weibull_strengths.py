@@ -31,14 +31,14 @@ def pulled():
     return {n: [chains(n, 4.0, seed, steps=STEPS) for seed in SEEDS] for n in (4, 16)}
 
 
-def test_strengths_are_drawn_from_weibulls_distribution():
+def test_strengths_follow_the_weibull_distribution():
     ds = ran("chain", "steps=1", "fracture.modulus=2.5", "fracture.scale=0.3")
     assert ds.strength.dims == ("bond",)
     assert len(ds.strength) == 1600
     assert kstest(ds.strength, weibull_min(2.5, scale=0.3).cdf).pvalue > LEVEL
 
 
-def test_the_seed_decides_and_nothing_else():
+def test_strengths_depend_only_on_the_seed():
     one = ran("chain", "steps=1", "seed=4").strength.values
     same = ran("chain", "steps=1", "seed=4", "rule.type=mean-displacement").strength.values
     other = ran("chain", "steps=1", "seed=5").strength.values
@@ -47,7 +47,7 @@ def test_the_seed_decides_and_nothing_else():
 
 
 @pytest.mark.parametrize("bonds", [4, 16])
-def test_every_chain_parts_at_its_weakest_bond(pulled, bonds):
+def test_every_chain_breaks_at_its_weakest_bond(pulled, bonds):
     """Exactly: in the increment in which the applied strain exceeds the smallest strength."""
     for first, increment, strength in pulled[bonds]:
         weakest = strength.min(axis=1)
@@ -58,7 +58,7 @@ def test_every_chain_parts_at_its_weakest_bond(pulled, bonds):
 
 
 @pytest.mark.parametrize("bonds", [4, 16])
-def test_chains_have_the_exact_distribution_of_the_minimum(pulled, bonds):
+def test_chain_strengths_have_the_exact_distribution_of_the_minimum(pulled, bonds):
     """Kolmogorov's test of the strength at which 400 chains part, as the test above has it, against
     1 - exp(-n (ε/scale)^m), that is Weibull with the scale times n^(-1/m)."""
     weakest = np.concatenate([strength.min(axis=1) for _, _, strength in pulled[bonds]])
@@ -68,7 +68,7 @@ def test_chains_have_the_exact_distribution_of_the_minimum(pulled, bonds):
 
 
 @pytest.mark.parametrize("bonds", [4, 16])
-def test_mean_strength_falls_as_the_root_of_the_size(pulled, bonds):
+def test_mean_strength_scales_as_the_root_of_the_size(pulled, bonds):
     """Within 3.3 standard errors of scale Γ(1 + 1/m) n^(-1/m), the standard deviation Weibull's."""
     strength = np.concatenate([first - increment / 2 for first, increment, _ in pulled[bonds]])
     spread = sqrt(gamma(1 + 2 / 4.0) - gamma(1 + 1 / 4.0) ** 2) * 0.1 * bonds ** (-1 / 4.0)
@@ -102,14 +102,14 @@ def test_the_load_of_a_sheet_is_that_of_its_rows():
     assert 1 / 8 < stiffness(ds, ~cut | (along[:, 0, 1] == 0), 8) < 0.6
 
 
-def test_a_large_modulus_is_one_strength_for_all():
+def test_large_modulus_gives_uniform_strength():
     ds = ran("sheet", "fracture.modulus=1000")
     broken = ds.broken_step.values[ds.broken_step.values > 0]
     # 0.002 an increment, so that all strengths of 0.1 (1 ± 0.01) lie within a few of them.
     assert 48 <= broken.min() <= 51
 
 
-def test_the_experiments_run_with_this_plugin_and_break():
+def test_experiments_run_and_break_with_this_plugin():
     files = sorted(FOLDER.glob("*.yaml"))
     assert [file.stem for file in files] == ["chain", "sheet"]
     for file in files:

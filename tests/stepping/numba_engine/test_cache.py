@@ -81,7 +81,7 @@ def kept(folder):
     return {file.suffix: file for file in files}
 
 
-def test_damaged_files_are_made_anew(kept_kernel):
+def test_damaged_files_are_rebuilt(kept_kernel):
     cache = kept_kernel
     assert kernel_is_right()
     assert set(kept(cache)) == {".py", ".json", ".nbi", ".nbc"}
@@ -95,7 +95,7 @@ def test_damaged_files_are_made_anew(kept_kernel):
     assert len(list(cache.iterdir())) == 1
 
 
-def test_a_whole_kernel_is_read_and_not_made(kept_kernel, monkeypatch):
+def test_complete_kernel_is_read_and_not_rebuilt(kept_kernel, monkeypatch):
     cache = kept_kernel
     assert kernel_is_right()
     before = {file: file.stat().st_mtime_ns for file in kept(cache).values()}
@@ -114,7 +114,7 @@ class Counted:
         return self.function(*arguments)
 
 
-def test_a_full_disk_is_no_fault_of_the_rule_and_leaves_nothing(cache, monkeypatch, tmp_path):
+def test_full_disk_is_not_blamed_on_the_rule_and_leaves_nothing(cache, monkeypatch, tmp_path):
     def full(*arguments, **words):
         raise OSError(28, "No space left on device")
 
@@ -127,7 +127,7 @@ def test_a_full_disk_is_no_fault_of_the_rule_and_leaves_nothing(cache, monkeypat
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX systems")
-def test_a_folder_that_others_can_write_is_not_run(kept_kernel):
+def test_directory_writable_by_others_is_not_used(kept_kernel):
     cache = kept_kernel
     kept(cache)[".py"].write_text("raise SystemExit('planted')")
     cache.chmod(0o777)
@@ -137,7 +137,7 @@ def test_a_folder_that_others_can_write_is_not_run(kept_kernel):
     assert kept(cache)[".json"].read_bytes() == before
 
 
-def test_where_no_folder_can_be_made_kernels_are_made_in_memory(cache):
+def test_without_a_directory_kernels_are_compiled_in_memory(cache):
     cache.write_text("a file")
     assert kernel_cache.cache_folder() is None
     assert kernel_is_right()
@@ -180,14 +180,14 @@ def test_a_fracture_model_that_does_not_compile_is_named(cache, monkeypatch):
 
 
 @pytest.mark.parametrize("initial", ["reference", "noise"])
-def test_what_a_rule_raises_while_kernels_are_made_is_the_rules(initial):
+def test_exception_during_compilation_is_an_error_of_the_rule(initial):
     start = {"type": initial} | ({"amplitude": 0.1} if initial == "noise" else {})
     scene = build_scene(pbdkit.Experiment(**SHEET | {"rule": Raises(), "initial": start}))
     with pytest.raises(pbdkit.PluginError, match=r"FollowerRule 'raises' failed .*too much"):
         CompiledStepper(scene)
 
 
-def test_of_those_who_want_the_same_kernel_one_makes_it(cache, monkeypatch):
+def test_concurrent_requests_compile_a_kernel_once(cache, monkeypatch):
     made = []
 
     def make(source, folder, names, arguments):

@@ -75,19 +75,19 @@ def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
 
 @samples(30)
 @given(experiments())
-def test_the_kernels_logic_on_random_scenes(experiment):
+def test_kernel_logic_on_random_scenes(experiment):
     compare_interpreted(experiment)
 
 
 @samples(30)
 @given(experiments(leaders=pulled_apart(), fracturing=st.just(True)))
-def test_the_kernels_logic_on_torn_scenes(experiment):
+def test_kernel_logic_on_broken_scenes(experiment):
     compare_interpreted(experiment)
 
 
 @samples(30)
 @given(calibrated_experiments())
-def test_the_kernels_logic_on_calibrated_scenes(experiment):
+def test_kernel_logic_on_calibrated_scenes(experiment):
     compare_interpreted(experiment)
 
 
@@ -163,7 +163,7 @@ COMPONENTS = {
 
 
 @pytest.mark.parametrize("parts", COMPONENTS.values(), ids=COMPONENTS)
-def test_the_kernels_logic_for_every_component(parts, interpreted, monkeypatch):
+def test_kernel_logic_for_every_component(parts, interpreted, monkeypatch):
     scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
     assert_bitwise_equal(scene, CompiledStepper(scene))
     monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
@@ -249,7 +249,7 @@ def banded(monkeypatch):
 
 
 @pytest.mark.parametrize("parts", THREADED.values(), ids=THREADED)
-def test_the_kernels_logic_on_any_number_of_threads(parts, banded, interpreted):
+def test_kernel_logic_on_any_number_of_threads(parts, banded, interpreted):
     scene = banded(parts)
     assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2), calls=(1, 2, 7))
 
@@ -261,7 +261,7 @@ def test_any_number_of_threads_gives_the_same(name, banded):
 
 
 @pytest.mark.parametrize("kind", ["whole", "torn"])
-def test_a_stiffness_of_its_own_in_every_cell(kind, interpreted):
+def test_different_stiffness_in_every_cell(kind, interpreted):
     parts = TWICE | {"rule": ELASTIC, "initial": {"type": "noise", "amplitude": 0.1}}
     if kind == "torn":
         parts |= {"fracture": SCATTERED}
@@ -273,7 +273,7 @@ def test_a_stiffness_of_its_own_in_every_cell(kind, interpreted):
 
 
 @pytest.mark.parametrize("parts", [{"fracture": TORN}, CUT["hexagonal"]], ids=["torn", "cut"])
-def test_kinds_of_rows_are_a_matter_of_speed_alone(parts, interpreted, monkeypatch):
+def test_row_kinds_affect_only_speed(parts, interpreted, monkeypatch):
     """Everything in the loop over slots, or as much as can be without."""
     scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
     for short in (0, 100):
@@ -346,7 +346,7 @@ class Uncompilable(Halfway):
         return globals()["SHARE"] * total[0]
 
 
-def test_a_rule_that_does_not_compile_runs_slower_and_says_so(monkeypatch):
+def test_uncompilable_rule_runs_slower_with_a_message(monkeypatch):
     monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
     scene = build_scene(pbdkit.Experiment(**sheet(rule=Uncompilable(type="uncompilable"))))
     engine, made = make_engine(scene, choose(scene))
@@ -359,7 +359,7 @@ def test_small_scenes_are_not_compiled():
     assert choose(scene).engine == "numpy"
 
 
-def test_large_scenes_are_compiled_unless_something_stands_in_the_way(monkeypatch):
+def test_large_scenes_are_compiled_unless_prevented(monkeypatch):
     experiment = sheet(body={"type": "grid", "columns": 400, "rows": 400}, steps=5000)
     scene = build_scene(pbdkit.Experiment(**experiment))
     assert choose(scene).engine == "compiled"
@@ -371,7 +371,7 @@ def test_large_scenes_are_compiled_unless_something_stands_in_the_way(monkeypatc
         choose(build_scene(pbdkit.Experiment(**asked)))
 
 
-def test_nothing_beyond_the_reach_of_the_leaders_is_touched():
+def test_particles_beyond_the_reach_of_leaders_are_untouched():
     body = {"type": "grid", "columns": 80, "rows": 30}
     leaders = [{"select": {"edge": "left"}, "motion": {"type": "displace", "displacement": [1, 0]}}]
     scene = build_scene(pbdkit.Experiment(**sheet(body=body, leaders=leaders)))
@@ -409,19 +409,19 @@ class Reads(Halfway):
 @pytest.mark.parametrize(
     ("name", "value"), [("SHARE", 0.3), ("FACTORS", np.array([0.2, 1.0])), ("WHOLE", np.int64(3))]
 )
-def test_whatever_a_rule_reads_is_part_of_its_kernels_key(monkeypatch, name, value):
+def test_names_read_by_a_rule_are_part_of_its_kernel_key(monkeypatch, name, value):
     before = source_key(Reads.gather, Reads.apply)
     assert before == source_key(Reads.gather, Reads.apply)
     monkeypatch.setitem(globals(), name, value)
     assert source_key(Reads.gather, Reads.apply) != before
 
 
-def test_what_cannot_be_told_apart_makes_a_new_kernel_every_time(monkeypatch):
+def test_indistinguishable_values_give_a_new_key_every_time(monkeypatch):
     monkeypatch.setitem(globals(), "FACTORS", [object()])
     assert source_key(Reads.apply) != source_key(Reads.apply)
 
 
-def test_functions_of_one_source_in_two_modules_have_kernels_of_their_own():
+def test_equal_functions_in_two_modules_have_separate_kernels():
     """A kernel that is kept finds its functions by their modules, which may be gone."""
     source = "def gather(d, r, w, p):\n    return d, 1.0\n"
     one, other, again = {"__name__": "one"}, {"__name__": "other"}, {"__name__": "one"}

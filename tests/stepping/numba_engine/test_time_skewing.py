@@ -60,7 +60,7 @@ IN_ONE_PASS = {
 }
 
 
-def test_most_components_can_go_several_steps_a_pass():
+def test_most_components_support_several_steps_per_pass():
     assert len(IN_ONE_PASS) >= 35
     assert {"fracture", "damage", "relaxed, with memory", "frame lag"} <= set(IN_ONE_PASS)
 
@@ -137,7 +137,7 @@ WITH_MORE = {
 
 @pytest.mark.parametrize("parts", WITH_MORE.values(), ids=WITH_MORE)
 @pytest.mark.parametrize("pieces", [1, 3])
-def test_what_steps_do_besides(parts, pieces):
+def test_further_events_during_steps(parts, pieces):
     with small_passes(order=backwards):
         scene = scene_of(**LONG | parts)
         engine = CompiledStepper(scene, pieces)
@@ -168,7 +168,7 @@ def test_random_scenes(experiment, calls, pieces, sizes):
 
 @samples(15)
 @given(experiments(leaders=pulled_apart(), fracturing=st.just(True)), CALLS, PIECES, SIZES)
-def test_torn_scenes(experiment, calls, pieces, sizes):
+def test_broken_scenes(experiment, calls, pieces, sizes):
     compare(experiment, calls, pieces, sizes)
 
 
@@ -191,7 +191,7 @@ def compare(experiment, calls, pieces, sizes):
 
 
 @pytest.mark.parametrize("pieces", [1, 2])
-def test_steps_too_near_each_other_would_spoil_the_numbers(pieces, monkeypatch):
+def test_insufficient_step_distance_gives_wrong_results(pieces, monkeypatch):
     monkeypatch.setattr(Reach, "step", 1)
     with small_passes(order=backwards):
         scene = scene_of(**LONG | {"neighbours": {"type": "chebyshev", "shells": 2}})
@@ -200,7 +200,7 @@ def test_steps_too_near_each_other_would_spoil_the_numbers(pieces, monkeypatch):
             assert_bitwise_equal(scene, engine, calls=(1, 9))
 
 
-def test_where_moving_leaders_go_is_known_for_many_steps(monkeypatch):
+def test_leader_positions_are_known_for_many_steps(monkeypatch):
     """One call of the kernel makes them, and stops where a group is released."""
     scene = scene_of(steps=40)
     with small_passes():
@@ -211,7 +211,7 @@ def test_where_moving_leaders_go_is_known_for_many_steps(monkeypatch):
     assert counts == [9, 31]
 
 
-def test_compiled_in_the_sizes_that_were_measured(monkeypatch):
+def test_compiled_in_the_measured_sizes(monkeypatch):
     for module in (bands, passes):
         monkeypatch.setattr(module, "CACHE", 2**20)
     experiment = sheet(
@@ -233,7 +233,7 @@ ONE_STEP = {
 
 
 @pytest.mark.parametrize(("parts", "why"), ONE_STEP.values(), ids=ONE_STEP)
-def test_what_goes_one_step_a_pass_says_why(parts, why, monkeypatch):
+def test_single_step_passes_have_a_reason(parts, why, monkeypatch):
     monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
     solver = {"type": "stepping", "threads": 1} | parts.get("solver", {})
     scene = scene_of(**parts | {"solver": solver})
@@ -244,14 +244,14 @@ def test_what_goes_one_step_a_pass_says_why(parts, why, monkeypatch):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_what_goes_several_steps_a_pass_says_nothing(threads, monkeypatch):
+def test_passes_of_several_steps_give_no_message(threads, monkeypatch):
     monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
     monkeypatch.setattr(passes, "CACHE", 0)
     solver = {"type": "stepping", "threads": threads}
     assert "a pass" not in choose(scene_of(solver=solver)).reason
 
 
-def test_a_frame_that_follows_from_afar_goes_one_step_a_pass(monkeypatch):
+def test_frame_with_distant_particles_uses_one_step_per_pass(monkeypatch):
     monkeypatch.setattr(passes, "FARTHEST", 1)
     assert single_steps(scene_of()) == "frame points follow particles far away"
     near = Skew(scene_of(frame={"type": "none"}))
