@@ -110,8 +110,8 @@ class DivergedError(PbdkitError):
     message : str
         Text for the user.
     dataset : xarray.Dataset, optional
-        The records until then, with status "diverged", "unconverged" or "separated"; None if the
-        run writes to a file, which contains the same.
+        The records before the failure, with status "diverged", "unconverged" or "separated"; None
+        if the run writes to a file, which contains the same.
     """
 
     exit_status = 4
@@ -130,7 +130,8 @@ class StorageError(PbdkitError):
 class WriteError(StorageError):
     """A file could not be written. An earlier file of this name is unchanged.
 
-    The message begins with the place, and is not changed by code that reads another file meanwhile.
+    The message begins with the place of this file. Code that was reading another file at the time
+    does not add that file to the message.
     """
 
 

@@ -24,7 +24,7 @@ import pluggy
 from pbdkit.errors import AnswerError, did_you_mean, one_line
 
 GROUP = "pbdkit"
-"""The entry-point group of plugins, and the project name of their hook markers."""
+"""The entry-point group of plugins, and the project name that pluggy's hook markers require."""
 COMMAND_GROUP = "pbdkit.commands"
 """The entry-point group of modules that implement `pbdkit_commands`. They are imported to list
 commands, unlike those of the group "pbdkit"."""
@@ -108,9 +108,9 @@ def worded(error: BaseException, package: str = "", component: type[Any] | None 
     error
         The error.
     package
-        Package for which the last place in the traceback is appended.
+        Package; the last place of the traceback that lies in it is appended.
     component
-        Component for which a remedy is appended.
+        Component; the remedy for its error is appended.
     """
     try:
         message = str(error)
@@ -165,7 +165,8 @@ ALL = "*"
 """Value of that variable that disables all plugins."""
 
 SEVERITY = ("ok", "conflict", "broken")
-"""States of an offer in increasing severity; the state of a plugin is the most severe."""
+"""States of an offer in the order of increasing severity; a plugin has the most severe state of its
+offers."""
 
 
 @dataclass(frozen=True)
@@ -257,11 +258,12 @@ class Plugin:
 
 
 def installed_plugins(group: str = GROUP) -> list[Plugin]:
-    """Return the entry points in a group of all other distributions, sorted by name, without
+    """Return the entry points that other distributions have in a group, sorted by name, without
     loading them.
 
-    A distribution with unreadable metadata becomes a broken plugin, one that the user disables a
-    disabled plugin. Of two distributions with the same name, the first on the Python path counts.
+    A distribution with unreadable metadata is returned as a broken plugin, and one that the user
+    disables as a disabled plugin. Of two distributions with the same name, the first on the Python
+    path is used.
     """
     names: set[str] = set()
     plugins: list[Plugin] = []

@@ -144,14 +144,14 @@ TRIANGLE_STIFFNESS = math.sqrt(0.75)
 
 
 class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
-    """Network of springs: each follower moves to the weighted mean of the positions in which single
-    springs would be relaxed.
+    """Network of springs: each follower moves to the weighted mean of the positions at which each
+    spring alone would be relaxed.
 
     The spring to neighbour k, of rest length l₀, is relaxed at x_k + l₀ (x_j - x_k)/|x_j - x_k|.
     Weights are equal on the hexagonal lattice with 6 neighbours, 2 : 1 for edges and diagonals on
-    the square lattice with 8, and half on free edges. For small strain the network is linear
-    elastic in plane stress with ν = 1/3. Rotations are exact, and the energy of the springs does
-    not increase with relaxation 1.
+    the square lattice with 8, and half as large on free edges. For small strain the network is
+    linear elastic in plane stress with ν = 1/3. Rotations are exact, and the energy of the springs
+    does not increase with relaxation 1.
     """
 
     type: Literal["springs"] = "springs"
@@ -165,7 +165,8 @@ class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
         return Stiffness(*(self.stiffness * ratio for ratio in (9 / 8, 9 / 8, 3 / 8, 3 / 8)))
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """Return half the stiffness of the spring, for each cell beside it, and its rest length."""
+        """Return the rest length of the spring, and half of its stiffness, the part of each
+        adjacent cell."""
         cells, rest = setting.cells, math.hypot(*slot.rest)
         if cells.regular == 3:
             return {"half": self.stiffness * TRIANGLE_STIFFNESS / 2, "rest": rest}

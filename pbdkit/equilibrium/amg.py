@@ -28,7 +28,7 @@ ROUNDS = 12
 MARGIN = 1.1
 """Safety factor of the largest eigenvalue."""
 BAND = 5.0
-"""Ratio of the largest eigenvalue to the smallest that relaxation damps."""
+"""Ratio of the largest eigenvalue to the smallest of those that relaxation damps."""
 SINGULAR = 1e-9
 """Relative singular value below which pseudo-inverses discard a mode."""
 
@@ -150,8 +150,8 @@ def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
 
 
 def _free(hats: Any, held: Mask) -> tuple[Any, Mask]:
-    """Return the hats of free unknowns, and a mask of the held unknowns of the next grid: those to
-    which a held unknown is nearer than any other."""
+    """Return the hats of free unknowns, and a mask of the held unknowns of the next grid: an
+    unknown is held there if the nearest unknown of this grid is held."""
     led_weights, free_weights = (_chosen(mask) @ hats for mask in (held, ~held))
     below = (led_weights.max(axis=0).toarray() > free_weights.max(axis=0).toarray()).ravel()
     return (free_weights @ _chosen(~below)).tocsr(), below

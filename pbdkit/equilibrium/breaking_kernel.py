@@ -2,13 +2,13 @@
 The kernel moves the body to equilibrium, updates and breaks bonds, and repeats both.
 
 The system is A c = r with a band matrix A = 1 - (step operator). It has one unknown for each
-follower and axis or, if the axes are independent and have equal matrices, one for each follower
-with the axes as right sides: `wide` is the number of unknowns of a follower. Row i of a band holds
-A[i, i - half] to A[i, i + half]. A is factorised in place into L, with ones on the diagonal, and U,
-without pivoting. A row of the factors depends on earlier rows only: if bonds have changed, only the
-rows from the first affected follower on are assembled and factorised again. Their entries are the
-moves at rest for a unit displacement of each neighbour, which is exact for linear rules. The
-general path takes 20 times as long (docs/decisions/0010).
+follower and axis or, if the axes are independent and have equal matrices, one for each follower,
+and a right side for each axis: `wide` is the number of unknowns of a follower. Row i of a band
+holds A[i, i - half] to A[i, i + half]. A is factorised in place into L, with ones on the diagonal,
+and U, without pivoting. A row of the factors depends on earlier rows only: if bonds have changed,
+only the rows from the first affected follower on are assembled and factorised again. The entries of
+A are the moves at rest for a unit displacement of each neighbour, which is exact for linear rules.
+The general path takes 20 times as long (docs/decisions/0010).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from pbdkit.stepping.state import State, unmoved_state
 SAME = 1e-12
 """Difference of entries, relative to a move, that counts as rounding."""
 SAFETY = 3.0
-"""Safety factor of the estimated spread."""
+"""Safety factor of the estimated norm of A⁻¹."""
 
 
 def rows_of(work: Any, count: int, reach: int, wide: int) -> Any:
@@ -134,9 +134,9 @@ def refactor(
     work: Any, blocks: Any, pattern: Any, factors: Any, facts: Any, first: int, is_uniform: bool
 ) -> None:
     """Update the factors from follower `first` on. `facts` contains the number of unknowns of a
-    follower, the norm of A⁻¹ for random signs times a safety factor, the largest diagonal entry,
-    and the half-bandwidth in followers; `is_uniform` is true if frame points follow equally along
-    all axes."""
+    follower, the norm of A⁻¹ estimated from random signs, times a safety factor, the largest
+    diagonal entry, and the half-bandwidth in followers; `is_uniform` is true if frame points follow
+    equally along all axes."""
     diagonal, inverse, signs = factors
     count, axes = blocks.shape[0], blocks.shape[2]
     wide = 1 if is_uniform and are_alike(blocks) else axes
@@ -251,9 +251,9 @@ Entry = tuple[Indices, Indices, Indices, Floats]
 @dataclass(frozen=True)
 class Pattern:
     """Couplings of the followers. `place` is the flat place of each follower. The entries from
-    `first[e]` to `first[e + 1]` belong to follower e: the derivative of its move with respect to a
-    neighbour along `slot` (last: itself), times `weight` (entry, axis, axis), is the coupling to
-    the follower `column`."""
+    `first[e]` to `first[e + 1]` belong to follower e. The coupling to the follower `column` is the
+    derivative of the move of e with respect to its neighbour along `slot` (or, if `slot` is the
+    last one, to itself), times `weight` (entry, axis, axis)."""
 
     place: Indices
     first: Indices
@@ -317,8 +317,9 @@ def _entries(scene: Scene, place: Indices) -> Iterator[Entry]:
 
 
 def _followed(scene: Scene, places: Indices) -> Iterator[tuple[Indices, Indices, Floats]]:
-    """Generate the indices of those places that are frame points, with a body place that each
-    follows and its weight: the first of each point, then the second, and so on."""
+    """Generate the indices of those places that are frame points, with a body place that each point
+    follows, and its weight. The first body place of each point is generated first, then the second
+    of each, and so on."""
     if (frame := scene.frame) is None:
         return
     point_at = np.full(scene.raster.kind.size, -1)
@@ -402,7 +403,7 @@ def _write_derivative(plan: Plan, general: Function) -> Function:
 
 
 def _bonds(plan: Plan, pattern: str) -> list[str]:
-    """Return the pattern for each state variable of bonds."""
+    """Return the pattern once for each state variable of bonds, with # replaced by its number."""
     return [pattern.replace("#", str(n)) for n in range(plan.bonds)]
 
 
@@ -428,7 +429,8 @@ def _write_mark(plan: Plan) -> Function:
 
 
 def _write_changed(plan: Plan) -> Function:
-    """Write the function that returns whether bonds broke or changed; if not, it restores them."""
+    """Write the function that returns whether bonds broke or changed; if not, it restores the state
+    variables of the bonds."""
     out = Function(plan.shared, "changed", "slack")
     numbers = [n for n in plan.levels[-1].seen.bond if n.home is Home.BOND]
     changing = [str(n) for n, number in enumerate(numbers) if number.changes]
@@ -495,8 +497,8 @@ a second."""
 
 
 class Settler:
-    """Kernel for a linear rule, with its band matrix, which depends on the bonds alone, to the last
-    bit; nothing else is stored between two increments.
+    """Kernel for a linear rule, with its band matrix. Nothing else is stored between two
+    increments. The matrix depends on the bonds alone, to the last bit.
 
     Raises PluginError for parts that cannot be compiled.
     """
@@ -536,8 +538,8 @@ class Settler:
         return bool(self._of_roles["band"].size <= LARGEST_BAND)
 
     def settle(self, state: State, moment: float, most: int) -> tuple[bool, int]:
-        """Move a state, in place, from an equilibrium to that of a moment, and update bonds, until
-        no bond changes or `most` equilibria have been computed.
+        """Move a state, in place, from an equilibrium to the equilibrium at a moment, and update
+        bonds, until no bond changes or `most` equilibria have been computed.
 
         Returns whether no bond changes any more, and the number of changes of bonds. If the band
         matrix is not accurate enough, the state is that of the last equilibrium.
@@ -568,7 +570,7 @@ class Settler:
         size = count * axes * (2 * ((reach + 1) * axes - 1) + 1)
         self._work = 1 + size * (reach + 1) * axes
         self._roles, self._of_roles = roles, self._arrays_of(pattern, size)
-        # Differs from the state of any bond, so that all rows are assembled.
+        # The value -2 differs from the state of any bond, so that all rows are assembled.
         stale = {"known_broken": np.full_like(state.broken_step, -2)}
         stale |= {f"known{n}": value.copy() for n, value in enumerate(state.bond_values)}
         self._of_roles |= stale
@@ -585,7 +587,7 @@ class Settler:
         planes = [f"{name}_{c}" for name in ("v", "still") for c in self._plan.axes]
         signs = np.random.default_rng(0).choice([-1.0, 1.0], count * axes)
         return {
-            # The first entries are the runs, one of a single place for each follower.
+            # The first entries are runs of a single place, one for each follower.
             "runs": np.concatenate([alone, self._runs]).astype(np.int64),
             "body": np.array(self._body, np.int64) + np.array([0, count, count]),
             "place": pattern.place,

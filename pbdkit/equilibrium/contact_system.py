@@ -44,8 +44,8 @@ from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.state import State
 
 WEAK = 1e-6
-"""Stiffness of springs to the current positions of particles, relative to that of their
-neighbours."""
+"""Stiffness of the weak springs that hold particles at their current positions, relative to the
+stiffness with which its bonds hold a particle."""
 NO_FACE = -1
 """Index of a missing face."""
 REMEDY = "constrain it with a leader group, or use solver: {type: stepping}"
@@ -53,7 +53,7 @@ REMEDY = "constrain it with a leader group, or use solver: {type: stepping}"
 
 
 class ContactSystem(System):
-    """Linear system at a state, in which particles that would enter an obstacle from there are
+    """Linear system at a state. Particles that the next step would move into an obstacle are
     constrained."""
 
     def __init__(
@@ -92,8 +92,8 @@ class ContactSystem(System):
         ]
 
     def _part(self, matrix: Any, members: Indices, held: bool) -> Subsystem:
-        """Return the system of a part. A part that is held has an inverse, unless it has a free
-        motion; it then counts as floating."""
+        """Return the system of a part. A part that is held has an inverse. If it has a free motion
+        nevertheless, it is treated like a floating part."""
         part_matrix = matrix if len(members) == matrix.shape[0] else matrix[members][:, members]
         if held:
             coordinates = Coordinates(2, self._X[members[::2] // 2], self._led)
@@ -108,8 +108,8 @@ class ContactSystem(System):
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound: by the solution, or by the inverse for its rounding if the inverse is
-        available."""
+        """Kind of the bound: computed from the inverse, or from a solution if some part has no
+        inverse."""
         ways = {part.bound_kind for _, part in self._parts}
         return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
 
@@ -170,8 +170,9 @@ class ContactSystem(System):
         return math.inf
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the bound from another solution for the remaining moves, plus the effect of
-        rounding: of displacements for all followers, of positions for those in contact."""
+        """Return the bound: another solution, for the remaining moves, plus the effect of rounding.
+        Rounding affects the displacements of all followers, and the positions of those in
+        contact."""
         r, far = self._table(moves), [0.0]
         for n, (members, part) in enumerate(self._parts):
             far.append(part.farthest(r[members], rounding * self._share_of_places))

@@ -43,7 +43,7 @@ WAYS = {
 }
 """Descriptions of the kinds of bounds."""
 CORRECTION = "correction, "
-"""Prefix of a kind of bound that applies only to the error that a computed correction leaves."""
+"""Prefix of the kind of a bound on the error that remains after a computed correction."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Certificate:
     distance : float
         Bound on the distance of any follower from equilibrium, in lattice units.
     share : float
-        The distance over the largest prescribed displacement.
+        The distance divided by the largest prescribed displacement.
     bound : str
         Kind of the bound.
     linearised : bool
@@ -125,7 +125,7 @@ class RoundingError(UnconvergedError):
 
 
 def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
-    """Return the largest prescribed displacement of leaders or of the start. If all are zero,
+    """Return the largest displacement that leaders or the initial state prescribe. If all are zero,
     return the largest displacement caused by loads; without loads, the length of the shortest
     bond."""
     ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
@@ -179,7 +179,7 @@ TOO_NONLINEAR = "the rule is too nonlinear between the state and equilibrium for
 
 @dataclass(frozen=True)
 class PredictedEquilibrium:
-    """Predicted equilibrium `u` with its error bound; `obstacle` is the reason of an infinite
+    """Predicted equilibrium `u` with its error bound; `obstacle` is the reason for an infinite
     distance."""
 
     u: Floats
@@ -290,14 +290,14 @@ class ErrorBound:
 
 
 FINEST = 256
-"""Divisor of the number of steps since the first check that gives the minimum number of steps to
-the next check."""
+"""The next check follows after at least the number of steps since the first check, divided by this
+number."""
 COARSEST = 4
-"""Divisor of the number of steps since the first check that gives the maximum number of steps to
-the next check."""
+"""The next check follows after at most the number of steps since the first check, divided by this
+number."""
 OVERDUE = 4
-"""Factor by which the number of steps since the first check increases until a bound is computed
-even if steps do not shrink (because of rounding, or vibrations)."""
+"""A bound is computed, even if steps do not shrink (because of rounding, or vibrations), when the
+number of steps since the first check has increased by this factor."""
 NEVER = 2**62
 """Number of a step that no run reaches."""
 
@@ -308,9 +308,9 @@ class Pace:
 
     If the modes of a symmetric step decay by ρ or faster, the sizes of its steps decay at a rate of
     at least -ln ρ, which decreases. The distance is extrapolated from two checks: distance ≈ ρ / (1
-    - ρ) · ‖last step‖, with ρ from the ratio of the sizes of two steps. The result is too small, so
-    that a check is early rather than late; it is exact once a single mode remains. The estimate
-    determines when a bound is computed, and not its value.
+    - ρ) · ‖last step‖, with ρ from the ratio of the sizes of two steps. The extrapolated distance
+    is too small, so that checks are early rather than late; it is exact once a single mode remains.
+    The estimate determines when a bound is computed, and not its value.
     """
 
     next_look: int
@@ -451,7 +451,8 @@ class SteadyStateMonitor:
 
 
 def _carrying(scene: Scene) -> float:
-    """Return the ratio to the last step of the displacement that may follow it: |b| / (1 - |b|) for
-    momentum b, by which each step is b times the last, plus 1 for a frame with delay."""
+    """Return the displacement that may follow the last step, relative to that step: |b| / (1 - |b|)
+    for the momentum b, since each further step is b times the one before, plus the delay of the
+    frame."""
     memory = abs(scene.experiment.stepping.memory)
     return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + scene.lag

@@ -2,9 +2,9 @@
 
 A grid has two arrays (row, place): `code` is the index of the stencil in `own`, -1 where no
 particle is free; `kind` is 0 outside, 1 at free particles, 2 at leaders. `halved` are the axes
-along which the next grid has half the places: there its place n coincides with place 2n - 1 of this
-grid, and along the other axes with place n. Fields are planes (axis, row, place), zero where no
-particle is free; the outermost ring is never free.
+along which the next grid has half the places. Along these axes place n of the next grid coincides
+with place 2n - 1 of this grid, along the other axes with place n. Fields are planes (axis, row,
+place), zero where no particle is free; the outermost ring is never free.
 
 A row consists of runs of places, from `begin` to `end`, that share the stencil `same`, and of lone
 places with stencils `own[which]`. A stencil is 3 × 3 places, row by row, of 4 numbers: xx, xy, yx,
@@ -173,8 +173,9 @@ def symmetrise(code, stencils):
 
 @njit(cache=KEPT)
 def balance(code, stencils, factor):
-    """Propagate row factors that make K as symmetric as possible, from the factors that are not 0.
-    Return the number of places without a factor, after and before."""
+    """Compute the row factors that make K as symmetric as possible, starting from the neighbours of
+    places with a factor that is not 0. Return the number of places without a factor, afterwards and
+    before."""
     initial = 0
     for i in range(code.shape[0]):
         for j in range(code.shape[1]):

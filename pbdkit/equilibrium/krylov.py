@@ -92,7 +92,7 @@ class Descent(KrylovResult):
 
 
 class LatticeKrylov(ABC):
-    """Solver of K x = b by the grids of K, or by a coarser one of them."""
+    """Solver of K x = b on the finest grid of K, or on a coarser one at a given depth."""
 
     name: str
 

@@ -147,7 +147,8 @@ LOOKS_AHEAD = 2
 SAFETY = 2.0
 """Divisor of the estimated eigenvalue λ."""
 NEAR = 0.01
-"""Ratio to the first jump at which an iteration has removed most of an error."""
+"""An iteration has removed most of an error if the estimated distance is at most this fraction of
+its first jump."""
 TURNS = 6
 """Number of inverse iterations."""
 
@@ -241,7 +242,8 @@ class LatticeSystem(System):
         return LatticeSystem(transposed(self._matrix), False, self._shape, self._watch)
 
     def _to_share(self, b: Floats, share: float, near: Sequence[Floats]) -> Floats:
-        """Return the solution of K x = b with an error relative to the largest number of x."""
+        """Return the solution of K x = b with an error of at most `share` times the largest entry
+        of x."""
         self._watch.begin("solving")
         start = best_of(self._solver, near, b)
 
@@ -277,8 +279,7 @@ class LatticeSystem(System):
         return remainder + length + rounding * self._spread
 
     def _tracked(self, r: Floats) -> tuple[float, float]:
-        """Return the bound on the error of x after some iterations on K x = r, and the size of
-        x."""
+        """Iterate on K x = r; return a bound on the remaining error of x, and the size of x."""
         if self._symmetric:
             iteration: KrylovResult = self._iterate(r, lambda d: len(d.jumps) >= LOOKS_AHEAD)
             assert isinstance(iteration, Descent)
@@ -362,7 +363,8 @@ class LatticeSystem(System):
 
 
 FAITHFUL = 1e-3
-"""Largest relative difference between products with stencils from differences and moves."""
+"""Largest relative difference between moves and products with stencils that are computed by
+differences."""
 
 
 def lattice_system(
@@ -376,8 +378,9 @@ def lattice_system(
     """Return the linear system of a scene on stencils; None if there is no such system, or if
     leaders do not hold the body.
 
-    At a state that is not at rest the matrix is assembled by differences of compiled `moves`. With
-    `rows` of one of several processes the system is the one at rest.
+    At a state that is not at rest the matrix is assembled by differences of compiled `moves`. If
+    the lattice is distributed among processes, `rows` are those of this process, and the system is
+    the one at rest.
     """
     if moves and moves.is_compiled and state.u.any():
         matrix = differenced_matrix(scene, state, step, moves)

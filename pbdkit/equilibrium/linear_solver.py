@@ -3,7 +3,7 @@
 Small matrices are inverted. Narrow ones are factorised as bands by LAPACK, with particles in rows
 across the shorter side of the body. Others are factorised by SuperLU, in an order with little
 fill-in: nested dissection (A. George, Nested dissection of a regular finite element mesh, SIAM J.
-Numer. Anal. 10, 1973), A strip that no coupling crosses divides the body in two; both halves are
+Numer. Anal. 10, 1973). A strip that no coupling crosses divides the body in two; both halves are
 divided in the same way, and the strip is eliminated last. SuperLU itself does not offer this order.
 Large systems are solved by iteration, with multigrid (amg.py) as preconditioner.
 docs/decisions/0010 contains measurements.
@@ -51,7 +51,7 @@ FEWEST = 1000
 LEAF = 40
 """Number of places up to which a part is not divided."""
 TINY = 1e-300
-"""Smallest reach of couplings, which makes it positive."""
+"""Smallest reach of couplings; it is positive, so that the reach can be a divisor."""
 WIDEST = 0.25
 """Largest fraction of all places in the first strip of a dissection."""
 
@@ -303,7 +303,7 @@ def is_symmetric(matrix: Any) -> bool:
 
 
 def is_nearly_symmetric(matrix: Any) -> bool:
-    """Return whether a sparse matrix has most entries where its transpose has entries."""
+    """Return whether most entries of a sparse matrix have a counterpart in its transpose."""
     from scipy.sparse import csr_array
 
     ones = csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), matrix.shape)
@@ -312,8 +312,8 @@ def is_nearly_symmetric(matrix: Any) -> bool:
 
 def dissected(matrix: Any, places: Floats) -> Indices | None:
     """Return the unknowns of a sparse matrix in the order of nested dissection. `places` (unknown,
-    axis) are their positions; unknowns of one place are adjacent. None if couplings extend too far,
-    or if there are few places."""
+    axis) are their positions; unknowns of one place are adjacent. Return None if couplings extend
+    too far, or if there are few places."""
     fresh = np.ones(len(places), bool)
     fresh[1:] = (places[1:] != places[:-1]).any(axis=1)
     sites, every = places[fresh], np.arange(np.count_nonzero(fresh))

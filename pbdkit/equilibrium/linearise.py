@@ -36,7 +36,7 @@ NOT_SHARED = (
     "body, it must be stable at rest, frame points must follow nearby particles, and the coupling "
     "of the axes must be mutual or absent; run it in one process"
 )
-"""Reason why ranks do not share the equilibrium of an experiment."""
+"""Reason why several ranks cannot compute the equilibrium of an experiment together."""
 
 
 def linearised(
@@ -51,7 +51,7 @@ def linearised(
     """Return the linear system of a scene at a state, with the roles of the step that contains a
     moment, by a method of the solver. `moves` are reused if given.
 
-    A scene that is distributed among processes has a system on stencils alone. Raises
+    For a scene that is distributed among processes, the only system is the one on stencils. Raises
     ExperimentError if there is no unique solution, or none on stencils.
     """
     if rows.strip:
@@ -70,8 +70,8 @@ def linearised(
 
 
 def mismatch_at_rest(scene: Scene, moves: Moves, size: float, method: str, watch: Watch) -> float:
-    """Return the nonlinearity of the moves at random displacements of a size, as System.mismatch of
-    the linearisation at rest."""
+    """Return the nonlinearity of the moves: System.mismatch of the linearisation at rest, for
+    random displacements of a given size."""
     start, steps = initial_state(scene), scene.experiment.steps
     rest = replace(start, u=np.zeros_like(start.u))
     with one_thread():

@@ -55,7 +55,7 @@ def finder_of(
 
 
 SAMPLES = 16
-"""Number of parts of an interval in each of which the path of a leader counts as straight."""
+"""Number of straight parts by which the path of a leader in an interval is approximated."""
 
 
 def events(scene: Scene) -> list[int]:
@@ -77,9 +77,9 @@ def events(scene: Scene) -> list[int]:
 def moments(scene: Scene, count: int) -> list[float]:
     """Return the ends of about `count` increments, and all events.
 
-    The increments are of equal lengths of the path of leaders, and of equal numbers of changes of
-    loads and parameters. An increment consists of several whole steps, or a step of several whole
-    increments; an interval without motion is one increment.
+    In each increment the leaders move by about the same length, or loads and parameters change by
+    about the same amount, whichever requires more increments. An increment consists of whole steps,
+    or a step of whole increments; an interval without motion is one increment.
     """
     ends = events(scene)
     intervals = list(pairwise(ends)) or [(0, ends[-1])]
@@ -144,9 +144,9 @@ RECORD_LAST = "; or record the equilibrium of the last step only, `record: {{at:
 MOST_SETTLINGS = 2000
 """Maximum number of changes of bonds in an increment."""
 TINY = 1e-9
-"""Relative length of a remainder that is joined to the last part of a path."""
+"""Relative length up to which the remainder of a path is joined to the last part."""
 SMALLEST = 2.0**-12
-"""Smallest part of an increment, relative to it."""
+"""Smallest part into which an increment is divided, as a fraction of the increment."""
 REMEDY = (
     "To continue from there, use solver: {type: stepping, relaxation: auto, memory: auto}; "
     "record: {increments: true} keeps the equilibria within steps"
@@ -187,9 +187,9 @@ def increments(
     finder: Finder | None = None,
     stops: Sequence[int] = (),
 ) -> Way:
-    """Move a scene, in place, from its initial state, or from one at the moment `since`, to the
-    equilibrium of its last step, and yield the states on the way. The equilibria of `stops`, which
-    are steps before the last one, are included.
+    """Move a scene, in place, from its initial state, or from its state at the moment `since`, to
+    the equilibrium of its last step, and yield the states on the way. The equilibria of `stops`,
+    which are steps before the last one, are included.
 
     The body is in equilibrium before each change of roles or loads, so that leaders that start
     later and floating parts are where slow loading moves them. Floating parts under a load are
@@ -314,7 +314,7 @@ def _step_to(last: int, state: State, scene: Scene, finder: Finder) -> Iterator[
 
 @contextmanager
 def _at_step(step: int, remedy: str = "") -> Iterator[None]:
-    """Add the step to the message of an equilibrium that does not exist."""
+    """Add the step to the message of an error about an equilibrium that does not exist."""
     try:
         yield
     except NoEquilibriumError as error:
@@ -363,7 +363,8 @@ def _load(
         try:
             max_changes = MOST_SETTLINGS
             if since == step - 1 and cut_bonds(scene, state.broken_step, step) and since > 0:
-                # Bonds that break because of a cut break under the load at which the cut is made.
+                # If a cut makes other bonds break, they break under the load at which the cut is
+                # made.
                 _settle_bonds_at(scene, state, finder, since, since, max_changes, step)
             settled, changes = quick.settle(state, moment, max_changes) if quick else (False, 0)
             if not settled or moment == last:  # It has an error bound.
@@ -483,9 +484,9 @@ def _settle_bonds_at(
 
 
 def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: float) -> Certificate:
-    """Move from the equilibrium of a moment to that of a later one, in parts that are small enough
-    to follow one path. If none is small enough (snap-through), make steps; if bonds broke, make
-    implicit steps at once."""
+    """Move from the equilibrium of a moment to that of a later one, in parts of the increment that
+    are small enough for the equilibrium to change continuously. If no part is small enough
+    (snap-through), make steps; if bonds broke, make implicit steps at once."""
     reached, part = since, moment - since
     while True:
         target = moment if reached + part > moment - TINY * part else reached + part
@@ -537,7 +538,7 @@ def _stepped(
 ) -> Certificate:
     """Make steps with leaders at their positions of a moment, until an equilibrium is near.
 
-    Raises UnconvergedError if no stable one is reached.
+    Raises UnconvergedError if no stable equilibrium is reached.
     """
     placed, state.starts = prescribe(scene, state, moment)
     place(state.u, placed)

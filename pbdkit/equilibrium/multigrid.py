@@ -4,8 +4,9 @@ The basis functions of a coarser grid are bilinear hats; its stencils are Galerk
 direction is much stiffer than the other, only that direction is coarsened.
 
 If there are several processes, each has a strip of rows of the finer grids, with a halo that is
-wide enough for a cycle without communication, and all have the whole coarser grids. They
-communicate twice in a cycle: at its beginning, and to gather the residuals on the first whole grid.
+wide enough for a cycle without communication; every process has all rows of the coarser grids. The
+processes communicate twice in a cycle: at its beginning, and to gather the residuals on the first
+grid that is not distributed.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ PRECISION = np.float32
 WEIGHT = 0.8
 """Relaxation factor. It is below 1 because all places of a row are relaxed simultaneously."""
 STIFFNESS_RATIO = 3.0
-"""Ratio of stiffness above which only the stiffer direction is coarsened."""
+"""Ratio of the stiffnesses along the two axes above which only the stiffer direction is
+coarsened."""
 MIN_PLACES = 5
-"""Number of places along an axis, including the ring of empty places, from which a grid is not
+"""Number of places along an axis, including the ring of empty places, up to which a grid is not
 coarsened along that axis."""
 EVERY = slice(None)
 """Slice of all rows."""
@@ -95,7 +97,7 @@ class StencilGrid:
         return int(along[0] > along[1]), int(along[1] > along[0])
 
     def coarser(self, halved: tuple[int, int], known: slice = EVERY) -> StencilGrid:
-        """Return the next grid, or its rows `known`."""
+        """Return the next grid; places outside the rows `known` are empty."""
         shape = [
             coarser_size(n) if half else n for n, half in zip(self.code.shape, halved, strict=True)
         ]
@@ -261,7 +263,7 @@ class Multigrid(Grids):
 
     @property
     def whole(self) -> Multigrid:
-        """The hierarchy of whole grids, which is this one."""
+        """The hierarchy of grids that are not distributed: here all of them."""
         return self
 
     @property
@@ -298,7 +300,7 @@ class Multigrid(Grids):
 
 SMALL = 100 * COARSEST
 """Number of unknowns below which a grid is not distributed: more than four times that of the
-coarsest grid, so that at least two grids are whole."""
+coarsest grid, so that at least two grids are not distributed."""
 
 
 class PartedGrids(Grids):

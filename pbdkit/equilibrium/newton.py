@@ -46,8 +46,8 @@ MOST_CORRECTIONS = 12
 MAX_PROPOSED_TOLERANCE = 0.1
 """Largest tolerance that messages propose."""
 CONTRACTION = 0.5
-"""Largest ratio of a correction to the last one. Below it Newton's iteration converges to the only
-equilibrium nearby (Deuflhard, Newton Methods for Nonlinear Problems, 2004)."""
+"""Largest ratio of a correction to the previous one. Below this ratio Newton's iteration converges
+to the only equilibrium nearby (Deuflhard, Newton Methods for Nonlinear Problems, 2004)."""
 MAX_REUSE_RATIO = 0.02
 """Largest ratio of errors after and before a correction for which a linearisation is used again."""
 MAX_CORRECTION_RTOL = 1e-3
@@ -63,8 +63,9 @@ UNSTABLE = "the equilibrium is not stable"
 ROUNDING = "rounding errors limit the relative distance"
 """Message for a tolerance that rounding prevents."""
 MAX_ROUNDING_RATIO = 1e5
-"""Largest ratio of distance to rounding error of a body that is not near a limit point. Beyond it a
-smaller increment could converge."""
+"""Largest ratio of the distance to the rounding error up to which rounding is regarded as the
+reason why the search does not converge. Above it the body may be near a limit point, and a smaller
+increment could converge."""
 MAX_IMPLICIT_STEPS = 200
 """Maximum number of implicit steps."""
 MAX_MOVE = 0.2
@@ -74,21 +75,22 @@ MIN_DAMPING = 1e-10
 MIN_DAMPING_RATIO = 0.05
 """Smallest ratio of a damping to the one before."""
 DAMPING_FACTOR = 0.5
-"""Factor of the ratio of the moves, if it is below 1, that gives the ratio of two dampings."""
+"""If moves decrease, a damping is this factor times the ratio of the moves, times the damping
+before."""
 MAX_DAMPING_RATIO = 2.0
 """Largest ratio of a damping to the one before."""
 NEGLIGIBLE_STIFFNESS = 1e-6
-"""Stiffness, as a damping, below which motions are excluded from an error bound."""
+"""Stiffness, in the units of the damping, below which motions are excluded from an error bound."""
 MAX_SOFT_RATIO = 100.0
-"""Largest ratio of the moves to those of soft motions within the tolerance, for which a bound
-without soft motions is computed."""
+"""A bound without soft motions is computed if the moves are at most this number times the moves of
+soft motions within the tolerance."""
 
 
 @dataclass(frozen=True)
 class Finder:
     """Search for equilibria of a scene to within a length, by a method of the solver.
 
-    Relative values refer to the length `scale`; `compiles` is that of the moves; `rows` are those
+    Relative values refer to the length `scale`; `compiles` is passed to `Moves`; `rows` are those
     of the scene; `at_rest` is the last system at rest, and `rest` are the data on which it depends.
     """
 
@@ -158,9 +160,9 @@ class Finder:
 
 @dataclass(frozen=True)
 class Rest:
-    """Data that determine a system at rest, by which a later search detects that it can use the
-    system again: the scene with its parameters, the leading groups, the bonds, and the methods of
-    the solver."""
+    """Data that determine a system at rest. If they are unchanged, a later search uses the system
+    again: the scene with its parameters, the leading groups, the bonds, and the methods of the
+    solver."""
 
     scene: Scene
     leads: tuple[bool, ...]
@@ -176,7 +178,7 @@ class Rest:
         return cls(finder.scene, leads, bonds, methods)
 
     def serves(self, other: Rest) -> bool:
-        """Return whether both have the same system."""
+        """Return whether both data determine the same system."""
         same = self.scene is other.scene and (self.leads, self.methods) == (
             other.leads,
             other.methods,
@@ -219,8 +221,8 @@ class Search(ABC):
         return 0.0
 
     def _is_rounding(self, share: float) -> bool:
-        """Return whether rounding, as a relative distance, prevents convergence to the
-        tolerance."""
+        """Return whether rounding errors that cause the relative distance `share` prevent
+        convergence to the tolerance."""
         finite = math.isfinite(self._finder.rows.max_norm(self._residual))
         return (
             finite
@@ -294,8 +296,8 @@ class Search(ABC):
 
 
 def _reachable(share: float) -> str:
-    """Return a remedy: a tolerance that can be reached with such a bound, empty if there is
-    none."""
+    """Return the remedy for a relative bound: a tolerance that can be reached or, if none can, the
+    reason."""
     tolerance = 10.0 ** math.ceil(math.log10(share / SHARE)) if 0.0 < share < math.inf else 1.0
     if tolerance < MAX_PROPOSED_TOLERANCE:
         return f"; set solver.tolerance: {tolerance:.0e}"
@@ -353,7 +355,7 @@ class _Newton(Search):
         super().__init__(finder, state, moment, before, "following the load")
         self._before, self._leader_change = before, state.u - before.u
         self._load_change = float(np.abs(self._leader_change).max())
-        """Change of the displacements of leaders, or, under loads, of followers."""
+        """Largest change of the displacements of leaders or, under loads, of followers."""
 
     def run(self) -> Certificate:
         """Correct until the tolerance is reached.
@@ -368,8 +370,8 @@ class _Newton(Search):
         return certificate
 
     def _go_ahead(self) -> None:
-        """Predict the equilibrium at the end of the increment from the previous one, by the moves
-        for a small part of the increment."""
+        """Predict the equilibrium at the end of the increment from the previous equilibrium, by
+        extrapolating the moves for a small part of the increment."""
         nudge = NUDGE * self._finder.scene.neighbourhood.nudge_unit
         moves, part = (
             self._finder.moves,
@@ -393,7 +395,8 @@ class _Newton(Search):
                 distance = self._distance()
             if distance <= self._finder.tolerance or not math.isfinite(distance):
                 return
-            # Each solution is as accurate as the moves are linear (Eisenstat and Walker, 1996).
+            # The accuracy of a solution is adapted to the nonlinearity of the moves (Eisenstat and
+            # Walker, 1996).
             share = (
                 min(MAX_CORRECTION_RTOL, (distance / previous_distance) ** 2)
                 if previous_distance
@@ -415,8 +418,8 @@ class _Relaxing(Search):
     """Pseudo-transient continuation (Kelley and Keyes, 1998): implicit steps, (A + damping) c =
     move, with a damping that decreases with the moves.
 
-    Parts that hang by one bond, and floating parts, are moved by implicit steps and by nothing
-    else.
+    Floating parts, and parts that are connected by one bond only, are moved by implicit steps
+    alone.
     """
 
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
@@ -471,8 +474,8 @@ class _Relaxing(Search):
 MAX_SETS = 60
 """Maximum number of changes of the active set."""
 MIN_PART = 2.0**-6
-"""Smallest fraction of a correction, tried if the whole correction removes particles from obstacles
-that hold them."""
+"""Smallest fraction of a correction that is tried. Fractions are tried if the complete correction
+would separate particles from obstacles that hold them."""
 
 
 def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:

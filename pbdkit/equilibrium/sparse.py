@@ -40,14 +40,14 @@ SAFETY = 3.0
 ACCURACY = 1e-9
 """Relative accuracy of solutions; a second correction improves it if necessary."""
 ROUGH = 1e-3
-"""Relative accuracy of solutions from which only a bound is computed."""
+"""Relative accuracy of solutions that are used for a bound only."""
 TURNS = 20
 """Number of inverse iterations."""
 SOFT = 1e10
-"""Norm of A⁻¹ from which a part may be floating."""
+"""Norm of A⁻¹ above which a part may be floating."""
 TOO_SOFT = 1e13
-"""Norm of A⁻¹, without the rigid modes, from which these cannot be distinguished from soft modes in
-double precision."""
+"""Norm of A⁻¹, rigid modes excluded, above which rigid modes cannot be distinguished from soft
+modes in double precision."""
 NOTHING = 64.0 * float(np.finfo(float).eps)
 """Rounding error of A y and of the push on a rigid mode y, relative to the terms that cancel."""
 RANDOM_SHARE = 0.1
@@ -94,7 +94,7 @@ class Subsystem(ABC):
 
     @abstractmethod
     def solve_transposed(self, weights: Floats) -> Floats:
-        """Return λ with λ · r = weights · x for the solution x of every r that has one."""
+        """Return λ such that λ · r = weights · x for every r for which there is a solution x."""
 
     @property
     def name(self) -> str:
@@ -250,12 +250,12 @@ class ConstrainedSubsystem(Subsystem):
 
 
 class SingularSubsystem(Subsystem):
-    """Linear system of a part with modes that no step changes: their invariants Yᵀ u, where Yᵀ A =
-    0, are constant.
+    """Linear system of a part with modes that no step changes: the invariants Yᵀ u, with Yᵀ A = 0,
+    are constant.
 
     `before` is the part of A that multiplies the state before the last one. It contributes to the
-    invariants, K = Yᵀ (1 + before). The system is A x + Y μ = r, K x = k. It has no solver if modes
-    grow or other modes have almost no stiffness.
+    invariants, K = Yᵀ (1 + before). The system is A x + Y μ = r, K x = k. There is no solver if
+    modes grow or other modes have almost no stiffness.
     """
 
     def __init__(self, matrix: Any, before: Any, watch: Watch) -> None:
@@ -401,8 +401,8 @@ class MatrixSystem(System):
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound: by the solution, or by the inverse for its rounding if the inverse is
-        available."""
+        """Kind of the bound: computed from the inverse, or from a solution if some part has no
+        inverse."""
         if self._damping:
             return "damped"
         ways = {part.bound_kind for block in self._blocks for _, part in block.parts}
@@ -514,7 +514,7 @@ class MatrixSystem(System):
             return float(np.linalg.norm(difference) / np.linalg.norm(pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the bound from another solution for the remaining moves, plus the effect of
+        """Return the bound: another solution, for the remaining moves, plus the effect of
         rounding."""
         table, bounds = self._table(moves), np.zeros(2)
         for block in self._blocks:
@@ -604,8 +604,8 @@ class MatrixSystem(System):
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
     def _coordinates(self, axes: list[int], members: Indices) -> Coordinates:
-        """Return the coordinates of these unknowns. Particles with one axis, which is prescribed,
-        count as leaders."""
+        """Return the coordinates of these unknowns. If the unknowns belong to one axis, particles
+        that are prescribed along it are listed with the leaders."""
         where, is_guided = members[:: len(axes)] // len(axes), self._guided[:, axes]
         positions = self._X[is_guided[:, 0]] if len(axes) == 1 else self._X[:0]
         guided = is_guided[where].ravel() if len(axes) > 1 and is_guided.any() else None

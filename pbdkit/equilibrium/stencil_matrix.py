@@ -33,7 +33,7 @@ CANDIDATES = 16
 """Number of most frequent stencils of each process among which the most frequent stencil overall is
 selected."""
 SAME = 1e-12
-"""Relative difference below which two stencils count as one."""
+"""Relative difference up to which two stencils are regarded as equal."""
 
 
 @cache
@@ -50,8 +50,8 @@ def kernels() -> SimpleNamespace:
 def most_first(
     code: Integers, stencils: Floats, scale: Floats, rows: Rows
 ) -> tuple[NDArray[np.int32], Floats, Floats]:
-    """Return the code, stencils and scales with the most frequent stencil as number 0, and the
-    equal ones merged with it."""
+    """Return the code, stencils and scales such that the most frequent stencil is number 0 and
+    includes all stencils that are equal to it."""
     tables = stencils, scale
     frequent = _most(code[..., rows.own, :], tables, rows)
     differences = [
@@ -211,8 +211,8 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     particles of one of nine groups are three places apart, so that no stencil contains two of them.
     Each follower has a separate stencil.
 
-    The stencil of a particle is wrong if it depends on more distant particles; the result has to be
-    compared with moves.
+    The stencil of a particle is wrong if the particle depends on more distant ones; the result has
+    to be compared with moves.
     """
     grid = PrimitiveRaster.of(scene)
     kind = kinds_of_places(scene.raster, scene.leading, step)
@@ -222,7 +222,7 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     body = np.flatnonzero((kind == FOLLOWER) | (kind == LEADER))
     code = np.full(kind.size, -1, np.int32)
     group, groups = (_number(grid.index(particles).T % 3 - 1) for particles in (place, body))
-    # Index in a stencil of the place that particles of one group have relative to those of another.
+    # numbers[n, g] is the index of the particles of group n in the stencils of group g.
     ways = np.stack(np.unravel_index(np.arange(WINDOW), (3, 3)))
     numbers = _number((ways[:, :, None] - ways[:, None] + 1) % 3 - 1)
     stencils, every = np.empty((len(place), WINDOW, 2, 2)), np.arange(len(place))
@@ -358,7 +358,7 @@ class _Assembly:
 
 
 def _number(way: Any) -> Any:
-    """Return the index in a stencil of the place at a step."""
+    """Return the index in a stencil of the place that is one step from the centre."""
     return 3 * (way[0] + 1) + way[1] + 1
 
 
@@ -406,9 +406,9 @@ def constrained(matrix: StencilMatrix, held: Held | None) -> StencilMatrix:
 def with_held(
     code: NDArray[np.int32], stencils: Floats, held: Held
 ) -> tuple[NDArray[np.int32], Floats, NDArray[np.intp]]:
-    """Return code and stencils, and the index of the former stencil of each. Places adjacent to
-    constrained components have separate stencils, without the columns of those components; the rows
-    of constrained components have a diagonal entry."""
+    """Return code and stencils, and for each stencil the index of the one that it replaces. Places
+    adjacent to constrained components have separate stencils, without the columns of those
+    components; the rows of constrained components have a diagonal entry."""
     from scipy.ndimage import binary_dilation
 
     is_adjacent = binary_dilation(held.any(axis=0), structure=np.ones((3, 3))) & (code >= 0)
@@ -436,8 +436,8 @@ def without_held(code: NDArray[np.int32], stencils: Floats, held: Held) -> Float
 
 
 def coarser_held(kind: NDArray[np.int8], held: Held, halved: tuple[int, int], below: Any) -> Held:
-    """Return the constrained components of the next grid, of kinds `below`: those with places
-    that coincide with constrained places."""
+    """Return the constrained components of the next grid, of kinds `below`: those at places that
+    coincide with a place where this grid has a constrained component."""
     coarse = np.zeros((2, *below.shape), bool)
     for axis, component in enumerate(held):
         kinds, out = np.where(component, LED, kind).astype(np.int8), np.zeros_like(below)
@@ -572,7 +572,7 @@ def _apart(
     matrix: StencilMatrix, bonds: NDArray[np.bool_], places: tuple[Indices, ...], s: int
 ) -> bool:
     """Return whether some of the particles with a separate stencil are separated from their
-    neighbour along place s of it."""
+    neighbour at place s of that stencil."""
     row, place = places
     down, along = s // 3 - 1, s % 3 - 1
     is_present = matrix.kind[row + down, place + along] != OUTSIDE

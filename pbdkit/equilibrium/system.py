@@ -47,9 +47,9 @@ ROUNDING = 4 * float(np.finfo(float).eps)
 class Moves:
     """Evaluation of the moves of a scene's followers.
 
-    Moves include relaxation but not momentum; frame points follow the body, and obstacles have
-    their positions of a moment. With `compiles` the moves of large bodies are compiled, which takes
-    seconds and saves time if many states of one scene are evaluated.
+    Moves include relaxation but not momentum; frame points follow the body, and obstacles are at
+    their positions at a given moment. With `compiles` the moves of large bodies are compiled, which
+    takes seconds and saves time if many states of one scene are evaluated.
     """
 
     def __init__(self, scene: Scene, *, compiles: bool = True) -> None:
@@ -151,14 +151,14 @@ def coarser_size(size: int) -> int:
 
 
 def outside(rows: slice, count: int) -> tuple[slice, slice]:
-    """Return the ranges of `count` rows before and after `rows`."""
+    """Return the ranges before and after `rows`, which are some of `count` rows."""
     first, last, _ = rows.indices(count)
     return slice(0, first), slice(last, count)
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of a grid of `count` rows that a process stores, by their indices in the grid.¶Arrays
+    """Rows of a grid of `count` rows that a process stores, by their indices in the grid. Arrays
     start at row `low`; the process owns rows `begin` to `end`, and has the stencils of rows `first`
     to `last`. `low` is even if rows are halved, so that row n of the next grid lies at 2n - 1 in
     the arrays too; this holds for `depth` coarser grids."""
@@ -281,8 +281,8 @@ TURNS = 4
 
 
 PUSH = 1e-10
-"""Relative error of moves, as of those from differences, up to which a load on a floating part is
-ignored."""
+"""Relative error of moves, for instance of moves computed by differences, up to which a load on a
+floating part is ignored."""
 
 
 class StuckError(Exception):
@@ -318,7 +318,7 @@ class System(ABC):
 
     @property
     def is_stuck(self) -> bool:
-        """True if an iteration makes no progress and the method allows no other."""
+        """True if an iteration makes no progress and the method has no alternative."""
         return False
 
     @property
@@ -330,7 +330,7 @@ class System(ABC):
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Solve for the correction c to within a length.
+        """Solve for the correction c with an error of at most `tolerance`, a length.
 
         `owed` is the state if the step depends on the state before it: the invariants of floating
         parts then have to change. `rounding` is the rounding error of the moves.
@@ -340,8 +340,8 @@ class System(ABC):
 
     @abstractmethod
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
-        """Return x with A x = moves, with an error relative to the largest number of x. Solutions
-        `near`, as of similar systems, save iterations."""
+        """Return x with A x = moves, with an error of at most `share` times the largest entry of x.
+        Similar solutions `near`, for instance of similar systems, save iterations."""
 
     @abstractmethod
     def pushed_by(self, led: Floats) -> Floats | None:
@@ -350,8 +350,8 @@ class System(ABC):
 
     @abstractmethod
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """Return λ with Aᵀ λ = weights, with an error relative to the largest number of λ. λ is
-        zero except at followers, and Σ λ · moves = Σ weights · A⁻¹ moves for all moves."""
+        """Return λ with Aᵀ λ = weights, with an error of at most `share` times the largest entry of
+        λ. λ is zero except at followers, and Σ λ · moves = Σ weights · A⁻¹ moves for all moves."""
 
     @abstractmethod
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:

@@ -196,8 +196,9 @@ class MeasuredField(MeasuredColumns):
 
 
 class MeasuredTracks(MeasuredColumns):
-    """Displacements of points of the body as it moves: at `time`, in steps, of the point at x and y
-    in the reference configuration."""
+    """Displacements of points of the moving body. Each row contains a `time`, in steps, the
+    coordinates x and y of a point in the reference configuration, and its displacement at that
+    time."""
 
     type: Literal["tracks"] = "tracks"
     columns: Annotated[tuple[str, str, str, str, str], Field(strict=False)] = (
@@ -406,8 +407,8 @@ MIN_BROKEN = 3
 
 class Peaks(Strict):
     """The peak load of each specimen: a list of `peaks`, or the `column` of a CSV `file` beside
-    this one. `of` is their quantity: the `force` or the `displacement` of the leader group `group`
-    at the peak, or `factor`, the fraction of the experiment's load.
+    this one. `of` names the measured quantity: the `force` or the `displacement` of the leader
+    group `group` at the peak, or `factor`, the peak load as a fraction of the experiment's load.
 
     Instead of `column`, `curve` names the columns specimen, displacement and force of whole curves;
     their peaks are used. `broke` is 1 if a specimen broke and 0 if its test ended before, as a list
@@ -498,9 +499,9 @@ class StrengthFit(Strict):
 
     `law` is the distribution of strengths, by default that of the experiment's fracture. `method`:
     `likelihood` assumes that a specimen fails with its first bond, `simulation` compares with
-    simulated specimens, `auto` uses the second if that assumption does not hold. `check` is the
-    number of specimens that are simulated to test it, `simulations` the number for the second
-    method, `seed` is the seed of the random numbers of both methods.
+    simulated specimens, `auto` uses `simulation` if that assumption does not hold. `check` is the
+    number of specimens that are simulated to test the assumption, `simulations` the number for the
+    method `simulation`, and `seed` the seed of the random numbers of both methods.
     """
 
     version: Version = 1

@@ -478,7 +478,7 @@ class Observation(ABC):
     noise
         Their standard deviation.
     rows : (row,)
-        Numbers of the rows of the file that count.
+        Indices of the rows of the file that are used.
     left_out, left_out_because
         Number of other rows, and the reason.
     unit
@@ -549,10 +549,10 @@ class Observation(ABC):
         """
 
     def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:
-        """Return Σ measured · p and Σ p², both divided by the square of the weighted noise.
+        """Return Σ measured · p and Σ p², with the predictions p for a modulus of 1, both divided
+        by the square of the weighted noise.
 
-        The ratio of the two sums, with the predictions p for a modulus of 1, is the initial
-        modulus.
+        The ratio of the two sums is the initial modulus.
         """
         return 0.0, 0.0
 
@@ -853,7 +853,7 @@ def _monotonic_part(places: Floats, forces: Floats) -> tuple[Floats, Floats]:
 
 
 DERIVATIVES = 1e-5
-"""Accuracy of derivatives relative to the largest, far below any noise."""
+"""Accuracy of derivatives, relative to the largest derivative; it is far below any noise."""
 CLOSE = 0.02
 """Largest distance of parameters, relative to the interval between their bounds, for which
 derivatives with respect to boundaries are reused. Residuals are exact in any case, and estimates
@@ -1115,7 +1115,7 @@ CORNERS = 1024
 
 
 def deeper(body: Body, lattice: Lattice, points: Floats, margin: float) -> NDArray[np.bool_]:
-    """Return whether points, (point,), lie at least at a distance from the outline of a body, up to
+    """Return whether points, (point,), are inside the outline of a body by at least `margin`, up to
     rounding."""
     rounding = tolerance_of(body, lattice)
     return np.asarray(depths(body, lattice, points) >= margin - 2.0 * rounding)
@@ -1192,8 +1192,8 @@ def _dogbone(body: Dogbone) -> Any:
 
 
 def _grid_region(grid: Grid, lattice: Lattice, removed: bool) -> Any:
-    """Return the cells with all corners among the sites of a grid, or with any corner if it is
-    removed."""
+    """Return the cells that have all corners among the sites of a grid or, for a grid that is
+    removed from a body, at least one corner."""
     cell = lattice.cell()
     tiling = tiling_of(cell, ((),) * len(cell.sites))
     margin = margin_of(tiling)

@@ -110,7 +110,8 @@ def _on_particles(field: FieldObservation) -> Floats:
 
 
 WIDE = 10.0
-"""Ratio of bounds above which the initial guess is not their middle."""
+"""Ratio of the upper to the lower bound above which the initial guess is not the middle of the
+bounds."""
 
 
 @dataclass(frozen=True)
@@ -388,8 +389,8 @@ class Directions:
 
     @property
     def unsure(self) -> NDArray[np.bool_]:
-        """Return a mask of the unknowns that a direction determines insufficiently, (direction,
-        unknown)."""
+        """Return a mask of the unknowns for which the data determine the value along a direction
+        insufficiently, (direction, unknown)."""
         components = np.abs(self.vectors)
         is_large = components * np.sqrt(self.variance)[:, None] > TELLS
         is_uncertain = (self.variance > TELLS**2)[:, None]
@@ -405,7 +406,8 @@ class Directions:
         return np.where(self.is_null, 0.0, along)
 
     def error_of(self, gradient: Floats) -> float:
-        """Return the standard error of a number with a gradient by z, without null directions."""
+        """Return the standard error of a number from its gradient with respect to z, without null
+        directions."""
         along = self.vectors @ (gradient * self.scale)
         return float(np.sqrt(np.square(along[~self.is_null]) @ self.variance[~self.is_null]))
 

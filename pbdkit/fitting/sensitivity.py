@@ -221,7 +221,8 @@ class Resting:
         return Adjoint(weights, combined, pull)
 
     def answer(self, leaders: Floats) -> Floats:
-        """Return ∂u for displacements of leaders, as planes; followers are in equilibrium."""
+        """Return the change of u caused by displacements of leaders, with followers in equilibrium,
+        as planes."""
         load = self.system.pushed_by(leaders) if self.finder.linear else None
         moves = self.along(self._moves, leaders) if load is None else load
         return self._with_frame(0.0, leaders + self._solve(moves, leaders.tobytes()))
@@ -300,8 +301,8 @@ class Resting:
 class Adjoint:
     """Adjoint solution of J = Σ weights · u.
 
-    dJ/dθ is Σ weights · ∂u/∂θ of leaders and frame points at fixed followers, plus Σ pull · ∂m/∂θ.
-    All are planes.
+    dJ/dθ = Σ weights · ∂u/∂θ + Σ pull · ∂m/∂θ, where ∂u/∂θ is the derivative for leaders and frame
+    points while followers are fixed. All arrays are planes.
 
     Parameters
     ----------

@@ -455,7 +455,8 @@ COARSE = 40
 FINE = 64
 """Number of nodes along a parameter to integrate it."""
 NEGLIGIBLE = 18.0
-"""Difference to the largest logarithm above which the likelihood is negligible (2e-8)."""
+"""Difference from the largest logarithm of the likelihood above which the likelihood is negligible
+(2e-8)."""
 DRAWS = 20_000
 """Number of draws for the likelihood."""
 NEGLIGIBLE_DEPTH = 1e-8
@@ -585,8 +586,8 @@ class UniformLaw(StrengthLaw):
         return np.asarray(second / np.sqrt(3.0))
 
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
-        """Draw parameters on a grid of ln w and of the distance of a below the strain of the
-        weakest specimen."""
+        """Draw parameters on a grid over ln w and the logarithm of the distance between the lower
+        end of the distribution and the strain of the weakest specimen."""
         strain, rate = strains.at(breaks.load), strains.rate(breaks.load)
         lowest = float(strain[breaks.broke].max(axis=1).min())
 
@@ -628,7 +629,7 @@ def _uniform(strain: Floats, rate: Floats, count: Floats, broke: Mask, a: float,
 
 
 def _nodes(ends: tuple[float, float]) -> Floats:
-    """Return logarithms from end to end."""
+    """Return equidistant logarithms between those of the two ends."""
     return np.linspace(np.log(ends[0]), np.log(ends[1]), COARSE)
 
 
@@ -664,8 +665,8 @@ MIDDLE = (0.15865525393145707, 0.8413447460685429)
 CUT = 1.02
 """Ratio of a bound to the end of an interval up to which the interval ends at the bound."""
 SHIFT = 0.25
-"""Largest mean of ln peak above first breaks, in standard errors of the mean: an interval of 95 %
-with this bias contains 94.3 %."""
+"""Largest mean of ln(peak / first break) that is harmless, in standard errors of the mean: an
+interval of 95 % with this bias still contains 94.3 %."""
 
 
 @dataclass(frozen=True)
@@ -1144,7 +1145,7 @@ def _check_first_break(
     """Simulate specimens with the fitted strengths, to test whether they fail when their first bond
     breaks.
 
-    None if the experiment does not define what happens afterwards.
+    Return None if the experiment does not define what happens afterwards.
     """
     kind = experiment.fracture.type
     if (

@@ -13,8 +13,8 @@ sampler uses the affine-invariant stretch moves of Goodman and Weare (emcee).
 
 Combinations: if predictions do not change along a direction v of the parameters θ, they do not
 change along the direction v / θ of ln θ either, to first order. Products of powers Π θ^e with e ·
-(v / θ) = 0 are then identifiable, and so are sums Σ e θ with e · v = 0. Both agree near the fit;
-the one that is valid over the longer distance is chosen by evaluating residuals.
+(v / θ) = 0 are then identifiable, and so are sums Σ e θ with e · v = 0. Product and sum agree near
+the fit. Residuals are evaluated to choose the one that is valid over the longer distance.
 
 Cross-validation leaves out blocks of adjacent points (Roberts et al. 2017, Ecography 40, 913),
 since a single point could be predicted from its neighbours.
@@ -162,9 +162,10 @@ class Candidate:
         Mean square of left-out residuals divided by their noise (1 is the noise alone), and its
         standard error over blocks.
     behind, behind_error
-        Mean difference of `left_out` to that of the best model over blocks, and its standard error.
+        Mean difference over blocks between `left_out` and that of the best model, and its standard
+        error.
     differs
-        Root mean square difference to the predictions of the best model, over the noise.
+        Root mean square difference from the predictions of the best model, divided by the noise.
     values
         Fitted parameters by path.
     """
@@ -297,7 +298,7 @@ STEP = 0.75
 """First step of a profile in standard errors."""
 
 EQUAL_STEPS = 4
-"""Number of equal steps; further steps double."""
+"""Number of equal steps; each further step is twice the previous one."""
 
 MAX_STEPS = 12
 """Largest number of steps."""
@@ -547,7 +548,7 @@ SAME = 1e-3
 SIMPLE = 5e-3
 """Largest deviation of an exponent from a whole or half number to which it is rounded."""
 NEAR_ZERO = 1e-2
-"""Fraction of the interval between its bounds below which a parameter may be 0."""
+"""Fraction of the interval between its bounds up to which a parameter is regarded as possibly 0."""
 UNSEEN = 1e-2
 """Change of the squared residuals, relative to that of the noise, that is negligible."""
 MAX_RELATIVE_CHANGE = 0.2

@@ -139,8 +139,8 @@ class Elasticity:
         return -transverse / longitudinal if longitudinal else None
 
     def _strains(self, degrees: float) -> tuple[float, float]:
-        """Compute the strains along and across a bar under tension, times det C; rounding errors
-        along it are 0.
+        """Compute the strains along and across a bar under tension, times det C. A strain along the
+        bar that is a rounding error is returned as 0.
 
         They are computed from the minors of C, so that they exist for a singular C, too.
         """

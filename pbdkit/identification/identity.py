@@ -100,7 +100,8 @@ class Identity:
 
     @property
     def body(self) -> Elasticity | None:
-        """Elastic body; isotropic diffusion is one, too, away from free edges."""
+        """Elastic body; away from free edges isotropic diffusion is equivalent to an elastic body,
+        too."""
         is_elastic = self.kind == ELASTICITY or (self.kind == DIFFUSION and self.isotropic)
         return self.long.elasticity if self.long and is_elastic else None
 

@@ -107,7 +107,8 @@ def probe(scene: Scene, spacing: float) -> RuleProperties:
 def _reasons(
     scene: Scene, cases: list[tuple[Scene, Here]], stencils: dict[Here, Stencil], spacing: float
 ) -> Iterator[str]:
-    """Yield why the rule is neither diffusion nor elasticity, apart from long waves."""
+    """Yield reasons why the rule is neither diffusion nor elasticity, except those from long
+    waves."""
     drift = (
         max(_move_at_rest(rule, place, scene.neighbourhood.slots) for rule, place in cases)
         / spacing
@@ -155,7 +156,7 @@ def _move_at_rest(scene: Scene, at: Here, slots: tuple[Slots, ...]) -> float:
 
 
 def _is_linear(scene: Scene, at: Here, size: float, tolerance: float) -> bool:
-    """Return whether the rule's move is Σ W d for random differences d of a size."""
+    """Return whether the rule's move is Σ W d for random differences d of a given size."""
     stencil = linearised(scene, at)
     for slots, d in _random(scene, size, seed=0):
         change = _move(scene, slots, d, at) - _move(scene, slots, {}, at)
@@ -286,7 +287,8 @@ def _refuse_no_numbers(stencil: Stencil, rule: str) -> None:
 
 
 def _long_waves(stencil: Primitive) -> tuple[LongWaves | None, list[str]]:
-    """Expand the response to long waves, and list why it is neither diffusion nor elasticity."""
+    """Expand the response to long waves, and list reasons why it is neither diffusion nor
+    elasticity."""
     waves = slow_waves(stencil)
     if isinstance(waves, str):
         return None, [waves]

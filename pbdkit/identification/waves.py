@@ -12,16 +12,17 @@ displacement, and Y·X = 1 with the left null vectors Y of L(0). The eigenvalues
 A(k) are the rates of the slow waves to every order: a step subtracts A(k) u from u. With one site A
 = L.
 
-A lattice may be described by a larger cell than necessary, as the hexagonal lattice is by a
-rectangular cell with two sites. Sites that a translation maps onto one another, stencil included,
-count as one site. The remaining ones are the sublattices of a lattice with a basis.
+A lattice may be described by a larger cell than necessary, for instance the hexagonal lattice by a
+rectangular cell with two sites. If a translation maps sites onto one another, and their stencils
+are equal, they are treated as one site. The remaining ones are the sublattices of a lattice with a
+basis.
 
 The rate z of a wave is the fraction of it that a step removes. For long waves z = d k² (1 + λ² k²),
-where d is the diffusivity along the direction, of the faster and of the slower wave, and λ² the
-fourth-order length. In gradient elasticity, u'' - l² u'''', λ² is l²; a lattice alone has λ² < 0.
-Along the normal of a family of lattice rows, h apart, interactions with the next row alone give z =
-d s, s = (2 sin(kh/2) / h)², hence λ² = -h²/12. This part is due to the discreteness of the lattice;
-the rest,
+with the diffusivity d and the square λ² of the fourth-order length. Both depend on the direction,
+and differ between the faster and the slower wave. In gradient elasticity, u'' - l² u'''', λ² is l²;
+a lattice alone has λ² < 0. Along the normal of a family of lattice rows, h apart, interactions with
+the next row alone give z = d s, s = (2 sin(kh/2) / h)², hence λ² = -h²/12. This part is due to the
+discreteness of the lattice; the rest,
 
     l² = λ² + h²/12
 
@@ -49,7 +50,7 @@ from pbdkit.plugin import Cell
 NEAR = 1e-6
 """Distance below which two places coincide, in units of the spacing."""
 ALIKE = 1e-8
-"""Relative tolerance, of the largest entry, for the equality of matrices."""
+"""Tolerance for the equality of matrices, relative to the largest entry."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,8 @@ def primitive(cell: Cell, stencil: Stencil) -> Primitive:
 
 
 def _image(positions: Floats, vectors: Floats, shift: Floats) -> NDArray[np.intp] | None:
-    """Return the site onto which a shift maps each site; None if it maps one onto no site."""
+    """Return the site onto which a shift maps each site, or None if the image of some site is not a
+    site."""
     differences = positions[:, None, :] + shift - positions[None, :, :]
     cells = differences @ np.linalg.inv(vectors)
     misses = np.linalg.norm((cells - np.rint(cells)) @ vectors, axis=-1)
@@ -153,7 +155,7 @@ def _shortest(vectors: Floats, shifts: Floats) -> Floats:
 
 
 ZERO = 1e-8
-"""Relative tolerance for zero, of the stencil's largest entry."""
+"""Tolerance for zero, relative to the largest entry of the stencil."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +197,8 @@ class SlowWaves:
 def slow_waves(stencil: Primitive) -> SlowWaves | str:
     """Return the slow waves, or the reason why there are none.
 
-    There are none if a translation of the whole is not preserved, or if sites can move separately.
+    There are none if a step does not preserve a translation of the body, or if sites can move
+    separately.
     """
     rest = operator(stencil, np.zeros((1, 2)))[0].real
     translations = _translations(stencil.sites)
@@ -309,7 +312,8 @@ class LongWaves:
     diffusivity : (2, 2)
         D_cd if x and y diffuse separately and equally, else None.
     elasticity
-        The elastic body with the equilibrium that the rule approaches, also that of a diffusion.
+        The elastic body with the equilibrium that the rule approaches; it is also given for
+        diffusion.
     fast, slow
         Diffusivities of the two waves by direction.
     gradients
@@ -443,8 +447,8 @@ def minimum(
     where, best = low, np.inf
     for _ in range(ROUNDS):
         values = value(grid)
-        # Among points that differ by rounding only the first counts, and none after an equal best
-        # point.
+        # Of points with values that differ by rounding only, the first is used, and none if the
+        # best point so far has the same value.
         candidates = values <= values.min() + ROUNDING * np.abs(values).max()
         index = int(candidates.argmax())
         if best == np.inf or values[index] < best - ROUNDING * abs(best):

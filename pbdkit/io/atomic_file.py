@@ -1,5 +1,5 @@
-"""Atomic writing of files: complete or not at all, locked against other writers, replacing an
-earlier file only on request.
+"""Atomic writing of files. A file appears complete or not at all, it is locked against other
+writers, and it replaces an earlier file only on request.
 
 `NewFile` is a file under construction, for libraries that do not handle writes that fail or are
 incomplete.
@@ -168,7 +168,7 @@ class NewFile(io.RawIOBase):
         return len(view)
 
     def close(self) -> None:
-        """Close the file, on the disk too."""
+        """Close this object and the file on the disk."""
         self.disk.close()
         super().close()
 
@@ -177,7 +177,7 @@ class NewFile(io.RawIOBase):
         self._fault = self._fault or fault
 
     def check(self) -> None:
-        """Raise the OSError that was recorded in writing, if any."""
+        """Raise the OSError that a write recorded, if there is one."""
         if self._fault:
             raise self._fault
 
@@ -199,9 +199,9 @@ class NewFile(io.RawIOBase):
 
 
 WHOLE = ("complete", "settled")
-"""Status of results that may replace other results."""
+"""Statuses of results that may replace an earlier file."""
 PARTIAL = "-partial"
-"""Suffix of the name of other results, if their name exists already."""
+"""Suffix that is added to the name of any other result if a file has that name already."""
 TEMPORARY = ".partial"
 """Suffix of files under construction."""
 RANDOM_BYTES = 8

@@ -148,8 +148,7 @@ def _is_consistent(
         earlier = [recorded.step, recorded.recorded, parts.get("kept", -1), guard["good_step"]]
         later = [guard["next_look"], pace.next_look if pace else step, steps]
         integral = all(isinstance(n, int) for n in (step, *earlier[2:], *later))
-        # An equilibrium may be recorded within a step, and the step may be one that is still to be
-        # made.
+        # An equilibrium may be recorded at a moment within a step, before the step is complete.
         latest = max(step, parts.get("moment", 0.0))
         in_order = min(earlier) >= -1 and max(earlier) <= latest and step <= min(later)
         in_order = in_order and 0.0 <= parts.get("moment", 0.0) <= steps
@@ -161,7 +160,7 @@ def _is_consistent(
 def _is_like(facts: Any, template: Any) -> bool:
     """Return whether facts have the types of a template, the facts of a run before its first step.
 
-    A None of the template may be a number, an array, or numbers.
+    Where the template has None, the facts may have a number, an array, or a list of numbers.
     """
     if isinstance(template, dict) and "array" not in template:
         same_keys = isinstance(facts, dict) and facts.keys() == template.keys()

@@ -52,7 +52,7 @@ class BondStatus:
 
     @property
     def share(self) -> float | None:
-        """Fraction of the breaking strain reached at that step; 1 where the bond breaks."""
+        """Fraction of the breaking strain that is reached at `at_step`; the bond breaks at 1."""
         return self.strain / self.breaks_above if self.breaks_above else None
 
 
@@ -201,8 +201,8 @@ class BondRecords:
         raise ExperimentError(f"no bond joins {a} and {b}; the bonds of {a} are to {partners}")
 
     def around(self, row: int) -> Rows:
-        """Return the other bonds at the ends of a bond, the broken ones first and in their
-        order."""
+        """Return the other bonds at the ends of a bond: first the broken ones, in the order of
+        breaking."""
         touches = np.asarray(np.isin(self.bonds.ends, self.bonds.ends[row]).any(axis=1))
         touches[row] = False
         broken = self.order[touches[self.order]]
