@@ -1,5 +1,5 @@
-"""Hooks that a distribution may implement, installed plugins, and the isolation in which each is
-loaded, so that an error in its code becomes a message with its name.
+"""Hooks that a distribution may implement, and installed plugins. Each plugin is loaded in
+isolation, so that an error in its code becomes a message with the name of the plugin.
 
 This module does not import the interfaces of components, so that commands start without them.
 """

@@ -176,8 +176,8 @@ def _nearest(at: Floats, low: Indices, shape: tuple[int, ...]) -> Floats:
 
 
 def _pieces(A: Any, axes: int, row: Indices, point: Indices, count: int) -> tuple[int, Indices]:
-    """Return the number of pieces and the piece of each entry of hats. Entries around one point
-    belong to one piece if their particles are bonded to each other."""
+    """Return the number of pieces and the piece of each entry of hats. The entries of a hat belong
+    to one piece if their particles are connected by bonds."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import connected_components
 

@@ -171,8 +171,9 @@ ACCURACY = 1e-8
 """Relative accuracy of linear systems; the bound includes the remaining error."""
 
 CONTRACTION = 0.1
-"""Largest ratio of moves after and before a correction for which the linearisation is valid.
-Further corrections, each smaller by this ratio, then add up to at most a ninth of the first."""
+"""Largest ratio of the moves after a correction to those before it for which the linearisation is
+valid. Further corrections, each smaller by this ratio, then add up to at most a ninth of the
+first."""
 TOO_NONLINEAR = "the rule is too nonlinear between the state and equilibrium for a bound"
 """Reason for an infinite distance under a rule that is too nonlinear."""
 

@@ -22,8 +22,8 @@ from pbdkit.equilibrium.system import ALL, Rows
 MAX_ITERATIONS = 400
 """Maximum number of iterations."""
 ALIKE = 1e-13
-"""Relative size below which the component of a field outside the span of the others counts as
-zero."""
+"""Relative size below which the part of a field that is linearly independent of the others is
+regarded as zero."""
 SLOWEST = 0.9
 """Largest ratio of successive jumps from which the distance is extrapolated."""
 
@@ -69,9 +69,8 @@ class KrylovResult(ABC):
 
 @dataclass
 class Descent(KrylovResult):
-    """Result of conjugate gradients: `steps` and `turns` are the numbers α and β,
-    `residual_energy` is rᵀ B r
-    of the residual, with the cycle B."""
+    """Result of conjugate gradients: `steps` and `turns` are the numbers α and β, and
+    `residual_energy` is rᵀ B r with the residual r and the cycle B."""
 
     x: Floats
     residual_energy: float = math.inf

@@ -3,8 +3,8 @@
 The error e of a state satisfies K e = r. Some iterations remove most of it. The energy of the
 remaining error is at most rᵀ B r / λ, with the multigrid cycle B and the smallest eigenvalue λ of B
 K, which conjugate gradients estimate (Lanczos). The displacement of a place is at most √(g ·
-energy) with its compliance g, which is extrapolated from coarse grids. These are estimates and not
-rigorous bounds; for safety λ is halved.
+energy), where g is the compliance of the place, extrapolated from coarse grids. These are estimates
+and not rigorous bounds; for safety λ is halved.
 
 The slowest mode of the steps is computed by inverse iteration, v ← A⁻¹ v.
 """
@@ -65,12 +65,13 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 ENOUGH = 8
-"""Number of iterations by which the compliance of a place is estimated."""
+"""Number of iterations in the estimate of the compliance of a place."""
 
 
 def compliance(grids: Multigrid | PartedGrids) -> float:
-    """Estimate the largest displacement of a place under a unit load. The increase from the
-    coarsest grid to the next is assumed for each finer grid."""
+    """Estimate the largest displacement of a place under a unit load. From the coarsest grid to the
+    next finer one it increases by a certain amount; the same increase is assumed for each finer
+    grid."""
     coarse, last = grids.whole, len(grids) - 1
     axis, place, displacement = coarse.softest
     if last == 0:
@@ -271,8 +272,8 @@ class LatticeSystem(System):
         return math.sqrt(solver.dot(difference, difference) / solver.dot(pull, pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the error that a number of iterations remove, plus a bound on the remaining error
-        and on the effect of rounding. Rounding errors are taken to be random."""
+        """Return the sum of the error that some iterations remove, of a bound on the remaining
+        error, and of a bound on the effect of rounding. Rounding errors are taken to be random."""
         remainder, length = self._tracked(self._pull(moves))
         if self._spread is None:
             self._spread = self._spread_of_rounding()

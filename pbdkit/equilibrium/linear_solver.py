@@ -40,7 +40,8 @@ WIDEST_BAND = 120
 """Largest half-bandwidth that is factorised as a band. Beyond it, for a square body, the factors of
 a band matrix take more memory than sparse ones, and soon more time."""
 PIVOT_THRESHOLD = 0.1
-"""Ratio to the largest entry of its column from which a diagonal entry is used as a pivot."""
+"""A diagonal entry is used as a pivot if it is at least this fraction of the largest entry of its
+column."""
 PATTERN_ASYMMETRY = 1.2
 """Largest ratio of the number of nonzeros of A + Aᵀ to that of A for which the pattern counts as
 nearly symmetric."""
@@ -61,8 +62,8 @@ class Coordinates:
     """Coordinates of the unknowns, `axes` for each particle, stored next to each other.
 
     These are the positions of particles and of leaders, (particle, axis of space), and a mask of
-    the `held` unknowns; their rows and columns have a diagonal entry alone (None if there are
-    none).
+    the `held` unknowns; their rows and columns have no entry except the diagonal one. The mask is
+    None if no unknown is held.
     """
 
     axes: int

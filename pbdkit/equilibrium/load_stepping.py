@@ -138,7 +138,7 @@ def changes(scene: Scene, steps: int) -> list[int]:
 VALUES_A_CALL = 200_000_000
 """Number of values times steps in a call of an engine. A call takes a few tenths of a second."""
 GROWING = 1e-6
-"""Excess over 1 from which the eigenvalue of a mode counts as growth."""
+"""A mode grows if its eigenvalue exceeds 1 by more than this number."""
 RECORD_LAST = "; or record the equilibrium of the last step only, `record: {{at: [{}]}}`"
 """Remedy for equilibria of intermediate steps that do not exist."""
 MOST_SETTLINGS = 2000
@@ -153,7 +153,7 @@ REMEDY = (
 )
 """Remedy for a body that came apart."""
 MOST_ROUNDS = 40
-"""Maximum number of rounds of steps if an equilibrium cannot be followed."""
+"""Maximum number of rounds of steps that are made if an equilibrium cannot be followed."""
 STEPS_A_ROUND = 50
 """Number of steps in a round."""
 
@@ -191,11 +191,11 @@ def increments(
     the equilibrium of its last step, and yield the states on the way. The equilibria of `stops`,
     which are steps before the last one, are included.
 
-    The body is in equilibrium before each change of roles or loads, so that leaders that start
-    later and floating parts are where slow loading moves them. Floating parts under a load are
-    moved by steps. If bonds can break, and for rules that are not linear, leaders and loads move in
-    increments, within steps too: the body is moved to equilibrium, bonds that are too long break,
-    and both are repeated until no bond breaks.
+    The body is in equilibrium before each change of roles or loads, so that floating parts, and
+    leaders that start later, are at the positions to which slow loading moves them. Floating parts
+    under a load are moved by steps. If bonds can break, and for rules that are not linear, leaders
+    and loads move in increments, within steps too: the body is moved to equilibrium and bonds that
+    are too long break, repeatedly, until no bond breaks.
 
     Raises ExperimentError if there is no equilibrium, UnconvergedError, SeparatedError, and
     StoppedError on interruption; the state is then the last one reached.
@@ -402,7 +402,7 @@ def _torn(state: State) -> int:
 
 def _refuse_thrown_off(scene: Scene, state: State, farthest: float) -> None:
     """Raise NoEquilibriumError if bonds broke and a particle has moved farther than the size of the
-    body plus all prescribed displacements, so that nothing holds it."""
+    body plus all prescribed displacements: nothing holds the particle."""
     if _torn(state) and not (longest := most_of(state)) <= farthest:
         number = Guard(farthest, 0, 0, None).worst(scene, state)
         raise NoEquilibriumError(

@@ -51,10 +51,11 @@ modes in double precision."""
 NOTHING = 64.0 * float(np.finfo(float).eps)
 """Rounding error of A y and of the push on a rigid mode y, relative to the terms that cancel."""
 RANDOM_SHARE = 0.1
-"""Smallest component of a vector of random numbers along one mode, multiplied by the square root of
-their number."""
+"""Smallest component along one mode that a normalised vector of random numbers is assumed to have,
+multiplied by the square root of the number of unknowns."""
 SHIFT = 1e-13
-"""Shift of a large singular matrix, relative to its largest entry."""
+"""Number that is added to the diagonal of a large singular matrix, relative to its largest
+entry."""
 MODES = 6
 """Number of modes among which the kernel of a matrix is searched first."""
 MAX_MODES = 96

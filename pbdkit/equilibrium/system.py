@@ -228,7 +228,7 @@ class Rows:
         return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
 
     def whole(self, numbers: Array) -> Array:
-        """Return the numbers of all rows, (..., row), from those of the rows of this process."""
+        """Gather numbers, (..., row), of the rows of this process; return those of all rows."""
         return numbers
 
     def total(self, numbers: Array) -> float:

@@ -85,7 +85,8 @@ class MeasuredColumns(Component):
     """A measurement: the columns of a CSV `file` beside the fit file. `noise` is the standard
     deviation of the measured numbers; by default it is estimated from the residuals. With a
     `weight` of 4 each number counts as if its noise were halved. `settings` are changes of the
-    experiment, by path, for this measurement alone, for instance another load or another end."""
+    experiment, by path, for this measurement alone, for instance another load or another number of
+    steps."""
 
     file: str
     noise: Positive | None = None
@@ -156,9 +157,9 @@ def _rows_of(table: xarray.Dataset, columns: Sequence[str]) -> Floats:
 
 
 class Distortion(Strict):
-    """Apparent displacements in the plane that are not those of the body: polynomials of x and y,
-    by their exponents, with fitted amplitudes. They describe a rotated camera, a lens, and bending
-    out of the plane, for instance `ux: [[2, 0]]`, a strain that grows linearly along x."""
+    """Apparent displacements in the plane that are not displacements of the body: polynomials of x
+    and y, by their exponents, with fitted amplitudes. They describe a rotated camera, a lens, and
+    bending out of the plane, for instance `ux: [[2, 0]]`, a strain that grows linearly along x."""
 
     ux: Terms = ()
     uy: Terms = ()
@@ -333,9 +334,9 @@ class Fit(Strict):
     """Fits the `unknown` parameters of an experiment, within bounds, to measurements: a field in
     equilibrium, tracks, a curve, or several of these.
 
-    Leader groups that move by `measured` get `modes` smooth displacements along each axis, which
-    are estimated, too; with 0 the measured displacements are prescribed. `loss` is the loss
-    function of the residuals: all but `linear` reduce the weight of outliers.
+    For leader groups with the motion `measured`, the amplitudes of `modes` smooth displacements
+    along each axis are estimated, too; if `modes` is 0, the measured displacements are prescribed.
+    `loss` is the loss function of the residuals: all but `linear` reduce the weight of outliers.
 
     Optional and expensive: `profile` lists parameters for a profile likelihood, computed by
     fitting all others again; `sampler` draws from the posterior; `candidates` are other models by

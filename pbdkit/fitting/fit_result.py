@@ -84,13 +84,13 @@ class Misfit:
     noise
         Standard deviation of the noise.
     ratio
-        Standard deviation of the residuals over the noise.
+        Standard deviation of the residuals divided by the noise.
     numbers
         Number of measured numbers.
     left_out, left_out_because
         Number of rows that are left out, and the reason.
     factor, unit
-        `factor` times the noise is in `unit`, if the experiment has units.
+        If the experiment has units, `factor` times the noise is its value in `unit`.
     """
 
     kind: str
@@ -117,8 +117,8 @@ class Misfit:
 class Fitted:
     """Result of a fit.
 
-    Standard errors are scaled by the residuals if these are larger than the noise over the root of
-    the weight.
+    Standard errors are scaled by the residuals if the residuals are larger than the noise divided
+    by the square root of the weight.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class Fitted:
     misfits : tuple of Misfit
         Residuals of each measurement, independent of its weight.
     ratio : float
-        Standard deviation of all residuals over the noise.
+        Standard deviation of all residuals divided by the noise.
     problem, solution
         Least-squares problem and its solution.
     profiles : mapping of str to Profile
@@ -309,8 +309,8 @@ class Fitted:
 
         Notes
         -----
-        It is the square of the part of the derivative that is orthogonal to those of all other
-        unknowns.
+        It is the square of the part of the derivative that is orthogonal to the derivatives with
+        respect to all other unknowns.
         """
         jacobian, result = self.solution.at.jacobian, dict[str, Floats]()
         _, rows = [*self.problem.rows()][n]

@@ -1,9 +1,9 @@
 """Observations of a fit: predictions of an equilibrium or a run for measured displacements, tracks
 and forces.
 
-A measured boundary contains noise, which would be prescribed with it. The displacement of each
-group that moves by `measured` is therefore a polynomial along the boundary. Its coefficients are
-estimated with all other unknowns, starting from the measured values.
+If the displacements of a measured boundary were prescribed, their noise would be prescribed, too.
+The displacement of each group that moves by `measured` is therefore a polynomial along the
+boundary. Its coefficients are estimated with all other unknowns, starting from the measured values.
 
 Displacements between particles are interpolated bilinearly in the cells of the lattice. Derivatives
 of predictions of a run are central differences of order 8 of whole runs, in which the same bonds
@@ -107,7 +107,8 @@ class Boundary:
         return experiment.model_copy(update={"leaders": tuple(leaders)})
 
     def planes(self, scene: Scene, n: int) -> Floats:
-        """Return the displacement for coefficient n alone, (axis, sublattice, cell, cell)."""
+        """Return the displacements if coefficient n is 1 and all others are 0, (axis, sublattice,
+        cell, cell)."""
         axis, mode = divmod(n, self.modes.shape[1])
         planes = np.zeros((scene.axes, *scene.raster.shape))
         flat = planes.reshape(scene.axes, -1)
@@ -201,9 +202,10 @@ class Interpolation:
     def at(cls, scene: Scene, points: Floats) -> Interpolation:
         """Interpolate at points.
 
-        The corners of a lattice with one site in a cell are the four around a point, otherwise the
-        nearest three of a polygon of the lattice. Points without all of them, as in a hole, are
-        left out, and so are points between particles with a bond that is broken from the start.
+        On a lattice with one site in a cell, the four particles around a point are used, otherwise
+        the nearest three corners of a polygon of the lattice. Points for which one of these
+        particles is missing, for instance in a hole, are left out, and so are points between
+        particles with a bond that is broken from the start.
         """
         has_one_site = len(scene.raster.cell.sites) == 1
         interpolation = _in_cells(scene, points) if has_one_site else _in_triangles(scene, points)

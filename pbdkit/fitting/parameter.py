@@ -30,11 +30,12 @@ larger."""
 MIN_STEP = 1e-7
 """Smallest step as a fraction of the value, used near a bound."""
 SMOOTH = 1e-5
-"""Relative difference of the results of orders 2 and 4 up to which the error of order 4 is about
-the square of this number."""
+"""If the results of orders 2 and 4 differ by at most this fraction, the relative error of order 4
+is about the square of this number."""
 
 ROUGH = 1e-8
-"""Relative accuracy for which order 2 suffices, with a step of a quarter of its square root."""
+"""Order 2 suffices for a relative accuracy of at least this number; the step is a quarter of the
+square root of the accuracy."""
 PARTS = ("rule", "fracture")
 """Parts of an experiment that are replaced without any other change."""
 SEPARATE_PARTS = ("leaders", "loads")

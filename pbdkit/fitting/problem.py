@@ -4,8 +4,8 @@ guess, and a Gauss-Newton iteration restricted to identifiable directions.
 The initial guess minimises the equilibrium gap. With the true parameters θ, measured displacements
 u at the particles are in equilibrium: the moves m(u, θ) are zero wherever all neighbours are
 measured. Since m is nearly linear in θ, a few linear problems give θ without computing an
-equilibrium (Claire, Hild and Roux 2004). The guess is biased by noise, but independent of the
-bounds, and their middle may be far from the solution.
+equilibrium (Claire, Hild and Roux 2004). The guess is biased by noise, but it does not depend on
+the bounds; the middle of the bounds may be far from the solution.
 """
 
 from __future__ import annotations
@@ -349,7 +349,8 @@ MODULUS = "Young's modulus"
 CONVERGED = 1e-2
 """Largest step, in standard errors, of a converged fit."""
 MAX_REVERSAL = 0.25
-"""Fraction of the last change that a step may revert; otherwise the next step is halved."""
+"""If a step reverts more than this fraction of the change by the previous step, its length is
+halved."""
 FROZEN = 1e-3
 """Change of all residuals between the bounds, in units of their noise, below which an unknown is
 fixed."""

@@ -1,9 +1,9 @@
 """Sensitivity of an equilibrium to a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
 
 In equilibrium no follower moves, m(u, θ) = 0. A = -∂m/∂u is the matrix of the equilibrium solver,
-so that each parameter requires one more solution, and the moves of a few scenes with slightly
-different parameters. The derivatives of a scalar J = w · u with respect to all parameters require a
-single solution, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ (adjoint method).
+so that each parameter requires one more solution, and evaluations of the moves of a few scenes with
+slightly different parameters. The derivatives of a scalar J = w · u with respect to all parameters
+require a single solution, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ (adjoint method).
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ A specimen survives the load λ if all its bonds do, with probability Π_b (1 - 
 the distribution of strengths. The likelihood of repeated tests therefore follows without a run
 (weakest link: W. Weibull, J. Appl. Mech. 18 (1951) 293). Location μ and scale σ of ln strength
 (Weibull: μ = ln s, σ = 1/m) or of strength (uniform) have the prior density dμ dσ/σ, and the
-likelihood is integrated. If all bonds have equal strains, specimens also belong to a location-scale
-family, and intervals from the integrated likelihood are exact for any number of specimens (J.
-Berger, Statistical Decision Theory, 1985, section 6.6).
+likelihood is integrated. If all bonds have equal strains, the strengths of specimens belong to a
+location-scale family, too, and intervals from the integrated likelihood are exact for any number of
+specimens (J. Berger, Statistical Decision Theory, 1985, section 6.6).
 
 If specimens do not fail with their first bond, a synthetic likelihood is used: single specimens are
 simulated with strengths between all bounds, and then with strengths for which the measurement is
@@ -661,7 +661,7 @@ OF_FRACTURE = {"weibull": "weibull", "strain": "uniform"}
 LIMITS = (0.025, 0.975)
 """Quantiles of the 95 % interval."""
 MIDDLE = (0.15865525393145707, 0.8413447460685429)
-"""Quantiles of one standard error."""
+"""Quantiles at a distance of one standard error from the median."""
 CUT = 1.02
 """Ratio of a bound to the end of an interval up to which the interval ends at the bound."""
 SHIFT = 0.25
@@ -682,7 +682,7 @@ class StrengthEstimate:
     identifiable
         Whether the data determine the value.
     cut
-        Whether a bound ends the interval, which might extend beyond.
+        Whether the interval ends at a bound, and might extend beyond it without the bound.
     """
 
     value: float
@@ -710,9 +710,9 @@ class Checked:
     Parameters
     ----------
     excess
-        Mean of ln peak/first over simulated specimens.
+        Mean of ln(peak / first break) over simulated specimens.
     bore_more
-        Number of specimens with a larger peak.
+        Number of specimens with a peak above their first break.
     count
         Number of specimens.
     limit

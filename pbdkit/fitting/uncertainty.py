@@ -7,9 +7,10 @@ strongly nonlinear predictions. With a loss, the increase is divided by mean ψ�
 for M-estimators.
 
 Posterior: unknowns that enter linearly (boundaries of a linear rule, distortions, Young's modulus)
-are integrated out exactly, and boundaries of other rules by linearisation at the fit. With their
-derivatives J, the remaining residuals r and a flat prior, log p = -½ |r|² - ½ log det JᵀJ. The
-sampler uses the affine-invariant stretch moves of Goodman and Weare (emcee).
+are integrated out exactly, and boundaries of rules that are not linear by linearisation at the fit.
+With the derivatives J with respect to these unknowns, the remaining residuals r and a flat prior,
+log p = -½ |r|² - ½ log det JᵀJ. The sampler uses the affine-invariant stretch moves of Goodman and
+Weare (emcee).
 
 Combinations: if predictions do not change along a direction v of the parameters θ, they do not
 change along the direction v / θ of ln θ either, to first order. Products of powers Π θ^e with e ·
@@ -305,7 +306,8 @@ MAX_STEPS = 12
 MAX_FIRST_STEP = 0.1
 """Largest first step, as a fraction of the interval between the bounds."""
 STRAIGHT = 1.5
-"""Increment of the square root of the rise over which it is interpolated linearly."""
+"""Largest increment of the square root of the rise over which the square root is interpolated
+linearly."""
 
 REFINEMENTS = 30
 """Maximum number of additional values for that interpolation."""
@@ -389,7 +391,7 @@ def _walk(
 def _refine(side: Floats, problem: Problem, solution: Solution, n: int, loss: Loss) -> Floats:
     """Insert values, (value, 2), where the rise reaches RISE_95.
 
-    The square root of the rise is not linear there if the profile was flat before.
+    The square root of the rise is not linear near this value if the profile is flat near the fit.
     """
     unit, minimum = _unit(problem, solution, loss)
     for _ in range(REFINEMENTS):

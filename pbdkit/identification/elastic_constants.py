@@ -1,16 +1,16 @@
 """Elastic constants of a rule from its long-wave expansion, and whether they exist.
 
-To second order a step moves a body by Q_abcd ∂_c ∂_d u_b. The rule is elastic if a symmetric
-positive B exists, the inverse of the mobility, with
+To second order a step moves a body by Q_abcd ∂_c ∂_d u_b. The rule is elastic if there is a
+symmetric positive definite B, the inverse of the mobility, with
 
     B_ae Q_ebcd = (C_acbd + C_adbc) / 2
 
-and C the elastic constants. Six linear equations determine the three numbers of B: the left side is
-symmetric in a and b (an energy exists), and in two dimensions Huang's relations hold, Γ_xxyy =
-Γ_yyxx, Γ_xxxy = Γ_xyxx, Γ_yyxy = Γ_xyyy (a rigid rotation costs no energy). B = 1 except for rules
-in which x and y approach the same equilibrium at different rates. C is determined up to a factor,
-which depends on the time that a step represents. See Born and Huang, Dynamical Theory of Crystal
-Lattices, section 27.
+where C are the elastic constants. Six linear equations determine the three numbers of B: the left
+side is symmetric in a and b (an energy exists), and in two dimensions Huang's relations hold,
+Γ_xxyy = Γ_yyxx, Γ_xxxy = Γ_xyxx, Γ_yyxy = Γ_xyyy (a rigid rotation costs no energy). B = 1 except
+for rules in which x and y approach the same equilibrium at different rates. C is determined up to a
+factor, which depends on the time that a step represents. See Born and Huang, Dynamical Theory of
+Crystal Lattices, section 27.
 
 Harmonics of C by direction follow Vannucci, Anisotropic Elasticity, chapter 4.
 """

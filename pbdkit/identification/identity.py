@@ -18,8 +18,8 @@ from pbdkit.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Identity:
-    """Physical identity of a rule on its lattice and neighbourhood, linearised at rest; exact for
-    linear rules.
+    """Physical identity of a rule on its lattice and neighbourhood. The rule is linearised at rest,
+    which is exact for linear rules.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Identity:
     turns : bool
         Whether a finite rotation of the neighbours rotates the move.
     symmetric : bool
-        Whether particle j has the same weight for k as k has for j.
+        Whether particle j has the same weight in the rule of k as k has in the rule of j.
     rests_at_edges : bool
         Whether a particle at rest does not move if neighbours are missing.
     stencil : Primitive

@@ -124,7 +124,8 @@ def _reasons(
 
 
 def _single_rules(scene: Scene) -> list[Scene]:
-    """Return the scene with its own rule alone, and with each inner rule alone."""
+    """Return scenes with a single rule: one with the scene's own rule, and one with each inner
+    rule."""
     inner = _single_rules(scene.inner) if scene.inner else []
     return [replace(scene, inner=None), *inner]
 
@@ -179,14 +180,15 @@ def _commutes_with_rotation(scene: Scene, at: Here, spacing: float) -> bool:
 
 
 def _random(scene: Scene, size: float, seed: int) -> Iterator[tuple[Slots, Differences]]:
-    """Yield the slots of each sublattice with random differences of a size."""
+    """Yield the slots of each sublattice with random differences of a given size."""
     generator = np.random.default_rng(seed)
     for slots in scene.neighbourhood.slots:
         yield slots, {slot: size * generator.uniform(-1, 1, 2) for slot in slots}
 
 
 def _is_symmetric(stencil: Stencil) -> bool:
-    """Return whether the matrix of j for k is the transpose of that of k for j."""
+    """Return whether the derivative of the move of k with respect to j is the transpose of the
+    derivative of the move of j with respect to k."""
     by_key = {(s.source, s.target, s.cell): matrix for s, matrix in stencil.neighbours.items()}
     asymmetries = [matrix - by_key[t, s, (-m, -n)].T for (s, t, (m, n)), matrix in by_key.items()]
     asymmetries += [centre - centre.T for centre in stencil.centre]
@@ -196,8 +198,8 @@ def _is_symmetric(stencil: Stencil) -> bool:
 def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> Iterator[str]:
     """Yield a description of how the rule depends on the position.
 
-    The weights in the middle of the body are compared with those at the corner where they differ
-    most.
+    The weights in the middle of the body are compared with those at the corner with the largest
+    difference.
     """
     places, slots = list(stencils), scene.neighbourhood.slots
     weights = np.array(

@@ -262,7 +262,7 @@ ROUNDS = 14
 FINER = 7
 """Number of points along each axis of a refined grid."""
 SAME_CURVATURE = 1e-6
-"""Relative difference of diffusivities below which both waves are equally fast."""
+"""Relative difference of diffusivities below which both waves are regarded as equally fast."""
 
 ROUNDING = 1e-13
 """Relative difference of values that are equal up to rounding."""
@@ -434,7 +434,7 @@ def minimum(
     """Minimise a periodic function of (point, axis) between low and high.
 
     The best point of a grid is refined on ever finer grids around it. The minimum is exact up to
-    rounding if one point of the first grid lies in its valley.
+    rounding if a point of the first grid lies in the valley of the minimum.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Atomic writing of files. A file appears complete or not at all, it is locked against other
 writers, and it replaces an earlier file only on request.
 
-`NewFile` is a file under construction, for libraries that do not handle writes that fail or are
-incomplete.
+`NewFile` is a file under construction, for libraries that do not handle failed or incomplete
+writes.
 """
 
 from __future__ import annotations

@@ -39,8 +39,8 @@ Arrays = dict[str, Any]
 
 @dataclass
 class RecordedSteps:
-    """The last step, or moment between two steps, that was observed, and the last that was
-    recorded."""
+    """The last step that was observed, and the last one that was recorded; either may be a moment
+    between two steps."""
 
     step: float = -1
     recorded: float = -1
@@ -113,8 +113,8 @@ class Checkpoint:
         """Return the parts of the driver's state, and the recorded steps under ``seen``.
 
         `like` is the state of the driver before its first step, `steps` the number of steps of the
-        run, and `classes` are further classes that may occur. Raises StorageError if the checkpoint
-        is damaged or of another scene.
+        run, and `classes` are further dataclasses that the checkpoint may contain. Raises
+        StorageError if the checkpoint is damaged or of another scene.
         """
         try:
             facts = {**self.facts["run"], "seen": self.facts["seen"]}
