@@ -1,7 +1,7 @@
 """Forecast of a run before its first step: stability, supports, memory and time.
 
 `pbdkit check` reports the forecast, and `pbdkit run` issues those of its warnings that are computed
-quickly.¶Two of the checks are: steps of leaders with a mass are stable if ω ≤ 2, the limit of the
+quickly. Two of the checks are: steps of leaders with a mass are stable if ω ≤ 2, the limit of the
 symplectic Euler method with a step of 1. A part of the body resists rigid-body motions by its
 supports alone; if leaders do not constrain such a motion and the loads do work along it, there is
 no equilibrium, and steps do not converge.

@@ -413,7 +413,7 @@ class Store:
             )
         if is_full(self._folder):
             return FULL
-        return f"{error}; stored results remain; repeat the command to continue with the intact ones"
+        return f"{error}; repeat the command to continue with the stored results that are intact"
 
 
 def _may_become_database(path: Path) -> bool:
