@@ -235,7 +235,7 @@ def is_mutual(subject: Subject) -> None:
 
 @property_of(NeighbourMetric)
 def takes_offsets_of_the_cell(subject: Subject) -> None:
-    """Every offset is one of the cell's own: its site index and its opposite agree with the
+    """Every offset is an offset of the cell: its site index and its opposite agree with the
     lattice."""
     for where, cell, s, shells in _tried(subject):
         for offset in chain(*shells):
@@ -318,8 +318,8 @@ def _refuse_unlabelled(quantity: Any, description: str, example: str) -> None:
 
 @property_of(is_needed=True)
 def takes_part(subject: Subject) -> None:
-    """At least one of the tested scenes can be built with it: it may refuse others by an
-    ExperimentError, and raises nothing else."""
+    """At least one of the tested scenes can be built with the component: for the others it may
+    raise an ExperimentError, and no other exception."""
     assert subject.scenes
 
 
@@ -522,8 +522,8 @@ the position in an array."""
 
 @property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def returns_a_value_a_particle(subject: Subject) -> None:
-    """Results have one value for each particle, or one number for all; a rule contributes equally
-    many from every neighbour, and `breaks` returns booleans."""
+    """Results have one value for each particle, or one number for all; a rule returns the same
+    number of contributions for every neighbour, and `breaks` returns booleans."""
     for call in _elementwise(subject):
         for name, value in call.answer().items():
             if value.shape not in ((), SHAPE):
@@ -552,8 +552,8 @@ def is_finite(subject: Subject) -> None:
 
 @property_of(FollowerRule, FractureModel, is_needed=True)
 def renews_what_it_remembers(subject: Subject) -> None:
-    """`update`, or `remember`, returns one value for each number that changes, in their order, and
-    an integer for integer numbers."""
+    """`update`, or `remember`, returns one value for each state variable that changes, in the order
+    of declaration, and integers for variables of an integer dtype."""
     changing = [number for number in remembered(subject, subject.scene) if number.changes]
     renewals = [call for call in subject.calls() if call.function in ("update", "remember")]
     if not renewals:
@@ -646,8 +646,8 @@ def _refuse_an_order_of_slots(scene: Scene) -> None:
 
 @property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def is_local(subject: Subject) -> None:
-    """The result for a single particle, with plain numbers, is its result among others: only the
-    particle and its neighbours count."""
+    """A call with the plain numbers of a single particle gives the same result as a call with the
+    arrays of all particles: a result depends on the particle and its neighbours only."""
     for call in _elementwise(subject):
         whole = call.answer()
         for place in [(0, 0), (2, 1), (3, 2)]:
@@ -883,8 +883,8 @@ def measures_what_it_declares(subject: Subject) -> None:
 
 @property_of(Diagnostic)
 def takes_rows_in_any_order(subject: Subject) -> None:
-    """Values follow the particles if rows are permuted, up to rounding: rows are found by
-    `now.rows(numbers)` and mean nothing else."""
+    """If rows are permuted, the values are permuted alike, up to rounding: the row of a particle
+    is that of `now.rows(numbers)`, and no value depends on the order of rows."""
     diagnostic, scene = subject.component, subject.scene
     moment, order = moment_of(scene, 0), np.random.default_rng(0).permutation(scene.raster.count)
     values, permuted = diagnostic.measure(moment), diagnostic.measure(Shown(moment, order))
