@@ -52,7 +52,7 @@ class Watch:
         self.look(0.0, task)
 
     def look(self, fraction: float, what: str = "") -> None:
-        """Report the fraction that is done of a task, by default of the last one.
+        """Report the completed fraction of a task, by default of the task that was reported last.
 
         Raises
         ------
@@ -67,7 +67,7 @@ class Watch:
 
 @contextmanager
 def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
-    """Show progress from the first second on, until the block ends.
+    """Show progress after a delay of `DELAY_S` seconds, until the block ends.
 
     A bar is drawn on stderr. In a notebook, where bars need further packages, a line is updated.
 

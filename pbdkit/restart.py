@@ -40,9 +40,9 @@ def restore(
     communicator: Communicator,
     recorded: int | None = None,
 ) -> None:
-    """Let a run that has not begun continue from the checkpoint of the root. `recorded` is the last
-    recorded step, if it differs from that of the checkpoint. Raises StorageError for a checkpoint
-    that is damaged or of another scene."""
+    """Restore the checkpoint of the root in a run that has not begun, so that the run continues
+    there. `recorded` is the last recorded step, if it differs from that of the checkpoint. Raises
+    StorageError for a checkpoint that is damaged or of another scene."""
     initial, parts = driver.state_dict(), dict[str, Any]()
     with communicator.raise_together():
         if checkpoint:
@@ -67,7 +67,7 @@ BLOCK_BYTES = 2**22
 def unfinished_source(
     unfinished: UnfinishedRun, output: Path, steps: int | None, anyway: bool
 ) -> tuple[Source | None, dict[str, Any]]:
-    """Return the experiment of an unfinished run, and where it came from.
+    """Return the experiment of an unfinished run, and the description of its origin.
 
     The experiment is None if all steps are done.
 
@@ -105,12 +105,13 @@ def chosen_parameters(facts: Mapping[str, Any]) -> tuple[str, ...]:
 def longer(
     dataset: Any, output: Path, steps: int, anyway: bool, stack: ExitStack | None = None
 ) -> tuple[Source, Checkpoint]:
-    """Return the experiment of a result with more steps, and its final state.
+    """Return the experiment of a result, with a larger number of steps, and the result's final
+    state.
 
     Parameters
     ----------
     stack
-        Stack on which the file of the arrays stays open; without it they are read.
+        Stack that keeps the file of the arrays open; if it is None, the arrays are read at once.
 
     Raises
     ------
@@ -290,7 +291,7 @@ class Resumption:
         Raises
         ------
         PbdkitError
-            As any run does.
+            For the same reasons as any other run.
         """
         return record(self.run, self.recorder.sink, recorder=self.recorder)
 
@@ -452,7 +453,7 @@ def _refuse_other_weights(
     """Raise ExperimentError if a run with another number of steps would select other values for
     `auto`.
 
-    These depend on the roles of the last step.
+    The values of `auto` depend on the roles of the particles in the last step.
     """
     stepping = scene.experiment.stepping
     auto = stepping.model_copy(update={f"{name}_setting": "auto" for name in chosen})

@@ -57,7 +57,7 @@ class Driver(ABC):
     scene, state, watch
         Scene, current state, and display of progress.
     choice : Choice
-        Engine of the run, its threads, and the reason.
+        Engine of the run, number of its threads, and the reason for the choice.
     ends_early : bool
         True at the last state of a run that ends before its last step. That state is recorded even
         if no record is due.
@@ -153,8 +153,8 @@ class SteppingDriver(Driver):
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """Restore the result of `state_dict`.
 
-        Two data are not restored, because they follow from the scene: the size of the body and, if
-        convergence has not been tested yet, the first step at which it is tested.
+        Two values are not restored, because they follow from the scene: the size of the body and,
+        if convergence has not been tested yet, the first step at which it is tested.
         """
         self.state, self.recorded_step = parts["state"], parts["kept"]
         is_good = parts["guard"]["good_step"] == self.state.step
@@ -178,7 +178,7 @@ class SteppingDriver(Driver):
         monitor.pace, monitor.obstacle = pace, obstacle
 
     def restart(self, state: State) -> None:
-        """Continue from another state, which the guard accepts as good."""
+        """Continue from another state, which becomes the last good state of the guard."""
         super().restart(state)
         self.guard = replace(self.guard, good_step=state.step, good_copy=state.copy())
 
@@ -393,8 +393,8 @@ LARGEST = 50_000
 class Simulation:
     """Simulation of an experiment, step by step or to its end.
 
-    The results are those of `pbdkit.run`, bit for bit, for any number of steps in a call. The same
-    warnings are issued as by `pbdkit.run`.
+    The results are bitwise equal to those of `pbdkit.run`, independent of the number of steps in
+    each call, and the same warnings are issued.
 
     Parameters
     ----------
@@ -528,7 +528,7 @@ class Simulation:
         self._go(lambda: self.time >= time + n)
 
     def run(self) -> None:
-        """Continue to the end of the experiment, as `pbdkit.run`.
+        """Continue to the end of the experiment, like `pbdkit.run`.
 
         Raises
         ------
@@ -543,7 +543,7 @@ class Simulation:
 
         Bonds that exceed their limit in equilibrium break. The time does not change, and steps
         continue from the equilibrium. With ``solver: equilibrium`` the load is followed to the last
-        step, as by `run`.
+        step, as in `run`.
 
         Returns
         -------
@@ -675,7 +675,7 @@ class Simulation:
 
     @property
     def choice(self) -> Choice:
-        """Engine, number of threads, and the reason of the choice."""
+        """Engine, number of threads, and the reason for the choice."""
         return self.driver.choice
 
     @property

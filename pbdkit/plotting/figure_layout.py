@@ -1,4 +1,4 @@
-"""Figures with panels of one body, as large as the texts around them permit.
+"""Figures with one or more panels that show a body; panels are as large as the texts permit.
 
 The panels have the aspect ratio of the body, from 200 by 6 particles to 6 by 200. The figure is
 sized to fit its content: nothing is clipped, and nothing overlaps.
@@ -59,7 +59,8 @@ BAR_LENGTH_IN = 3.4
 BAR_WIDTH_IN = 0.14
 """Width of a colour bar in inches."""
 SIDE_BAR_HEIGHT_IN = 1.3
-"""Height of panels in inches below which the colour bar is below them."""
+"""Minimum height of the panels, in inches, for a colour bar beside them; otherwise it is below
+them."""
 LABEL_LINES = 3
 """Maximum number of lines of the label of a colour bar beside the panels."""
 CHARACTERS_PER_IN = 14.5
@@ -77,10 +78,10 @@ PYPLOT = "matplotlib.pyplot"
 
 
 def new_figure(*, standalone: bool = False, **options: Any) -> Figure:
-    """Return a new figure with these arguments of matplotlib.
+    """Return a new figure of matplotlib, created with these options.
 
-    If pyplot is loaded, or in a notebook, pyplot manages the figure unless it is `standalone`,
-    which the caller shows or saves.
+    If pyplot is loaded, or the code runs in a notebook, pyplot manages the figure. A `standalone`
+    figure is not managed; the caller shows or saves it.
     """
     if not standalone and (PYPLOT in sys.modules or in_notebook()):
         pyplot = import_module(PYPLOT)
@@ -104,7 +105,7 @@ def style_bar(bar: Any, scale: Scale) -> None:
 
 
 def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
-    """Return a dot with its name for each class that is present."""
+    """Return the entries of a legend, a labelled dot for each class that is present."""
     return [
         handle(name, colour)
         for number, (name, colour) in reversed(palette.colours.items())
@@ -113,7 +114,7 @@ def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
 
 
 def handle(name: str, colour: str) -> Line2D:
-    """Return a dot with a name."""
+    """Return an entry of a legend: a dot, labelled with a name."""
     return Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)
 
 
@@ -320,7 +321,7 @@ class Page:
             legend.set_bbox_to_anchor((middle[0], low), self.figure.dpi_scale_trans)
 
     def _drawn(self, artists: Iterable[Any], **options: Any) -> Bbox:
-        """Return the box around artists with all that belongs to them, in inches."""
+        """Return the box around artists, including their labels and ticks, in inches."""
         renderer = renderer_of(self.figure)
         boxes = [box for artist in artists if (box := artist.get_tightbbox(renderer, **options))]
         return Bbox(Bbox.union(boxes).get_points() / self.figure.dpi)
@@ -331,7 +332,8 @@ class Page:
         drawn = self._drawn([*self.figure.axes, *texts, *self.figure.legends])
         self._before = np.subtract(self._block.min, drawn.min) + EDGE_IN
         self._after = np.subtract(drawn.max, self._block.max) + EDGE_IN
-        # Titles that are wider than the panels make the page wider instead of the panels narrower.
+        # If titles are wider than the panels, the page is made wider, and the panels keep their
+        # width.
         narrow = self._drawn(self.figure.axes, for_layout_only=True)
         x0 = min(narrow.x0, self._drawn([self._labels[1]]).x0)
         self._around = self._before + self._after
@@ -341,7 +343,8 @@ class Page:
 
 
 def _locator(low: float, high: float, length: float, distance: float) -> Locator:
-    """Return a locator of ticks with a minimum distance in inches; of one tick on short axes."""
+    """Return a locator that places ticks at a minimum distance in inches, or one tick on a short
+    axis."""
     if length < SHORT_AXIS_IN:
         return FixedLocator([0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.1g}")])
     return MaxNLocator(max(1, int(length / distance)), steps=[1, 2, 5, 10])

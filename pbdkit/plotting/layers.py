@@ -1,4 +1,4 @@
-"""Layers of a panel: fields as pixels, classes, dots and bonds, each of which shows a step."""
+"""Layers of a panel: fields and classes as pixels, dots, and bonds. Each layer shows one step."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ than pixels."""
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """Pixels of a picture: `box` (left, right, bottom, top) and their numbers `across` and `up`."""
+    """Pixels of a picture: its `box` (left, right, bottom, top), and the numbers of pixels `across`
+    and `up`."""
 
     box: tuple[float, float, float, float]
     across: int
@@ -45,10 +46,11 @@ class PixelGrid:
         return np.asarray((position - np.array([xmin, ymin])).astype(np.float32) * scale)
 
     def mean(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
-        """Return the values at the pixels, (up, across), interpolated between those at the corners
-        of cells, (cell, 4), with positions in pixels (cell, 4, 2). They are NaN outside all cells
-        and where cells are `cut` off, and the mean where cells overlap. The distance of samples is
-        at most the width of a pixel, so that no pixel within a cell is missed."""
+        """Return the values at the pixels, (up, across), interpolated from `values` at the corners
+        of cells, (cell, 4). `corners` are the positions of the corners in pixels, (cell, 4, 2). The
+        result is NaN outside all cells and in parts that are `cut` off, and the mean where cells
+        overlap. Samples are at most the width of a pixel apart, so that no pixel within a cell is
+        missed."""
         sums, counts = np.zeros(self.across * self.up), np.zeros(self.across * self.up)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
@@ -60,8 +62,9 @@ class PixelGrid:
             return (sums / counts).reshape(self.up, self.across)
 
     def latest(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
-        """Return values that cannot be averaged, in the same way: that of the nearest corner, and
-        the largest of several in a pixel."""
+        """Return the values at the pixels like `mean`, for values that cannot be averaged: each
+        sample has the value of the nearest corner, and each pixel the largest value of its
+        samples."""
         largest = np.full(self.across * self.up, -np.inf)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
@@ -82,8 +85,8 @@ class PixelGrid:
 
 @dataclass(frozen=True)
 class OutlineCut:
-    """The parts of cells cut off by an outline: `row` (cell,) is the row of each among the cut
-    cells, -1 if it is not cut."""
+    """The parts of cells that an outline cuts off. `row`, (cell,), is the row of each cell in the
+    table of cut `cells`, or -1 if the cell is not cut."""
 
     cells: CutCells
     row: Array
@@ -102,19 +105,19 @@ def _kept(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
 
 
 def _weights(middles: Array) -> Array:
-    """Return the weights of the corners in each sample, (sample, 4), at `middles` along both
-    sides."""
+    """Return the weights of the four corners of a cell for each sample, (sample, 4). `middles` are
+    the relative positions of the samples along both sides of the cell."""
     u, v = (part.ravel() for part in np.meshgrid(middles, middles))
     return np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1)
 
 
 def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
-    """Generate the rows of cells with equally many samples, and the positions of these along both
-    sides, from 0 to 1."""
+    """Generate groups of cells with the same number of samples: the rows of the cells, and the
+    relative positions of the samples along both sides of a cell, from 0 to 1."""
     a, b, c, d = (corners[:, k] for k in range(4))
     along = np.maximum(abs(b - a), abs(c - d)), np.maximum(abs(d - a), abs(c - b))
-    # The distance between samples, along both sides together, is at most a pixel, so that none is
-    # missed.
+    # The sum of the distances between samples along both sides is at most a pixel, so that no pixel
+    # is missed.
     finest = np.maximum(np.ceil(np.maximum(*(along[0] + along[1]).T)), 1.0)
     finest = np.maximum(finest * min(1.0, math.sqrt(MOST / max(1.0, (finest**2).sum()))), 1.0)
     # The numbers are rounded up to powers of √2, which gives few groups and not many more samples.
@@ -183,7 +186,7 @@ class PixelField(Layer):
 
 
 class BondField(Layer):
-    """A quantity of bonds too many for lines, as pixels."""
+    """A quantity of bonds, drawn as pixels where there are too many bonds for lines."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale) -> None:
         self._body, self._grid, self._image = body, grid, _image(ax, grid, scale)
@@ -199,7 +202,7 @@ class BondField(Layer):
 
 
 class Classes(Layer):
-    """Classes of particles that are too many for dots, as pixels."""
+    """Classes of particles, drawn as pixels where there are too many particles for dots."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, palette: Palette) -> None:
         self._body, self._grid, self._palette = body, grid, palette
@@ -212,7 +215,8 @@ class Classes(Layer):
         self.artists = [self._image]
 
     def show(self, snapshot: Snapshot) -> None:
-        """Show the class of the nearest particle; of several in a pixel, the topmost."""
+        """Show the class of the nearest particle in each pixel, or the topmost of several
+        classes."""
         body, ranks = self._body, self._palette.ranks(snapshot)
         chosen, has_class = (
             body.whole_cells(body.cells_with_frame, snapshot.broken),
@@ -221,8 +225,8 @@ class Classes(Layer):
         chosen = chosen[has_class[body.cells_with_frame[chosen]].all(axis=1)]
         alone = _alone(body.cells_with_frame[chosen], has_class & ~body.outside)
         cells = _with(body.cells_with_frame[chosen], alone)
-        # If cells are cut the picture contains the body alone, so that both kinds of cells are the
-        # same.
+        # If cells are cut, the picture contains the body alone, so that the cells with frame points
+        # are the same as those without.
         cut = _cut(body, chosen, len(alone)) if body.inside.all() else None
         corners = self._grid.places(snapshot.position)[cells]
         self._image.set_data(self._grid.latest(corners, ranks[cells], cut))
@@ -240,7 +244,8 @@ class Dots(Layer):
         self.artists = [self._dots]
 
     def show(self, snapshot: Snapshot) -> None:
-        """Show leaders over followers over the frame."""
+        """Draw the dots in the order of their classes; leaders cover followers, and followers the
+        frame."""
         palette = self._colours if isinstance(self._colours, Palette) else OF_KINDS
         ranks = palette.ranks(snapshot)
         order = np.argsort(ranks, kind="stable")
@@ -255,7 +260,7 @@ class Dots(Layer):
 
 
 class BondLines(Layer):
-    """Lines of whole bonds or, with `broken`, of broken ones."""
+    """Lines of intact bonds or, with `broken`, of broken ones."""
 
     def __init__(
         self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False
@@ -329,8 +334,9 @@ def _image(ax: Axes, grid: PixelGrid, scale: Scale) -> AxesImage:
 
 
 def _filled(values: Array, cells: Array, outside: Array) -> Array:
-    """Return the values, with missing ones `outside` the outline replaced by the mean of the cells
-    that meet there, each of which has the mean of its finite corners."""
+    """Return the values after replacement of missing ones at particles `outside` the outline. Such
+    a particle receives the mean over the cells that meet there, where the value of a cell is the
+    mean of its finite corners."""
     finite = np.isfinite(values)
     mixed = cells[(outside & ~finite)[cells].any(axis=1) & finite[cells].any(axis=1)]
     means = np.nanmean(values[mixed], axis=1)
@@ -342,8 +348,8 @@ def _filled(values: Array, cells: Array, outside: Array) -> Array:
 
 
 def _cut(body: ReferenceBody, chosen: Array, alone: int) -> OutlineCut | None:
-    """Return the parts that the outline cuts off the chosen cells, followed by `alone` uncut
-    ones."""
+    """Return the parts that the outline cuts off a list of cells: the chosen cells, followed by as
+    many uncut cells as `alone` states."""
     if body.cut is None:
         return None
     return OutlineCut(body.cut, np.append(body.cut.row[chosen], np.full(alone, -1)))
@@ -357,5 +363,5 @@ def _alone(cells: Array, chosen: Array) -> Array:
 
 
 def _with(cells: Array, alone: Array) -> Array:
-    """Append a cell of zero extent for each of these particles."""
+    """Append a cell of zero extent for each particle in `alone`."""
     return np.concatenate([cells, np.repeat(alone[:, None], 4, axis=1)])

@@ -50,7 +50,7 @@ FASTEST = 240
 FASTEST_GIF = 50
 """Maximum frame rate of a GIF in 1/s."""
 FINER = 0.6
-"""Resolution of fields relative to the pixels of the movie; coarser ones are interpolated."""
+"""Number of pixels of a field per pixel of the movie, along each axis; fields are interpolated."""
 NEARLY_WHITE = 240
 """Brightness from which a colour of a palette counts as white."""
 FRAMES = 60
@@ -161,7 +161,8 @@ def _refuse_speed(path: Path, fps: float, every: int) -> None:
 
 
 def _movie_file(color: str | None, file: str | Path | None) -> Path:
-    """Return the path of the movie. Raises ExperimentError if it stands for the variable."""
+    """Return the path of the movie. Raises ExperimentError if the path is missing or was passed as
+    the variable."""
     if file is not None and Path(str(color)).suffix not in FORMATS:
         return Path(file)
     if isinstance(color, str | Path) and Path(color).suffix in FORMATS:
@@ -261,7 +262,8 @@ def refuse_no_movie(path: Path) -> None:
 
 
 class MovieSheet:
-    """A sheet of one panel with layers that show step after step, over a background drawn once."""
+    """A sheet with one panel. Its background is drawn once, and its layers show one step after the
+    other."""
 
     def __init__(
         self,
@@ -298,7 +300,7 @@ class MovieSheet:
         return [*self._panel.artists, self._heading]
 
     def frames(self, rows: Sequence[int], show: Show = silent) -> Iterator[Frame]:
-        """Generate the steps as pixels, in an even number across and up."""
+        """Generate the pixels of each step; the numbers of pixels across and up are even."""
         figure = self.sheet.figure
         pixels = np.ceil(figure.get_size_inches() * figure.dpi / 2 - 1e-9) * 2
         figure.set_size_inches(*(pixels / figure.dpi))

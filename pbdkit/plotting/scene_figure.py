@@ -28,8 +28,8 @@ HEAD = 7.0
 
 
 class Svg:
-    """Picture of the coordinates from `low` to `high` within `limits` in pixels, with a `margin`
-    around them.
+    """SVG picture of the region from the corner `low` to the corner `high`, with a `margin` around
+    it, of a size within `limits`. Margin and limits are in pixels.
 
     The whole picture extends from `self.low` to `self.high`, with y upward. Shapes are drawn in the
     order in which they are added.
@@ -222,8 +222,8 @@ def picture_of(scene: Scene) -> Picture | None:
 
 
 def draw_scene(scene: Scene, canvas: Canvas) -> SceneLegend:
-    """Draw a scene in a plane, and return the meanings of its colours. Lengths of arrows are
-    proportional to each other, not to the body."""
+    """Draw a scene in a plane, and return the meanings of its colours. The lengths of arrows show
+    the ratios of displacements or forces to each other, not to the size of the body."""
     drawing = _Drawing(scene, canvas)
     drawing.draw()
     return tuple(drawing.legend)
@@ -351,8 +351,8 @@ class _Drawing:
             self._note(ACTS, "body force" if loading.load.body_force else "force")
 
     def _arrows(self, at: Floats, ways: Floats, longest: float, colour: str) -> None:
-        """Draw arrows at some of the places: away from them or, where such arrows would point into
-        the body, towards them."""
+        """Draw arrows at some of the places. An arrow starts at its place or, if it would then
+        point into the body, ends there."""
         extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
         count = min(max(int(extent / APART), 1), ARROWS)
         ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])

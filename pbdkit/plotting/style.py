@@ -78,7 +78,7 @@ def label(
 
 
 def _even(text: str, width: int) -> str:
-    """Wrap a text into the smallest number of lines of equal length."""
+    """Wrap a text into as few lines as possible, of about the same length."""
     lines = len(textwrap.wrap(text, width))
     every = (textwrap.wrap(text, length) for length in range(1, width + 1))
     return "\n".join(next((wrapped for wrapped in every if len(wrapped) == lines), []))

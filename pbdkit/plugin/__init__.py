@@ -1,5 +1,6 @@
-"""Everything that the author of a component needs: the six interfaces, what only some components
-can do, the data that they exchange, and the marker of the hook by which a distribution offers them.
+"""Everything that the author of a component needs: the interfaces, the optional capabilities, the
+data that components exchange with pbdkit, and the marker of the hook by which a distribution
+registers its components.
 
 Examples
 --------
@@ -106,7 +107,7 @@ INTERFACES: dict[str, type[Component]] = {
     "operations": ParticleOperation,
     "diagnostics": Diagnostic,
 }
-"""The open interfaces by the field of the experiment in which their components stand."""
+"""The open interfaces, by the field of the experiment that specifies their components."""
 LISTS = frozenset({"operations", "diagnostics"})
 """The fields that list any number of components."""
 

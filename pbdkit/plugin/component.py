@@ -290,7 +290,8 @@ class Remembers(ABC):
         Returns
         -------
         tuple of Remembered
-            Declarations, in the order of the values that change.
+            Declarations. A function that returns new values returns them in this order, without the
+            variables that do not change.
         """
 
 

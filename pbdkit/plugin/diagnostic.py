@@ -137,7 +137,7 @@ class BondHistory(Bonds):
         Step at which each bond broke, -1 if it is intact, 0 for an initial crack.
     broken_strain : array of float, shape (bond,)
         Strain at breaking, in the intermediate configuration. NaN if the bond is intact, was cut,
-        or broken from the start.
+        or was broken from the start.
     """
 
     broken_step: NDArray[np.int32]
@@ -148,8 +148,8 @@ class CellValues(ABC):
     """Quantities of the cells of the body.
 
     A cell is a polygon of neighbouring sites with no other site in its circumcircle: a rectangle on
-    the square and rectangular lattices, a triangle on the others. Cells tile the plane independent
-    of the neighbour metric.
+    the square and rectangular lattices, a triangle on the others. Cells tile the plane, and do not
+    depend on the neighbour metric.
     """
 
     @abstractmethod
@@ -298,7 +298,8 @@ class Moment(ABC):
         Parameters
         ----------
         points : tuple of (float, float)
-            Points in lattice units; of several particles the one with the lowest number is taken.
+            Points in lattice units. If several particles are equally near, the one with the lowest
+            number is chosen.
 
         Returns
         -------
@@ -355,8 +356,8 @@ class Moment(ABC):
         Parameters
         ----------
         function : callable
-            Function of d = u_k - u_j and r = X_k - X_j, evaluated elementwise as the method
-            `gather` of a rule is.
+            Function of d = u_k - u_j and r = X_k - X_j, evaluated elementwise like the method
+            `gather` of a rule.
         intact_only : bool
             Whether to exclude broken bonds; otherwise they are included with the displacement of
             the real neighbour, not of the fictitious point.
@@ -379,7 +380,7 @@ class Moment(ABC):
 
     @abstractmethod
     def loads(self) -> tuple[LoadRows, ...]:
-        """Return the loads in the order of the experiment; at time 0 none acts.
+        """Return the loads in the order of the experiment; no load acts at time 0.
 
         Returns
         -------
@@ -462,7 +463,7 @@ class Diagnostic(Component):
     evaluates the whole lattice.
     """
     own_dimension: ClassVar[str] = ""
-    """With `at_end`: name of a dimension that has the length of the values."""
+    """Name of a dimension of variables with `at_end`, of the length that the values have."""
 
     @abstractmethod
     def variables(self) -> tuple[Variable, ...]:

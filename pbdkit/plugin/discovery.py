@@ -1,5 +1,5 @@
-"""Loading of the components of plugins, checks of their classes, and errors of their functions as
-messages that name the component and its distribution.
+"""Loading of components from plugins, and checks of their classes. Errors in the functions of a
+component are converted to messages that name the component and its distribution.
 
 Components of earlier versions are mapped to their successors until version 1.0.
 """
@@ -55,8 +55,9 @@ def blame(component: type[Component], when: str, error: BaseException) -> Plugin
 def blaming(component: Component, when: str, *field: str | int) -> Iterator[None]:
     """Convert errors in the code of a component.
 
-    An exception becomes a PluginError with interface, type and distribution of the component. An
-    ExperimentError gets the `field` of the component, if one is given. An interrupt gets the place.
+    An exception is converted to a PluginError with the interface, type and distribution of the
+    component. If the `field` of the component is given, an ExperimentError is raised again with
+    that field. A KeyboardInterrupt is raised again with a message that names the component.
     """
     try:
         yield
@@ -98,8 +99,8 @@ def load_builtin() -> Plugin:
 def loaded(plugin: Plugin) -> Plugin:
     """Import a plugin and call its hook `pbdkit_components`.
 
-    Errors become state and reason of the plugin; disabled plugins are not imported. An unusable
-    class does not affect the others.
+    Errors are stored as the state of the plugin and its reason; disabled plugins are not imported.
+    An unusable class does not affect the others.
     """
 
     def load(entry: EntryPoint, package: str) -> Plugin:

@@ -1,6 +1,7 @@
 """Parameters that vary in space or time.
 
-By region, by functions of position, by values on a grid, as random fields, and time-dependent.
+A parameter is given by values for regions, by a function of position, by values on a grid, as a
+random field, or as a function of time.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Varying(ABC):
         regions
             Masks of the places inside each region.
         reach
-            Distance up to which places outside the data may have the nearest value.
+            Maximum distance from the data at which a place outside receives the nearest value.
 
         Returns
         -------
@@ -76,7 +77,7 @@ class Varying(ABC):
 class ByRegion(Varying):
     """One value for each region, and `otherwise` outside all regions.
 
-    Where regions overlap, the last one in the experiment counts.
+    Where regions overlap, the value of the last one in the experiment is used.
     """
 
     otherwise: float
@@ -101,12 +102,13 @@ class ByRegion(Varying):
 
 
 class Gridded(Varying):
-    """Values on a grid (x, y), bilinear between; constant along an axis with a single coordinate.
+    """Values on a grid (x, y) with bilinear interpolation; constant along an axis with one
+    coordinate.
 
     Parameters
     ----------
     x, y
-        Coordinates, which increase.
+        Coordinates, in increasing order.
     values
         Values, (x, y).
 
@@ -482,7 +484,7 @@ class TakesFields(Component):
 
     The attribute of a parameter contains the value that is used where a single number is required;
     for a time-dependent parameter this is the last value. `varying` and `courses` contain the
-    variation.
+    functions of space and time.
     """
 
     _varying: dict[str, Varying] = PrivateAttr(default_factory=dict)
@@ -503,7 +505,7 @@ class TakesFields(Component):
         return self.with_more(**{name: c.at(moment) for name, c in self._courses.items()})
 
     def with_more(self, **values: Any) -> Any:
-        """Return the component with some parameters changed, and its other variations.
+        """Return the component with some parameters changed; all others vary as before.
 
         Raises
         ------
@@ -519,7 +521,7 @@ class TakesFields(Component):
         return fields | courses
 
     def with_values(self, **values: Any) -> Any:
-        """Return the component with some parameters changed, and without its other variations.
+        """Return the component with some parameters changed; all others become single numbers.
 
         Raises
         ------

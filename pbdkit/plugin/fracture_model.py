@@ -152,9 +152,9 @@ class RenewsBonds(Remembers):
     def update(d: Vector, r: Vector, c: Constants, p: Parameters) -> tuple[Number, ...]:
         """Return the new values of the numbers that change, in their order, elementwise.
 
-        It is called for one end of a bond only. In a lasting configuration the values must converge
-        (the largest value so far does, a count of steps does not); otherwise the solver
-        `equilibrium` finds no equilibrium.
+        It is called for one end of a bond only. If the configuration no longer changes, the values
+        must converge (a maximum over the steps does, a number of steps does not); otherwise the
+        solver `equilibrium` finds no equilibrium.
 
         Parameters
         ----------
@@ -254,8 +254,8 @@ class SoftensCells(RenewsBonds):
     It requires a rule that derives from `TearsCells`, and a frame that weighs cells. Its numbers
     come in pairs, with names that end in `_left` and `_right`, as seen along the slot of the bond.
     All start at 0 and stay there until the cell softens. `damage_left` and `damage_right` are the
-    fractions of its pull that the bond has lost in the two cells. A diagonal has the same cell on
-    both sides.
+    fractions by which the force of the bond is reduced in each of the two cells. A diagonal has the
+    same cell on both sides.
     """
 
     @staticmethod
@@ -351,8 +351,8 @@ def breaking_order(
 ) -> NDArray[np.intp]:
     """Return the rows of broken bonds in the order in which they broke.
 
-    The order is that of the steps; within a step bonds that were cut come first, then the most
-    strained.
+    Bonds are sorted by step. Within a step, bonds that were cut precede all others, which are
+    sorted by decreasing strain.
 
     Parameters
     ----------

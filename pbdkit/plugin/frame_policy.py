@@ -61,14 +61,15 @@ class FrameSites(ABC):
     def rule(self) -> FollowerRule:
         """Rule of the followers with its parameters at a step.
 
-        A map created with it is created again whenever these parameters change.
+        If the policy uses the rule to create the map, the map is created again whenever these
+        parameters change.
         """
 
     @abstractmethod
     def nearest(self) -> tuple[Indices, Indices]:
         """Return the body particles nearest to each frame point in the reference configuration.
 
-        Nearest are all those with a distance ≤ d_min (1 + 1e-9).
+        All particles with a distance of at most d_min (1 + 1e-9) count as nearest.
 
         Returns
         -------
@@ -101,8 +102,8 @@ class FramePolicy(Component):
     weighs_cells: ClassVar[bool] = False
     """True if the body consists of cells, each weighted by its share inside the outline.
 
-    For rules that declare `uses_cells`. The corners of cut cells on both sides of the outline are
-    then particles of the body.
+    Such frames are used with rules that declare `uses_cells`. The corners of cut cells on both
+    sides of the outline are then particles of the body.
     """
     local: ClassVar[bool] = False
     """True if each frame point can be mapped independently, to particles near it.
@@ -150,7 +151,6 @@ class FramePolicy(Component):
 
 
 class Anchors:
-    """Frame that fixes the body in space: moves are not invariant under translation of the body.
-
-    Under other frames the weights of each point sum to 1.
+    """Frame that fixes the body in space: moves change if the body is translated. Under all other
+    frames the weights of each point sum to 1, and moves do not change.
     """

@@ -88,10 +88,10 @@ def _of_one_site(axes: int) -> tuple[tuple[BasisSite], Index, tuple[Index, ...]]
 class Cell:
     """The repeat cell of a lattice.
 
-    Sites have integer indices (i, j). The cell repeats every `period[0]` of i along `vectors[0]`,
-    every `period[1]` of j along `vectors[1]` and so on. The site with index (i, j) has the basis
-    site with the `index` (i mod period[0], j mod period[1]); if there is none, the lattice has a
-    hole.
+    Sites have integer indices (i, j). The sites repeat along `vectors[0]` when i increases by
+    `period[0]`, along `vectors[1]` when j increases by `period[1]`, and so on. The site with index
+    (i, j) is a copy of the basis site with the `index` (i mod period[0], j mod period[1]); if there
+    is none, the lattice has a hole.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ class Cell:
         return sorted(offsets, key=lambda o: (o.length, o.site))
 
     def _cells_within(self, radius: float) -> Iterator[Index]:
-        """Yield the repeat cells within a radius, and few others.
+        """Yield the repeat cells within a radius, and a few others.
 
         The indices along the previous axes limit the range along each axis (Fincke and Pohst). For
         nearly collinear vectors there would be too many combinations to test all of them.
@@ -317,7 +317,8 @@ class NeighbourMetric(Component):
     """Selects the neighbours of a site on the infinite lattice, by shells.
 
     To add a metric, write `shells_around`. Neighbourhood is mutual: if the offset from j to k is
-    selected, so must be that from k to j, in the same shell; other metrics are refused.
+    selected, the offset from k to j must be selected, too, in the same shell. Otherwise the metric
+    is rejected.
 
     Examples
     --------
@@ -378,7 +379,7 @@ class CellPolygon:
         Number of the cell among those of this sublattice.
     corners : tuple of Offset
         Offsets from the first corner to all corners, itself included, counterclockwise. The first
-        corner is the lowest, of those the leftmost.
+        corner is the lowest one, and the leftmost of several lowest ones.
     """
 
     source: int
@@ -402,7 +403,8 @@ class CellPolygon:
 
     @cached_property
     def is_regular(self) -> bool:
-        """True if all sides are equal, and therefore, on a circle, all angles."""
+        """True if all sides are equal. All angles are then equal, too, since the corners lie on a
+        circle."""
         sides = [math.dist(self.rest[k - 1], self.rest[k]) for k in range(len(self.rest))]
         return max(sides) - min(sides) <= 1e-9 * max(sides)
 
@@ -416,7 +418,7 @@ class Side:
     kind : int
         Number of the polygon of the sublattice of its first corner.
     first : Slot or None
-        Slot from the start of the bond to the first corner; None if it is the start itself.
+        Slot from the start of the bond to the first corner; None if the two are the same site.
     start, end : int
         Corners between which the bond lies.
     """
@@ -436,9 +438,10 @@ class Tiling:
     polygons : tuple of CellPolygon
         Cells.
     beside : dict of Slot to (Side, Side)
-        Cells to the left and right of a slot; a diagonal has one cell twice. It is empty unless the
-        neighbours of every site are the corners of the cells around it, which are triangles or
-        parallelograms: 8 on the square and rectangular lattices, 6 on the hexagonal one.
+        Cells to the left and right of a slot; a diagonal has the same cell twice. The map is empty
+        unless all cells are triangles or parallelograms, and the neighbours of every site are the
+        corners of the cells around it: 8 neighbours on the square and rectangular lattices, 6 on
+        the hexagonal one.
     """
 
     polygons: tuple[CellPolygon, ...] = ()
@@ -489,8 +492,8 @@ def area_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
 def corner_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
     """Return the smallest relative signed area of the triangles at the corners of a polygon.
 
-    Each triangle is spanned by two adjacent sides; all areas are positive exactly if the polygon is
-    convex and not inverted.
+    Each triangle is spanned by two adjacent sides. All areas are positive if and only if the
+    polygon is convex and not inverted.
     """
     triples = [(k - 1, k, (k + 1) % len(r)) for k in range(len(r))]
     shares = (area_share([d[k] for k in three], [r[k] for k in three]) for three in triples)

@@ -1,4 +1,4 @@
-"""Registry: from the `type` in an experiment to the class that implements it."""
+"""Registry, which finds the class that implements a `type` of an experiment."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ GIVEN = "components"
 class Registry:
     """Built-in components, those passed as Python objects, and, on demand, installed ones.
 
-    An experiment with built-in components only imports no third-party code, and one that specifies
-    a distribution imports no other.
+    An experiment that uses only built-in components imports no third-party code; an experiment that
+    specifies a distribution imports only that distribution.
 
     Parameters
     ----------
@@ -129,9 +129,10 @@ class Registry:
         return versions | ({GIVEN: types} if local_classes else {})
 
     def name_of(self, component: Component) -> str:
-        """Return the type by which an experiment selects a component again.
+        """Return the type by which another experiment can select the class of a component.
 
-        The name includes the distribution unless no other is known to provide the type.
+        The name includes the distribution if another distribution provides the same type, as far as
+        is known.
         """
         offers = [(p, o) for p in [*self._local, *self._loaded.values()] for o in p.offers]
         names = (self._name_in(p, o) for p, o in offers if o.component is type(component))

@@ -27,8 +27,8 @@ class Here(NamedTuple):
         Reference position, as in the experiment and the dataset; None unless the rule declares
         `uses_reference`.
     centred : Vector
-        Reference position relative to the middle of the body's box, independent of the position of
-        the body to the last bit; None unless the rule declares `uses_reference`.
+        Reference position relative to the middle of the body's box. It does not depend on the
+        position of the body, not even by rounding; None unless the rule declares `uses_reference`.
     own : Numbers
         State variables of the particle, by name.
     """
@@ -119,7 +119,7 @@ class FollowerRule(TakesFields):
        d), w the weights of the slot and p the parameters;
     2. the contributions are summed over the neighbours in the order of the slots;
     3. ``apply(total, here, p)`` returns the move, a vector, from the position in m to the target. A
-       move of exactly zero is rest.
+       particle with a move of exactly zero is at rest.
 
     Relaxation and memory are applied afterwards by the framework. A particle without neighbours
     does not move. A fictitious neighbour counts as present.
@@ -137,16 +137,16 @@ class FollowerRule(TakesFields):
     """True if moves superpose: for given neighbours the move is a constant plus a linear function
     of the displacements. Predictions of `check` then hold for the whole run."""
     uses_reference: ClassVar[bool] = False
-    """True if the move depends on the position: `here.X` and `here.centred` are then set. Other
-    rules move a translated body equally."""
+    """True if the move depends on the position: `here.X` and `here.centred` are then set. Under all
+    other rules, moves do not change if the body is translated."""
     has_axes: ClassVar[bool] = False
     """True if directions matter: a body that is reflected, or rotated by a right angle, may then
     move differently."""
     uses_cells: ClassVar[bool] = False
     """True if the rule works cell by cell of the lattice. ``w.left`` and ``w.right`` are then the
     shares, 0 to 1, of the cells to the left and right of the bond, seen from j, that belong to the
-    body: 1 inside, and everywhere unless the frame weighs cells. A bond across a cell has that cell
-    on both sides."""
+    body. They are 1 inside the body, and everywhere if the frame does not weigh cells. A bond
+    across a cell has that cell on both sides."""
 
     def parameters(self, setting: Setting) -> dict[str, float]:
         """Return the numbers that `gather` and `apply` receive as ``p.name``; by default the
@@ -276,7 +276,7 @@ class Calibrated(ABC):
 
 
 class Loadable(Calibrated):
-    """A calibrated rule that takes loads: external forces on followers."""
+    """A calibrated rule that supports loads, which are external forces on followers."""
 
     @staticmethod
     @abstractmethod
@@ -352,9 +352,9 @@ class Torn(NamedTuple):
 class TearsCells(Calibrated):
     """A calibrated rule that works cell by cell and computes the forces of damaged cells.
 
-    The forces balance, and no rigid motion causes any. If bonds can break, a broken bond keeps its
-    difference d; fictitious points are not used, and a fracture model must not place one that
-    pulls.
+    The forces balance, and rigid motions cause no forces. If bonds can break, a broken bond keeps
+    its difference d, and fictitious points are not used. The fictitious points of the fracture
+    model must therefore exert no forces.
     """
 
     @staticmethod
@@ -381,7 +381,7 @@ class TearsCells(Calibrated):
         Returns
         -------
         tuple of Vector or Number
-            Contributions, as those of `gather`.
+            Contributions, of the same form as those of `gather`.
         """
 
 
@@ -408,9 +408,10 @@ class MixesCells(Calibrated):
         """
 
     def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """Return the weights that act in torn cells alone, the others 0; by default there are none.
+        """Return the weights of springs, which act in torn cells alone; by default there are none.
 
-        They are not linear in the stiffness of a cell: see `spring_share`.
+        All other weights of the slot are 0. The weights of springs are not linear in the stiffness
+        of a cell; in cells of another stiffness they are multiplied by `spring_share`.
 
         Parameters
         ----------
@@ -427,7 +428,7 @@ class MixesCells(Calibrated):
         return {}
 
     def spring_share(self, c: Floats, setting: Setting) -> Floats:
-        """Return the factor of `spring_weights` for cells of other stiffnesses.
+        """Return the factors that multiply `spring_weights` in cells of other stiffnesses.
 
         Parameters
         ----------

@@ -23,13 +23,14 @@ PLAIN = "number"
 COURSE = "course"
 """Form of a time-dependent number in the messages of pydantic."""
 WORD = "a number or 'auto'"
-"""Form of a number that can be selected automatically in messages."""
+"""Form, in messages, of a number that can also be 'auto'."""
 FORMS = (PLAIN, COURSE, WORD)
 """Forms of numbers in messages."""
 
 
 class Course(Strict, Generic[Value]):
-    """Time-dependent number: `values` at the end of `steps`, linear between, constant outside."""
+    """Time-dependent number: `values` at the end of `steps`, interpolated linearly, constant
+    outside."""
 
     steps: Annotated[
         tuple[Annotated[int, Field(ge=0, lt=2**53)], ...],
@@ -72,8 +73,8 @@ class Course(Strict, Generic[Value]):
         return tuple(step for step, (first, second) in pairs if first != second)
 
     def bends_within(self, begin: int, end: int) -> list[int]:
-        """Return the bends between two steps, both included, and the end if the number changes
-        there.
+        """Return the bends from step `begin` to step `end`, and `end` if the number changes in that
+        step.
 
         Empty if the end precedes the beginning.
         """
@@ -102,7 +103,7 @@ class Course(Strict, Generic[Value]):
 
 
 class NumberCourse(Course[float]):
-    """Time-dependent plain number. Each kind of number has a class of its own, which can be
+    """Time-dependent plain number. Each kind of number is a separate class, so that it can be
     pickled.
     """
 

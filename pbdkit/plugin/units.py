@@ -51,8 +51,8 @@ class Quantity:
     meaning : str
         Name of the quantity in messages.
     lattice : str
-        Unit in datasets: a stress unit is that of Young's modulus, a thickness unit that of
-        thickness.
+        Unit in datasets, in which "stress unit" denotes the unit of Young's modulus, and "thickness
+        unit" that of the thickness.
     unit : str
         Unit in terms of mm and MPa.
     length, youngs_modulus, thickness : int
@@ -119,7 +119,7 @@ FRACTURE_ENERGY = Quantity(
     "fracture energy", "stress unit * lattice unit", "N/mm",
     length=1, youngs_modulus=1, also=LENGTH,
 )  # fmt: skip
-"""Energy per area; over Young's modulus a length."""
+"""Quantity of an energy per area, in N/mm. Divided by Young's modulus it is a length."""
 BODY_FORCE = Quantity(
     "force per area", "stress unit * thickness unit / lattice unit", "N/mm^2",
     length=-1, youngs_modulus=1, thickness=1,
@@ -164,7 +164,7 @@ class Units(Strict):
     )
 
     def value(self, name: str) -> float | None:
-        """Return length, modulus or thickness in mm or MPa, or None."""
+        """Return the length, modulus or thickness in mm or MPa; None if it is not given."""
         text = getattr(self, name)
         unit, meaning = ("MPa", "stress") if name == "youngs_modulus" else ("mm", "length")
         return None if text is None else magnitude(text, unit, meaning)
@@ -205,7 +205,8 @@ class Scales(Strict):
 class FromUnits:
     """Parameter of diagnostics that `units` can give: `youngs_modulus` in MPa, `thickness` in mm.
 
-    If neither gives it, it is `otherwise`, or missing. The default of the field is `unset`.
+    A parameter that is not given has the value in `units` or, without `units`, the value
+    `otherwise`; it is an error if there is no such value. The default of the field is `unset`.
     """
 
     name: str
@@ -271,12 +272,13 @@ def of_one_material(part: Component, info: ValidationInfo) -> Component:
 
 
 def magnitude(text: str, unit: str, meaning: str) -> float:
-    """Return the number of text with a unit, converted to `unit`.
+    """Return the number that is written in a text with a unit, converted to `unit`.
 
     Raises
     ------
     PydanticCustomError
-        If the text is not such a number, or pint is not installed for another unit.
+        If the text is not a number with a suitable unit, or its unit differs and pint is not
+        installed.
     """
     match = TEXT.fullmatch(text)
     number, name = match.groups() if match else (text, "")

@@ -1,7 +1,7 @@
 """Vectors, and functions for elementwise code.
 
-The functions of a rule are called with whole arrays, single numbers or probes, one value for each
-component. They use + - * /, the functions of numpy, and `where` for choices.
+The functions of a rule are called with vectors of which each component is an array, a number or a
+probe. They use + - * /, the functions of numpy, and `where` in place of conditions.
 """
 
 from __future__ import annotations
@@ -143,8 +143,8 @@ def where(condition: Any, yes: Number, no: Number) -> Number: ...
 def where(condition: Any, yes: Any, no: Any) -> Any:
     """Return `yes` where the condition holds, else `no`, elementwise.
 
-    Elementwise functions choose with this and not with `numpy.where`, which kernels do not accept
-    for vectors.
+    Elementwise functions use this function and not `numpy.where`, which kernels do not support for
+    vectors.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
     Returns
     -------
     Number or Vector
-        As `yes` and `no`.
+        Value of the same kind as `yes` and `no`.
 
     Examples
     --------
@@ -195,7 +195,7 @@ def dot(a: Vector[T], b: Vector[T]) -> T:
 
 
 def squared_length(v: Vector[T]) -> T:
-    """Return v·v, equal to the last bit for v and -v.
+    """Return v·v, which is bitwise equal for v and -v.
 
     Parameters
     ----------

@@ -37,15 +37,15 @@ MAX_DISTANCE = 2.0
 MAX_LISTED = 5
 """Maximum number of distant points listed in warnings."""
 ROUND_ANGLE = math.pi / 12
-"""Angle of which multiples are recognised as radians."""
+"""Angle in radians. Numbers that are multiples of it are assumed to be in radians, not degrees."""
 ROUND_ATOL = 1e-3
 """Tolerance of the recognition of multiples of `ROUND_ANGLE`."""
 DECIMALS = 2
-"""Smallest number of decimals of an angle that counts as not rounded."""
+"""Number of decimals up to which an angle is assumed to be in degrees."""
 LOCKING_FACTOR = 0.07
-"""Factor of the relative excess stiffness in bending, which is about this factor times c_shear / λ
-/ n for a body of n cells across. λ is the smallest stiffness of a cell, of a mode that extends one
-axis and contracts the other."""
+"""Factor k of the relative excess stiffness in bending, which is about k c_shear / (λ n) for a body
+that is n cells thick. λ is the smallest stiffness of a cell, that of a mode that extends one axis
+and contracts the other."""
 MAX_LOCKING = 0.05
 """Relative excess stiffness above which a warning is issued."""
 
@@ -158,8 +158,8 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
 def carried_by_leaders(
     raster: Raster, leading: Sequence[Leading], loads: Loads | None, steps: int
 ) -> Iterator[str]:
-    """Generate a warning for each load on particles that all lead along its direction while it
-    acts."""
+    """Generate a warning for each load without effect, because all its particles are led along its
+    direction while it acts."""
     for n, loading in enumerate(loads.each if loads else ()):
         load = loading.load
         along = np.flatnonzero(load.force_at(max(load.from_, 1))).tolist()
@@ -206,7 +206,8 @@ def _offsets(driven: Leading | Barrier, steps: int) -> list[NDArray[Any]]:
 
 
 def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
-    """Generate a warning for each of the first points of `nearest` far from every particle."""
+    """Generate a warning for each of the first points of `nearest` that are far from all
+    particles."""
     selections = {f"leaders.{n}": group.select for n, group in enumerate(experiment.leaders)}
     selections |= {f"loads.{n}": load.select for n, load in enumerate(experiment.loads)}
     points = [(name, at) for name, select in selections.items() for at in select.nearest or ()]
@@ -247,8 +248,8 @@ def angles_in_radians(experiment: Experiment) -> Iterator[str]:
 
 
 def round_in_radians(angle: float) -> bool:
-    """Return whether an angle equals a multiple of 15° up to a full turn in radians, given with at
-    least `DECIMALS` decimals.
+    """Return whether an angle is a multiple of 15°, up to a full turn, expressed in radians with
+    more than `DECIMALS` decimals.
 
     0.7854 is such an angle, 2.88 is not.
     """

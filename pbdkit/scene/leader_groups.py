@@ -54,8 +54,9 @@ def check_directions(experiment: Experiment, *, has_frame: bool) -> None:
     Raises
     ------
     ExperimentError
-        If a rule that reads the state variables of neighbours has neighbours without these, or
-        leaders are clamped under a rule without directions.
+        If a rule that reads the state variables of neighbours is combined with frame points or
+        broken bonds, for which there are none, or if leaders are clamped under a rule without
+        directions.
     """
     rule = experiment.rule
     if shares_particles(rule):
@@ -105,8 +106,8 @@ class Leading:
 
     def is_in(self, to: Restriction) -> Mask:
         """Return a mask of the particles that lie in a part of the lattice. If the group moves by
-        Newton's law, only particles with all their neighbours count, since the forces of these are
-        needed."""
+        Newton's law, only particles with all their neighbours are included, since the forces of the
+        neighbours are needed."""
         return (to.is_present if self.share is None else to.is_moving)(self.place)
 
     def restrict(self, to: Restriction) -> Leading:
@@ -246,8 +247,8 @@ def _refuse_infinite(
 def _is_comparable(a: LeaderGroup, b: LeaderGroup, at_rest: bool) -> bool:
     """Return whether two motions can be compared before the run.
 
-    Rotations depend on the position at their start, which must be known; motions by Newton's law
-    are not known at all.
+    Rotations depend on the positions at their start, which must be available before the run.
+    Motions by Newton's law are never available before the run.
     """
     if any(isinstance(group.motion, Newton) for group in (a, b)):
         return False

@@ -1,6 +1,7 @@
 """Stiffness of cells under rules with spatially varying material.
 
-A cell that the border of two materials cuts is a laminate of layers along the border.
+A cell that is cut by the border of two materials is replaced by a laminate with layers along the
+border.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ ISOTROPY_RTOL = 1e-6
 """Relative anisotropy of the integral of n nᵀ below which a border has no main direction, as for a
 square inside a cell."""
 DIRECTIONS = 12
-"""Number of directions over which the stiffness of such cells is averaged; it divides the symmetry
-of every lattice."""
+"""Number of directions over which the stiffness of cells without a main direction is averaged. The
+set of directions has the rotational symmetries of every lattice."""
 
 
 def layered(outer: Floats, inner: Floats, share: Floats, facing: Floats) -> Floats:
@@ -145,7 +146,7 @@ def _to_layers(normal: Floats) -> Floats:
 STIFFNESS = "stiffness"
 """Name of the parameter that scales the stiffness of cells under every rule."""
 SPRINGS = "springs"
-"""Name of the springs that torn cells with a different stiffness retain."""
+"""Name, beside those of the components of stiffness, of the springs in torn cells."""
 PLACES = {
     "xx": (0, 0),
     "yy": (1, 1),
@@ -218,7 +219,8 @@ def weighed(
 
 
 def _springs(rule: Any, setting: Setting, mixed: Mask, stiffness: Floats) -> Floats:
-    """Return the multiple of the springs of the rule in torn cells, 0 where `mixed` is false."""
+    """Return the factor that multiplies the springs of the rule in each cell, 0 if `mixed` is
+    false."""
     result = np.zeros(len(mixed))
     result[mixed] = rule.spring_share(stiffness[mixed], setting)
     return result
@@ -327,7 +329,7 @@ class _Cells:
         -------
         tuple
             Ratio of the stiffness to that of the rule, (cell,), 0 where the stiffness is not a
-            multiple of it; and the stiffness of these cells, (cell, 3, 3).
+            multiple of it; and the stiffness of the cells with ratio 0, (cell, 3, 3).
         """
         rule, x, y = self.experiment.rule, self.x.mean(axis=0), self.y.mean(axis=0)
         values = dict(values_at(self.experiment, "rule", x, y, self.inside))

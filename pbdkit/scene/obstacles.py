@@ -31,7 +31,7 @@ CIRCLES = 1
 POLYGON = 2
 """Kind of the outline of a polygon."""
 NOTHING = 0
-"""Shape of a face that does not exist."""
+"""Shape code of a missing face."""
 LINE = 1
 """Shape of a face that is a line."""
 SEGMENT = 2
@@ -281,8 +281,8 @@ def way_out(
 
 
 def clearance(x: Any, y: Any, kinds: Any, points: Any, first: Any, radii: Any) -> Any:
-    """Return 0 at places outside all outlines, otherwise minus the depth in the outline in which
-    the place is deepest.
+    """Return 0 at places outside all outlines, and the negative depth at places inside. If outlines
+    overlap, the largest depth is used.
 
     `kinds`, `first` and `radii` (inner, outer, size) have a row for each outline; `points` are
     those of all outlines.
@@ -675,8 +675,8 @@ def collisions(
 
 
 def _can_evade(outline: Outline, places: Floats, axis: int) -> Mask:
-    """Return a mask of the places, (axis, place), that have a point outside the outline on the line
-    along their other axis."""
+    """Return a mask of the places, (axis, place), at which a particle that is led along `axis` can
+    leave the outline along its other axis."""
     walls, result = Walls.of([outline]), np.zeros(places.shape[1], bool)
     with np.errstate(all="ignore"):
         for k, at in enumerate(places.T):
@@ -686,8 +686,8 @@ def _can_evade(outline: Outline, places: Floats, axis: int) -> Mask:
 
 
 def _moments(leaders: Leading, barrier: Barrier, steps: int) -> Iterator[int]:
-    """Generate the steps at which both are active: the first, the last, and the knots of their
-    motions."""
+    """Generate steps at which both the leader group and the obstacle are active: the first, the
+    last, and the knots of both motions."""
     groups = leaders.group, barrier.group
     begin = max(group.from_ for group in groups)
     end = min(group.last(steps) for group in groups)

@@ -288,8 +288,8 @@ class Scene:
 
     @cached_property
     def home_reach(self) -> tuple[Index, Index]:
-        """Largest differences of repeat cell, backward and forward, between a particle and the
-        places that store the bonds on which its move depends.
+        """Largest differences in repeat cells, backward and forward, between a particle and the
+        places that store the bonds on which the move of the particle depends.
 
         These are the bonds of the particle or, if cells can be torn, of all cells around it.
         """

@@ -1,5 +1,5 @@
-"""Stability analysis of an experiment: spectrum of its step operator, rate of convergence, and what
-limits both.
+"""Stability analysis of an experiment: spectrum of its step operator, rate of convergence, and the
+reasons why steps do not converge.
 
 If the step operator is too large to be stored as a matrix, the slowest mode is computed by inverse
 iteration on finer and finer grids, with multigrid on the lattice's stencils; 1 - λ is accurate to 1
@@ -64,7 +64,7 @@ class Spectra:
 
     @cached_property
     def operator(self) -> StepOperator:
-        """Return the step operator, two unknowns a follower."""
+        """Return the step operator, with two unknowns for each follower."""
         return step_operator(self.scene)
 
     @cached_property
@@ -152,7 +152,7 @@ class Spectra:
         """Return the matrix of the rule's own step.
 
         Without frame delay, the coupling to the previous step is -b for all followers, so that the
-        sum of both couplings does not depend on momentum.
+        sum of the couplings to the current and to the previous step does not depend on momentum.
         """
         steady = self.operator.couplings_steady.entries()
         scale, unknowns = (
@@ -168,7 +168,7 @@ class Spectra:
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
 """Fractions to which the slowest mode decays in `Analysis.steps_to`."""
 NEAR = 0.9
-"""Ratio to the bound of plane waves above which a relaxation causes a warning if edges have no
+"""Fraction of the bound of plane waves. A larger relaxation causes a warning if edges have no
 frame."""
 
 
@@ -242,7 +242,7 @@ class Analysis:
 
     @property
     def operator(self) -> StepOperator:
-        """Return the step operator, two unknowns a follower."""
+        """Return the step operator, with two unknowns for each follower."""
         return self.spectra.operator
 
     @property
@@ -340,7 +340,7 @@ class Analysis:
         return bool(np.abs(mu).max(initial=0.0) <= 1.0 + NEUTRAL)
 
     def swing(self, relaxation: float, memory: float) -> Swing | None:
-        """Return the oscillating mode of the longest period with a relaxation and momentum.
+        """Return the oscillating mode with the longest period for a given relaxation and momentum.
 
         Parameters
         ----------

@@ -1,10 +1,12 @@
 """Forecast of a run before its first step: stability, supports, memory and time.
 
 `pbdkit check` reports the forecast, and `pbdkit run` issues those of its warnings that are computed
-quickly. Two of the checks are: steps of leaders with a mass are stable if ω ≤ 2, the limit of the
-symplectic Euler method with a step of 1. A part of the body resists rigid-body motions by its
-supports alone; if leaders do not constrain such a motion and the loads do work along it, there is
-no equilibrium, and steps do not converge.
+quickly.
+
+Two of the checks need an explanation. The steps of leaders with a mass are stable if ω ≤ 2, the
+limit of the symplectic Euler method with a step of 1. A part of the body resists rigid-body motions
+by its supports alone; if leaders do not constrain such a motion and the loads do work along it,
+there is no equilibrium, and steps do not converge.
 """
 
 from __future__ import annotations
@@ -85,7 +87,7 @@ class Forecast:
     spectral_radius, smallest_eigenvalue, largest_stable_relaxation, stable, steps_to
         See `pbdkit.Analysis`.
     period, decay
-        Period in steps, and decay a step, of the slowest oscillating mode; None if there is no
+        Period in steps, and decay per step, of the slowest oscillating mode; None if there is no
         momentum or no mode oscillates.
     exact
         Whether the analysis holds for the whole run, or is linearised at the start.
@@ -131,7 +133,7 @@ class Forecast:
 QUICK_PARTICLES = 2000
 """Number of particles up to which a run analyses the body as `check` does (at most 0.9 s)."""
 MAX_CHANGES = 16
-"""Largest number of steps at which parameters change that are analysed separately."""
+"""Maximum number of separate analyses, each at a step at which parameters change."""
 ANALYSIS_FIELDS = (
     *("spectral_radius", "smallest_eigenvalue", "largest_stable_relaxation", "stable", "steps_to"),
     *("exact", "estimated", "lag"),
@@ -303,7 +305,7 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
 def refuse_unheld_loads(scene: Scene) -> None:
     """Raise the ExperimentError of the run if loads act on a part of the body without supports.
 
-    The check applies only to equilibria, because such a part has none.
+    The check applies only to the solver `equilibrium`: a part without supports has no equilibrium.
     """
     if scene.experiment.solver.makes_steps or not scene.loads:
         return

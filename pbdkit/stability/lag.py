@@ -1,9 +1,9 @@
 """Distance of a body from its equilibrium while leaders move at a steady speed.
 
-In a step the leaders move first, then the followers. Frame points have the displacements of the end
-of the step before, so that those that follow leaders have their earlier displacements (with frame
-delay, of one more step before). With the influence L of leaders on followers, and its part S that
-acts through frame points,
+In a step the leaders move first, then the followers. During a step, frame points have the
+displacements from the end of the step before. Frame points that follow leaders therefore have the
+displacements of the leaders at that time or, with frame delay, one step earlier. With the influence
+L of leaders on followers, and its part S that acts through frame points,
 
     u(t+1) = P u(t) + Q u(t-1) + (L - S) u_L(t+1) + S u_L(t - lag) + s,
 
@@ -101,7 +101,8 @@ def boundary_coupling(scene: Scene, state: State, step: int) -> BoundaryCoupling
 MAX_PRODUCTS = 2e8
 """Largest number of products that are computed for the lag at the end of an interval."""
 EARLY_FRACTION = 0.01
-"""Fraction of 1 / (1 - λ), in steps, up to which the decay of the difference is negligible."""
+"""Number of steps, as a fraction of 1 / (1 - λ), up to which the decay of the difference is
+negligible."""
 MIN_ACCURACY = 1e-12
 """Smallest tolerance of the linear solver."""
 
@@ -115,14 +116,15 @@ class Lag:
     Parameters
     ----------
     first, last
-        These steps.
+        First and last of the steps in which a leader moves fastest.
     speed
         Displacement of the fastest leader in a step.
     steady
         Largest distance of a follower from its equilibrium once it has become steady.
     reached
-        The distance at the end of these steps if the body starts in equilibrium. It is accurate to
-        10 % if a computation by steps would take too long, and None if the step has momentum, too.
+        The distance at the end of these steps if the body starts in equilibrium. If a computation
+        by steps would take too long, it is accurate to 10 %, or None if the step has momentum or
+        the frame a delay.
     """
 
     first: int
@@ -203,7 +205,7 @@ class Trail:
             return None
         size, accuracy = float(np.abs(v).max()), 0.1
         while True:
-            # The error of δ may grow by the slowness in A⁻¹ δ.
+            # In A⁻¹ δ, the error of δ may be amplified by the slowness.
             accuracy *= ACCURACY
             delta = system.solve(direct + through_frame, accuracy * size)
             first = delta - direct

@@ -146,8 +146,8 @@ class Fracturing:
                 np.copyto(b, a, where=begins & (load < threshold))
 
     def _load(self, part: _Renewed, side: int) -> NDArray[Any]:
-        """Return the load of the cells on one side of bonds; at the edge of the body, of those on
-        the other side."""
+        """Return the load of the cells on one side of bonds. If there is no cell on that side, at
+        the edge of the body, return the load of the cell on the other side."""
         loads = [self._evaluator.load(cell, part.limits, part.numbers) for cell in part.cells]
         load: NDArray[Any] = np.where(part.cells[side].share > 0.0, loads[side], loads[1 - side])
         return np.broadcast_to(load, part.intact.shape)
@@ -166,7 +166,7 @@ class _Renewed(NamedTuple):
 
 
 BREAKS_AT_REST = Hindrance("an equilibrium with breaking bonds", "fracture")
-"""Reason why ranks do not share an equilibrium."""
+"""Reason why an equilibrium cannot be computed on several ranks."""
 
 
 class CutBonds(Operation):
@@ -182,7 +182,8 @@ class CutBonds(Operation):
         cut_bonds(self.scene, step.state.broken_step, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write nothing: a call never contains a step with a cut except as its first."""
+        """Write nothing: a step with a cut is always the first of a call, and is prepared before
+        it."""
 
     def reads(self, state: State) -> bool:
         """Return whether the next step begins with a cut."""

@@ -22,9 +22,9 @@ from pbdkit.stepping.state import shown
 class CellBeside:
     """Cell on one side of the bonds along a slot.
 
-    `corners` are the differences from the start of a bond to each corner, a sublattice and a step
-    of repeat cells; `rates` give the mean gradient of the displacement, Σ_k (u_k - u_0) ⊗ rates_k,
-    over the corners but the first.
+    `corners` contains the sublattice of each corner and the number of repeat cells, along each
+    axis, from the start of a bond to the corner. `rates` are the coefficients of the mean gradient
+    of the displacement, Σ_k (u_k - u_0) ⊗ rates_k, where k runs over all corners except the first.
     """
 
     corners: tuple[tuple[int, Index], ...]
@@ -32,8 +32,8 @@ class CellBeside:
     side: Side
 
     def gradient(self, u: NDArray[Any], home: Block) -> list[Any]:
-        """Return the gradient at bonds that start at places of a block: xx, xy, yx, yy, the
-        component first."""
+        """Return the gradient at bonds that start at places of a block, as xx, xy, yx, yy: the
+        first letter is the component of the displacement, the second the axis."""
         first, *corners = (Vector(*shown(self._at(corner, home).of(u))) for corner in self.corners)
         d = [other - first for other in corners]
         return [
@@ -186,6 +186,6 @@ def _elastic(xx: Any, yy: Any, shear: Any, c: Any) -> Any:
 
 
 def tried(model: object, ones: Any) -> tuple[CellStress, ...]:
-    """Return cells for a test of a model's functions, as many as it receives."""
+    """Return cells for a test of a model's functions, as many as the functions receive."""
     stress = CellStress(ones, 0.5 * ones, 0.25 * ones, ones)
     return (stress, stress) if isinstance(model, SoftensCells) else ()

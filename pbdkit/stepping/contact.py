@@ -79,9 +79,10 @@ def _stiffnesses(scene: Scene, place: Indices, sublattice: int) -> Floats:
 
 
 def compliance(scene: Scene) -> Floats | None:
-    """Return C = S⁻¹ of every particle, up to a factor of each: (xx xy yy, sublattice, cell, cell).
+    """Return C = S⁻¹ of every particle, scaled for each particle: (xx xy yy, sublattice, cell,
+    cell).
 
-    None if C is a multiple of 1 everywhere. For rules without forces C is 1.
+    None if C is a multiple of the identity for all particles, as for rules without forces.
     """
     if material_of(scene.experiment.rule) is None:
         return None
@@ -337,7 +338,7 @@ class PushOut(Operation):
         return arrays | ({} if codes is None else {"led_axes": codes})
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of particles that are pushed where they rest."""
+        """Generate the cells of particles that are pushed in their reference positions."""
         for step in call.moments:
             yield from self.contact.touched_at_rest(step)
 

@@ -356,8 +356,8 @@ def make_kernel(source: str, functions: Mapping[str, DeviceFunction], threads: i
     most `threads` threads."""
     scope = vars(ModuleType("kernel"))
     scope |= words(_on_device) | {name: _on_device(of) for name, of in functions.items()}
-    # Devices code is linked at once: the driver could contract operations in code that is linked
-    # later.
+    # The device code is linked at once, since the driver could contract operations in code that is
+    # linked later.
     options = {} if is_simulated() else {"lto": False, "launch_bounds": threads}
     scope.update(cuda=cuda, part=_on_device, kernel=cuda.jit(**options))
     exec(compile(source, "<kernel>", "exec"), scope)
@@ -375,7 +375,7 @@ def text_of(run: Any, arguments: tuple[Any, ...], device: tuple[int, int]) -> st
 
 
 def first_launch(run: Any, arguments: tuple[Any, ...]) -> None:
-    """Launch the kernel once on one thread, which compiles it.
+    """Launch the kernel once on one thread. The launch compiles the kernel.
 
     Raises PbdkitError if products and sums could be contracted.
     """
