@@ -13,7 +13,7 @@ from pbdkit.lazy_accessor import register_accessor
 
 
 def _public_names() -> dict[str, str]:
-    """Return the module of each public name: ``from MODULE import NAME as NAME`` in the stub."""
+    """Return the module of each public name: the stub has ``from MODULE import NAME as NAME``."""
     # The same as `pkgutil.get_data`, which takes 13 ms to import; archives are supported, too.
     stub = __spec__.loader.get_data(f"{__file__}i").decode()  # type: ignore[union-attr]  # optional
     lines = (line for line in stub.splitlines() if not line.startswith("#"))

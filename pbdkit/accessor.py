@@ -1,4 +1,4 @@
-"""Imported when a dataset's accessor `pbd` is first used: what it offers."""
+"""Methods of the accessor `pbd` of datasets; imported when it is first used."""
 
 from __future__ import annotations
 
@@ -113,13 +113,13 @@ class PbdAccessor:
         Returns
         -------
         xarray.Dataset
-            The selected members. If every parameter is given, the dataset of this run, with its
-            experiment.
+            The selected members. If every parameter is given, this is the dataset of one run, with
+            its experiment.
 
         Raises
         ------
         ExperimentError
-            If the dataset is no sweep, or no member has these values.
+            If the dataset is not that of a sweep, or no member has these values.
 
         Examples
         --------
@@ -191,7 +191,7 @@ class PbdAccessor:
         Returns
         -------
         xarray.Dataset
-            Dataset with converted variables. Variables without a scale, as all those of experiments
-            without `units`, are unchanged.
+            Dataset with converted variables. Variables without a scale, such as all variables of
+            experiments without `units`, are unchanged.
         """
         return in_physical_units(self._dataset)

@@ -126,7 +126,7 @@ def run(
 
     See Also
     --------
-    Simulation : step by step.
+    Simulation : Run an experiment step by step.
 
     Examples
     --------
@@ -287,7 +287,7 @@ def rerun(
     Warns
     -----
     ReproducibilityWarning
-        If other versions than the installed ones made the dataset.
+        If the dataset was made by other versions than the installed ones.
 
     Examples
     --------
@@ -386,7 +386,7 @@ def sweep(
     vary : mapping
         Lists of values by path of the parameter; all combinations are run.
     together : mapping
-        Lists of one length by path of the parameter, which are varied simultaneously.
+        Lists of equal length by path of the parameter; these parameters are varied simultaneously.
     replicates : int
         Number of runs of each combination, with different seeds.
     keep : mapping
@@ -394,7 +394,8 @@ def sweep(
     names : mapping
         Names of the new dimensions by path; by default the last word of the path.
     folder : str or path, optional
-        Folder for finished members. A second call with the same folder runs the missing ones only.
+        Folder for finished members. A second call with the same folder runs only the members that
+        are missing.
     workers : int, optional
         Number of processes; by default one for each processor. With 1 no process is started.
     client : dask.distributed.Client, optional
@@ -405,8 +406,8 @@ def sweep(
     Returns
     -------
     xarray.Dataset
-        Dataset with the parameters as dimensions, as `pbdkit sweep` writes it. A member that
-        failed is NaN, with the reason in `message`.
+        Dataset with the parameters as dimensions, as `pbdkit sweep` writes it. The values of a
+        member that failed are NaN, and `message` contains the reason.
 
     Raises
     ------

@@ -34,8 +34,8 @@ class Communicator(ABC):
 
     @abstractmethod
     def raise_together(self) -> AbstractContextManager[None]:
-        """Run the block; an exception in any process is raised in all of them at its end, that of
-        the lowest rank."""
+        """Run the block; at its end the exception of the lowest rank that has one is raised in all
+        processes."""
 
     def bcast(self, value: Any) -> Any:
         """Return the value of the root."""

@@ -23,8 +23,9 @@ This page compares the program with the paper that defines its model: R. dell'Er
 [doi](https://doi.org/10.1007/s00161-018-0663-5)). Each claim of the paper that can be tested is
 quoted in a few words and has one of three verdicts: **reproduced** by the shipped case,
 **reproduced only with** a named variant, option or range, or **not reproduced**. Below the
-quotation is the measurement from which the verdict is computed. If a claim failed, thresholds,
-frame delay, shells, metric, frame and particles near those of the case were tried too.
+quotation is the measurement from which the verdict is computed. If a claim failed, it was also
+tested with thresholds, frame delays, shells, neighbour metrics, frames and particles near those of
+the case.
 
 The paper's time t is step t − 1: its figures at time 401 show step 400. Figure numbers are those of
 the pre-print, and particles have the paper's numbers. The paper does not give all speeds,

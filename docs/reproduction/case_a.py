@@ -22,7 +22,7 @@ def section() -> Section:
         ),
         (
             configurations(run("paper/a-lag"), [1, 10, 20, 401], "a-lag-pe1.png"),
-            "The same with paper/a-lag: the convexity",
+            "Case a with the delayed frame of paper/a-lag, which causes the convexity",
         ),
         (
             configurations(a, [2, 10], "a-pe2.png", "pe2"),
@@ -194,8 +194,9 @@ def _history() -> list[Claim]:
         ),
         Claim(
             "later decrease with parabolic like behaviour to the original position",
-            f"{both_text(x, top)}. Over the whole decrease the two differ by "
-            f"{abs(whole[1] - whole[0]):.0e}. At step 400 the displacement is {x[400]:.3f}; its "
+            f"{both_text(x, top)}. Over the whole decrease the two values of R² "
+            f"differ by {abs(whole[1] - whole[0]):.0e}. At step 400 the displacement is "
+            f"{x[400]:.3f}; its "
             f"maximum was {x[top]:.3f}.",
             parabolic(whole),
             f"steps {top} to 150 of the decrease",

@@ -91,7 +91,7 @@ def _claims_b() -> list[Claim]:
             "Left of the leaders PE1 is larger at the edge than in the middle row by "
             f"{near[9]:.2%}, {near[19]:.2%} and {near[99]:.1%} at times 10, 20 and 100 "
             f"({in_a:.2%} in case a): its contours are concave toward the left, visibly at time "
-            "100. In the middle of the sheet they are then concave toward the right "
+            "100. In the middle of the sheet they are concave toward the right at that time "
             f"({middle[99]:.1%}).",
             near[99] > 0.02 and near[99] > in_a,
         ),

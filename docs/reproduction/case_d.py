@@ -83,9 +83,9 @@ def _line() -> list[Claim]:
         Claim(
             "points close to the frame are detached before the others [first gradient]",
             f"The rows separate at steps {rows['1']} in `paper/d1` and {rows['lag']} in "
-            f"`paper/d1-lag`. Thresholds from {THRESHOLDS[0]:g} to {THRESHOLDS[-1]:g} were tried; "
-            "of those at which all rows separate, the following numbers separate at the edges "
-            f"first: {found}.",
+            f"`paper/d1-lag`. Thresholds from {THRESHOLDS[0]:g} to {THRESHOLDS[-1]:g} were tried. "
+            "The edges separate first at the following numbers of those thresholds at which all "
+            f"rows separate: {found}.",
             len(first["one shell"]) == len(sheets_of["one shell"]),
             f"`paper/d1-lag`, at {share['one shell and lag 1']}",
             edges_first(parted(lag)),
@@ -113,8 +113,9 @@ def _line() -> list[Claim]:
             "time (1, 5, 6, 7 and 100) … (1, 5, 6, 7, 8 and 100) [when it tears]",
             f"The rows separate at time {span('d1')} in `paper/d1` and {span('d2')} in "
             f"`paper/d2`. Thresholds from {TRIED[0]:g} to {TRIED[-1]:g} were tried in steps of "
-            "0.1: the last rows separate after time 5 and not after times 7 and 8 at thresholds "
-            f"of {which(fitting('d1', 'd2'))}. At a threshold of 6 the times are "
+            "0.1: the last rows separate after time 5, and not after times 7 (`paper/d1`) and 8 "
+            f"(`paper/d2`), at thresholds of {which(fitting('d1', 'd2'))}. At a threshold of 6 the "
+            "times are "
             f"{_times('d1', 6.0)} and {_times('d2', 6.0)}.",
             5.2 in fitting("d1", "d2"),
         ),
@@ -176,7 +177,7 @@ def _rebound() -> list[Claim]:
             "The number of thresholds with a rebound is "
             f"{kinds(swept('one shell'))} with one shell, and there is none in `paper/d2` either. "
             "If bonds to the frame do not break, there is "
-            f"{'one' if tied_one else 'none'} with one shell and one with two.",
+            f"{'one' if tied_one else 'no'} rebound with one shell, and one with two.",
             rebound(x_of(one)) is None and rebound(x_of(two)) is not None,
             "`paper/d2-frame-bonds` against `paper/d1` with `frame_bonds: false`",
             tied_one is None,

@@ -72,12 +72,12 @@ def elements() -> list[Claim]:
             "moved). "
             "The equilibrium of the barycentre rule under the copying frame differs from it by "
             f"{off} with 10 and 20 cells per unit length, so that a finer lattice does not help. "
-            f"It is not faster either. Only calibrated rules reach an error of {WANTED}; their "
+            f"It is not faster either. Only calibrated rules reach an error of {WANTED}. Their "
             f"steps took {', '.join(f'{r:.1f}' for r in ratio['steps'])} times as long as linear "
-            "or quadratic elements, with mesh and set-up included in both, and with momentum, "
-            "which the paper does not have, "
-            f"{', '.join(f'{r:.2f}' for r in ratio['memory'])} times "
-            "([times to smaller errors](materials.md#time-to-an-error)). The verdict requires "
+            "or quadratic elements; with momentum, which the paper does not have, they took "
+            f"{', '.join(f'{r:.2f}' for r in ratio['memory'])} times as long. The times of both "
+            "methods include mesh and set-up ([times to smaller "
+            "errors](materials.md#time-to-an-error)). The verdict requires "
             f"an error of {SIMILAR:.0%} in half the time.",
             similar and max(ratio["steps"]) < 0.5,
             "calibrated rules and memory",
@@ -90,8 +90,8 @@ def elements() -> list[Claim]:
             f"with the frame `natural` and 20 cells are {close}. Fracture was not compared with "
             "finite elements.",
             similar,
-            "`elastic` and `natural`, which the paper does not have (`material/bar`), and without "
-            "fracture",
+            "the rule `elastic` and the frame `natural`, which the paper does not have "
+            "(`material/bar`), and without fracture",
             near,
         ),
         *_cauchy(),
@@ -121,20 +121,23 @@ def _cauchy() -> list[Claim]:
     return [
         Claim(
             "deformable bodies … according to the standard Cauchy model",
-            f"`pbdkit identify` computes the continuum limit inside the body: {found}. Diffusion "
-            "does not couple x and y; it equals elasticity with ν = −1. The rule of mixed "
+            "`pbdkit identify` computes whether the continuum limit inside the body is diffusion, "
+            f"elasticity or neither of them: {found}. Diffusion does not couple x and y; it equals "
+            "elasticity with ν = −1. The rule of mixed "
             "coordinates depends on the position, which no material law does. Among the paper's "
             f"rules {of_weights}. `elastic` is {calibrated.symmetry} elasticity with the given "
             f"ν ({calibrated.poisson_ratio:.3f}).",
             all(kind == "elasticity" for kind in kinds.values()),
-            "`elastic` and `natural`, which the paper does not have (`material/bar`)",
+            "the rule `elastic` and the frame `natural`, which the paper does not have "
+            "(`material/bar`)",
             calibrated.kind == "elasticity",
         ),
         Claim(
             "isotropic … elastic behaviour",
             f"The continuum limit of no case is elasticity: {found}. However, {of_weights}.",
             all(kind == "elasticity" for kind in kinds.values()),
-            f"distance-weighted on the hexagonal lattice, relaxation below {bound:.3f}",
+            "the rule distance-weighted on the hexagonal lattice and a relaxation below "
+            f"{bound:.3f}",
             (hexagonal.kind, hexagonal.symmetry) == ("elasticity", "isotropic") and bound > 0,
         ),
         Claim(
@@ -143,8 +146,9 @@ def _cauchy() -> list[Claim]:
             f"spacings² per step: {speeds}. {of_weights.capitalize()}. K is not a material "
             "constant.",
             any(m.kind == "elasticity" for m in means.values()),
-            "`elastic`, `orthotropic`, `strain-gradient` and `springs`, which the paper does not "
-            "have ([materials](materials.md))",
+            "the rules `elastic`, `orthotropic`, `strain-gradient` and `springs`, which the paper "
+            "does "
+            "not have ([materials](materials.md))",
             calibrated.kind == "elasticity",
         ),
     ]

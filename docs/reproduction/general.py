@@ -38,8 +38,8 @@ def section() -> Section:
                 ylim=(0.2, 2.05),
             ),
             "Stiffness for waves along x. The lines of 4 and 8 neighbours coincide: the paper's "
-            "second shell has no effect. Only 24 neighbours, the lowest line, soften short waves "
-            "more; gradient elasticity with l² > 0 stiffens them",
+            "second shell has no effect. 24 neighbours (the lowest line) soften short waves more "
+            "than 4 neighbours do; gradient elasticity with l² > 0 stiffens them",
         )
     ]
     words = "Claims of the introduction, sections 3 and 5 and the conclusions that can be tested."
@@ -200,8 +200,9 @@ def _shape() -> list[Claim]:
         Claim(
             "automatically takes into account large deformation elasticity",
             "If both end columns are rotated by 90° (`paper/a-rotation`), the body should rotate "
-            f"with them. After convergence particles are up to {error:.2f} from there, on a body "
-            f"9 wide, and PE1 is {turned.of('pe1')[-1].max():.1f} instead of 0.",
+            f"with them. After convergence particles are up to {error:.2f} away from their rotated "
+            f"positions, on a body 9 wide, and PE1 is {turned.of('pe1')[-1].max():.1f} instead of "
+            "0.",
             bool(error < 0.01),
         ),
         Claim(

@@ -50,7 +50,8 @@ def hooke() -> Claim:
         "introduce relative distance between the points into the rule … and simulate Hook law",
         f"If a neighbour moves away by {', '.join(f'{way:g}' for way in WAYS)}, its force "
         f"increases by {', '.join(f'{r:.2f}' for r in ratios[0])} times this distance, at "
-        f"relaxations of {', '.join(f'{w:g}' for w in RELAXATIONS)} alike. The force is therefore "
+        f"each of the relaxations {', '.join(f'{w:g}' for w in RELAXATIONS)}. The force is "
+        "therefore "
         f"r² (within {off:.0e}), where r is the distance, with the energy Σ r³/3; Hooke's law "
         "would give a constant factor. In addition, the rule as printed is unstable: noise of "
         f"1e-6 grows to {noisy[0][60]:.2g} in 60 steps at rest. With a relaxation of 0.6 "

@@ -99,7 +99,7 @@ def _meaning() -> list[str]:
         f"extension: u_y / u_x of the upper row at step 100 varies from {far[1]:.3f} at column 2 "
         f"to {far[8]:.3f} at column 9.",
         "**Large rotations are not represented.** A rotation by a right angle gives a PE1 of "
-        f"{turned.of('pe1')[-1].max():.1f}; a rigid rotation has 0.",
+        f"{turned.of('pe1')[-1].max():.1f}; that of a rigid rotation is 0.",
         "**PE1 after a fracture** measures the gap instead of the body; use `pe1-intact`.",
         "**λ is not a yield stress.** The final strain of the piece is λ − 1 for every "
         "displacement of the leaders, because the broken edge is permanently loaded. A free piece "

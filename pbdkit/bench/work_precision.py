@@ -56,8 +56,8 @@ def resized(experiment: Experiment, size: int) -> tuple[str, ...]:
     """Return the settings with which about `size` sites lie along the longer side of the body.
 
     A grid gets `size` columns and rows in proportion; positions are scaled with the body. For any
-    other body the lattice constant is reduced, and with it lengths in lattice constants: thresholds
-    and the radius of neighbours.
+    other body the lattice constant is changed, and so are lengths that are given in lattice
+    constants: thresholds and the radius of neighbours.
 
     Raises
     ------
@@ -143,7 +143,7 @@ MAX_STEPPING_S = 60.0
 COMPARISONS = 4
 """Number of steps, evenly spread up to the last, at which displacements are compared."""
 NOISY_START = ("initial={type: noise, amplitude: 1e-3}", "steps=10000000")
-"""Settings by which every particle moves in timed steps, with the engine for long runs."""
+"""Settings for timed steps: every particle moves, and the engine is that for long runs."""
 TIMED_STEPS = (2, 42)
 """Steps between which the rate is measured."""
 Job = Callable[..., dict[str, Any]]
@@ -164,7 +164,7 @@ class Row:
     tolerance, certified, error
         Tolerance, certified bound and upper bound of the error: the largest distance from the
         reference, relative to the largest displacement; for equilibria to the largest prescribed
-        one. Infinite if a run diverged.
+        displacement. Infinite if a run diverged.
     steps
         Number of steps, or of iterations of the linear solver.
     setup_first_s, setup_s
@@ -177,7 +177,7 @@ class Row:
     peak_memory_mib
         Peak memory above that of the imports in MiB.
     is_predicted
-        True if times are those of a step times their number.
+        True if times are the time of one step times the number of steps.
     reason
         Reason for which there is no measurement.
     """
@@ -202,12 +202,12 @@ class Row:
 
     @property
     def line(self) -> str:
-        """Method and threads, which rows of one colour in a picture share."""
+        """Method and threads; rows with the same ones have the same colour in a picture."""
         return self.method + (f", {self.threads} threads" if (self.threads or 1) > 1 else "")
 
 
 def engines() -> list[tuple[str, str, int]]:
-    """Return engine, precision and threads of all ways to step, the reference first."""
+    """Return engine, precision and threads of each variant of steps, the reference first."""
     combinations = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
     combinations += [] if what_is_missing() else [("gpu", 1)]
     return [
@@ -557,7 +557,7 @@ def show_work_precision(
 
 Task = dict[str, Any]
 REPEATS = 7
-"""Maximum number of repetitions of a measurement, of which the fastest counts."""
+"""Maximum number of repetitions of a measurement, of which the fastest is used."""
 MAX_REPEATING_S = 2.0
 """Maximum duration of all repetitions in seconds."""
 MAX_SOLVING_S = 60.0
@@ -598,7 +598,7 @@ def _times() -> Floats:
 
 
 def _repetitions(spent: list[Floats]) -> Iterator[int]:
-    """Yield repetitions until they suffice; each appends its `spent` times, (..., clock)."""
+    """Yield numbers of repetitions until these suffice; the caller appends times to `spent`."""
     for turn in range(REPEATS):
         yield turn
         took = [float(times[..., 0].max(initial=0.0)) for times in spent]

@@ -146,7 +146,7 @@ def _motion(group: Driven) -> str:
 
 
 def _duration(group: Driven) -> str:
-    """Return axes and steps of a group, if not all."""
+    """Describe the axes and steps of a group, except where they are all axes or all steps."""
     axes, until = "".join(getattr(group, "axes", None) or ()), group.until
     begins = f" from step {group.from_}" * (group.from_ > 1)
     return f" along {axes}" * bool(axes) + begins + f" until step {until}" * (until is not None)

@@ -164,7 +164,7 @@ class CommandTable(click.Group):
             raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands by group; none is imported for its line."""
+        """Write the commands by group, without importing them."""
         for group, rows in _sections().items():
             with formatter.section(group):
                 formatter.write_dl([(f"{name:<12}", does) for name, does in rows])

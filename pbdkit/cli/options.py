@@ -90,7 +90,7 @@ set_option = click.option(
 def _choice(
     context: click.Context, option: click.Parameter, texts: tuple[str, ...]
 ) -> dict[str, str]:
-    """Return the values by name; raise click.BadParameter for text without a value."""
+    """Return the values by name; raise click.BadParameter for a text that is not NAME=VALUE."""
     for text in texts:
         if not all(text.partition("=")):
             raise click.BadParameter(f"'{text}': expected NAME=VALUE, for instance steel=3")

@@ -147,7 +147,7 @@ DEFAULT_PARTS = {
     "operations": "[]",
     "diagnostics": "[{type: displacement}]",
 }
-"""Parts of the example experiment, apart from the one of the plugin."""
+"""Parts of the example experiment, except the component of the plugin."""
 TEMPLATES = {
     "pyproject.toml": "pyproject.toml",
     "README.md": "README.md",
@@ -213,9 +213,9 @@ class Project:
         Raises
         ------
         ExperimentError
-            If there is something of that name.
+            If a file or folder of that name exists.
         StorageError
-            If it cannot be written; then nothing of it remains.
+            If the project cannot be written; files written until then are removed.
         """
         folder = parent / self.distribution
         texts = self.files()

@@ -28,7 +28,7 @@ def resume(
     quiet: bool,
     as_json: bool,
 ) -> int:
-    """Continue the run that was to write a file, and return the exit status."""
+    """Continue the interrupted run of an output file, and return the exit status."""
     quiet = quiet or not communicator.is_root
 
     def resume_by(execution: Execution, is_repeated: bool) -> int:

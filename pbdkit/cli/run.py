@@ -76,7 +76,7 @@ def run(
 
 
 def refuse_unfinished(path: Path, *, force: bool) -> None:
-    """Raise ExperimentError beside an unfinished run, unless `force` discards it.
+    """Raise ExperimentError if there is an unfinished run, unless `force` discards it.
 
     A run that another process is writing is never discarded.
     """

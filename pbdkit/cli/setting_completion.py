@@ -91,7 +91,7 @@ class SettingPaths:
                 yield _entry(path, {}, key, schema)
 
     def _forms(self, schema: Schema) -> Iterator[Schema]:
-        """Yield the alternatives of a schema that are not deprecated, references followed."""
+        """Yield the alternatives of a schema that are not deprecated, with references resolved."""
         if "$ref" in schema:
             yield from self._forms(self._definitions.get(schema["$ref"].split("/")[-1], {}))
             return
@@ -131,7 +131,7 @@ def settings(context: click.Context, prefix: str) -> Iterator[str]:
 
 
 def _data(context: click.Context) -> dict[str, Any]:
-    # The option that waits for its value prevents click from assigning the arguments.
+    # Click does not assign the arguments while an option has no value.
     name = context.params.get("experiment") or next(iter(context.args), None)
     defaults = Experiment.defaults()
     source = read_experiment(name) if name else Source(data={})

@@ -1,4 +1,4 @@
-"""Commands ``pbdkit sweep`` and ``fit``, and ``schema`` of the files that they take."""
+"""Commands ``pbdkit sweep`` and ``fit``, and ``schema`` of the files that they read."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from pbdkit.sweeps.specification import SweepPlan, read_sweep, sweep_schema
 CONNECT_S = 10.0
 """Timeout for the connection to a cluster in seconds."""
 MAX_LISTED = 20
-"""Number of failures that are listed; `message` in the dataset has all."""
+"""Number of failures that are listed; `message` in the dataset contains all."""
 
 
 def sweep(

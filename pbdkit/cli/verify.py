@@ -46,7 +46,7 @@ def _fault_of(file: Path) -> str:
 
 
 def _refuse_elsewhere(file: Path) -> None:
-    """Raise StorageError if the bytes are those that were sealed, but refer to other files."""
+    """Raise StorageError if a file with a correct checksum refers to other files."""
     try:
         open_sealed(file).close()
     except StorageError:

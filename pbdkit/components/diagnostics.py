@@ -63,7 +63,7 @@ class PE1Intact(Diagnostic):
 class PE2(Diagnostic):
     """Pseudo-energy PE2_j(t) = |x_j(t) - x_j(t-1)|, 0 at time 0.
 
-    The previous step counts even if it is not recorded.
+    The previous step is used even if it is not recorded.
     """
 
     type: Literal["pe2"] = "pe2"
@@ -269,7 +269,7 @@ class Strain(Diagnostic):
 class LocalRotation(Diagnostic):
     """Rotation angle of the neighbourhood of each particle inside the outline; 0 without cells.
 
-    The angle of R in the polar decomposition F = R U, atan2(F_yx - F_xy, F_xx + F_yy),
+    This is the angle of R in the polar decomposition F = R U, atan2(F_yx - F_xy, F_xx + F_yy),
     counterclockwise from -π to π.
     """
 
@@ -427,12 +427,12 @@ class StrainEnergy(Diagnostic):
 class Reaction(Diagnostic):
     """Reaction force of each leader group; 0 while the group is inactive.
 
-    The reaction is minus the sum of neighbour forces and loads on the particles of the group; a
-    particle of two groups counts half in each. A group that leads along some axes only has no
-    reaction along the others; forces from obstacles on its particles are included along its own
-    axes. Under the natural frame the reactions of all groups sum to zero, or to minus the loads and
-    the forces of obstacles. Frame points exert forces too; at the corners of prescribed edges these
-    are artefacts of the frame, of which a warning informs.
+    The reaction is minus the sum of neighbour forces and loads on the particles of the group; for a
+    particle in two groups, half of these forces is assigned to each. A group that leads along some
+    axes only has no reaction along the others; forces from obstacles on its particles are included
+    along its own axes. Under the natural frame the reactions of all groups sum to zero, or to minus
+    the loads and the forces of obstacles. Frame points exert forces too; at the corners of
+    prescribed edges these forces are artefacts of the frame, and a warning is issued.
     """
 
     type: Literal["reaction"] = "reaction"
@@ -459,8 +459,9 @@ class Reaction(Diagnostic):
 class LoadDisplacement(Diagnostic):
     """Load-displacement curve of each load.
 
-    Its resultant, 0 while the load does not act, and the mean displacement of its particles
-    weighted by their shares of the load, so that the area under the curve is the work of the load.
+    The curve consists of the resultant of the load, which is 0 while the load does not act, and the
+    mean displacement of its particles, weighted by their shares of the load, so that the area under
+    the curve is the work of the load.
     """
 
     type: Literal["load-displacement"] = "load-displacement"

@@ -127,7 +127,7 @@ def bond_springs(slot: Slot, c: Stiffness, cells: Tiling) -> float:
     The springs of a cell are as stiff as possible without exceeding the stiffness of the cell: the
     remainder is positive semidefinite. On squares of an isotropic material with 0 ≤ ν ≤ 1/3 the
     remainder is pure shear, so that the edges beside a straight cut carry the stress along the cut
-    as half a cell does.
+    like half a cell.
     """
     x, y = slot.rest
     if cells.regular == 3:
@@ -431,9 +431,9 @@ class Elastic(IsotropicElastic):
     """Isotropic linear elasticity, in plane stress or plane strain.
 
     Requires the square or rectangular lattice with 8 neighbours, or the hexagonal lattice with 6,
-    where the rule is that of linear triangles. At ν = -1 the rule is the barycentre, of the four
-    nearest or of all six neighbours. Stable for a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or
-    3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
+    where the rule is that of linear triangles. At ν = -1 the rule is the barycentre rule with the
+    four nearest or with all six neighbours. Stable for a relaxation below (5 - 3ν)/4 (square, ν ≥
+    0) or 3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
     """
 
     type: Literal["elastic"] = "elastic"
@@ -486,7 +486,7 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
     on the hexagonal lattice. Along an axis the equilibrium is u'' - l² u'''' = 0; the internal
     length of shear waves is √((1 - ν')/2) l. Leaders on an edge prescribe its displacement and its
     slope. Requires cells of equal sides and the natural frame. Stable for a relaxation below 2/(λ +
-    cλ²), where 2/λ is the bound of the elastic rule. This bound is mostly very small, so that
+    cλ²), where 2/λ is the bound of the elastic rule. In most cases this bound is very small, and
     solver: {type: equilibrium} is more efficient.
     """
 

@@ -1,6 +1,6 @@
 """Built-in fracture models.
 
-They are no fracture; a threshold on length (the paper's section 5); a limit of strain, with or
+The models are: none; a threshold on length (the paper's section 5); a limit of strain, with or
 without gradual damage; and cohesive cells, which dissipate the same energy per crack length for
 every lattice constant (docs/fracture.md).
 """
@@ -163,7 +163,7 @@ class Threshold(BreaksAtStrain, Parting):
         return {**super().courses, **courses}
 
     def at(self, moment: float) -> Any:
-        """Return the model with the thresholds of a moment."""
+        """Return the model with the thresholds at a given time."""
         thresholds = [at(limit, moment) for limit in self.limits]
         return super().at(moment).with_more(thresholds=thresholds)
 
@@ -228,7 +228,7 @@ SCATTER = "Scatter s: strengths are multiplied by random factors, uniform in 1 �
 
 
 def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strains: float) -> Drawn:
-    """Multiply each strain by one random factor for each bond; empty without scatter."""
+    """Return each strain times one random factor per bond, or nothing if there is no scatter."""
     if not scatter:
         return {}
     factors = 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
@@ -261,9 +261,10 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
     scatter: Scatter = Field(0.0, description=SCATTER, examples=[0.2])
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """Return `square` = |r|², and the `failure_strain` of the bond unless it has scatter.
+        """Return `square` and, if there is no scatter, `failure_strain`.
 
-        Without scatter they are (1 + failure)² |r|² and 0, which saves one rounded multiplication.
+        With scatter `square` is |r|². Without scatter it is (1 + failure)² |r|², and
+        `failure_strain` is 0, which saves one rounded multiplication.
         """
         rest = squared_length(slot.rest)
         if self.scatter:
@@ -271,7 +272,7 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
         return {"square": (1.0 + self.failure) ** 2 * rest, "failure_strain": 0.0}
 
     def remembered(self) -> tuple[Remembered, ...]:
-        """Declare `failure_strain` if it has scatter."""
+        """Declare `failure_strain` if there is scatter."""
         return (_FAILURE_STRAIN,) if self.scatter else ()
 
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
@@ -300,8 +301,8 @@ class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
     Its damage is the maximum over time of D = failure / (failure - onset) (1 - onset / ε), 0 at the
     onset and 1 at failure. Damage is irreversible and does not increase under compression. The rule
     is evaluated with the difference (1 - D) d + D lost, where `lost` is the difference to the
-    fictitious point. Under the barycentre the force (1 - D) ε of the bond decreases linearly from
-    the onset to zero at failure.
+    fictitious point. Under the barycentre rule the force (1 - D) ε of the bond decreases linearly
+    from its value at the onset to zero at failure.
 
     With `scatter` s both strains of each bond are multiplied by one random factor from the uniform
     distribution over 1 ± s, by the seed of the experiment.

@@ -42,7 +42,7 @@ class LatticeNeighbours(NeighbourMetric):
 
 
 class Coordination(LatticeNeighbours):
-    """Neighbours by shells of equal distance on the infinite lattice, within 1e-6 relative."""
+    """Neighbours by shells of equal distance (to 1e-6 relative) on the infinite lattice."""
 
     type: Literal["coordination"] = "coordination"
 
@@ -158,7 +158,7 @@ def cells_within(cell: Cell, radius: float) -> float:
 
 
 def _ranked(offsets: Sequence[Offset], distances: Sequence[float]) -> list[list[Offset]]:
-    """Group sorted offsets into shells of equal distance, within 1e-6 relative."""
+    """Group sorted offsets into shells of equal distance, to a relative tolerance of 1e-6."""
     shells: list[list[Offset]] = []
     first = -1.0
     for offset, distance in zip(offsets, distances, strict=True):
