@@ -28,8 +28,8 @@ def register_accessor() -> None:
 
 
 class AccessorFinder:
-    """Finder of modules that finds xarray by the other finders, and registers the accessor after
-    xarray is executed."""
+    """Module finder that delegates the search for xarray to the other finders, and registers the
+    accessor after the import of xarray."""
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None

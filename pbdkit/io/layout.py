@@ -151,15 +151,15 @@ def base_columns(axes: int = 2) -> list[Column]:
 
 
 def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
-    """Return the CF attributes of a variable of codes."""
+    """Return the CF attributes of a variable that contains integer codes."""
     values = np.array([*meanings.values()], np.int8)
     return {"flag_values": values, "flag_meanings": " ".join(meanings)}
 
 
 def optional_columns() -> list[list[Column]]:
     """Return the columns that depend on the experiment but not on its diagnostics: the table of
-    bonds, their steps of breaking, the coordinate of what is measured at every step, and those of
-    leader groups, loads, obstacles and principal values."""
+    bonds with the steps in which they broke, the coordinate of quantities measured at every step,
+    and the coordinates of leader groups, loads, obstacles and principal values."""
     bond, by_ends = ("bond",), "counted from 1, by its ends"
     whole = "-1 where it has not broken"
     no_strain = "NaN where it has not broken, was cut, or was broken from the start"
@@ -191,8 +191,8 @@ def reserved_names() -> set[str]:
 
 
 def remembered_column(number: Remembered, owner: str, part_renews: bool) -> Column:
-    """Return the column of a state variable that a component declares for each `owner`, bond or
-    particle."""
+    """Return the column of a state variable that a component declares for each `owner` (bond or
+    particle)."""
     grows = number.changes and part_renews
     dims, when = (("time", owner), When.RECORD) if grows else ((owner,), When.START)
     return Column(number.name, dims, number.dtype, when, number.long_name, number.units)
@@ -259,8 +259,8 @@ def makers_of(names: set[str]) -> list[str]:
 
 
 def _columns_of(diagnostic: type[Component]) -> list[Column]:
-    """Return the columns of a diagnostic with unset parameters; none if its variables depend on
-    parameters or cannot be evaluated, which leaves the schema open."""
+    """Return the columns of a diagnostic with unset parameters. The list is empty if its variables
+    depend on parameters or cannot be evaluated; the schema then does not constrain them."""
     assert issubclass(diagnostic, Diagnostic)
     with suppress(Exception):  # Code of a plugin that the user has not selected must not fail here.
         variables = diagnostic.model_construct(type="").variables()
@@ -299,12 +299,12 @@ def refuse_no_dataset(candidate: Any) -> None:
 
 
 def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset in the current layout. Older ones lack indices and roles of particles, and
-    have bonds by index from 0 instead of by particle number; the whole body counts as inside its
-    outline.
+    """Return the dataset in the current layout. Older datasets lack the indices and roles of
+    particles, and identify the particles of a bond by an index from 0 instead of the particle
+    number; all particles of the body count as inside its outline.
 
-    Diagnostics are unchanged: at frame points they are 0, where they are NaN in the current layout.
-    Raises ExperimentError if the argument is not a dataset.
+    Diagnostics are unchanged: at frame points they remain 0, whereas they are NaN in the current
+    layout. Raises ExperimentError if the argument is not a dataset.
     """
     refuse_no_dataset(dataset)
     variables, dims = dataset.variables, {name: v.dims for name, v in dataset.variables.items()}
@@ -391,7 +391,7 @@ def indices_of(dataset: xarray.Dataset) -> list[str]:
 
 def rows_at(dataset: xarray.Dataset, index: Mapping[str, int]) -> Array:
     """Return the rows of the particles at the given lattice indices. Raises ExperimentError if
-    there is none, and for unknown names."""
+    there is no such particle, or for unknown names of indices."""
     names = indices_of(dataset)
     matches = np.ones(dataset.sizes.get("particle", 0), np.bool_)
     for name, value in index.items():

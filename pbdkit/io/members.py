@@ -22,7 +22,8 @@ SWEEP = "sweep"
 STATUS = "status"
 """Variable with the status of each member."""
 TEXT = "_text"
-"""Suffix of the coordinate with the texts of values that are numbered along a dimension."""
+"""Suffix of the name of the coordinate that contains values as text, if the coordinate of the
+dimension itself only numbers them."""
 PARAMETER = "parameter"
 """Attribute of a coordinate with the path of its parameter in the experiment."""
 SHOWN = 6
@@ -49,12 +50,14 @@ def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset
     dataset : xarray.Dataset
         The dataset of a sweep.
     choice : mapping
-        Values by the names of parameters, which are numbers, or texts such as the `type` of a part.
+        Values by the names of parameters. A value is a number, or text such as the `type` of a
+        part.
 
     Raises
     ------
     ExperimentError
-        For a dataset of one run, a name that is no parameter, and a value that no member has.
+        If the dataset is that of a single run, a name is not that of a parameter, or no member has
+        a value.
     """
     if SWEEP not in dataset.attrs:
         raise ExperimentError(
@@ -85,8 +88,8 @@ def choices(dataset: xarray.Dataset) -> str:
 
 
 def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
-    """Return the labels along a dimension: its coordinate, as text if the dataset has that, or
-    otherwise the indices."""
+    """Return the labels along a dimension: the coordinate of text values if there is one, otherwise
+    the coordinate of the dimension, or the indices if it has none."""
     for label in (f"{name}{TEXT}", name):
         if label in dataset.coords:
             return np.asarray(dataset[label].values)

@@ -1,7 +1,6 @@
-"""Write a dataset to a netCDF-4 file while it is recorded, each chunk once; the file appears
-complete or not at all, and the part recorded so far is kept for `resume` from the first second
-on.
-"""
+"""Write a dataset to a netCDF-4 file while it is recorded, each chunk once. The file appears only
+when it is complete; after the first second of a run, the part recorded so far is preserved for
+`resume`."""
 
 from __future__ import annotations
 
@@ -42,8 +41,9 @@ Waiting = dict[str, list[Array]]
 
 
 class NetcdfFile:
-    """File with the columns of a dataset, which are written while a run continues. Its state is
-    `waiting` and `written`, the number of entries of each column in the file."""
+    """File with the columns of a dataset, which are written while a run continues. Its state
+    consists of the buffered entries, `waiting`, and of the number of entries of each column in the
+    file, `written`."""
 
     def __init__(self, file: PagedFile, columns: list[Column], *, compress: bool = False) -> None:
         self.file, self._compress = file, compress
@@ -63,8 +63,8 @@ class NetcdfFile:
             self._define(column, sizes, planned)
 
     def reopen(self, waiting: Waiting, written: Mapping[str, Any]) -> None:
-        """Continue with a file as it was committed. Raises StorageError if it holds fewer entries
-        than `written`."""
+        """Continue with a file in the state of its last commit. Raises StorageError if it holds
+        fewer entries than `written`."""
         self.waiting |= waiting
         self.written |= written
         self._open("r+")
@@ -105,7 +105,7 @@ class NetcdfFile:
         self._h5.close()
 
     def add_group(self, name: str, facts: str, arrays: Mapping[str, Any]) -> None:
-        """Add a group with arrays and JSON facts, apart from the dataset."""
+        """Add a group with arrays and JSON facts, separate from the dataset."""
         group = self._content.create_group(name)
         group.attrs["facts"] = facts
         for key, array in arrays.items():
@@ -151,7 +151,7 @@ class NetcdfFile:
             variable.attrs[LABELS] = " ".join(labels)
 
     def _labels(self, dims: set[str]) -> list[str]:
-        """Return the coordinates along these dimensions that are not those of a dimension."""
+        """Return the coordinates along these dimensions that do not bear the name of one."""
         of_others = (c for c in self._columns.values() if c.coordinate and c.dims != (c.name,))
         return [column.name for column in of_others if dims.issuperset(column.dims)]
 
@@ -275,7 +275,7 @@ class NetcdfSink(KeepingSink):
 
     @property
     def written(self) -> Path:
-        """Path of the finished result: beside `path` where that was in use."""
+        """Path of the finished result: `path`, or a name beside it if `path` was in use."""
         return self._destination.written
 
     @property

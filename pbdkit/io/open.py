@@ -1,6 +1,5 @@
-"""Open results: of finished and of unfinished runs, one member of a sweep, and a message for files
-of other kinds that names the command that reads them.
-"""
+"""Open results of finished and unfinished runs, and single members of sweeps. For files of other
+kinds the error message names the command that reads them."""
 
 from __future__ import annotations
 
@@ -136,8 +135,8 @@ def _unfinished(output: Path) -> xarray.Dataset:
 
 
 def _output_of(file: Path) -> Path | None:
-    """Return the output of the unfinished run that a path names, by its own name or that of its
-    store."""
+    """Return the output of the unfinished run to which a path refers, whether it is the path of the
+    output or of the store."""
     if file.name.endswith(STORE) and file.is_file():
         return file.with_name(file.name.removesuffix(STORE))
     return file if not file.exists() and has_committed(file) else None
@@ -147,11 +146,12 @@ def _output_of(file: Path) -> Path | None:
 def reading(
     path: str | Path, *, sweeps: bool = False, at: Mapping[str, str] | None = None
 ) -> Iterator[xarray.Dataset]:
-    """Open the dataset of a run, or with `sweeps` of a sweep too, for reading in the block.
+    """Open the dataset of a run, or of a sweep if `sweeps` allows it, for reading in the block.
 
-    `at` selects a member of a sweep. Raises ExperimentError for a sweep otherwise, the errors of
-    `open`, and StorageError for any error in reading and using the values: files are sound when
-    written. A WriteError of another file in the block passes unchanged.
+    `at` selects a member of a sweep. Raises the errors of `open`, and ExperimentError for a sweep
+    from which no member is selected, unless `sweeps` is true. Any other error in reading and using
+    the values is raised as a StorageError, since files are sound when they are written; errors of
+    pbdkit, such as a WriteError of another file in the block, keep their type.
     """
     with open(path) as whole:
         dataset = _chosen(whole, path, at) if at else whole

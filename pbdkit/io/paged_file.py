@@ -36,14 +36,15 @@ PAUSE_S = 0.02
 
 
 class Header(NamedTuple):
-    """The identity of a store, and the number of commits that returned."""
+    """The identity of a store, and the number of completed commits."""
 
     identity: bytes
     commits: int
 
 
 SETTLED = Header(b"", 1)
-"""Header that marks the end of a finished file, which follows a commit."""
+"""Header returned for a file in which the superblock of HDF5 has already replaced the header, which
+happens after at least one commit."""
 
 
 def write_header(file: io.FileIO, header: Header) -> None:
@@ -83,11 +84,11 @@ LARGE_BYTES = 2**16
 class PagedFile(NewFile):
     """A file on the disk overlaid by pages in memory.
 
-    Large writes are appended to the file on the disk, after all that existed at the last `commit`.
-    Each extent is written once. Everything else, such as the metadata that HDF5 rewrites, stays in
-    memory until `settle`. The bytes on the disk together with the pages, extents and size of a
-    commit therefore form the file as of that commit, independent of later writes. With `read_only`
-    all writes stay in memory.
+    Large writes are appended to the file on the disk, after all bytes that existed at the last
+    `commit`. Each extent is written once. Everything else, such as the metadata that HDF5 rewrites,
+    stays in memory until `settle`. The bytes on the disk together with the pages, extents and size
+    of a commit therefore form the file as of that commit, independent of later writes. With
+    `read_only` all writes stay in memory.
 
     Extents passed to the constructor are verified before any of their bytes are returned; damage
     raises BrokenSealError.
@@ -111,7 +112,8 @@ class PagedFile(NewFile):
         self.changed: set[int] = set()
         """Numbers of the pages written since the last commit."""
         self.values_bytes = -1
-        """Size of single writes that count as values even if they are small."""
+        """Number of bytes of a write that is treated as values even if it is small; -1 if there is
+        none."""
         self.noted = len(self.extents)
         """Number of extents at the last commit."""
         self._unchecked = {extent.start for extent in extents}
@@ -187,7 +189,8 @@ class PagedFile(NewFile):
         self.disk.truncate(max((extent.stop for extent in self.extents), default=HEADER_BYTES))
 
     def commit(self) -> None:
-        """Mark the present content as committed: pages, extents and size have been stored."""
+        """Mark the present content as committed, after its pages, extents and size have been
+        stored."""
         self._append_from = max(self._append_from, self.size)
         self.noted, self.changed = len(self.extents), set()
 
@@ -207,8 +210,8 @@ class PagedFile(NewFile):
             )
 
     def is_settled(self) -> bool:
-        """Return whether the pages are at their positions on the disk; the seal follows the
-        last."""
+        """Return whether the pages are at their positions on the disk; the seal is written after
+        the last page."""
         for number, page in self.pages.items():
             length = min(PAGE, max(0, self.size - number * PAGE))
             if self._on_disk(number * PAGE, length) != page[:length]:
@@ -233,7 +236,7 @@ class PagedFile(NewFile):
         self._append_from = self.extents[-1].stop
 
     def _on_disk(self, start: int, length: int) -> bytes:
-        """Read from the disk, with zeros behind its end."""
+        """Read from the disk, with zeros beyond the end of the file."""
         self.disk.seek(start)
         return self.disk.read(length).ljust(length, b"\0")
 
@@ -283,8 +286,9 @@ class PiecedArray:
             yield block.view(self.dtype).reshape(-1, *self.shape[1:])
 
     def tiles(self, nbytes: int) -> Iterator[tuple[tuple[Any, ...], Array]]:
-        """Generate index and values of tiles of about `nbytes` bytes: entries along one axis, the
-        first of one or two axes, else the last but one."""
+        """Generate index and values of tiles of about `nbytes` bytes. A tile consists of entries
+        along the first axis of an array with one or two axes, and along the last but one axis of
+        others."""
         *lead, count = self.shape[: max(1, self.ndim - 1)]
         inner = self.shape[len(lead) + 1 :]
         each = math.prod(inner) * self.dtype.itemsize

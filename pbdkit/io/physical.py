@@ -35,7 +35,7 @@ class Physical:
 
     Stresses, forces and energies, which need a modulus, are stored in MPa, N and mJ with their
     lattice units as attributes. All other variables keep their values and have the factor as an
-    attribute; lengths, except the large positions, are also stored in mm.
+    attribute; lengths, except positions because of their size, are also stored in mm.
     """
 
     def __init__(self, units: Units | None) -> None:
@@ -93,7 +93,7 @@ class Physical:
 
 
 def _with_comment(column: Column) -> Column:
-    """Add to the comment of a column the given quantities that define its units."""
+    """Add the given quantities, which define the units of a column, to its comment."""
     notes = [
         f"{unit}: that of {n} as it is given"
         for n, unit in OF_GIVEN.items()
@@ -119,7 +119,8 @@ class ConvertedCopies:
 
 
 def in_physical_units(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset with every variable that has a scale converted, under its own name."""
+    """Return the dataset in physical units: every variable with a scale is converted and keeps its
+    name."""
     converted = dataset.drop_vars([n for n, v in dataset.variables.items() if TWIN_OF in v.attrs])
     for name, variable in converted.variables.items():
         attributes: dict[Any, Any] = dict(variable.attrs)

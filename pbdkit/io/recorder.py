@@ -1,5 +1,5 @@
-"""Recorder: takes the variables of the dataset, diagnostics and state variables included, from the
-states of a run and passes them to a sink."""
+"""Recorder, which evaluates the variables of the dataset, diagnostics and state variables included,
+in the states of a run and passes them to a sink."""
 
 from __future__ import annotations
 
@@ -149,8 +149,9 @@ class RecordedVariables:
         return {n: values for d in self._diagnostics for n, values in d.coordinates().items()}
 
     def remembered(self, moment: Moment, *, first: bool) -> Values:
-        """Return the changing state variables and, the `first` time, the constant ones; NaN at
-        frame points for floats. Raises FloatingPointError for changing ones that are not finite."""
+        """Return the changing state variables and, if `first` is true, also the constant ones.
+        Variables of type float are NaN at frame points. Raises FloatingPointError if a changing
+        variable is not finite."""
         values: Values = {}
         for column in (c for c in self._remembered if c.grows or first):
             value = moment.remembered(column.name)
@@ -163,7 +164,8 @@ class RecordedVariables:
     def diagnosed(
         self, when: When, moment: Moment, which: Callable[[Diagnostic], bool] = lambda _: True
     ) -> Values:
-        """Measure the diagnostics of that time, by variable; all, or those selected by `which`.
+        """Evaluate the diagnostics that are measured at the time `when`, or those of them selected
+        by `which`. Returns values by variable.
 
         Raises PluginError for a shape other than the declared one, and FloatingPointError for
         values that are not finite. At the end of a run such values are kept, since the run may have
@@ -229,7 +231,8 @@ class RunOutcome:
 
 
 class Recorder:
-    """Records the run of one scene into a sink; `last_steps` are those observed and recorded."""
+    """Records the run of one scene into a sink; `last_steps` holds the last step observed and the
+    last step recorded."""
 
     def __init__(self, scene: Scene, sink: Sink) -> None:
         self._scene, self.sink = scene, sink
@@ -283,10 +286,10 @@ class Recorder:
     def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
         """Record the variables that are due at this step.
 
-        The `last` state of a run that stops early is recorded in any case, even if it was observed
-        before; otherwise a step that was observed is skipped. `time` is that of an equilibrium
-        within a step. Raises FloatingPointError if a recorded value is not finite; nothing of the
-        step is then recorded.
+        A step that was observed before is skipped, unless it is the `last` one of a run that stops
+        early, which is recorded in any case. `time` is the time of an equilibrium within a step.
+        Raises FloatingPointError if a recorded value is not finite; nothing of the step is then
+        recorded.
         """
         if (state.step if time is None else time) > self.last_steps.step or last:
             self._put(state, self._record_of(state, last, time))

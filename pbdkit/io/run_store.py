@@ -51,8 +51,8 @@ FORMAT = "3"
 TABLE = "CREATE TABLE pieces (key TEXT PRIMARY KEY, digest BLOB NOT NULL, data BLOB NOT NULL)"
 """SQL statement that creates the table of pieces."""
 SCHEMA = [(TABLE,), (None,)]
-"""Schema of the database: the table and the index of its keys, by which digests are read without
-the data."""
+"""Schema of the database: the table and the index of its keys, which allows digests to be read
+without the data."""
 IDENTITY = "identity"
 """Key of the random number on which every digest depends."""
 COMMIT = "commit"
@@ -166,8 +166,8 @@ class RunStore:
             raise StorageError(f"{self.path}: is damaged: '{key}' is not valid JSON") from None
 
     def close(self) -> None:
-        """Close without raising, whatever the state of the disk; as a single file where
-        possible."""
+        """Close the store, as a single file if possible, without raising an error in any state of
+        the disk."""
         with suppress(sqlite3.Error):
             if self._writes:
                 self._file.execute("PRAGMA journal_mode = DELETE")
@@ -336,7 +336,7 @@ def store_of(output: Path) -> Path:
 
 
 def records_of(output: Path) -> Path:
-    """Return the path of its large values."""
+    """Return the path of the file with the large values of an unfinished run."""
     return output.with_name(output.name + RECORDS)
 
 
@@ -375,8 +375,8 @@ def is_unfinished(output: Path) -> bool:
 def make_room(output: Path, *, discard: bool = False) -> bool:
     """Return whether an output is free for a run, removing stores without commits.
 
-    The output of an unfinished run is not free unless the run is to be discarded; such a run may be
-    damaged. Raises the errors of `is_unfinished`.
+    The output of an unfinished run is free only if the run is to be discarded, which is also
+    possible for a damaged run. Raises the errors of `is_unfinished`.
     """
     with _exclusive(output):
         if not discard and has_committed(output):
@@ -539,8 +539,8 @@ class UnfinishedRun:
 
     @classmethod
     def open(cls, output: Path, *, writing: bool, anyway: bool = False) -> UnfinishedRun:
-        """Open an existing store; with `anyway` even if commits are lost. A damaged store is not
-        changed. Raises ExperimentError if another process writes it."""
+        """Open an existing store; with `anyway`, even one that has lost commits. A damaged store is
+        not changed. Raises ExperimentError if another process writes it."""
         store, records = store_of(output), records_of(output)
         try:
             disk = open_locked(records) if writing else io.FileIO(records, "rb")
@@ -618,8 +618,9 @@ class UnfinishedRun:
         return self._dict("facts")
 
     def checkpoint(self, *, on_disk: bool = False) -> Checkpoint:
-        """Return the checkpoint of the last commit. Its arrays are those of the run, read on access
-        if `on_disk`, and the entries that wait for a chunk to be full, ``waiting.NAME``."""
+        """Return the checkpoint of the last commit. It contains the arrays of the run, which are
+        read on access if `on_disk` is true, and the buffered entries of each column, under the name
+        ``waiting.NAME``."""
         facts, arrays = self.facts, Arrays()
         try:
             for name, (dtype, shape) in facts["arrays"].items():
@@ -682,8 +683,8 @@ class UnfinishedRun:
         write_header(self.disk, Header(self._store.identity, self._store.commits))
 
     def _refuse_other(self, header: Header | None, anyway: bool) -> None:
-        """Raise StorageError if the records belong to another run and, unless opened `anyway`, if
-        the store lacks commits that their header counts."""
+        """Raise StorageError if the records belong to another run or, unless opened with `anyway`,
+        if the store has fewer commits than the header of the records states."""
         commits, store = self._store.commits, self._store.path
         if header is None or (header is SETTLED and "finished" not in self.facts):
             raise damage_error(self.records, "its first bytes have changed since they were written")

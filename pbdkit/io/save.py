@@ -1,4 +1,5 @@
-"""Write datasets as sealed result files, and refuse names that are taken before any work."""
+"""Write datasets as sealed result files, and check before a computation that the name of its file
+is free."""
 
 from __future__ import annotations
 

@@ -25,7 +25,8 @@ from pbdkit.io.atomic_file import write_all
 from pbdkit.untrusted_files import check_declared
 
 BLOCK = 2**20
-"""Maximum number of bytes of a digest, and so of the bytes read in addition to those requested."""
+"""Maximum number of bytes that one digest covers, and therefore of the bytes that are read in
+addition to those requested."""
 MARK = b"pbdkit seal 2\n\0\0"
 """Last bytes of a sealed file."""
 FOOT = struct.Struct("<QQ16s16s")

@@ -30,7 +30,7 @@ class Sink(ABC):
 
     @abstractmethod
     def put(self, values: Values) -> None:
-        """Receive one entry of each growing column, or the whole of others."""
+        """Receive one entry of each growing column, or all values of other columns."""
 
     @abstractmethod
     def finish(self, attributes: dict[str, str]) -> None:
@@ -54,7 +54,7 @@ class KeepingSink(Sink):
 
     @abstractmethod
     def suspend(self, checkpoint: Checkpoint) -> None:
-        """Store a checkpoint and end for now."""
+        """Store a checkpoint and stop; the run can be resumed."""
 
     @abstractmethod
     def keep_final(self, checkpoint: Checkpoint) -> None:
@@ -91,7 +91,7 @@ class MemorySink(Sink):
         return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)
 
     def values(self, column: Column, rows: Iterable[int] | None = None) -> Any:
-        """Return the values of a column; of a growing one the entries `rows`, by default all."""
+        """Return the values of a column; if it grows, only the entries `rows` (default: all)."""
         entries = self._entries[column.name]
         if column.grows:
             entries = entries if rows is None else [entries[row] for row in rows]

@@ -70,8 +70,9 @@ def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, 
     (component × axis, sublattice, cell, cell); at each particle the mean over the given cells
     around it, weighted by their area fractions.
 
-    In a cell it is -Σ ΔF ⊗ X over its corners, divided by its area, with the forces ΔF that damage
-    changes: the mean stress of a body under forces on its surface.
+    In a cell it is -Σ ΔF ⊗ X over its corners, divided by its area, where ΔF is the change of the
+    force on a corner by damage: the formula for the mean stress of a body under forces on its
+    surface.
     """
     total, area = np.zeros((4, *scene.raster.shape)), np.zeros(scene.raster.shape)
     for patch, share in cells:
@@ -144,8 +145,8 @@ def _of_sides(w: Any, sides: list[bool]) -> Any:
 
 
 def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness | None:
-    """Return the stiffness over Young's modulus at each particle, each component (particle,); that
-    of the rule where it is uniform."""
+    """Return the stiffness over Young's modulus at each particle, each component (particle,), or
+    the stiffness of the rule if it is uniform."""
     rule = experiment.rule
     if not (rule.varying and rule.uses_cells):
         return material_of(rule)
@@ -156,7 +157,7 @@ def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness 
 
 
 def through_thickness_of_particles(experiment: Experiment, raster: Raster) -> Floats | float:
-    """Return σ_zz over σ_xx + σ_yy at each particle, (particle,); that of the rule where it is
+    """Return σ_zz over σ_xx + σ_yy at each particle, (particle,), or the ratio of the rule if it is
     uniform."""
     rule = experiment.rule
     if not isinstance(rule, Calibrated):
@@ -275,8 +276,9 @@ class Tables:
 
 
 FLAT = 0.1
-"""Ratio to its own area of the area spanned by the centres of the cells around a corner, below
-which they do not define a slope: they are collinear, as in a body of one row of cells."""
+"""Threshold of the area of a cell after its corners are moved to the mean centres of the cells
+around them, relative to its area at rest. Below it the centres are nearly collinear, as in a body
+of one row of cells, and define no slope."""
 
 
 def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]) -> Floats:
@@ -335,7 +337,8 @@ def _extend_gradient(
     gradient: Floats, phase_cells: list[tuple[Patch, Floats]], cells: list[tuple[Patch, Floats]]
 ) -> Floats:
     """Extend a gradient computed from some cells only, (4, ...), to particles without such cells:
-    the mean over the particles that share any cell; NaN where there is none either."""
+    they have the mean over the particles with which they share any cell, or NaN if none of these
+    has a gradient."""
     shape = gradient.shape[1:]
     weight, total, count = np.zeros(shape), np.zeros_like(gradient), np.zeros(shape)
     for patch, share in phase_cells:
@@ -378,7 +381,7 @@ class StateCells(CellValues):
         return np.concatenate(parts)
 
     def gradient(self) -> Floats:
-        """Return the gradient, computed once a moment."""
+        """Return the gradient, which is computed once for each moment."""
         return self._gradient
 
     @cached_property
@@ -411,9 +414,9 @@ class StateCells(CellValues):
     def _by_phase(
         self, phase: NDArray[Any], u: Floats, cells: list[tuple[Patch, Floats]], whole: Floats
     ) -> Floats:
-        """Return the gradient from the cells of each particle's own material alone, since it jumps
-        at interfaces. A particle without such cells has the mean of its neighbours that have some.
-        """
+        """Return the gradient at each particle computed only from cells of its own material, since
+        gradients are discontinuous at interfaces. A particle without such cells has the mean of the
+        neighbouring particles that have some."""
         gradient, phases = whole.copy(), self._tables.phase
         for number in np.unique(phases).tolist():
             phase_cells = [
@@ -528,8 +531,8 @@ class StateMoment(Moment):
         return read_only(self._raster.table(self._state.u))
 
     def displacement(self, rows: Indices | None = None) -> Floats:
-        """Return the displacements; the whole table is computed once a moment, a few rows without
-        it."""
+        """Return the displacements of all particles, from a table that is computed once for each
+        moment, or those of some rows without computing the table."""
         if rows is None:
             return self._u
         place = self._raster.place_of(rows)
@@ -590,7 +593,7 @@ class StateMoment(Moment):
         )
 
     def touching(self) -> tuple[TouchingRows, ...]:
-        """Return the contacts with obstacles, computed once a moment."""
+        """Return the contacts with obstacles, which are computed once for each moment."""
         return self._touching
 
     @cached_property
@@ -644,7 +647,7 @@ class StateMoment(Moment):
         raise ValueError(f"no component has a state variable '{name}'{did_you_mean(name, names)}")
 
     def _of_bonds(self, planes: NDArray[Any]) -> NDArray[Any]:
-        """Return values on the planes of bonds by bond, (bond,)."""
+        """Convert values on the planes of bonds to one value for each bond, (bond,)."""
         bonds = self._scene.bonds
         return np.asarray(planes.reshape(len(planes), -1)[bonds.plane, bonds.place])
 
@@ -673,7 +676,7 @@ class StateForces(ForceValues):
         return self._tables.through_thickness
 
     def on_particles(self) -> Floats:
-        """Return the forces on particles, computed once a moment."""
+        """Return the forces on particles, which are computed once for each moment."""
         return self._on_particles
 
     @cached_property

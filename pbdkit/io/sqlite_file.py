@@ -31,7 +31,8 @@ def files_of(path: Path) -> list[Path]:
 
 
 def journal_mode(path: Path) -> str:
-    """Return the mode of the journal: on a network a write-ahead log would need shared memory."""
+    """Return the journal mode. No write-ahead log is used on a network drive, since it would need
+    shared memory."""
     return "WAL" if is_local(path) else "TRUNCATE"
 
 
@@ -43,7 +44,7 @@ def size_of(path: Path) -> int:
 def is_database(path: Path) -> bool:
     """Return whether a file begins as an SQLite database does. Raises OSError.
 
-    SQLite would remove the log of any other file.
+    SQLite would remove the log beside a file that is not a database.
     """
     try:
         with path.open("rb") as file:

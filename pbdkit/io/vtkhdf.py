@@ -68,8 +68,8 @@ class UnstructuredGrid:
 
 
 def grid_of(dataset: xarray.Dataset, scene: Scene | None) -> UnstructuredGrid:
-    """Return the grid of a dataset; without its scene, and on a lattice in space, without
-    polygons."""
+    """Return the grid of a dataset. It has no polygons if the scene is not given, or on a lattice
+    in space."""
     count = dataset.sizes["particle"]
     has_bonds = "bond_ends" in dataset.variables
     bonds = dataset["bond_ends"].values - 1 if has_bonds else np.empty((0, 2), int)

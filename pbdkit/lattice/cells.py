@@ -32,8 +32,8 @@ LEVEL = 1e-9
 
 @lru_cache(maxsize=32)
 def tiling_of(cell: Cell, slots: Slots) -> Tiling:
-    """Compute the polygons of a plane lattice, each once for a repeat cell, and those beside its
-    slots.
+    """Compute the polygons of a plane lattice, each once for a repeat cell, and find those beside
+    each slot.
 
     Returns
     -------
@@ -305,8 +305,8 @@ def _reach(cell: Cell) -> float:
 
 
 def _around_the_origin(x: Floats) -> Iterator[list[int]]:
-    """Generate the polygons that meet at the origin, by their other corners among x,
-    counterclockwise.
+    """Generate the polygons that meet at the origin, counterclockwise. Each is given by its other
+    corners, which are among x.
 
     x are the surrounding sites, sorted by distance; the nearest site is always a corner. The
     polygons are those of the Delaunay tessellation: among the sites q to the left of a side (0, p),

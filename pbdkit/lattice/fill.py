@@ -256,7 +256,8 @@ def has_narrow_slot(body: Mask, layers: int) -> bool:
 
 
 def _narrow(body: Mask, width: int) -> bool:
-    """Check along the last axis, for several lines at a time and the next one."""
+    """Apply the criterion of `has_narrow_slot` along the last axis, to several lines at a time
+    together with the line after them."""
     lines = max(1, CHUNK_ROWS // body[0].size)
     parts = (body[begin : begin + lines + 1] for begin in range(0, len(body), lines))
     return any(_narrow_lines(part, width) for part in parts)
@@ -294,7 +295,8 @@ SITES_AT_ONCE = 2**18
 CELLS_AT_ONCE = 512
 """Number of cut cells processed together, so that memory does not grow with the body."""
 NEAREST = 0.6
-"""Largest distance of an outline through a cell from the nearest corner, relative to the width.
+"""Largest distance between an outline that crosses a cell and the nearest corner of the cell,
+relative to the width of the cell.
 
 No point of a triangle is farther from its nearest corner than 1/√3 of the longest side."""
 MIN_SHARE = 0.02
@@ -307,8 +309,8 @@ The distance is not linear at a corner of the outline, or between two sides of i
 MAX_HALVINGS = 8
 """Maximum number of subdivisions of triangles in which the distance is not linear."""
 FAR = 1e100
-"""Finite substitute for infinite distances, as those from bodies of given sites, which makes
-differences of distances defined."""
+"""Finite substitute for infinite distances, such as those from bodies of given sites, so that
+differences of distances are defined."""
 KINK = 1 / 32
 """Change of slope of the signed distance along a side of a cell above which more than one line of
 the outline may cross the cell."""
@@ -516,7 +518,8 @@ class _Cutter:
         return [_distinct_rows(np.concatenate(places)) for places in bridges]
 
     def _joined(self, start: Indices, end: Indices) -> Mask:
-        """Return whether edges from places outside end inside or on the outline, (place,).
+        """Return whether edges that start at places outside the outline end inside or on it,
+        (place,).
 
         An end on the outline does not count if it is the tip of a void with less than a right
         angle.
@@ -602,8 +605,8 @@ def has_pieces(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats)
     next_border, next_distance = np.roll(border, -1, axis=1), np.roll(distance, -1, axis=0)
     inside = distance <= 0.0
     is_separated = _is_separated(signed, border, next_border, distance, next_distance)
-    # The border of a connected inside without holes is a single run of the border of the cell, and
-    # continues near each of its corners.
+    # If the inside is connected and has no holes, its part of the border of the cell is a single
+    # run, which includes the points next to each corner that lies inside.
     runs = (inside & (next_distance > 0.0)).sum(axis=0)
     is_isolated = (signed(x, y) <= 0.0) & ~inside[::FINER]
     (candidates,) = np.nonzero((runs > 1) | is_separated.any(axis=0) | is_isolated.any(axis=0))

@@ -23,7 +23,8 @@ from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.lattice import Index, Tiling
 
 MIN_FLATNESS = 1e-3
-"""Smallest accepted flatness of a cell. Within a cell vector of a site lie π/flatness sites."""
+"""Smallest accepted flatness of a cell. With one site in a cell, about π/flatness sites are closer
+to a site than the length of the longest cell vector."""
 COINCIDENCE_RTOL = 1e-9
 """Distance up to which two sites coincide, relative to the first cell vector."""
 BARYCENTRE_RTOL = 1e-9
@@ -110,7 +111,8 @@ class Neighbourhood:
     def nudge_unit(self) -> float:
         """Power of two near the shortest rest length.
 
-        Perturbations proportional to it are independent of the unit of length without rounding.
+        Perturbations are proportional to it, so that they scale with the unit of length;
+        multiplication by a power of two is exact.
         """
         return float(2.0 ** round(math.log2(min(map(min, self.shells())))))
 
@@ -167,8 +169,8 @@ def checked_cell(lattice: Lattice) -> Cell:
 def flatness(cell: Cell) -> float:
     """Return the area of a cell relative to the largest possible area.
 
-    sites · area / (longest vector)², the sine of the angle for one site and vectors of equal
-    length; in space the volume relative to that of a cube.
+    It is sites · area / (longest vector)², which for one site and vectors of equal length is the
+    sine of their angle; in space it is the volume relative to that of a cube.
     """
     scaled = np.array(cell.vectors) / max(math.hypot(*v) for v in cell.vectors)
     return len(cell.sites) * abs(float(np.linalg.det(scaled)))
@@ -396,7 +398,7 @@ def _bonds_of_plane(
 def missing_segments(
     raster: Raster, neighbourhood: Neighbourhood, segments: Mapping[str, Segment]
 ) -> list[str]:
-    """Return a warning for each segment, by its field, that crosses no bond."""
+    """Return a warning, with its field, for each segment that crosses no bond."""
     return [
         f"{field}: it crosses no bond of the body; check its end points"
         for field, segment in segments.items()

@@ -205,7 +205,8 @@ class RowRange:
     own
         Range of the lines that belong to this process.
     framed
-        Range of the lines with frame points that this process resolves.
+        Range of the lines with the frame points for which this process determines the particles
+        that they follow.
     """
 
     stretch: Stretch
@@ -324,7 +325,8 @@ class Raster:
         return (lines >= low) & (lines < high)
 
     def sees_frame(self, lines: Indices) -> Mask:
-        """Return the lines of sites with frame points that this process resolves."""
+        """Return a mask of the lines with the frame points for which this process determines the
+        particles that they follow."""
         low, high = self.row_range.framed if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
@@ -505,7 +507,8 @@ class Raster:
 class Restriction:
     """Rows of repeat cells of a raster, as a separate raster.
 
-    Features of a scene have a method `restrict`, which returns the feature of these rows.
+    Features of a scene have a method `restrict`, which returns the feature restricted to these
+    rows.
 
     Parameters
     ----------

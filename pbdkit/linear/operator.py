@@ -104,8 +104,8 @@ class StepOperator:
     """One step, linearised at a state, for fixed roles and leaders at rest.
 
     In the plane, unknown 2n is the x displacement of the n-th follower and 2n + 1 its y
-    displacement; leaders are numbered in the same way. The couplings hold the same matrices by
-    particle.
+    displacement; leaders are numbered in the same way. The couplings are the same matrices, as
+    blocks between particles.
 
     Parameters
     ----------
@@ -132,7 +132,8 @@ class StepOperator:
 
     @property
     def couplings_steady(self) -> BlockMatrix:
-        """Return `couplings_current` + `couplings_previous`: the step of displacements at rest."""
+        """Return `couplings_current` + `couplings_previous`, the matrix of a step if u(t-1) is
+        u(t)."""
         current = self.couplings_current
         return BlockMatrix(
             current.shape, current.axes, current.parts + self.couplings_previous.parts

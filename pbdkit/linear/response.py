@@ -177,8 +177,8 @@ def _group_alike(
     differing = [mask for to in neighbours for mask in (to.present, to.broken) if mask is not None]
     for mask in differing:
         code = 2 * code + mask
-    # The key would exceed an integer; 20 bits are reserved for the cut and torn cells around a
-    # particle.
+    # With more masks the key would exceed an integer of 64 bits; 20 bits are reserved for the cut
+    # and torn cells around a particle.
     if len(differing) > 42:
         return np.arange(len(place)), place
     _, representatives, kind[irregular] = np.unique(code, return_index=True, return_inverse=True)
@@ -293,7 +293,7 @@ class _Followers:
             return tuple(self._total(values, 1 + axes) for values in zip(*parts, strict=True))
 
     def _total(self, by_slot: Sequence[Any], common: int) -> Any:
-        """Return the totals of one number or vector, given by slot."""
+        """Return the totals of one number or vector, with contributions given by slot."""
         if isinstance(by_slot[0], Vector):
             return vector(self._total(along, common) for along in zip(*by_slot, strict=True))
         if all(np.ndim(values) < 2 for values in by_slot):

@@ -88,7 +88,8 @@ def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | No
     """Return the relaxation below which all modes decay with this momentum, apart from those with λ
     = 1.
 
-    None if no positive relaxation is stable (an eigenvalue above 1, |memory| ≥ 1) or all are.
+    Return None if no positive relaxation is stable (if an eigenvalue exceeds 1, or |memory| ≥ 1),
+    and also if all are stable.
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z) or z.real.min() < NEUTRAL or abs(memory) >= 1.0:
@@ -122,8 +123,8 @@ MAX_MULTIPLICATIONS = 1e9
 """Largest number of multiplications that are spent on one spectrum."""
 
 KRYLOV_VECTORS = 20
-"""Number of Krylov vectors, which is the number of multiplications per component in addition to
-each matrix product."""
+"""Number of Krylov vectors. In addition to each matrix product, this number of multiplications is
+made for each component."""
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@ for plane waves.
 
 Derivatives of elementwise functions are taken by a complex step if that is valid, else by
 differences. Functions built from arithmetic and roots are analytic, and ∂f = Im f(x + ih) / h is
-exact to rounding. Other functions (an absolute value, a hypotenuse) drop or refuse the imaginary
-part: a central difference detects this and replaces the result, with about nine digits.
+exact to rounding. Other functions (an absolute value, a hypotenuse) discard the imaginary part or
+raise an error. Comparison with a central difference detects this; the difference, with about nine
+digits, is then used instead.
 
 A step multiplies a displacement exp(iθ·c) over repeat cells c by the symbol, a matrix of blocks
 (axis, axis) over sublattices. The eigenvalues of a finite body lie within the range of those of
@@ -41,7 +42,7 @@ SMALL = 1e-6
 """Real step of derivatives, as a fraction of the spacing."""
 
 Moved = Callable[[complex], tuple[Any, Any]]
-"""Components of a function's value as a function of a step along one direction."""
+"""Type of a function that returns the components of a value after a step along one direction."""
 
 
 def derivative(moved: Moved, shape: tuple[int, ...], unit: float) -> NDArray[np.float64]:
@@ -223,9 +224,9 @@ class Bound:
 def wave_bound(scene: Scene) -> Bound | None:
     """Compute the bound of plane waves for the scene's rule at rest.
 
-    None for rules that depend on the place or do not accept scalars, for neighbours that are
-    searched at every step or exceed some 300, and for frames with a delay, which can cause growth
-    of modes that are not plane waves.
+    Return None for rules that depend on the place or do not accept scalars, if neighbours are
+    searched at every step or number more than some 300, and for frames with a delay, which can
+    cause growth of modes that are not plane waves.
     """
     if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MAX_EVALUATIONS:
         return None

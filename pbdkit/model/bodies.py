@@ -109,7 +109,8 @@ class Rectangle(Body):
         return [Box((x, y), (x + self.width, y + self.height))]
 
     def distance(self, sites: Sites) -> Floats:
-        """Return the larger of the distances from both centre lines minus half the sides."""
+        """Return the larger of the distances from the two centre lines, each minus half the length
+        of a side."""
         (x, y), (left, low), w, h = sites.at, self.origin, self.width / 2, self.height / 2
         return np.asarray(np.maximum(np.abs(x - (left + w)) - w, np.abs(y - (low + h)) - h))
 

@@ -187,9 +187,10 @@ class Motion(Component):
         """
 
     def knots(self) -> tuple[int, ...]:
-        """Return the steps n between and after which the displacement is a single formula in n.
+        """Return the steps n that divide the motion into parts, in each of which the displacement
+        is a single formula in n.
 
-        It is empty by default: the displacement is a single formula for all n.
+        There are none by default: the displacement is a single formula for all n.
         """
         return ()
 
@@ -205,7 +206,8 @@ class Motion(Component):
 Pairs = Annotated[tuple[Place, ...], Field(strict=False, min_length=2, max_length=MAX_ROWS)]
 """Type of the points or displacements of a measurement."""
 EDGE_RTOL = 1e-7
-"""Distance up to which a place outside counts as on the edge, relative to a triangle or line."""
+"""Distance up to which a place outside counts as on the edge, relative to the size of a triangle or
+the length of the line."""
 
 
 class Measured(Motion):
@@ -213,9 +215,9 @@ class Measured(Motion):
     steps.
 
     Displacements are linear on the Delaunay triangles of the points, or along the line through all
-    points. `outside`: particles outside the points are an error (`refuse`), or have the value of
-    the nearest point. `file`: a CSV with columns x, y, ux, uy in place of `points` and
-    `displacements`.
+    points. Particles outside the points are an error if `outside` is `refuse`; otherwise they have
+    the value of the nearest point. `file` is a CSV file with the columns x, y, ux, uy, which
+    replaces `points` and `displacements`.
     """
 
     model_config = ConfigDict(json_schema_extra=or_a_file("points", "displacements"))
@@ -252,7 +254,7 @@ class Measured(Motion):
         return self
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """Return min(n / ramp, 1) of the measured displacements; NaN outside the points."""
+        """Return the measured displacements times min(n / ramp, 1); NaN outside the points."""
         return self.at(start) * min(n / self.ramp, 1.0)
 
     def knots(self) -> tuple[int, ...]:
@@ -432,7 +434,8 @@ class Tabulated(Motion):
         return self
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """Return the interpolated displacement, after the last step that of the last step."""
+        """Return the interpolated displacement, or the last displacement of the table after its
+        last step."""
         k = min(bisect_left(self.steps, n), len(self.steps) - 1)
         begin, previous = (self.steps[k - 1], self.displacements[k - 1]) if k else (0, (0.0, 0.0))
         components = zip(previous, self.displacements[k], strict=True)

@@ -110,7 +110,8 @@ PLAIN = {
 }
 """Messages in terms of experiment files, by the type of a pydantic error."""
 _LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20})[-\d.]+")
-"""Pattern of a bound that pydantic writes without exponent, as 1e-100."""
+"""Pattern of a bound with many digits, which pydantic writes without an exponent, for example
+1e-100."""
 
 
 def report(error: ValidationError, source: Source) -> ExperimentError:

@@ -17,7 +17,7 @@ from pbdkit.communicator import Communicator
 from pbdkit.errors import PbdkitError
 
 NUMBERS_AT_ONCE = 2**20
-"""Number of values of all processes together that are compared at once."""
+"""Number of values, summed over all processes, that are compared at once."""
 PAUSE_S = 0.05
 """Interval in seconds at which processes test for a message of the root."""
 FAILED = 1
@@ -135,8 +135,9 @@ class MPICommunicator(Communicator):
 
     @contextmanager
     def root_speaks(self) -> Iterator[None]:
-        """Report an exception that ends the block in the root alone. After an exception other than
-        a PbdkitError the end of this process ends all others, which would wait for it."""
+        """Let only the root report an exception that ends the block. After an exception that is not
+        a PbdkitError, the end of this process also ends all others, which would otherwise wait for
+        it."""
         try:
             yield
         except PbdkitError as error:

@@ -41,9 +41,9 @@ from pbdkit.stepping.state import State
 class PartitionScheme(NamedTuple):
     """Partition of a scene for a solver.
 
-    `subdomains` divides the scene, and `widest` returns an upper bound of the halo from the number
-    of rows that a step reads, that neighbours reach, the minimum number of rows of a part, and the
-    number of parts.
+    `subdomains` divides the scene, and `widest` returns an upper bound of the halo. Its arguments
+    are the number of rows that a step reads, the number of rows that neighbours reach, the minimum
+    number of rows of a part, and the number of parts.
     """
 
     subdomains: Callable[[Scene, int], list[partition.Subdomain]]
@@ -96,7 +96,8 @@ class BuildCommunicator(Communicator):
 
 def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
     """Return the scene of the rows of a process and their halo. The whole scene is returned if
-    frame points follow distant particles, or to raise the same error as a single process.
+    frame points follow distant particles. It is also built after an error, so that the same error
+    is raised as by a single process.
 
     Raises the errors of `build_scene`, in all processes.
     """
@@ -154,8 +155,8 @@ def _built(experiment: Experiment, ranks: Communicator) -> Scene:
 
 
 def _levels(rule: FollowerRule) -> int:
-    """Return an upper bound of the number of times that a step evaluates neighbours; forces on
-    masses are one of them."""
+    """Return an upper bound of the number of times that a step evaluates neighbours, including once
+    for the forces on masses."""
     levels = 2
     while isinstance(rule, AppliesTwice):
         with blaming(rule, "to return its inner rule", "rule"):
@@ -164,8 +165,9 @@ def _levels(rule: FollowerRule) -> int:
 
 
 def _search(ground: Ground) -> int:
-    """Return the largest number of rows between a frame point and its nearest particles, or
-    particles at twice the depth of the frame, in site indices."""
+    """Return an upper bound of the number of rows between a frame point and the particles that it
+    can follow: its nearest particles, or particles at a difference of site index of twice the depth
+    of the frame."""
     cell: Cell = ground.cell
     steps = [math.hypot(*v) / p for v, p in zip(cell.vectors, cell.period, strict=True)]
     farthest = ground.layers * sum(steps) + sum(math.hypot(*v) for v in cell.vectors)
@@ -191,7 +193,7 @@ class DistributedRecorder(Recorder):
         self._local = {when_measured(d) for d in diagnostics if d.local}
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
-        """Begin; a history contains the whole lattice, in the first process."""
+        """Begin. A history, which contains the whole lattice, is used in the first process only."""
         super().begin(None if history is None else ())
         if history is not None:
             self._joining.take(history)
@@ -363,8 +365,8 @@ class DistributedSimulation(Simulation):
         self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
 
     def _warnings(self, scene: Scene, bound: Bound | None) -> tuple[str, ...]:
-        """Return the warnings of the part; those about masses refer to the whole and are issued by
-        the first process."""
+        """Return the warnings of the part; warnings about masses refer to the whole scene and are
+        issued by the first process."""
         if not any(leading.share is not None for leading in scene.leading):
             return quick_warnings(scene, bound)
         with self.division.ranks.raise_together():

@@ -111,7 +111,7 @@ class Division:
         return self.dealt(whole), False
 
     def dealt(self, whole: State | None) -> State:
-        """Return the part of a state that the first process has."""
+        """Return this process's part of a state that only the first process has."""
         members = self.ranks.allgather(self.halo.members)
         if whole is None or not self.ranks.is_root:
             return self._state(None)
@@ -177,7 +177,7 @@ class DividedGuard(Guard):
 
 
 class DividedSettling(SteadyStateMonitor):
-    """Steady-state monitor of the whole in the first process."""
+    """Steady-state monitor of the whole scene, which runs in the first process."""
 
     def __init__(self, division: Division, settle: Settle) -> None:
         self._division, self._settling = division, None
@@ -255,8 +255,8 @@ def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> 
 SHARE = 4
 """Ratio of the number of rows of a part to that of the finest whole grid."""
 A_CYCLE = 6
-"""Number of rows of that grid, in addition to its own, with which a process computes a cycle: the
-number of valid rows decreases by 4 on the way down, and by 2 on the way up."""
+"""Number of rows of that grid that a process uses for a cycle in addition to its own: the number of
+valid rows decreases by 4 on the way down, and by 2 on the way up."""
 
 
 class DistributedRows(Rows):
@@ -333,8 +333,8 @@ STUCK = "the distributed iteration does not converge; run it in one process"
 
 
 class DistributedEquilibriumDriver(EquilibriumDriver):
-    """Driver of an equilibrium that several processes share. It supports linear rules without
-    breaking bonds and obstacles, on the stencils of a lattice with one site in a cell."""
+    """Driver of an equilibrium that several processes share. It supports linear rules, without
+    obstacles and bonds that break, on the stencils of a lattice with one site in a cell."""
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division

@@ -62,8 +62,9 @@ class Share:
 
 
 def joined(ranks: MPICommunicator, part: Array, axis: int, lengths: Sequence[int]) -> Any:
-    """Return an array that is divided among processes with these lengths along an axis, in the
-    order of ranks: a PiecedArray in the first process, and their share in the others."""
+    """Return an array of which each process has a part, with these lengths along an axis in the
+    order of ranks. The result is a PiecedArray in the first process and a Share in each of the
+    others."""
     if not ranks.is_root:
         return Share(part, axis)
     shape = (*part.shape[:axis], sum(lengths), *part.shape[axis + 1 :])
@@ -147,7 +148,7 @@ class Subdomain:
 
 
 def reaches(scene: Scene) -> tuple[int, int]:
-    """Return the number of rows that a step reaches, and that of its neighbours."""
+    """Return the number of rows that a step reaches, and the number that neighbours reach."""
     sweeps = sum(operation.sweeps() for operation in program_of(scene))
     reach = reach_of(scene, 0).reach
     return sweeps * (reach + farthest_apart(scene)), reach
@@ -173,8 +174,8 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     # Bonds from own frame points lead to moving particles.
     halo = max(steps * each, looked_at, 2 * edge * experiment.shows_bonds) + edge
     if scene.has_fracture and not experiment.fracture.breaks_frame_bonds():
-        # Bonds to particles that do not move are spared, so that these must be beyond the bonds of
-        # own rows.
+        # Bonds to particles that do not move cannot break here, so that such particles must lie
+        # beyond the bonds of own rows.
         halo += edge
     return [
         Subdomain(b, e, max(0, b - halo), min(len(counts), e + halo), edge, steps)
@@ -368,8 +369,8 @@ class Halo:
                 yield as_bytes(array[plane][rows])
 
     def joined(self, state: State) -> State:
-        """Return the state of the whole with arrays that are joined on access; in processes other
-        than the first, with their shares."""
+        """Return the state of the whole lattice with arrays that are joined on access; in each
+        process other than the first, the arrays are its shares."""
         rows_of_part, rows = (
             self._part.subdomain.own,
             [part.end - part.begin for part in self._parts],
@@ -386,7 +387,7 @@ class Halo:
         return state.map(whole, starts)
 
     def gathered(self, state: State) -> State | None:
-        """Return the state of the whole in the first process; None in the others."""
+        """Return the state of the whole lattice in the first process; None in the others."""
         shares = self.joined(state)
         if self._ranks.is_root:
             starts = (None if start is None else np.asarray(start) for start in shares.starts)

@@ -1,7 +1,7 @@
 """Pictures over matplotlib: set-ups of experiments, bodies, histories, curves, cracks, movies.
 
-The functions here are the public ones; what they draw with is imported when they are called, since
-matplotlib is an extra.
+The functions of this module are public. The modules that draw are imported when the functions are
+called, since matplotlib is an optional dependency.
 """
 
 from __future__ import annotations
@@ -285,11 +285,11 @@ def curve(
     Parameters
     ----------
     dataset : xarray.Dataset
-        Result of a run, or of a sweep: one line for each member then.
+        Result of a run, or of a sweep, for which one line is drawn for each member.
     x : str, optional
-        Variable along the abscissa, with `y`; without `y` the variable that is drawn over time.
-        Variables are a number a step, components such as `reaction_x`, or sums and means over
-        particles.
+        Variable along the abscissa if `y` is given, otherwise the variable that is drawn over time.
+        A variable has one number for each step, or is a component such as `reaction_x`; of a
+        variable of particles the sum or the mean is drawn.
     y : str, optional
         Variable along the ordinate.
     kind : {"stress-strain", "load-displacement", "energies"}, optional

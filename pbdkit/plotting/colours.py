@@ -135,7 +135,8 @@ def scale_of(
 
 
 def _map(name: str, about_zero: tuple[float, float] | None) -> Colormap:
-    """Return the colour map of a name, cropped so that its middle is at zero in `about_zero`."""
+    """Return the colour map of a name, cropped to the range `about_zero` (low, high) such that zero
+    has its middle colour."""
     if name not in colormaps:
         suggestion = did_you_mean(name, colormaps) or "; viridis, YlOrRd and RdBu_r are"
         raise ExperimentError(f"'{name}' is not a colour map of matplotlib{suggestion}")

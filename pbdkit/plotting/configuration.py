@@ -122,8 +122,9 @@ def _side_by_side(
 def difference_of(
     first: xarray.Dataset, second: xarray.Dataset, color: str, time: float | None
 ) -> tuple[xarray.Dataset, str]:
-    """Return the second dataset at one step, at rest, with the difference in `color` as an
-    additional variable, for particles that have the same number in both; and the name to draw."""
+    """Return the second dataset at one step, in the reference configuration and with the difference
+    in `color` as an additional variable, for particles with the same number in both datasets; and
+    the name of the variable to draw."""
     runs = [of_one_run(dataset) for dataset in (first, second)]
     quantity, _ = (quantity_of(dataset, color) for dataset in reversed(runs))
     if quantity.owner != "particle":
@@ -194,7 +195,7 @@ class RenderStyle:
 def choose_style(
     body: ReferenceBody, quantity: PlottedQuantity, look: Look, distance: float
 ) -> RenderStyle:
-    """Choose the rendering style from the options, and for legibility if they are not given. Raises
+    """Choose the rendering style by the options that are given, and otherwise by legibility. Raises
     ExperimentError for an option that is impossible or too expensive."""
     crowded = len(body.reference) > DETAILED or distance < CROWDED_PT
     of_bonds, filled = quantity.owner == "bond", _is_filled(body, quantity, look, distance)

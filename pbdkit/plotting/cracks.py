@@ -48,7 +48,7 @@ BESIDE_IN = 1.3
 LONG = 2.5
 """Ratio of width to height above which the colour bar is below the body."""
 SCALE_IN = 0.7
-"""Height of such a colour bar in inches."""
+"""Height of a colour bar below the body in inches."""
 THIN = 0.08
 """Ratio of the sides below which the shorter side has a single tick."""
 POINTS = 30_000
@@ -151,7 +151,8 @@ def _lengths(broken: CrackBonds) -> Array:
 
 
 def _extents(middle: Array) -> Array:
-    """Return the largest distance between the middles of the bonds up to each, (bond,)."""
+    """Return, for each bond, the largest distance between the midpoints of all bonds up to and
+    including it, (bond,)."""
     extents = np.zeros(len(middle))
     for angle in np.arange(DIRECTIONS) * (np.pi / DIRECTIONS):
         along = middle @ (np.cos(angle), np.sin(angle))

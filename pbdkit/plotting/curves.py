@@ -52,7 +52,8 @@ def load_curve(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> Loa
     """Return force and displacement of the chosen group, load or obstacle, or of the one with the
     largest displacement, along its main axis.
 
-    Raises ExperimentError if the dataset has no such forces, or not of the chosen one.
+    Raises ExperimentError if the dataset has no such forces, or none of the chosen group, load or
+    obstacle.
     """
     dim, moved = _moving(dataset, chosen)
     force, place = in_units(dataset[FORCE_OF[dim]]), chosen.get(CHOSEN_BY[dim])
@@ -76,8 +77,8 @@ def load_curve(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> Loa
 
 
 def _moving(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> tuple[str, Any]:
-    """Return the dimension of the forces and the displacements: of the chosen kind, or the first
-    that moves."""
+    """Return the dimension of the forces, and the displacements along it: those of the chosen kind
+    (group, load or obstacle), otherwise of the first kind that moves."""
     requested = [dim for dim, argument in CHOSEN_BY.items() if chosen.get(argument) is not None]
     available = [dim for dim in requested or FORCE_OF if FORCE_OF[dim] in dataset.variables]
     candidates = [(dim, _displacements(dataset, dim)) for dim in available]
@@ -118,8 +119,8 @@ def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
 
 
 def _of_barriers(scene: Scene, step: int) -> Floats:
-    """Return the offset of each obstacle at a step, (obstacle, axis); after its end it stays at its
-    last place."""
+    """Return the offset of each obstacle at a step, (obstacle, axis); after the last step of its
+    motion it keeps its last offset."""
     offsets = []
     for barrier in scene.barriers:
         n = min(step, barrier.group.last(step)) - barrier.group.from_ + 1
@@ -166,7 +167,7 @@ QUICK = 20_000
 LEGEND_IN = 1.9
 """Width of a legend beside the panel in inches."""
 ROUND = [1, 2, 5, 10]
-"""Numbers of which the distances between ticks are multiples."""
+"""Distances between ticks are multiples of one of these numbers, times a power of ten."""
 
 
 @dataclass(frozen=True)

@@ -41,13 +41,13 @@ BRIDGE = 1.35
 
 
 def cells_of(site: Array, reference: Array) -> Array:
-    """Return the rows of the corners of each cell, (cell, 4), in turn; triangles have the last one
-    twice.
+    """Return the rows of the corners of each cell in order around it, (cell, 4); in triangles the
+    last corner occurs twice.
 
     `site` (particle, 2) are whole numbers. If the places of sites (i, j) repeat along i, as on
     Bravais lattices, the cells are those of the Delaunay tessellation of the lattice: squares,
     rectangles or triangles. Otherwise they are the Delaunay triangles of the particles without
-    those that bridge gaps. None if all particles are in line.
+    those that bridge gaps. Returns None if all particles are collinear.
     """
     cells = _of_sites(site, reference) if len(site) else None
     if cells is None:
@@ -223,7 +223,8 @@ def outline_at_rest(shape: Shape, cut: CutCells, cells: Array, reference: Array)
 
 
 def _through_cells(cut: CutCells, corners: Array) -> Array:
-    """Return the zero line of the distance, in triangles, each half of a part of a cut cell."""
+    """Return the zero line of the distance as segments, one in each triangle that it crosses; two
+    triangles form a part of a cut cell."""
     at = between(corners, np.linspace(0.0, 1.0, cut.distance.shape[1]))
     low, high, segments = slice(None, -1), slice(1, None), []
     first, last = (low, low), (high, high)
@@ -273,9 +274,9 @@ PLACES = ("position", "reference", "number", "particle", "site", *INDICES)
 
 @dataclass(frozen=True)
 class PlottedQuantity:
-    """Values of each `owner`, particle or bond, of the variable `variable`: its component number
-    `component`, or the length of a vector if that is None, times `factor` in `units`. `words` holds
-    the meanings of flag values."""
+    """A quantity with a value for each `owner` (particle or bond): component number `component` of
+    the variable `variable`, or the length of the vector if `component` is None. Values times
+    `factor` are in `units`. `words` holds the meanings of flag values."""
 
     variable: str
     owner: str
@@ -367,8 +368,8 @@ def quantity_of(dataset: xarray.Dataset, name: str) -> PlottedQuantity:
 def refuse_color(
     name: str, dataset: xarray.Dataset, drawable: Iterable[str], axes: Iterable[str]
 ) -> None:
-    """Raise ExperimentError with the diagnostic that makes the variable, or the drawable
-    variables."""
+    """Raise ExperimentError with a message that names the diagnostic that records the variable, or
+    the variables that can be drawn."""
     names = [n for n in drawable if n in dataset.data_vars]
     if makers := makers_of_missing(dataset, name):
         raise ExperimentError(
@@ -421,11 +422,11 @@ area."""
 @dataclass(frozen=True)
 class ReferenceBody:
     """The constant data of a body: `reference` (particle, axis), `site` (particle, index), `number`
-    (particle,), whether a particle is of the body and not of the frame, `inside` (particle,), the
-    rows of both ends of each bond (bond, 2), and the step in which it broke (bond,), -1 if intact.
-    `outside` marks corners of cut cells outside the outline, `shape`, which is None if there are
-    none or it is unknown. A lattice unit is `unit` in the units of lengths; the shape is in lattice
-    units."""
+    (particle,), whether a particle belongs to the body rather than the frame, `inside` (particle,),
+    the rows of both ends of each bond, `ends` (bond, 2), and the step in which it broke,
+    `broken_step` (bond,), -1 if intact. `outside` marks the corners of cut cells outside the
+    outline. The outline, `shape`, is in lattice units, and None if it is unknown or no such corners
+    exist. The length of a lattice unit is `unit` in the units of lengths."""
 
     reference: Array
     site: Array
@@ -775,7 +776,8 @@ def _unknown(dataset: xarray.Dataset, name: str, axes: list[str]) -> str:
 
 def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None]) -> Any:
     """Return a DataArray along time and the dimensions of a sweep: the sum or mean over particles
-    or bonds, the `chosen` leader group, load or obstacle, in the units of the variable.
+    or bonds, or the values of the `chosen` leader group, load or obstacle, in the units of the
+    variable.
 
     Raises ExperimentError if the result is not one number for each step.
     """
@@ -801,7 +803,7 @@ def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None])
 
 
 def in_units(values: xarray.DataArray) -> xarray.DataArray:
-    """Return the values, read, in physical units if the variable defines the scale."""
+    """Read the values and return them, in physical units if the variable defines the scale."""
     factor, units = in_its_units(values.attrs)
     attributes = {"long_name": values.attrs.get("long_name", str(values.name)), "units": units}
     converted = values.astype(float) * factor
