@@ -271,7 +271,7 @@ class SteppingDriver(Driver):
         return RunOutcome("diverged", reason, step)
 
     def _cause_of_nan(self) -> str:
-        """Return the place in the rule at which NaN appears, or an empty string without NaN.
+        """Return the place in the rule at which NaN appears; an empty string if there is no NaN.
 
         It is located by repeating the last steps with numpy.
         """
@@ -387,7 +387,7 @@ DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
 FAILED = ("diverged", "unconverged", "separated")
 """Statuses of runs that reach neither their last step nor equilibrium."""
 LARGEST = 50_000
-"""Maximum number of particles of a body for diagnostics to be evaluated before the run."""
+"""Maximum number of particles for which the diagnostics are evaluated before the run."""
 
 
 class Simulation:

@@ -155,8 +155,8 @@ class PanelGrid:
 class Page:
     """A new figure with its axes, arranged again when its colour bar and legend are known.
 
-    `size` is that of the figure in inches; without it the figure is as large as it needs to be. A
-    `standalone` figure is not managed by pyplot.
+    `size` is the size of the figure in inches; if it is None, the figure is as large as its content
+    requires. A `standalone` figure is not managed by pyplot.
     """
 
     def __init__(

@@ -139,8 +139,8 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
 
 
 def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
-    """Return the factor of the values of tracks or a curve, the abscissa, and the labels of both,
-    in the units of the experiment if it has units."""
+    """Return the factor of the values of tracks or a curve, the abscissa, and the labels of values
+    and abscissa, in the units of the experiment if it has units."""
     numbers, observed = fitted.numbers(n), fitted.misfits[n]
     units = fitted.problem.observations[n].experiment.units
     if units is None:

@@ -33,7 +33,7 @@ class Strict(BaseModel):
     )  # fmt: skip
 
     _elsewhere: ClassVar[Mapping[str, str]] = {}
-    """Hints for keys that belong to another place, by key."""
+    """Hints for keys that belong in another place of the experiment, by key."""
 
     @classmethod
     def key_hint(cls, key: str) -> str:

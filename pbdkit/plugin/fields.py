@@ -36,7 +36,8 @@ from pbdkit.seeds import random_field_seed
 Held = Mapping[str, NDArray[np.bool_]]
 """Type of the masks of places inside each region, in the order of the experiment."""
 MAX_TEXT_VALUES = 1000
-"""Number of values above which they are written as bytes in base 64."""
+"""Maximum number of values that are written as numbers; more values are written as bytes in base
+64."""
 MAX_VALUES = 2**24
 """Maximum number of values on a grid."""
 

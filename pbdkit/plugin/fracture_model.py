@@ -84,7 +84,7 @@ class FractureModel(TakesFields):
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """Return whether the bond breaks in the intermediate configuration, elementwise.
 
-        It is called for one end of a bond only, so it must be the same for (-d, -r).
+        It is called for one end of a bond only, so the result must be the same for (-d, -r).
 
         Parameters
         ----------

@@ -108,8 +108,9 @@ class FramePolicy(Component):
     local: ClassVar[bool] = False
     """True if each frame point can be mapped independently, to particles near it.
 
-    These are the nearest particles, or those within twice the number of layers in site index.
-    Several processes then build the frame in parts; otherwise each builds the whole frame.
+    Particles near a frame point are the nearest particles, or those within a distance of twice the
+    number of layers in site index. Several processes then build the frame in parts; otherwise each
+    builds the whole frame.
     """
     has_axes: ClassVar[bool] = False
     """True if the map depends on directions or on the order of sites.

@@ -416,7 +416,7 @@ class Side:
     Parameters
     ----------
     kind : int
-        Number of the polygon of the sublattice of its first corner.
+        Number of the polygon among those with the sublattice of its first corner.
     first : Slot or None
         Slot from the start of the bond to the first corner; None if the two are the same site.
     start, end : int

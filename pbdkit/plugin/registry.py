@@ -25,7 +25,8 @@ GIVEN = "components"
 
 
 class Registry:
-    """Built-in components, those passed as Python objects, and, on demand, installed ones.
+    """Built-in components, components passed as Python objects and, on demand, installed
+    components.
 
     An experiment that uses only built-in components imports no third-party code; an experiment that
     specifies a distribution imports only that distribution.

@@ -179,7 +179,7 @@ class Units(Strict):
         return [n for n in type(self).model_fields if getattr(quantity, n) and not getattr(self, n)]
 
     def scale(self, quantity: Quantity) -> float:
-        """Return the unit of the quantity per lattice unit.
+        """Return the size, in terms of mm and MPa, of the lattice's unit of a quantity.
 
         Raises
         ------
@@ -244,7 +244,8 @@ def is_needed(field: FieldInfo) -> bool:
 
 
 def in_lengths(units: Units | None) -> tuple[float, str]:
-    """Return the lattice unit in mm and its name; without units 1 and "lattice units"."""
+    """Return the factor that converts lattice units to mm, and the name "mm"; without `units`
+    return 1 and "lattice units"."""
     return (units.length_mm, LENGTH.unit) if units else (1.0, f"{LENGTH.lattice}s")
 
 

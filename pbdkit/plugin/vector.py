@@ -189,7 +189,8 @@ def dot(a: Vector[T], b: Vector[T]) -> T:
     products: list[Any] = [
         component * factor for component, factor in zip(a, cast(Any, b), strict=True)
     ]
-    # No name of a type here: the kernel cache keys functions by what they refer to.
+    # No type is named here, because the kernel cache identifies functions by the objects to which
+    # they refer.
     total: T = sum(products[1:], products[0])
     return total
 

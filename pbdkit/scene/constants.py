@@ -203,7 +203,7 @@ def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: 
     """
     part: TakesFields = getattr(experiment, field)
     cell, regions = experiment.lattice.cell(), dict[str, Mask]()
-    # Largest distance from the body of the corners of cut cells.
+    # Largest distance of the corners of cut cells from the body.
     reach = max(math.hypot(*vector) for vector in cell.vectors)
     if any(isinstance(varying, ByRegion) for varying in part.varying.values()):
         for name, region in experiment.regions.items():
@@ -253,8 +253,8 @@ def signed_distance(body: Body, cell: Cell, x: Floats, y: Floats) -> Floats:
 
 
 def kinds_of(part: TakesFields, values: Values) -> tuple[list[Any], NDArray[np.intp]]:
-    """Return the component with each distinct combination of values, and the index of it at each
-    place.
+    """Return the component with each distinct combination of values, and the index of the
+    combination at each place.
 
     Returns
     -------

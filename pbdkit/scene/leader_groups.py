@@ -190,7 +190,8 @@ def _refuse_contradiction(
     a, b = sorted((groups[k], groups[n]), key=lambda leading: leading.group.from_)
     shared = np.intersect1d(a.rows, b.rows)
     begin, end = b.group.from_, min(a.group.last(steps), b.group.last(steps))
-    # Motion b starts from the positions at the end of a, unless both start at the same time.
+    # Motion b starts from the positions at the end of motion a, unless both motions start at the
+    # same time.
     at = raster.reference(shared)
     start = _offset(a.group, begin - 1, at)
     knots = {g.from_ - 1 + n for g in (a.group, b.group) for n in g.motion.knots()}
@@ -291,7 +292,8 @@ def has_guides(leading: Iterable[Leading]) -> bool:
 
 
 def guided_at(raster: Raster, leading: Iterable[Leading], step: int) -> Guided:
-    """Return the guided particles of a step; groups on different axes of one particle combine."""
+    """Return the guided particles of a step; groups that lead a particle along different axes are
+    combined."""
     active = [group for group in leading if group.group.leads(step)]
     axes = len(raster.cell.vectors)
     parts = [group.rows for group in active if len(group.axes) < axes]

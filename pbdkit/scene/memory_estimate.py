@@ -120,9 +120,9 @@ NEW_NEIGHBOURS_EACH = 118
 
 CHUNK_BYTES = 2**20
 """Approximate size of a chunk of a file in bytes. If entries are small, a chunk consists of several
-entries of a variable; if they are large, it is a part of an entry. Reading the time series of a
-particle touches one chunk for each batch of steps, and reading a snapshot little more than the
-snapshot."""
+entries of a variable; if they are large, it is a part of an entry. To read the time series of a
+particle, one chunk is read for each batch of steps; to read a snapshot, little more than the
+snapshot is read."""
 
 OPEN_CHUNK = 1024
 """Number of entries of a chunk along a dimension of unknown length."""

@@ -45,9 +45,10 @@ FLAT = 1e-12
 TURNS = 8
 """Number of iterations of Newton's method for the nearest point of a circle."""
 STRAIGHTEST = 0.1
-"""Smallest second derivative used in these iterations, relative to that of a straight face."""
+"""Smallest second derivative in the iterations of Newton's method, relative to that of a straight
+face."""
 WIDEST = 0.5
-"""Largest rotation of the normal in one of these iterations (radians)."""
+"""Largest rotation of the normal, in radians, in an iteration of Newton's method."""
 
 
 class Face(NamedTuple):
@@ -132,7 +133,8 @@ class Outline:
     outer: float = 0.0
 
     def shifted(self, by: Floats) -> Outline:
-        """Return the outline with its points shifted, by one vector for all or by one for each."""
+        """Return the outline with its points shifted, by one vector for all points or by one for
+        each point."""
         return Outline(self.kind, self.points + by, self.inner, self.outer)
 
     @property
@@ -469,8 +471,8 @@ def _to_circle(dx: Any, dy: Any, radius: Any, xx: Any, xy: Any, yy: Any) -> Any:
     """Return the displacement to the nearest point of a circle from (dx, dy) relative to its
     centre.
 
-    Newton's method for the angle of the normal (u_x, u_y), with a fixed number of iterations, so
-    that numbers and arrays are treated by the same operations.
+    The angle of the normal (u_x, u_y) is computed by Newton's method. The number of iterations is
+    fixed, so that the operations are the same for numbers and arrays.
     """
     r = np.sqrt(dx * dx + dy * dy)
     off = r > 0.0

@@ -148,8 +148,8 @@ class Ground:
                 row_range=self._row_range,
             )
         cells, tiling = filling.on(raster, self.neighbourhood.tiling), self.neighbourhood.tiling
-        # Without frame points, a cell with a missing corner does not count, because the forces
-        # between its other corners would not balance.
+        # Without frame points, a cell with a missing corner is left out, because the forces between
+        # its other corners would not balance.
         if not (cells or self.layers) and isinstance(self.experiment.rule, MixesCells):
             cells = whole_cells(raster, tiling) if tiling.beside else None
         return raster, cells

@@ -139,7 +139,7 @@ class Spectra:
         return result, result is not None
 
     def _spectrum_of(self, matrix: Callable[[], Any], wanted: bool) -> Spectrum | None:
-        """Compute a spectrum; None if it is not wanted, does not exist or takes too long."""
+        """Compute a spectrum; None if it is not required, does not exist or takes too long."""
         if not wanted or not self.has_matrix:
             return None
         try:
@@ -194,7 +194,7 @@ class Analysis:
     scene: Scene
 
     def __repr__(self) -> str:
-        """Return the name of the experiment alone: everything else takes time or space."""
+        """Return the name of the experiment alone, because all other data take time or space."""
         return f"<pbdkit.Analysis of {self.scene.experiment.name}>"
 
     def __str__(self) -> str:
@@ -503,7 +503,8 @@ MAX_ITERATIONS = 8
 LARGE_BODY = 200_000
 """Number of particles above which the slowest mode on coarse grids is accurate enough."""
 BYTES_PER_PARTICLE = 500
-"""Memory that the estimate takes for each particle, measured at 1000 × 1000."""
+"""Number of bytes of memory per particle that the estimate requires, measured for 1000 × 1000
+particles."""
 
 
 class StabilityEstimate:

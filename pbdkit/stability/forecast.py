@@ -92,7 +92,7 @@ class Forecast:
     exact
         Whether the analysis holds for the whole run, or is linearised at the start.
     estimated
-        Whether the spectrum is estimated, 1 - ρ to 1 %.
+        Whether the spectrum is an estimate, in which 1 - ρ is accurate to 1 %.
     lag, lag_reached
         Largest distance of a follower from its equilibrium in the fastest steps of the leaders, in
         lattice units: the steady value, and the value at the end of these steps. None if no leader
@@ -196,7 +196,7 @@ def _seconds(scene: Scene) -> float | None:
 
 
 def _sizes(analysis: Analysis) -> Sizes:
-    """Estimate sizes; those of a large equilibrium depend on its linear solver."""
+    """Estimate the sizes of a run; for a large equilibrium they depend on the linear solver."""
     scene = analysis.scene
     count, grids = scene.raster.count, not scene.barriers
     if grids and count > LARGEST_ANEW and not scene.experiment.solver.makes_steps:
@@ -405,7 +405,8 @@ def pushed_parts(scene: Scene) -> list[PushedPart]:
     for leading in scene.leading:
         for axis in leading.axes if leading.group.leads(step) else ():
             is_prescribed[axis, leading.place] = True
-    # Only linear rules rotate without resistance by any angle; frames that copy the body resist.
+    # Only under linear rules is there no resistance to rotations by any angle; frames that copy the
+    # displacements of the body resist rotations.
     modes = 3 if rule.linear and (scene.frame is None or frame.weighs_cells) else 2
     return [
         PushedPart(len(followers), raster.particle_offset + int(raster.body_rows[followers[0]]) + 1)

@@ -135,7 +135,7 @@ class Lag:
 
     @property
     def size(self) -> float:
-        """Return the distance that is reached, or the steady one if that is unknown."""
+        """Return the distance that is reached; the steady distance if `reached` is None."""
         return self.steady if self.reached is None else self.reached
 
     def late(self, bond: float, units: Units | None = None) -> list[str]:

@@ -77,12 +77,12 @@ def best_weights(
     eigenvalues : (n,)
         Eigenvalues λ of the rule's own step.
     relaxation, memory
-        Prescribed values; None for values to be chosen.
+        Prescribed values; None for values that are to be chosen.
 
     Raises
     ------
     HopelessError
-        If no such values let all modes decay.
+        If there are no values for which all modes decay.
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z):

@@ -202,7 +202,8 @@ class CutBonds(Operation):
         return self._steps
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason for an equilibrium on several ranks if bonds can break."""
+        """Return the reason why an equilibrium cannot be computed on several ranks, if bonds can
+        break."""
         return BREAKS_AT_REST if mode is Mode.RANKS_AT_REST else None
 
     @property

@@ -4,10 +4,10 @@ onto its outline.
 A rule moves a particle by S⁻¹ · force, with a 2 × 2 matrix S of the particle. For calibrated rules
 S is the stiffness by which its neighbours hold it; for springs it is a multiple of the identity. A
 particle is projected onto the nearest point outside all obstacles in the metric S. With the normal
-n at that point the displacement is proportional to S⁻¹ n, or to a combination for several normals
-where obstacles meet, so that the remaining force in equilibrium is along the normals. If S is a
-multiple of the identity, the projection is orthogonal. A guided particle is moved along its free
-axis alone.
+n at that point the displacement is proportional to S⁻¹ n, or to a combination of S⁻¹ n for several
+normals where obstacles meet, so that the remaining force in equilibrium is along the normals. If S
+is a multiple of the identity, the projection is orthogonal. A guided particle is moved along its
+free axis alone.
 """
 
 from __future__ import annotations
@@ -103,7 +103,8 @@ def compliance(scene: Scene) -> Floats | None:
 Touching = list[tuple[Indices, Floats]]
 """Type of the rows on the outline of each obstacle, with the normals there, (row, axis)."""
 FREE = 0
-"""Code of particles that are free along both axes; 1 and 2 are led along x and along y."""
+"""Code of particles that are free along both axes. Code 1 is for particles led along x, 2 for
+particles led along y."""
 ALL_LED = 3
 """Code of particles that are led along both axes."""
 

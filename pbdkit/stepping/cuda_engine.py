@@ -1,9 +1,10 @@
 """GPU engine (numba-cuda): kernels that make many steps in a launch, and the state on the device.
 
-A thread moves one particle after the other with the lines of row sweeps, on flat arrays. Every
-place has a group: 0 without a follower, then a number for each sublattice and kind of row in which
-all neighbours exist, then one for each sublattice where neighbours may be missing.
-Threads are synchronised between the operations of a step, so that none reads what another writes.
+A thread moves one particle after the other, by the same lines of code as in row sweeps, but on flat
+arrays. Every place belongs to a group: group 0 has no followers; the particles of the next groups,
+one for each sublattice and kind of row, have all neighbours; in the last groups, one for each
+sublattice, neighbours may be missing. Threads are synchronised between the operations of a step, so
+that no thread reads what another one writes.
 
 The state stays on the device and is fetched at the end of a call. Kernels do not contract products
 and sums (written against numba-cuda 0.30; see `_uncontracted`).
@@ -394,7 +395,7 @@ def launcher(run: Any, blocks: int, threads: int) -> Any:
 
 
 def most_blocks(run: Any, threads: int) -> int:
-    """Return the number of blocks of `threads` threads that are on the device at once."""
+    """Return the number of blocks of `threads` threads that the device can hold at once."""
     (kernel,) = run.overloads.values()
     return int(kernel.max_cooperative_grid_blocks(threads))
 
