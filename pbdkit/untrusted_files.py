@@ -37,9 +37,9 @@ DENSEST = 1100
 SPARSEST = 16
 """Largest ratio of the bytes that a variable declares, written or not, to those of the file."""
 EMPTY = 2**20
-"""Number of bytes that a variable may declare for any size of the file."""
+"""Number of bytes that a variable may declare whatever the size of the file."""
 LARGEST_CHUNK = 2**26
-"""Number of bytes that a chunk may declare for any size of the file."""
+"""Number of bytes that a chunk may declare whatever the size of the file."""
 MAX_OBJECTS = 10_000
 """Maximum number of objects and of links in a file, and of attributes of each."""
 LARGEST_TEXTS = 2**28

@@ -19,8 +19,7 @@ KEPT_EVERY = 5000
 """Minimum number of steps between two copies of the state. Steps after a copy are repeated to find
 the last good state."""
 MAX_RELATIVE_SIZE = 1e6
-"""Factor by which a displacement exceeds the sum of the sizes of body, initial displacements and
-leaders' motions in a diverging run."""
+"""Limit of displacements in units of `size`; a run in which a displacement exceeds it diverges."""
 SAMPLES = 64
 """Number of moments at which the motion of a leader group is evaluated."""
 
@@ -47,8 +46,8 @@ class Guard:
 
     def look(self, scene: Scene, state: State, *, note: bool = True) -> None:
         """Raise FloatingPointError, with particle and step, if a displacement is not finite or
-        exceeds the limit. The result of a check that depends on the length of the run is not kept
-        (`note` false)."""
+        exceeds the limit. With `note` false the result is not stored: for checks at steps that
+        depend on the length of the run."""
         largest = self.most(state)
         if note:
             self.next_look = next_multiple(state.step)
@@ -78,8 +77,8 @@ class Guard:
     def last_good(
         self, scene: Scene, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]
     ) -> State | None:
-        """Return the last good state before a step, by repeating steps from the copy, at most
-        `patience` in a call; None if `stopping` returns true."""
+        """Return the last good state before a step; None if `stopping` returns true. The steps from
+        the copy on are repeated, at most `patience` of them in one call of the engine."""
         state, self.good_copy = self.good_copy or initial_state(scene), None
         while state.step < self.good_step and not stopping():
             state = engine.advance(state, min(patience, self.good_step - state.step))

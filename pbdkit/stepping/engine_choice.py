@@ -104,7 +104,8 @@ def seconds_of(scene: Scene, choice: Choice) -> float:
 
 
 def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
-    """Return the engine, and the choice: numpy if `auto` finds a rule that does not compile."""
+    """Return the engine and the choice. If the engine was chosen by `auto` and the compiled engine
+    fails, both are replaced by the numpy engine."""
     if choice.engine == "numpy":
         return Stepper(scene), choice
     if choice.engine == "gpu":
@@ -141,8 +142,8 @@ def what_kernels_lack(scene: Scene) -> str:
 
 
 def _about_passes(scene: Scene) -> str:
-    """Return the reason why each step is a pass of its own over the memory, in scenes in which
-    passes of several steps would be faster; empty otherwise."""
+    """If several steps per pass over the memory would be faster but are not possible, return the
+    reason; otherwise an empty text."""
     why = exceeds_cache(scene) and single_steps(scene)
     return f"; one step per pass over the memory: {why}" if why else ""
 

@@ -98,12 +98,13 @@ class SlotFollowers(Followers):
             evaluator.renew_particles(total, values, around.own(state), around.movable)
 
     def moves(self, m: Floats, state: State) -> Floats:
-        """Return the moves of the rule, of leaders too; zero for particles without neighbours."""
+        """Return the moves of body particles by the rule, including leaders; zero for particles
+        without neighbours."""
         return self._of_all(Evaluator.move, m, state)
 
     def forces(self, m: Floats, state: State) -> Floats:
-        """Return the forces of the rule on body particles, leaders too, over Young's modulus and
-        thickness; zero for particles without neighbours."""
+        """Return the forces of the rule on body particles, including leaders, divided by Young's
+        modulus and thickness; zero for particles without neighbours."""
         return self._of_all(Evaluator.force, m, state)
 
     def _of_all(self, function: Callable[..., Any], m: Floats, state: State) -> Floats:
@@ -117,8 +118,8 @@ class SlotFollowers(Followers):
         return out
 
     def energy(self, m: Floats, state: State) -> float:
-        """Return the strain energy over Young's modulus and thickness: that of the rule if it
-        defines one, otherwise -½ Σ u·force."""
+        """Return the strain energy divided by Young's modulus and thickness: the energy that the
+        rule defines or, if it defines none, -½ Σ u·force."""
         if not isinstance(self._scene.experiment.rule, StoresEnergy):
             return self._work(m, self.forces(m, state))
         planes, out = self._seen(m, state), np.zeros_like(m[0])
@@ -170,7 +171,7 @@ class GatheringFollowers(Followers):
 
     The same `gather` and `apply` run on tables with a row for each pair of neighbours and each
     particle. Neighbours of the reference configuration are summed first, in the order of their
-    slots and with the rest offsets of these, so that a body at rest stays exactly at rest.
+    slots and with the rest offsets of the slots, so that a body at rest stays exactly at rest.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -252,8 +253,8 @@ class MoveFollowers(Operation):
         return len(list(_levels(self.scene)))
 
     def reach(self, axis: int) -> Reach:
-        """Return the distance of neighbours. If the rule has an inner rule, the moves of the inner
-        rule are computed before particles move."""
+        """Return the distance of neighbours and, if the rule has an inner rule, the distances up to
+        which the moves of the inner rule are computed before particles move."""
         reach = self.scene.neighbourhood.reach_in_cells[axis]
         if not self.scene.inner:
             return Reach(reach)
@@ -362,8 +363,8 @@ def _levels(scene: Scene) -> Iterator[Scene]:
 
 
 def _differ_in_kernels(scene: Scene, changed: Scene) -> bool:
-    """Return whether two scenes that differ in parameters differ in constants that are literals in
-    kernels."""
+    """Return whether the change of parameters between two scenes changes constants that kernels
+    contain as literals."""
     return any(
         (old.constants.weights, old.constants.fracture)
         != (new.constants.weights, new.constants.fracture)

@@ -36,7 +36,7 @@ class FollowFrame(Operation):
         kernel.follow(self.mapped(kernel), "flat_v", self.scene.lag)
 
     def reach(self, axis: int) -> Reach:
-        """Return the distance of its points from the particles that they follow."""
+        """Return the distance of the frame points from the particles that they follow."""
         axis = 0 if axis == 0 else 1
         return Reach(apart=int(self._spans[axis].max()))
 
@@ -90,7 +90,7 @@ class FollowFrame(Operation):
         return np.stack([index[1], index[-1]])
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if the map changes: it is then an array on the host, and of the whole
+        """Return a reason if the map changes, because it is then stored on the host, for the whole
         lattice."""
         reasons = {
             Mode.COURSES: "the weights of the frame are time-dependent",
@@ -100,12 +100,13 @@ class FollowFrame(Operation):
         return Hindrance(reasons[mode], "frame") if changes else None
 
     def emit_for(self, kernel: KernelWriter, planes: str) -> None:
-        """Write the lines for planes that are no displacements: the moves of an inner rule."""
+        """Write the lines for planes that contain the moves of an inner rule instead of
+        displacements."""
         kernel.follow(self.mapped(kernel), planes)
 
     def mapped(self, kernel: KernelWriter) -> Callable[[str], Lines]:
-        """Return a function that returns the lines that compute t_@, the displacement of frame
-        point f, from planes."""
+        """Return a function of planes that gives the lines for t_@, the displacement of frame point
+        f."""
 
         def lines(planes: str) -> Lines:
             start = kernel.each(f"t_@ = {kernel.number(0.0)}")
@@ -115,7 +116,7 @@ class FollowFrame(Operation):
         return lines
 
     def _terms(self, kernel: KernelWriter, planes: str) -> Iterator[tuple[str, str]]:
-        """Generate each axis with its term of an entry of the map."""
+        """Generate, for each axis, its name and the term of an entry of the map."""
         frame = self.scene.frame
         assert frame
         for a, c in enumerate(kernel.each("@")):

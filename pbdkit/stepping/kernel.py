@@ -30,7 +30,8 @@ class Function:
 
     @property
     def used(self) -> list[str]:
-        """Shared names that occur in its lines, as they are or with the prefix of flat arrays."""
+        """Shared names that occur in the lines of the function, with or without the prefix of flat
+        arrays."""
         words = self._words() - set(self.own)
         return [name for name in self.shared if {name, f"flat_{name}"} & words]
 
@@ -90,9 +91,9 @@ class KernelWriter(ABC):
 
     @abstractmethod
     def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
-        """Write a loop over the entries e of a list of flat places, `name[e]`. It is placed `ahead`
-        of the moves of particles if it changes the displacements before the step, which these
-        read."""
+        """Write a loop over the entries e of a list of flat places, `name[e]`. With `ahead` the
+        loop is placed before the moves of particles; this is necessary if it changes the
+        displacements before the step, because the moves depend on these displacements."""
 
     @abstractmethod
     def judge_bonds(self) -> None:
@@ -112,4 +113,4 @@ class KernelWriter(ABC):
     @abstractmethod
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
         """Write a loop over the frame points f of some planes. `mapped` are the lines that compute
-        their displacements t_@ from planes; with `lag` from those before the step."""
+        their displacements t_@, with `lag` from the planes before the step."""

@@ -4,11 +4,11 @@ particles.
 A rule's move is S⁻¹ · force, with a 2 × 2 matrix S of the particle. If a guided particle is led
 along axes l and free along axes f, its move along f is
 
-    m_f + S_ff⁻¹ S_fl m_l:
+    m_f + S_ff⁻¹ S_fl m_l.
 
-which follows from S m = force without a force of the guide along f. S is computed for calibrated
-rules; the moves of other rules are not corrected. S_fl is zero on straight edges, and nonzero at
-corners and in cut cells.
+This follows from S m = force, because the guide exerts no force along f. S is computed for
+calibrated rules; the moves of other rules are not corrected. S_fl is zero on straight edges, and
+nonzero at corners and in cut cells.
 
 Forces on leaders that move by Newton's law are computed by numpy, in every engine.
 """
@@ -102,10 +102,10 @@ def _angle(leading: Leading, step: int) -> float:
 
 
 STRAIGHT = 1e-12
-"""Magnitude of S_ff⁻¹ S_fl up to which it counts as zero."""
+"""Magnitude of S_ff⁻¹ S_fl up to which it is treated as zero."""
 Slants = dict[tuple[int, int], tuple[Indices, Floats]]
-"""Type of the flat places of guided particles, by (free axis, led axis), with the factor by which
-the move along the led axis is added to the move along the free axis."""
+"""Type of the flat places of guided particles, by (free axis, led axis), with factors: the move
+along the led axis, times the factor, is added to the move along the free axis."""
 
 
 class Guidance:
@@ -134,8 +134,8 @@ class Guidance:
         return self._at(step)[1]
 
     def correct(self, new: Floats, u: Floats, step: int) -> None:
-        """Add to the displacements of guided particles along free axes the share of their moves
-        from u along prescribed axes, in place."""
+        """Correct the displacements of guided particles along free axes in place: their moves from
+        u along led axes are multiplied by the factors and added."""
         if not self.slanted:
             return
         flat, origin = new.reshape(len(new), -1), u.reshape(len(u), -1)
@@ -158,7 +158,8 @@ class Guidance:
         return slants
 
     def shares(self, guided: Guided) -> Floats:
-        """Return S_ff⁻¹ S_fl, zero for other pairs of axes, (particle, free axis, led axis)."""
+        """Return S_ff⁻¹ S_fl, (particle, free axis, led axis); it is zero for all other pairs of
+        axes."""
         axes = self._scene.axes
         shares = np.zeros((len(guided.place), axes, axes))
         if not self.slanted or not len(guided.place):
@@ -206,7 +207,8 @@ class NewtonForces:
         return share
 
     def on(self, n: int, state: State) -> Floats:
-        """Return the forces on a group over Young's modulus and thickness, (particle, axis)."""
+        """Return the forces on a group divided by Young's modulus and thickness, (particle,
+        axis)."""
         place = self._scene.leading[n].place
         if self._followers:
             forces = self._followers.forces(state.u, state)
@@ -266,8 +268,8 @@ def prescribe(
     """Return the leaders of a step with their displacements at its end, or at a moment within it,
     and the starts of motions.
 
-    The starts are displacements or, for groups that move by Newton's law with the forces at the end
-    of the step before, velocities.
+    The starts are displacements; for groups that move by Newton's law they are velocities, which
+    are computed with the forces at the end of the step before.
     """
     leaders: Leaders = []
     starts: list[Floats | None] = []
@@ -306,8 +308,8 @@ def _pushed(scene: Scene, state: State, forces: NewtonForces, n: int) -> tuple[F
 
 
 def _refuse_contradiction(scene: Scene, leaders: Leaders, step: int) -> None:
-    """Raise ExperimentError if groups prescribe different displacements of one particle. This
-    depends on the state where motions start from it."""
+    """Raise ExperimentError if groups prescribe different displacements of one particle. Motions
+    that start from the displacements of the state can be checked only during the run."""
     size = scene.raster.kind.size
     components = np.concatenate([a * size + at for at, _, axes in leaders for a in axes])
     u = np.concatenate([each.u.ravel() for each in leaders])
@@ -334,7 +336,7 @@ def is_cut_short(leading: Leading | Barrier, steps: int) -> bool:
 
 
 def place(u: Floats, leaders: Leaders) -> None:
-    """Put leaders where they are prescribed."""
+    """Set the displacements of leaders to the prescribed values, in place."""
     flat = u.reshape(len(u), -1)
     for places, values, axes in leaders:
         for axis, value in zip(axes, values, strict=True):
@@ -404,7 +406,8 @@ class PlaceLeaders(LeaderOperation):
             kernel.listed(f"leaders{end}", *lines)
 
     def reads(self, state: State) -> bool:
-        """Return whether a motion begins that starts from the displacements of the state."""
+        """Return whether a motion begins in the next step: its start is then read from the
+        state."""
         groups = zip(self.scene.leading, state.starts, strict=True)
         return any(begin is None and each.group.leads(state.step + 1) for each, begin in groups)
 
@@ -414,8 +417,8 @@ class PlaceLeaders(LeaderOperation):
         call.leaders, call.state = [leaders], replace(call.state, starts=call.starts)
 
     def is_foreseeable(self, step: int) -> bool:
-        """Return whether groups have no common particles: contradictions are raised in the step in
-        which they occur."""
+        """Return whether groups have no common particles. If they have, displacements are not
+        computed in advance, so that a contradiction is reported in the step in which it occurs."""
         return not self.scene.leaders_overlap
 
     def foresee(self, call: Call, step: int) -> None:
@@ -438,7 +441,7 @@ class PlaceLeaders(LeaderOperation):
         return lists
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of leaders with displacements."""
+        """Generate the cells of leaders with nonzero displacements."""
         for leaders in call.leaders:
             for at, u, _ in leaders:
                 moved = at[(u != 0.0).any(axis=0)]
@@ -462,8 +465,8 @@ class PlaceLeaders(LeaderOperation):
         return [at for each in self.scene.leading for at in each.group.events(steps)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if groups move by Newton's law: their forces are computed on the host,
-        from state variables there."""
+        """Return a reason if groups move by Newton's law, because the forces on them are computed
+        on the host, from state variables on the host."""
         if not any(isinstance(leading.group.motion, Newton) for leading in self.scene.leading):
             return None
         reasons = {Mode.GPU: "leaders move by Newton's law", Mode.COURSES: PUSHED_BY_COURSES}
@@ -514,7 +517,7 @@ class GuideToObstacles(GuideLeaders):
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
-        """Return whether particles may be guided, and pushed."""
+        """Return whether particles may be guided and the scene has obstacles."""
         return bool(scene.barriers) and super().is_needed(scene)
 
 

@@ -111,7 +111,8 @@ def last_event(scene: Scene) -> int:
 
 def bends_of(scene: Scene) -> list[int]:
     """Return the moments of the run between which parameters and forces change linearly. The end of
-    the run is one of them if they still change there. Kinks of a load count while the load acts."""
+    the run is one of them if they still change there. Kinks of a load are included only while the
+    load acts."""
     bends = (operation.bends(scene.experiment.steps) for operation in program_of(scene))
     return [*chain(*bends)]
 

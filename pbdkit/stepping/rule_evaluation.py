@@ -104,7 +104,7 @@ class Evaluator:
         return rule.gather(d, to.r, w, self._p, *to.shared)
 
     def energy(self, d: Vector, u: Vector, to: Neighbour) -> Contributions:
-        """Return half the energy of a bond, the part of one end."""
+        """Return half the energy of a bond, the part that belongs to one end."""
         assert isinstance(self.rule, StoresEnergy)
         if self.tears:
             w, t = to.w, to.torn
@@ -131,8 +131,8 @@ class Evaluator:
         return d if to.broken is None else where(to.broken, lost, d)
 
     def damage(self, r: Vector, c: Any) -> tuple[Any, Any]:
-        """Return the fraction of its force that an intact bond with the constants c has lost in the
-        cells to its left and right."""
+        """Return the fractions of the force of an intact bond with the constants c that are lost in
+        the cells to its left and right."""
         model: Any = self._model
         if isinstance(model, SoftensCells):
             return c.damage_left, c.damage_right
@@ -150,7 +150,7 @@ class Evaluator:
         return as_vector(self.rule.apply(total, here, self._p), "apply", here.u)
 
     def force(self, total: Contributions, here: Here) -> Any:
-        """Return the force of the neighbours over Young's modulus and thickness."""
+        """Return the force of the neighbours divided by Young's modulus and thickness."""
         assert isinstance(self.rule, Calibrated)
         return as_vector(self.rule.force(total, here, self._p), "force", here.u)
 
@@ -220,7 +220,7 @@ class Evaluator:
 def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
     """Return the sum of contributions of the neighbours that are present, in their order.
 
-    A contribution that is equal everywhere may be a plain number, and stays one.
+    The sum is a plain number if every contribution is one and no neighbour is missing.
     """
     total: Contributions | None = None
     for part, present in parts:
@@ -265,7 +265,8 @@ class Surroundings:
 
     @cached_property
     def _constant_neighbours(self) -> list[Neighbour]:
-        """Neighbours in a scene without fracture and shared numbers."""
+        """Neighbours in a scene without fracture in which the rule reads no state variables of
+        neighbours."""
         parts = zip(self.slots, self._weights, self._present, self._more, strict=True)
         return [Neighbour(slot.rest, w, present, more=extra) for slot, w, present, extra in parts]
 
@@ -374,8 +375,8 @@ class Surroundings:
         return torn
 
     def _damage(self, bond: CellBond, state: State) -> tuple[NDArray[np.floating[Any]], ...]:
-        """Return the fraction of their force that bonds have lost in the cells to their left and
-        right; 1 if they are broken."""
+        """Return the fractions of the force of bonds that are lost in the cells to their left and
+        right; 1 for broken bonds."""
         scene, home = self._scene, self.where
         if bond.home:
             home = home.seen_through(bond.home)

@@ -62,14 +62,14 @@ class State:
 
     `u` is the displacement, (axis, sublattice, cell, cell), zero at places without particles.
     `previous` is the displacement at the end of the step before, from which momentum and PE2 are
-    computed; the next step is written into it. `broken_step` has for each plane of bonds, (plane,
-    cell, cell), the step at which each bond broke, -1 for intact bonds, and `broken_length` its
-    length in the intermediate configuration of that step, 0 for intact and cut bonds; both are None
-    if no bond can break. `starts` has for each leader group that has begun the displacements at
-    which its motion started, (axis, particle), or the velocities for one that moves by Newton's
-    law. `bond_values` are the state variables of the fracture model for each bond, as
-    `broken_step`, and `particle_values` those of the rule for each particle, (sublattice, cell,
-    cell).
+    computed; the next step is written into it. `broken_step`, (plane, cell, cell), is the step at
+    which each bond broke, -1 for intact bonds, and `broken_length` the length of the bond in the
+    intermediate configuration of that step, 0 for intact and cut bonds; both arrays are None if no
+    bond can break. `starts` contains an entry for each leader group: the displacements at which its
+    motion started, (axis, particle), the velocities of a group that moves by Newton's law, or None
+    if the group has not begun. `bond_values` are the state variables of the fracture model for each
+    bond, with the shape of `broken_step`, and `particle_values` those of the rule for each
+    particle, (sublattice, cell, cell).
     """
 
     step: int
@@ -82,8 +82,8 @@ class State:
     particle_values: Values = ()
 
     def copy(self, over: State | None = None) -> State:
-        """Return a copy, written over another state of the same scene if one is given; allocating
-        memory takes several times as long as copying."""
+        """Return a copy. If another state of the same scene is given, it is overwritten, because
+        allocating memory takes several times as long as copying."""
         if over is None:
             return replace(self, **{name: _copied(part) for name, part in vars(self).items()})
         for mine, target in zip(self.arrays(), over.arrays(), strict=True):
@@ -144,8 +144,8 @@ def started(scene: Scene, numbers: Sequence[Remembered], shape: Sequence[int]) -
 
 def initial_state(scene: Scene) -> State:
     """Return the state at time 0: the body has its initial displacements, frame points follow, and
-    bonds across cracks and initial cuts are broken at step 0. Displacements of the step before are
-    the same."""
+    bonds across cracks and initial cuts are broken at step 0. The displacements of the step before
+    are equal to the initial ones."""
     experiment, state = scene.experiment, unmoved_state(scene, scene.raster.shape[1:])
     if not experiment.initial.at_rest:
         _displace(scene, state.u.reshape(scene.axes, -1))

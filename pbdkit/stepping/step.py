@@ -90,7 +90,8 @@ class Reach(NamedTuple):
         Distances behind and ahead of a particle up to which bonds are updated, or moves of an inner
         rule computed, before the particle moves.
     below, above
-        Distances below and above up to which these read displacements.
+        Distances below and above a particle up to which displacements are read for these bonds or
+        moves.
     apart
         Distance of frame points from the particles that they follow.
     """
@@ -133,7 +134,7 @@ class Step:
     invalid
         Treatment of operations of the rule that give NaN.
     leaders, origins
-        Leaders with the displacements that are prescribed, and with those before.
+        Leaders with the prescribed displacements, and with their displacements before the step.
     starts
         Starts of the motions of leader groups.
     directions
@@ -161,7 +162,7 @@ class Call:
     state
         State before the first step.
     leaders
-        Leaders in each step, or in all if there is one entry.
+        Leaders in each step; a single entry is valid for all steps.
     starts
         Starts of the motions of leader groups.
     clamps
@@ -325,7 +326,7 @@ class Operation(ABC):
 
     def next_change(self, step: int, foreseeable: bool = False) -> float:
         """Return the first step after `step` in which the operation changes; infinity if there is
-        none. Motions that are `foreseeable` do not count."""
+        none. Motions that are foreseeable (see `is_foreseeable`) are not included."""
         return math.inf
 
     def events(self, steps: int) -> list[int]:
@@ -337,5 +338,5 @@ class Operation(ABC):
         return []
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return the reason why it does not support a mode; None if it does."""
+        """Return the reason why the operation does not support a mode; None if it does."""
         return None

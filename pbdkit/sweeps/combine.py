@@ -43,8 +43,8 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     Raises
     ------
     ExperimentError
-        If there are no runs, if a dataset has no experiment, or if `dim` is the name of something
-        else.
+        If there are no runs, if a dataset has no experiment, or if `dim` is the name of a variable
+        or a dimension of a dataset.
 
     Examples
     --------
@@ -87,8 +87,8 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
 
 
 def _differences(parts: list[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, list[Any]]]:
-    """Yield the path of each place where parts differ, as deep as their structures agree, with all
-    values.
+    """Yield the path of each difference between parts, with the value in every part. Parts are
+    compared recursively as far as their structures agree.
 
     The path of a `type` is that of its part.
     """
@@ -120,7 +120,7 @@ def _attributes(runs: list[xarray.Dataset]) -> list[str]:
 
 Reports = Callable[[str], MemberReport]
 FILL = "fill_value"
-"""Attribute with the value of integers that a member does not have."""
+"""Name of the attribute with the value that replaces missing integers."""
 
 
 def combine_members(

@@ -77,8 +77,7 @@ killed."""
 HEARTBEAT_S = 0.2
 """Maximum time in seconds between two looks at the progress of workers."""
 MAX_LOSSES = 3
-"""Maximum number of times that a member may be lost with its process, while it was run alone,
-before it counts as failed."""
+"""A member has failed once it has been lost this many times with a process that ran it alone."""
 AHEAD = 2
 """Number of chunks that a worker has at a time, so that it does not wait for the next."""
 WAIT_FOR_WORKERS_S = 30.0
@@ -111,7 +110,8 @@ class Queue:
     def chunk(self) -> list[Job]:
         """Return the next members for one worker.
 
-        It is one member until durations are known, and a lost member is run alone.
+        A chunk contains a single member until durations are known, or if the member was lost
+        before.
         """
         if not self._count or self.jobs[0].key in self._losses:
             return [self.jobs.popleft()]
@@ -129,8 +129,8 @@ class Queue:
             yield report
 
     def lost(self, chunk: list[Job], reason: str) -> Iterator[MemberReport]:
-        """Return the members of a worker that ended to the queue. A member that was lost alone too
-        often has failed."""
+        """Put the members of a lost worker back into the queue. A member that was lost too often
+        while it was run alone has failed."""
         retries = []
         for job in chunk:
             losses = self._losses.get(job.key, 0) + (len(chunk) == 1)
@@ -249,7 +249,7 @@ class SizeEstimate:
         self._times: set[tuple[int, tuple[int, ...] | None, int, int]] = set()
 
     def look(self, experiment: Experiment, words: str) -> None:
-        """Include a member, which messages name by `words`. Raises ExperimentError and PluginError
+        """Include a member; `words` describe it in messages. Raises ExperimentError and PluginError
         if its scene cannot be built, or if its dataset lacks a variable to keep."""
         steps, record = experiment.steps, experiment.record
         between = experiment.record_count - record.count(steps)
@@ -318,8 +318,9 @@ Show = Callable[[str, float], None]
 class Summary:
     """Outcome of a sweep.
 
-    It has the members, status and message of those that ended by key, the number of members that
-    were run, messages about damage, and the path of the dataset, None if the sweep was stopped.
+    `members` are all members; `ends` contains, by key, the status and message of each member that
+    has ended; `run` is the number of members that were run, `faults` are messages about damage, and
+    `path` is the path of the dataset, None if the sweep was stopped.
     """
 
     members: list[Member]
@@ -527,7 +528,7 @@ class _Worker:
             yield from queue.reported(reports)
 
     def end(self) -> None:
-        """End the process in any state."""
+        """End the process, whatever its state."""
         if self._pool is not None:
             for process in self._processes:
                 process.kill()

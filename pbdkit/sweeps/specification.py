@@ -409,7 +409,7 @@ class Job(NamedTuple):
     Parameters
     ----------
     key
-        Digest of all the rest.
+        Digest of all other fields.
     experiment
         Experiment as JSON, without records and diagnostics that are not kept.
     variables

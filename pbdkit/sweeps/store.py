@@ -125,7 +125,7 @@ class Store:
             if not isinstance(raised[1], StorageError):
                 self.commit()
                 return
-            # The error has already waited for the lock.
+            # The statement that failed has already waited for the lock.
             with suppress(sqlite3.Error, StorageError):
                 self._database.execute("PRAGMA busy_timeout = 0")
                 self.commit()
@@ -133,7 +133,7 @@ class Store:
     def held(self) -> dict[str, tuple[str, str]]:
         """Return status and message of all intact results by key.
 
-        Damaged ones are removed, with a message in `faults`.
+        Damaged results are removed, with a message in `faults`.
         """
         results = {}
         with self._report_errors():

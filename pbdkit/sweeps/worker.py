@@ -74,8 +74,8 @@ def unpacked(content: bytes) -> dict[str, MemberVariable]:
 
 
 KEPT = (*WHOLE, "separated")
-"""Status of members with values in the dataset. Bodies that came apart under an equilibrium have
-the values recorded before."""
+"""Status of members with values in the dataset. A run that ended because its body came apart under
+an equilibrium solver ("separated") has the values recorded before that."""
 FAILED = "failed"
 """Status of members that cannot be run."""
 INTERRUPTED = "interrupted"
@@ -83,13 +83,13 @@ INTERRUPTED = "interrupted"
 LOST = "lost"
 """Status of members that were lost with their process."""
 _one_at_a_time = threading.Lock()
-"""Lock among the threads of a process, as of a dask worker: warnings and the number of threads of
-linear algebra are global."""
+"""Lock between the threads of one process, for example of a dask worker: warnings and the number of
+threads of linear algebra are global."""
 
 
 class MemberReport(NamedTuple):
     """Result of a member: `message` is the reason of a failure, or the warnings of its run.
-    `digest` covers all other fields; `lasting` is False if another attempt could have another
+    `digest` covers all other fields; `lasting` is False if a second attempt could have a different
     result."""
 
     key: str

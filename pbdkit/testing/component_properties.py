@@ -142,7 +142,8 @@ def refuses_unknown_keys(subject: Subject) -> None:
 
 @property_of()
 def survives_json(subject: Subject) -> None:
-    """Written as JSON and read again it is equal: every dataset contains its experiment as JSON."""
+    """A component that is written as JSON and read again is equal to the original: every dataset
+    contains its experiment as JSON."""
     component = subject.component
     text, kind = component.model_dump_json(by_alias=True), type(component)
     for copy in (kind.model_validate_json(text), kind.model_validate(json.loads(text))):
@@ -154,7 +155,8 @@ def survives_json(subject: Subject) -> None:
 
 @property_of()
 def survives_pickling(subject: Subject) -> None:
-    """Pickled and unpickled it is equal: worker processes receive components by pickle."""
+    """A component that is pickled and unpickled is equal to the original: worker processes receive
+    components by pickle."""
     try:
         copy = pickle.loads(pickle.dumps(subject.component))
     except Exception as error:
@@ -273,8 +275,8 @@ def finds_the_same_anew(subject: Subject) -> None:
 
 
 def _tried(subject: Subject) -> Iterator[tuple[str, Cell, int, Sequence[Sequence[Offset]]]]:
-    """Yield basis sites of the tested lattices, except those that the metric refuses: place, cell,
-    sublattice and shells.
+    """Yield each basis site of the tested lattices for which the metric raises no ExperimentError,
+    as (place, cell, sublattice, shells).
     """
     metric = subject.component
     experiments = experiments_with(metric, subject.parts)
@@ -424,8 +426,8 @@ def _written(function: str, where: str) -> str:
 
 @property_of(is_needed=True)
 def remembers_nothing(subject: Subject) -> None:
-    """Results do not depend on previous calls: memory belongs to the state of the run, or a resumed
-    run would differ."""
+    """Results do not depend on previous calls: a component must store values in the state of the
+    run only, because a resumed run would differ otherwise."""
     for call, other in zip(subject.calls(0), subject.calls(-1), strict=False):
         reachable = reached_by(subject.component)
         _, first, second = (call.answer() for _ in range(3))
@@ -572,7 +574,8 @@ def renews_what_it_remembers(subject: Subject) -> None:
 
 @property_of(FollowerRule, FractureModel, ParticleOperation)
 def keeps_single_precision(subject: Subject) -> None:
-    """Arguments of float32 give results of float32: a run in single precision is one throughout."""
+    """Arguments of float32 give results of float32: a run in single precision must not change to
+    double precision."""
     for call in _elementwise(subject):
         for name, value in flat(call.evaluate(_single)).items():
             kind = getattr(value, "dtype", None)
@@ -585,8 +588,8 @@ def keeps_single_precision(subject: Subject) -> None:
 
 @property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def takes_particles_in_any_order(subject: Subject) -> None:
-    """Results do not depend on the order of particles, nor the move, up to rounding, on the order
-    in which neighbours are summed: numbering has no meaning."""
+    """Results do not depend on the order of particles; up to rounding, the move does not depend on
+    the order in which neighbours are summed: numbering has no meaning."""
     order = np.random.default_rng(0).permutation(int(np.prod(SHAPE)))
     for call in _elementwise(subject):
         whole = call.answer()
@@ -747,7 +750,8 @@ def breaks_as_declared(subject: Subject) -> None:
 @property_of(FractureModel)
 def breaks_beyond_its_strain(subject: Subject) -> None:
     """A bond that is extended along itself breaks slightly above the `breaking_strain` that the
-    model declares and, unless broken before, not slightly below: `pbdkit explain` prints it."""
+    model declares, and does not break slightly below it unless it was broken before: `pbdkit
+    explain` prints it."""
     model, scene = subject.component, subject.scene
     if not isinstance(subject.component, BreaksAtStrain):
         raise NotApplicableError("it does not declare `breaking_strain`")
@@ -819,8 +823,8 @@ def takes_every_point_alone(subject: Subject) -> None:
 
 @property_of(FramePolicy)
 def follows_nearby_particles(subject: Subject) -> None:
-    """Points of a `local` frame follow the particles nearest to them, or particles at most twice
-    the layers away in site index."""
+    """Points of a `local` frame follow the particles nearest to them, or particles whose site index
+    differs by at most twice the number of layers."""
     policy = subject.component
     if not policy.local:
         raise NotApplicableError("it does not declare itself `local`")

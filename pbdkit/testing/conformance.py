@@ -123,7 +123,8 @@ class Report:
 
 
 def _outcomes(component: Component, parts: Mapping[str, Any]) -> Iterator[Outcome]:
-    """Yield the outcome of each property in order; if a needed one fails, others are skipped."""
+    """Yield the outcome of each property in order; if a property that others require fails, the
+    others are skipped."""
     subject, failed = Subject(component, parts), ""
     for tested in properties_of(type(component)):
         if failed:
@@ -251,7 +252,7 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
     Raises
     ------
     ValueError
-        Without a component.
+        If no component is given.
     PluginError
         If a class has no usable examples.
 

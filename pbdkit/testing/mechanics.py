@@ -73,7 +73,7 @@ def softened_state(scene: Scene, seed: int) -> State:
 
 
 def stiffness(scene: Scene, state: State) -> Floats:
-    """Return K over Young's modulus and thickness at rest, with the bonds of a state.
+    """Return K divided by Young's modulus and thickness, at rest, with the bonds of a state.
 
     The shape is (2 particles of the body, 2 particles): x of the first, y of the first, ...
     """
@@ -132,7 +132,7 @@ def rigid_motions(scene: Scene) -> Floats:
 
 
 def resistance_to_rigid_motions(scene: Scene, K: Floats) -> float:
-    """Return the largest force of a rigid motion.
+    """Return the largest force that a rigid motion causes.
 
     If K is symmetric and this is zero, no deformation has a resultant or a moment.
     """
@@ -197,8 +197,8 @@ class NoSolidError(Exception):
 class Solid:
     """A scene with known forces and free edges, and its stiffness.
 
-    The stiffness is that with all bonds, after random displacements with some bonds broken, and
-    with further bonds broken.
+    The stiffness is computed in three states: with all bonds, with the bonds that have broken or
+    softened after random displacements, and with further bonds broken at random.
     """
 
     scene: Scene

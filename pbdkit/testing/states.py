@@ -180,7 +180,7 @@ def moment_of(scene: Scene, seed: int) -> StateMoment:
 
 
 def measured_by(diagnostic: Diagnostic, now: Any) -> dict[str, Any]:
-    """Return the values that a diagnostic measures of a moment, by variable."""
+    """Return the values that a diagnostic measures at a moment, by variable."""
     names = [variable.name for variable in diagnostic.variables()]
     return dict(zip(names, diagnostic.measure(now), strict=True))
 

@@ -108,8 +108,8 @@ STEPS = 4
 
 @property_of(*STEPPED)
 def rests(subject: Subject) -> None:
-    """A body at rest inside a frame stays exactly at rest, and none of its bonds breaks: a
-    displacement of 1e-17 is one."""
+    """A body at rest inside a frame stays exactly at rest, and none of its bonds breaks: even a
+    displacement of 1e-17 is an error."""
     fracture = [(scene, scene.experiment.fracture) for scene in subject.scenes]
     quiet = [scene for scene, model in fracture if not model.check(scene.neighbourhood.shells())]
     if not quiet:

@@ -332,8 +332,9 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     """Yield small experiments with a component.
 
     Rules, frames and fracture models are combined with each of the five lattices and each of four
-    neighbourhoods, lattices and neighbour metrics each with the other and two rules. Components
-    that work cell by cell are combined with frames or rules that do.
+    neighbourhoods, lattices with all of these neighbourhoods and neighbour metrics with all of
+    these lattices, each with two rules. Components that work cell by cell are combined with frames
+    or rules that do.
 
     Parameters
     ----------

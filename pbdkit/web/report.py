@@ -508,8 +508,8 @@ def role_of(dataset: xarray.Dataset) -> Array:
 
 
 def _particles_over_time(each: Iterator[Array], rows: Rows) -> tuple[Array, dict[str, Any]]:
-    """Return the values of some rows, (particle, ..., time), and over time the mean, maximum and
-    minimum over all, of lengths for vectors."""
+    """Return the values of some rows, (particle, ..., time), and, for each time, the mean, maximum
+    and minimum over all rows; for vectors these are statistics of their lengths."""
     selection, statistics = [], []
     for values in each:
         selection.append(values[rows])
@@ -551,8 +551,8 @@ def _kinds(dataset: xarray.Dataset, thinning: Thinning) -> Array:
 
 
 def _box(reference: Array, places: Array) -> list[float]:
-    """Return left, bottom, right, top of all positions shown; of the body at rest where they are
-    far outside."""
+    """Return the left, bottom, right and top bounds of all positions shown or, if these extend far
+    beyond the body at rest, the bounds of that body."""
     low, high = np.nanmin(places, axis=(0, 2)), np.nanmax(places, axis=(0, 2))
     rest = np.nanmin(reference, axis=0), np.nanmax(reference, axis=0)
     if not (np.ptp([low, high], axis=0) < FAR * np.ptp(rest, axis=0).max()).all():
@@ -720,8 +720,8 @@ class SettlingMoves:
 
 
 def moves_of(dataset: xarray.Dataset) -> SettlingMoves | None:
-    """Return the moves between equidistant recorded steps, at most MOST; None if there are too few,
-    or no kinds."""
+    """Return the moves between equidistant recorded steps, at most MOST; None if there are too few
+    steps, or if the kinds of particles were not recorded."""
     recorded = dataset.sizes["time"]
     steps = np.arange(0, recorded, -(-recorded // MOST))
     times = dataset["time"].values[steps]
@@ -988,7 +988,8 @@ def numbers(dataset: xarray.Dataset, grid: list[str]) -> Iterator[dict[str, Any]
 
 
 def _statistics(values: Array, rest: list[str]) -> Iterator[tuple[str, Array]]:
-    """Generate numbers that summarise (member, *rest), with their descriptions."""
+    """Generate statistics of values of shape (member, *rest), one number for each member, each with
+    its description."""
     if "axis" in rest:
         values = np.linalg.norm(values, axis=1 + rest.index("axis"))
         rest = [dim for dim in rest if dim != "axis"]
@@ -1102,7 +1103,7 @@ class _Body:
         return cls(reference, broken_as(bonds, member) if bonds else None)
 
     def is_like(self, other: _Body) -> bool:
-        """Return whether two members are the same at rest."""
+        """Return whether the bodies of two members are the same at rest."""
         if self.bonds and other.bonds:
             same_bonds = np.array_equal(self.bonds.ends, other.bonds.ends)
         else:
@@ -1121,7 +1122,7 @@ class _Body:
     def moving(
         self, member: xarray.Dataset, thinning: Thinning, points: int, *, whole: bool
     ) -> dict[str, Any]:
-        """Return the moving content of the member, or the `whole` content."""
+        """Return the moving content of the member; with `whole` the static content, too."""
         fixed = self.resting(member, thinning) if whole else {"lattice": {}}
         broken = self.bonds.broken(thinning.particles) if self.bonds else None
         last = member["position"].isel(time=thinning.steps)

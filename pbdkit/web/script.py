@@ -55,7 +55,7 @@ class Hand(Motion):
         return Path.model_construct(**knots).offset(n, start)
 
     def knots(self) -> tuple[int, ...]:
-        """Return the last knot; earlier ones are in the past."""
+        """Return the last knot; earlier knots have no effect on later steps."""
         return tuple(self._steps[-1:])
 
     def at(self, n: int) -> Way:
@@ -302,7 +302,7 @@ class Script:
         return replace(self, numbers=numbers, groups=deepcopy(self.groups), cuts=[*self.cuts])
 
     def restore(self, snapshot: Script) -> None:
-        """Restore the changes of a copy, which is not used any more."""
+        """Restore the changes of a copy, which must not be used afterwards."""
         self.numbers, self.groups, self.cuts = snapshot.numbers, snapshot.groups, snapshot.cuts
 
     def grab(self, group: int, step: int) -> int:
@@ -461,11 +461,11 @@ class Saved:
 
 
 def save_script(script: Script, step: int, output: FilePath | None) -> Saved:
-    """Write the session until a step, under the next free name where the file exists or none is
+    """Write the session until a step, under the next free name if the file exists or no file is
     given.
 
-    Raises ExperimentError if there is no step yet, or more than a file may hold; StorageError if it
-    cannot be written.
+    Raises ExperimentError if no step has been made or the session exceeds the size of an experiment
+    file, and StorageError if the file cannot be written.
     """
     if step < 1:
         raise ExperimentError("no step has been made yet, but an experiment has at least one")
@@ -498,7 +498,8 @@ def _table(path: FilePath, group: int) -> FilePath:
 
 
 def _tables(parts: dict[str, Any], path: FilePath) -> dict[FilePath, str]:
-    """Move the longest paths into tables beside the file, and return these by path."""
+    """Move the longest paths of groups into tables beside the file; return the text of each table
+    by its file path."""
     tables = {}
     for n, group in enumerate(parts["leaders"]):
         motion = group["motion"]

@@ -295,7 +295,7 @@ class SocketViewer(Viewer):
 
 
 class SessionServer:
-    """Serves one session at a port of 127.0.0.1, 0 for any that is free."""
+    """Serves one session on a port of 127.0.0.1; port 0 selects one that is free."""
 
     def __init__(self, conductor: Conductor, title: str, port: int = 0) -> None:
         self._conductor, self._title, self._port = conductor, title, port

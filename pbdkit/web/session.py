@@ -175,8 +175,8 @@ class LiveStepper:
 
 def stepped(experiment: Experiment) -> Scene:
     """Build the scene of an experiment to be stepped, with values for relaxation and momentum. For
-    an equilibrium solver it uses the relaxation that converges fastest, if that is quickly
-    computed."""
+    an equilibrium solver the relaxation is the one that converges fastest, if it can be computed
+    quickly."""
     scene = build_scene(experiment)
     if experiment.solver.makes_steps:
         return tuned(scene)
@@ -296,8 +296,8 @@ WIDTH = 1e-3
 
 
 def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float) -> list[Segment]:
-    """Map a line across the deformed body to straight segments at rest. Each point is displaced by
-    the displacement of the nearest particle."""
+    """Map a line across the deformed body to straight segments at rest. The displacement of the
+    nearest particle is subtracted from each point."""
     a, b = np.array(line[0]), np.array(line[1])
     count = min(SAMPLES, 2 + int(2 * math.dist(*line) / spacing))
     places = a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
@@ -324,7 +324,8 @@ def across(ends: Floats) -> Segment:
 
 
 def _straightened(places: Floats, tolerance: float) -> list[int]:
-    """Return the corners of a polyline within the tolerance of these places."""
+    """Return the indices of the places that are corners of a polyline; all others are within the
+    tolerance of it."""
     first, last = places[0], places[-1]
     way, offsets = last - first, places - first
     length = math.hypot(*way)

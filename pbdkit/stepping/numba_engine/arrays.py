@@ -102,8 +102,8 @@ def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
 
 
 def _of_frame(frame: Frame, order: Indices, real: np.dtype[Any]) -> Arrays:
-    """Return the frame points in an order, and their entries in the frame's map one after the
-    other."""
+    """Return the frame points in a given order, and one after the other their entries in the
+    frame's map."""
     counts = np.bincount(frame.map.point, minlength=len(frame.place))
     entry = np.argsort(np.argsort(order)[frame.map.point], kind="stable")
     return {
@@ -137,8 +137,8 @@ def _ratios(plan: Plan) -> Arrays:
 
 
 def padded(slots: Sequence[tuple[Slot, ...]]) -> list[Slot]:
-    """Return equally many slots for each sublattice. Where there are fewer, the first is repeated
-    and not used."""
+    """Return the slots of all sublattices in one list, with equally many for each sublattice:
+    shorter ones are padded by copies of their first slot, which are not used."""
     width = max(map(len, slots))
     return [slot for each in slots for slot in (*each, *each[:1] * (width - len(each)))]
 
@@ -161,9 +161,9 @@ def _stacked(rows: Sequence[dict[str, Any]], real: np.dtype[Any]) -> Arrays:
 
 
 def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
-    """Return rest offset, weights, and sign of d at the home of bonds of a slot; and the
-    differences in flat arrays from a particle to the neighbour, to the home of the bond, and to the
-    area fractions of the cells beside it."""
+    """Return the rest offset and the weights of a slot, the sign of d at the home of its bonds (the
+    end at which a bond is stored), and the differences in flat arrays from a particle to the
+    neighbour, to the home of the bond, and to the area fractions of the cells beside the slot."""
     scene, shape = plan.scene, plan.scene.raster.shape
     away, (plane, is_home) = slot_step(shape, slot), scene.neighbourhood.home[slot]
     home = plane - (slot.source if is_home else slot.target)

@@ -156,10 +156,11 @@ def _exchanged(plan: Plan, call: str) -> str:
 
 
 def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> None:
-    """Write the beginning of a loop over steps. Passes of many steps are made while many steps
-    remain and motion has reached more than fits in the cache."""
+    """Write the beginning of a loop over steps. Several steps are made in a pass if more than one
+    remains and the part of the lattice that motion has reached does not fit in the cache."""
     out, plan = writer.out, writer.plan
-    # numba compiles a function again for each literal argument and for int64; so all are int64.
+    # numba would compile a function once for literal arguments and again for int64; therefore all
+    # arguments are int64.
     out.add(0, "boxes, moment = np.empty((sizes[0], box.size), np.int64), int64(0)")
     out.add(0, "while moment < count:", "    area = 1", "    for e in range(0, box.size, 2):")
     out.add(2, "area *= min(box[e + 1], kind.shape[e // 2 + 1]) - max(box[e], 0)")
@@ -179,7 +180,8 @@ def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> 
         out.add(0, "if deep % 2 == 0:", *(f"    own{m}[:] = was{m}" for m in plan.kept))
     u, v = (", ".join(plan.each(f"{side}_@")) for side in "uv")
     out.add(0, "if deep % 2:", f"    {u}, {v} = {v}, {u}", "moment += deep", "step += deep")
-    # The last step but one has its leaders where the last step has placed them.
+    # The displacements before the last step contain the leaders as placed in the last step; they
+    # are replaced by those of the last step but one.
     out.add(0, *plan.each("flat_v_@ = v_@.reshape(-1)"))
     out.add(0, *plan.opening("moment - 2"))
     out.depth -= 1

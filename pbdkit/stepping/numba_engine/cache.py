@@ -46,7 +46,8 @@ def _is_vector(kind: Any) -> bool:
 
 
 def _written(kind: Any, arguments: str, component: str, whole: str = "Vector({})") -> Any:
-    """Return a function of vectors, written out by components; `component` has `@` for each."""
+    """Return a function of vectors, written out by components; `component` is the pattern of one,
+    with `@` for its name."""
     names = kind.instance_class._fields
     parts = [component.replace("@", name) for name in names]
     scope: dict[str, Any] = {"Vector": kind.instance_class}
@@ -318,7 +319,8 @@ def _prepared(
 
 
 def words(made: Callable[[Function], Any]) -> dict[str, Any]:
-    """Return the names of every kernel, with functions converted by `made`."""
+    """Return the names that every kernel uses, with their values; functions are converted by
+    `made`."""
     kinds: dict[str, Any] = {kind.__name__: kind for kind in KINDS.values()}
     kinds |= {kind.__name__: kind for kind in (Here, Torn, CellStress, Stiffness)}
     numbers = {"int64": np.int64, "real": np.float32, "double": np.float64}

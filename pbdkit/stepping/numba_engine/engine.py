@@ -1,11 +1,11 @@
 """Compiled engine: many steps in one call, on the part of the lattice that motion has reached.
 
 In the reference configuration the move of a rule is exactly zero; a step can only move particles
-that bear a load or have a neighbour that has moved. If this follows from the scene, the box of
-moved particles is empty at the beginning; otherwise the first step computes every particle and
-detects those that are not at rest. The box, which includes the leaders, then grows in each step by
-one bond, times the number of nested rules. If state variables change, all particles are computed in
-every step.
+that bear a load or have a neighbour that has moved. If this is known of the scene in advance, the
+box of moved particles is empty at the beginning; otherwise the first step computes every particle
+and detects those that are not at rest. The box, which includes the leaders, then grows in each step
+by the reach of a bond times the number of nested rules. If state variables change, all particles
+are computed in every step.
 
 If neighbours are re-evaluated, the kernel is a sweep over their list.
 """
@@ -143,7 +143,7 @@ class MotionExtent:
         self._renews = isinstance(experiment.rule, RenewsParticles) or (
             scene.has_fracture and isinstance(experiment.fracture, RenewsBonds)
         )
-        # A body that is at rest with some parameters may not be with others.
+        # A body that is at rest with some parameters may move with others.
         self._renews |= any(field != "solver" for field, _ in experiment.courses)
         self._rests = not self._renews and _rests_by_construction(levels)
         self._bond = len(levels) * _growth(program)
@@ -153,14 +153,14 @@ class MotionExtent:
         self._reset(self._whole)
 
     def begin(self, state: State) -> None:
-        """Start from a state of another origin: the box is the whole lattice unless the body is at
-        rest."""
+        """Start from a state that this engine has not computed: the box is the whole lattice unless
+        the body is at rest."""
         self._is_known = self._rests and state.step == 0 and not state.u.any()
         self._reset(np.zeros_like(self._bond) if self._is_known else self._whole)
 
     def take_in_call(self, call: Call, count: int) -> int:
-        """Extend the box by the disturbances of a call; return how many of `count` steps it can
-        make."""
+        """Extend the box by the disturbances of a call; return how many of the `count` steps the
+        call can make."""
         if not self._is_known:
             return count if self._renews else 1
         for operation in self._program:
@@ -251,9 +251,9 @@ in the cache. It is larger on several threads, because of the time to start them
 class CompiledStepper(Engine):
     """Engine that steps a scene with its own kernel.
 
-    Broken bonds are stored in bit masks of the particles, which are computed again for states of
-    another origin; all other arrays are those of the numpy engine. If neighbours are re-evaluated,
-    the kernel sweeps over their list.
+    Broken bonds are stored in bit masks of the particles, which are recomputed for states that this
+    engine has not computed; all other arrays are those of the numpy engine. If neighbours are
+    re-evaluated, the kernel sweeps over their list.
     """
 
     name = "compiled"

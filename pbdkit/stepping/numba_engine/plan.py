@@ -137,8 +137,8 @@ class Plan:
         return max(map(len, self.scene.neighbourhood.slots)) > MAX_BITS
 
     def is_loaded(self, level: Level) -> bool:
-        """Return whether loads act on the particles moved by the rule of that level, which is the
-        last."""
+        """Return whether loads are added in the sweep of that level. They act in the last level
+        alone, which moves the particles."""
         return self.scene.loads is not None and level is self.levels[-1]
 
     @property
@@ -291,8 +291,8 @@ def listed(texts: Iterable[str]) -> str:
 
 
 def values(numbers: Sequence[Number], where: dict[Home, str]) -> str:
-    """Return the arguments of a named tuple; `where` has for each home the pattern of the
-    expression for its n-th value."""
+    """Return the arguments of a named tuple; `where` maps each home, the place in which numbers are
+    stored, to the pattern of the expression for its n-th number."""
     counts = defaultdict[Home, Iterator[int]](count)
     return listed(where[number.home].format(n=next(counts[number.home])) for number in numbers)
 
@@ -362,9 +362,9 @@ def goes_deep(plan: Plan) -> bool:
 
 
 def pass_arrays(plan: Plan, pieces: int) -> dict[str, Any]:
-    """Return the constant arrays of passes: sizes of a pass and number of pieces; and of the sorted
-    frame points the first index of each row, their columns, and the first rows of the particles
-    that they follow."""
+    """Return the constant arrays of passes. `sizes` contains the sizes of a pass and the number of
+    pieces. Others describe the sorted frame points: the first index of each row, the columns of the
+    points, and the first rows of the particles that they follow."""
     scene = plan.scene
     between = math.prod(scene.raster.shape[2:-1])
     tile = max(SHORTEST, ROW // (cell_bytes(scene) * between))
@@ -445,8 +445,8 @@ def load_blamed(
     arguments: tuple[Any, ...],
     more: Mapping[str, Callable[..., Any]] | None = None,
 ) -> Any:
-    """Return the kernel, with `more` functions than those of its components. Errors of the compiler
-    name the component that causes them."""
+    """Return the kernel; `more` are functions in addition to those of the components. Errors of the
+    compiler name the component that causes them."""
     with blamed(levels):
         return load_kernel(source, functions_of(levels) | dict(more or {}), arguments)
 

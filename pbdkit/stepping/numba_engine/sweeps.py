@@ -40,7 +40,7 @@ Marks = NDArray[np.uint8]
 
 
 def damage_word(plan: Plan, broken: str, n: str, bond: str, limit: str, side: int = 0) -> str:
-    """Return an expression for the fraction of its force that a bond of plane n has lost in the
+    """Return an expression for the fraction of the force of a bond of plane n that is lost in the
     cell on one side. It is built from the expression for the step at which the bond broke, and from
     patterns with `{n}` for its state variables and limits."""
     softened = plan.number(0.0)
@@ -114,9 +114,9 @@ def torn_at_slot(plan: Plan) -> list[str]:
 
 
 class RowDamage:
-    """Damage of the cells and bonds around the particles j0 to j1, which have all their neighbours,
-    of a row of sublattice s. `lines` compute it in a loop for each kind, because a single loop with
-    as many arrays is not vectorised."""
+    """Damage of the cells and bonds around particles j0 to j1 of a row of sublattice s; these
+    particles have all their neighbours. `lines` compute it in several loops, because a single loop
+    over so many arrays is not vectorised."""
 
     def __init__(self, plan: Plan, s: int) -> None:
         self._around = plan.scene.neighbourhood.cells_around[s]
@@ -140,7 +140,8 @@ class RowDamage:
         self.lines = [allocation, *rows, *loops]
 
     def _side(self, side: int) -> int:
-        """Return the index of the side of damage: one for both if they are equal."""
+        """Return the index of a side of the damage; it is 0 for both sides if their damage is
+        equal."""
         return side if len(self._sides) == 2 else 0
 
     def _add(self, plan: Plan, bond: CellBond, rows: list[str], loops: list[str]) -> None:
@@ -170,8 +171,9 @@ class RowDamage:
 
 
 def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
-    """Return lines that mark the particles around a damaged bond of plane n. `home` is the flat
-    place of the bond among the bonds, `there` that of its home among the particles."""
+    """Return lines that mark the particles around a damaged bond of plane n. `home` is the index of
+    the bond in flat arrays of bonds, `there` that of the particle at its home in flat arrays of
+    particles."""
     if not plan.tears:
         return []
     words = (_damage_at(plan, home, "n", side) for side in range(1 + plan.softens_cells))
@@ -209,9 +211,9 @@ def stress_lines(plan: Plan, home: str) -> list[str]:
 
 
 def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
-    """Return the tables that the lines of stresses read: by plane and side the differences from a
-    bond's home to the corners of the cell, their rates, and the difference to the area fraction of
-    the cell."""
+    """Return the tables that the lines of stresses read. For each plane and side they contain the
+    differences of flat places from a bond's home to the corners of the cell, the weights of the
+    corners in the displacement gradient, and the difference to the area fraction of the cell."""
     assert scene.cells is not None
     stresses, shape = CellStresses(scene), scene.raster.shape
     steps, rates, shares = [], [], []
@@ -237,9 +239,10 @@ def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
 
 
 def tearing_arrays(scene: Scene) -> dict[str, Any]:
-    """Return the tables of damage: by sublattice and cell around a particle the difference to each
-    bond, its plane, and the side of it on which the cell lies; by sublattice and slot the plane of
-    its bond and the cells beside it; by plane the differences to the particles around a bond."""
+    """Return the tables of damage. For each sublattice and each cell around a particle they contain
+    the difference of flat places to each bond, the plane of the bond, and the side of the bond on
+    which the cell lies; for each sublattice and slot, the plane of the bond and the cells beside
+    it; and for each plane, the differences to the particles around a bond."""
     around = scene.neighbourhood
     cells, bonds = _table_shape(scene)
     width, sublattices = max(map(len, around.slots)), len(around.slots)
@@ -454,9 +457,10 @@ def target_lines(
     movable: str = "",
     otherwise: str = "u.@",
 ) -> list[str]:
-    """Return lines for the displacement and the state variables of the particle after the step
-    where it is `movable` (everywhere if None), and the lines `otherwise`. `local` are the
-    components of X relative to site (0, 0)."""
+    """Return lines that set the displacement and the state variables of the particle after the
+    step. `movable` is the condition under which the particle moves (empty: it always does), and
+    `otherwise` its displacement if it does not. `local` are the components of X relative to site
+    (0, 0)."""
     n, solver = level.number, plan.scene.experiment.stepping
     sums = _pattern(level, totals, "Vector")
     lines = list[str]()
@@ -595,14 +599,15 @@ def _write_judging(out: Function, plan: Plan) -> None:
 
 
 def write_events(plan: Plan) -> Function:
-    """Return the function that records step and length of the bonds in a row that the sweep has
-    just broken, from the end at which a bond is stored; `base` is the first place of the row."""
+    """Return the function that records the step and the length of bonds that the sweep has just
+    broken in a row. The length is measured from the end at which a bond is stored; `base` is the
+    first flat place of the row."""
     out = Function(plan.shared, "note_broken", "s", "base", "width")
     out.add(0, "for here in range(base, base + width):")
     out.add(1, "bits = int64(flat_lost[here])", "for k in range(counts[s]):")
     out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
-    # The end at which the bond is stored records it; the other end does if that is no particle of
-    # the body.
+    # The bond is recorded at the end at which it is stored, or at the other end if the former is
+    # not a particle of the body.
     out.add(2, f"ours = signs[s, k] > 0 or flat_kind[there] != {FOLLOWER}")
     out.add(2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:")
     out.add(3, "flat_broken[home] = step")
@@ -741,7 +746,8 @@ def _slot_lines(
         Home.FIXED_BOND: words.limit,
     }
     c = f"Constants({values(level.seen.bond, bond)})"
-    # A bond is evaluated as at its home, so that both ends agree to the last bit.
+    # A bond is evaluated as at the end at which it is stored, so that both ends agree to the last
+    # bit.
     _, at_home = plan.scene.neighbourhood.home[slot]
     arguments = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
     literal = level.scene.constants.weights[slot]._asdict()
@@ -833,9 +839,9 @@ def _is_slot_after_slot(plan: Plan) -> bool:
 
 
 def _seen(out: Function, plan: Plan, array: str, away: str) -> str:
-    """Return an expression for a value of an array at the flat place `away` from that of the
-    particle: an element, or an element of a row of values if all particles are computed slot after
-    slot. `@` in the name stands for each axis."""
+    """Return an expression for a value of an array at the distance `away` from the flat place of
+    the particle: an element, or an element of a row of values if all particles are computed slot
+    after slot. `@` in the name stands for each axis."""
     if not _is_slot_after_slot(plan):
         return f"flat_{array}[at_j + {away}]"
     row = f"row_{array} = flat_{array}[base + {away}:base + {away} + width]"

@@ -1,10 +1,10 @@
 """Distances between the steps of a pass over the memory, and whether several steps can be made in a
 pass.
 
-Step s of a pass follows step s - 1 at a distance. It moves a particle after step s - 1 has moved
-all particles that it reads, and before it overwrites a value no earlier step has to read it. Both
-hold if the distance is the reach of the operations. Only the order of particles differs from
-separate steps: all results are the same.
+Step s of a pass follows step s - 1 at a distance. A particle is moved in step s after all particles
+on which its move depends have been moved in step s - 1, and a value is overwritten after all
+earlier steps have read it. Both conditions hold if the distance is the reach of the operations. The
+results are those of separate steps; only the order of the particles differs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ computation."""
 
 
 def cell_bytes(scene: Scene) -> int:
-    """Return the bytes that a step reads and writes of each repeat cell."""
+    """Return the number of bytes of each repeat cell that a step reads and writes."""
     real = np.dtype(scene.experiment.stepping.precision)
     return 2 * scene.axes * real.itemsize * scene.raster.shape[0]
 
