@@ -26,8 +26,8 @@ class Engine(ABC):
         invalid afterwards."""
 
     def renewed(self, state: State, rows: slice) -> None:
-        """Update what the engine stores in addition to the last state, after rows of its cells were
-        overwritten."""
+        """Update the data that the engine stores in addition to the state, after some rows of cells
+        of the state were overwritten."""
         return
 
 

@@ -498,8 +498,8 @@ class _Worker:
         self._processes: set[BaseProcess] = set()
 
     def take(self, queue: Queue) -> bool:
-        """Return whether the worker can take the next chunk; a killed worker cannot until its end
-        has been reported."""
+        """Return whether the next chunk can be passed to the worker. A killed worker receives none
+        until its end has been reported."""
         chunk = queue.chunk()
         for _ in range(1 + (not self.chunks)):
             try:

@@ -823,8 +823,8 @@ def takes_every_point_alone(subject: Subject) -> None:
 
 @property_of(FramePolicy)
 def follows_nearby_particles(subject: Subject) -> None:
-    """Points of a `local` frame follow the particles nearest to them, or particles whose site index
-    differs by at most twice the number of layers."""
+    """Points of a `local` frame follow the particles nearest to them, or particles at a distance in
+    site index of at most twice the number of layers."""
     policy = subject.component
     if not policy.local:
         raise NotApplicableError("it does not declare itself `local`")

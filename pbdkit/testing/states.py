@@ -188,8 +188,8 @@ def measured_by(diagnostic: Diagnostic, now: Any) -> dict[str, Any]:
 class Shown:
     """A moment, its cells or its forces with replaced tables or permuted particles.
 
-    Row n contains row order[n] of the inner object. Values that are not in the order of particles
-    are unchanged.
+    Row n contains row order[n] of the original object. Values that do not belong to particles are
+    unchanged.
     """
 
     OWN = ("displacement", "previous_displacement", "reference")

@@ -620,8 +620,8 @@ def _type(part: Any) -> str:
 
 
 def experiment_text(parts: dict[str, Any]) -> str:
-    """Return the experiment, or the sweep, as YAML; an experiment without defaults, as far as these
-    are known."""
+    """Return the experiment, or the sweep, as YAML; keys of an experiment with known default values
+    are omitted."""
     can_be_brief = "lattice" in parts and not retired_parts(parts)
     return yaml_text(_brief(parts) if can_be_brief else parts)
 

@@ -37,7 +37,8 @@ class TileWriter(PlanWriter):
         self._skew = Skew(plan.scene).axes
 
     def begin(self) -> None:
-        """Write the position of the step in the tile, and how far it reads."""
+        """Write the position of the step in the tile, and the distance up to which the step reads
+        values."""
         out, (rows, columns) = self.out, self._skew
         out.add(0, "i_low, i_high, j_low, j_high = extent", "begin, end, down, up = piece")
         out.add(0, "step = step + s + 1", "bottom, top = begin + s * down, end + s * up")

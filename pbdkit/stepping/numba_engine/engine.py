@@ -169,8 +169,7 @@ class MotionExtent:
         return count
 
     def take_in_rows(self, state: State, rows: slice) -> None:
-        """Extend the box by particles that have moved in rows of cells that other ranks have
-        written."""
+        """Extend the box by moved particles in rows of cells that were written by other ranks."""
         if self._is_known:
             moves = (u[:, :, rows] != 0.0 for u in (state.u, state.previous))
             first, *cells = np.nonzero(np.logical_or(*moves).any(axis=(0, 1)))
@@ -350,7 +349,8 @@ class CompiledStepper(Engine):
             self._numbered = scene
 
     def _named(self, call: Call) -> Arrays:
-        """Return by name the arrays of a kernel that makes steps in the arrays of the state."""
+        """Return, by name, the arrays of a kernel that writes steps into the arrays of the
+        state."""
         state = call.state
         return {
             **self._arrays,

@@ -116,7 +116,7 @@ def torn_at_slot(plan: Plan) -> list[str]:
 class RowDamage:
     """Damage of the cells and bonds around particles j0 to j1 of a row of sublattice s; these
     particles have all their neighbours. `lines` compute it in several loops, because a single loop
-    over so many arrays is not vectorised."""
+    over all these arrays is not vectorised."""
 
     def __init__(self, plan: Plan, s: int) -> None:
         self._around = plan.scene.neighbourhood.cells_around[s]
@@ -397,7 +397,8 @@ def difference(plan: Plan, level: Level, there: str) -> str:
 
 def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -> list[str]:
     """Return lines for d as the rule receives it at slot k: softened, or the difference to the
-    fictitious point if the bond `breaks` or was broken `since` an earlier step."""
+    fictitious point. The latter is used if the bond breaks in this step (`breaks`) or broke in an
+    earlier one (`since`)."""
     if plan.model is None or plan.tears:
         return []
     lines = [f"is_lost = {since} >= 0"]
