@@ -139,7 +139,7 @@ MISTAKES = {
     "no such map": (lambda ds: ds.pbd.plot("pe1", cmap="virdis"), "'virdis'", "mean 'viridis'?"),
     "one size": (lambda ds: ds.pbd.plot(figsize=5), "figsize: expected a width and a height in in"),
     "limit": (lambda ds: ds.pbd.plot("pe1", vmin="a"), "vmin: expected a finite number, got 'a'"),
-    "limits": (lambda ds: ds.pbd.plot("pe1", vmin=2, vmax=1), "2 (vmin), is not below the upper"),
+    "limits": (lambda ds: ds.pbd.plot("pe1", vmin=2, vmax=1), "vmin 2 is not below vmax 1; "),
     "file first": (lambda ds: ds.pbd.animate("a.gif", "pe1"), "write animate('pe1', file='a.gif')"),
     "no file": (lambda ds: ds.pbd.animate("pe1"), "write animate('pe1', file='movie.mp4')"),
     "no particle": (lambda ds: ds.pbd.history("pe1"), "write history('pe1', particle=67), or i=4"),

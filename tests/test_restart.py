@@ -426,7 +426,7 @@ def test_automatic_weights_are_those_of_the_longer_run(tmp_path: Path) -> None:
     given |= {"leaders": [BLOCK["leaders"][0], BLOCK["leaders"][1] | {"until": 20}]}
     record(Simulation.of_scene(scene_of(given | {"steps": 9})), NetcdfSink(part, True))
     with pytest.raises(
-        pbdkit.ExperimentError, match=r": the steps were .* relaxation 1\.5782, .* takes 1\.8"
+        pbdkit.ExperimentError, match=r": the completed steps used relaxation 1\.5782, .* uses 1\.8"
     ):
         resumption(part, Watch(), steps=60)
     found = resumption(part, Watch(), steps=60, anyway=True)
@@ -437,7 +437,7 @@ def test_automatic_weights_are_those_of_the_longer_run(tmp_path: Path) -> None:
         Simulation.of_scene(scene_of(given), watch=stopping_after(5)),
         NetcdfSink(tmp_path / "left.nc"),
     )
-    with pytest.raises(pbdkit.ExperimentError, match=r": the steps were .* takes 1\.8"):
+    with pytest.raises(pbdkit.ExperimentError, match=r": the completed steps used .* uses 1\.8"):
         resumption(tmp_path / "left.nc", Watch(), steps=60)
     found = resumption(tmp_path / "left.nc", Watch())
     assert found is not None

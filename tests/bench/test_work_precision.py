@@ -64,7 +64,7 @@ def test_without_sizes_the_body_keeps_its_size(call, monkeypatch):
     monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: FOUR[:1])
     result = call("bench", "e.json", "--set", "leaders.0.select={numbers: [7, 8]}", "--json", "b")
     assert result.code == 0, result.err
-    assert "as it is" in result.out
+    assert "unchanged" in result.out
     (row,) = json.loads(Path("b").read_text())["rows"]
     assert row["size"] is None
     assert row["particles"] == 6 * 5

@@ -210,7 +210,7 @@ def test_records_of_a_separated_run_are_kept_in_its_file(call, tmp_path):
         assert len(ds.time) > 1
     refused = call("resume", str(out), "--steps", "20")
     assert refused.code == 2
-    assert "has status separated" in refused.err
+    assert "has the status separated" in refused.err
 
 
 def test_refusal_during_a_run_leaves_nothing_to_resume(call, tmp_path, monkeypatch):

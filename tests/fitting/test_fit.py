@@ -348,7 +348,10 @@ def test_command_writes_the_result_of_the_python_call(call, tmp_path):
 
 WRONG = {
     "no such parameter": ({"unknown": {"rule.poison_ratio": [0.0, 0.4]}}, "no 'poison_ratio'"),
-    "bounds the wrong way": ({"unknown": {"rule.poisson_ratio": [0.4, 0.1]}}, "the lower first"),
+    "bounds the wrong way": (
+        {"unknown": {"rule.poisson_ratio": [0.4, 0.1]}},
+        "expected .lower bound",
+    ),
     "nothing unknown": ({"unknown": {}}, "unknown"),
     "no such file": ({"measured": {"file": "none.csv"}}, r"\.csv: does not exist"),
     "no such column": ({"measured": {"columns": ["x", "y", "u", "v"]}}, "no 'u'"),
@@ -357,7 +360,7 @@ WRONG = {
         {"force": {"group": 7, "value": [1.0, 0.0]}},
         "^force.group: there is no leader group 7",
     ),
-    "a force that is none": ({"force": {"group": 1, "value": [0.0, 0.0]}}, "leave it out"),
+    "a force that is none": ({"force": {"group": 1, "value": [0.0, 0.0]}}, "modulus; omit it"),
     "a force the other way": ({"force": {"group": 1, "value": [-1.0, 0.0]}}, "change its sign"),
     "bounds too wide": ({"unknown": {"rule.poisson_ratio": [0.2, 0.9]}}, "a bound is not valid"),
     "a term twice": ({"measured": {"distortion": {"ux": [[1, 0], [1, 0]]}}}, "twice"),
@@ -467,7 +470,7 @@ def test_dataset_is_fitted_like_the_file_with_its_columns(tmp_path):
     assert str(of_table).startswith("rule.poisson_ratio: 0.")
     for wrong, said in (
         (table.rename(ux="u_x"), "measured: the dataset has no variable 'ux'"),
-        (table.where(table.ux != table.ux[3]), "need finite numbers"),
+        (table.where(table.ux != table.ux[3]), "finite ones only"),
         (table.assign(uy=("other", [0.0])), r"need one size: x \d+, y \d+, ux \d+, uy 1$"),
     ):
         with pytest.raises(pbdkit.ExperimentError, match=said):

@@ -386,5 +386,5 @@ def test_parameter_that_changes_the_particles_has_no_derivative():
     experiment = pbdkit.Experiment(
         **SHEET | {"rule": ELASTIC, "body": {"type": "rectangle", "width": 5.1, "height": 4.1}}
     )
-    with pytest.raises(pbdkit.ExperimentError, match="which particles exist"):
+    with pytest.raises(pbdkit.ExperimentError, match="changes the set of particles"):
         Resting.of(experiment).change(Parameter("body.width"))

@@ -189,7 +189,7 @@ def test_censored_specimens_count():
     found = pbdkit.fit_strength(fit_of(16 * seen, measured={"broke": broke.tolist()}))
     for estimate, value in zip(found.values.values(), (0.02, 8.0), strict=True):
         assert abs(estimate.value - value) < 4.5 * estimate.error
-    assert f"of 300 specimens, {300 - broke.sum()} of which did not break" in str(found)
+    assert f"from 300 specimens, {300 - broke.sum()} of which did not break" in str(found)
     wrong = pbdkit.fit_strength(fit_of(16 * seen)).values["fracture.modulus"]
     assert wrong.value - 8.0 > 4.5 * found.values["fracture.modulus"].error
 

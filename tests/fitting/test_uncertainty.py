@@ -189,7 +189,7 @@ def test_correct_model_predicts_best(tmp_path):
     assert worst.behind > 3 * worst.behind_error
     assert best.values["rule.modulus_ratio"] == pytest.approx(0.5, abs=0.05)
     assert [c["name"] for c in found.as_dict()["candidates"]] == order
-    assert any(line.startswith("orthotropic: left-out") for line in str(found).splitlines())
+    assert any(line.startswith("orthotropic: mean squared") for line in str(found).splitlines())
 
 
 class Lazy(pbdkit.FollowerRule):
@@ -246,7 +246,7 @@ def test_wide_bounds_start_at_the_smallest_misfit(tmp_path):
 WRONG = {
     "a profile of what is known": ({"profile": ["rule.stiffness"]}, "which is not unknown"),
     "a sampler with a loss": (
-        {"loss": "huber", "sampler": {}}, "needs `loss: linear`",
+        {"loss": "huber", "sampler": {}}, "set `loss: linear`",
     ),
     "a candidate that is none": (
         {"candidates": {"other": {"settings": {"rule.poisson": 0.3}}}}, "poisson",

@@ -331,7 +331,7 @@ def test_one_of_several_runs_must_be_selected(tensile):
     with pytest.raises(ExperimentError) as refused:
         swept.pbd.plot()
     dimension = next(d for d in swept.position.dims if d not in ("time", "particle", "axis"))
-    assert f"({dimension}: 2); pick one" in str(refused.value)
+    assert f"({dimension}: 2); select one" in str(refused.value)
     assert f"ds.isel({dimension}=0).pbd.plot(...)" in str(refused.value)
     assert swept.isel({dimension: 1}).pbd.plot().get_title().endswith(f"step {swept.time[-1]:d}")
 

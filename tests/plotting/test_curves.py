@@ -371,7 +371,7 @@ def test_leader_curve_of_a_sweep_requires_one_member():
     led = experiment(**CALIBRATED, leaders=[HELD, pull_right(0.01, 0.0)], steps=2,
                      diagnostics=[{"type": "reaction", "youngs_modulus": 2.0}])  # fmt: skip
     found = pbdkit.sweep(led, vary={"solver.relaxation": [0.5, 1.0]}, workers=1, progress=False)
-    with pytest.raises(pbdkit.ExperimentError, match=r"relaxation.: select one member with isel"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"relaxation.; select one member with isel"):
         found.pbd.curve()
 
 

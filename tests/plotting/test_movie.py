@@ -99,7 +99,7 @@ def test_missing_package_is_named_with_its_extra(torn, tmp_path, monkeypatch):
     for name, missing in {"torn.mp4": "imageio-ffmpeg", "torn.gif": "pillow"}.items():
         with pytest.raises(ExperimentError) as refused:
             torn.pbd.animate(file=tmp_path / name)
-        assert f"need {missing}: pip install 'pbdkit[movie]'" in str(refused.value)
+        assert f"require {missing}: pip install 'pbdkit[movie]'" in str(refused.value)
 
 
 def test_failed_movie_leaves_no_file(torn, tmp_path, monkeypatch):

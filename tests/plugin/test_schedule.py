@@ -196,7 +196,7 @@ def test_numpy_replaces_kernels_with_a_reason(name):
     given_ = sheet(engine="auto", **CHANGING[name]) | {"steps": 10**9}
     choice = choose(build_scene(pbdkit.Experiment(**given_)))
     assert choice.engine == "numpy"
-    assert "change in time" in choice.reason
+    assert "are time-dependent" in choice.reason
     with pytest.raises(pbdkit.ExperimentError, match=r"^solver\.engine: the compiled"):
         pbdkit.run(sheet(engine="compiled", **CHANGING[name]), progress=False)
 
@@ -362,7 +362,7 @@ WRONG = {
                    r"rule\.stiffness: 'a' should be a number: values by region cannot vary"),
     "auto": ({"solver": {"type": "stepping", "relaxation": "auto",
                          "memory": course([1, 2], [0.1, 0.2])}},
-             r"'auto' needs constant parameters"),
+             r"'auto' requires constant parameters"),
     "force": ({"loads": [{"select": {"edge": "top"}, "force": [0, course([1, 2], [0])]}],
                "frame": NATURAL}, r"loads\.0\.force\.1: 2 steps have 1 values"),
     "a motion": ({"leaders": [{"select": {"edge": "left"}, "motion":

@@ -164,5 +164,5 @@ class Unaware(Vanes):
 
 
 def test_gather_without_its_declared_inputs_is_named():
-    with pytest.raises(pbdkit.ExperimentError, match=r"called as gather\(d, r, w, p, own, there\)"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"declare gather\(d, r, w, p, own, there\)"):
         pbdkit.run(vanes(rule={"type": "unaware"}), components=[Unaware], progress=False)

@@ -159,7 +159,7 @@ def test_missing_requirement_is_reported(monkeypatch):
     """The package here or elsewhere, the device on machines that have the package."""
     monkeypatch.setattr(limits, "find_spec", lambda name: None)
     scene = gpu_cases.scene_of(sheet(**ASKED))
-    with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[gpu\]'; take `eng"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[gpu\]'; use `eng"):
         make_engine(scene, choose(scene))
     monkeypatch.setattr(limits, "find_spec", find_spec)
     if find_spec("numba_cuda") and what_is_missing():

@@ -114,7 +114,7 @@ def test_commands_select_a_member(swept, call, tmp_path, monkeypatch):
     swept.to_netcdf("s.nc")
     refused = call("plot", "s.nc", "--color", "u_x")
     assert refused.code == 2
-    assert "choose one with --at NAME=VALUE" in refused.err
+    assert "--at NAME=VALUE, in Python with" in refused.err
     assert "steel: 0.1, 0.2, 0.3; span: 7, 8" in refused.err
     choice = ["--at", "steel=0.2", "--at", "poisson_ratio=0.3", "--at", "span=7"]
     assert call("plot", "s.nc", "--color", "u_x", "--dpi", "50", *choice).code == 0

@@ -269,7 +269,7 @@ def test_truncated_database_mixes_no_members(small, tmp_path):
     for left in (156, 500, 900):
         path.write_bytes(whole[: len(whole) - 4096 + left])
         damaged = path.read_bytes()
-        with pytest.warns(pbdkit.PbdkitWarning, match="is damaged: .* stay stored|it runs again"):
+        with pytest.warns(pbdkit.PbdkitWarning, match="is damaged: .* intact|it runs again"):
             same(first, swept(small, **asked))
         for aside in tmp_path.glob("set-aside-*"):
             assert (aside / stores.DATABASE).read_bytes() == damaged
@@ -301,7 +301,7 @@ def test_members_with_a_lost_log_are_reported(small, tmp_path, run_only):
         if without_log:
             (tmp_path / stores.DATABASE).write_bytes(without_log)
         run_only.clear()
-        with pytest.warns(pbdkit.PbdkitWarning, match="(0 of|and) 2"):
+        with pytest.warns(pbdkit.PbdkitWarning, match="although 2 members were"):
             same(first, swept(small, **asked))
         assert len(run_only) == 2
 
@@ -536,7 +536,7 @@ class Lost:
 
 
 def test_lost_scheduler_is_named_with_the_way_to_resume(small):
-    with pytest.raises(pbdkit.StorageError, match=r"the scheduler is lost.*is held, and the same"):
+    with pytest.raises(pbdkit.StorageError, match=r"the scheduler is lost.*are stored, and"):
         [*ClusterExecutor(Lost()).work(jobs_of(small, 2), lambda: False)]
 
 
