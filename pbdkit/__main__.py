@@ -14,7 +14,8 @@ default of 700 it runs hundreds of times while a command is imported, when nothi
 
 def main() -> None:
     """Run `pbdkit.cli.main`, without a traceback if it is interrupted during imports."""
-    # An exception can be lost in libraries during their import; there is nothing to undo.
+    # A KeyboardInterrupt can be lost in libraries during their import, and there is nothing
+    # to undo, so that the handler ends the process.
     previous = signal.signal(signal.SIGINT, _end)
     gc.set_threshold(COLLECT_AFTER)
     try:

@@ -60,7 +60,7 @@ class Communicator(ABC):
 
     @abstractmethod
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """Return the elementwise minimum over arrays of one shape."""
+        """Return the elementwise minimum of the arrays of all processes, which have one shape."""
 
     def processes_on_machine(self) -> int:
         """Return the number of processes on the machine of this one."""

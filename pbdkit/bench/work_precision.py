@@ -136,7 +136,7 @@ TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 METHODS = ("lu", "multigrid", "conjugate-gradients")
 """Methods of the solver `equilibrium`."""
 MAX_PARTICLES_LU = 2_000_000
-"""Number of particles above which LU is left out: its factors take 1.4 GiB for a million particles,
+"""Number of particles above which LU is omitted: its factors take 1.4 GiB for a million particles,
 and their size grows faster than the number."""
 MAX_STEPPING_S = 60.0
 """Duration in seconds above which steps are extrapolated from the rate instead of measured."""
@@ -156,9 +156,9 @@ class Row:
     Parameters
     ----------
     size
-        Sites along the longer side; None for the experiment's own size.
+        Sites along the longer side; None for the size in the experiment.
     method, precision, threads
-        Solver or engine.
+        Method of the solver or engine, its precision and its number of threads.
     particles
         Number of particles.
     tolerance, certified, error
@@ -179,7 +179,7 @@ class Row:
     is_predicted
         True if times are the time of one step times the number of steps.
     reason
-        Reason for which there is no measurement.
+        Reason why there is no measurement.
     """
 
     size: int | None
@@ -238,7 +238,7 @@ def measure(
     settings
         Settings with which it is loaded.
     size
-        Sites along the longer side; None for its own size.
+        Sites along the longer side; None for the size in the experiment.
     report
         Function that is called with a description after each measurement.
 
@@ -529,7 +529,7 @@ def show_work_precision(
     changes
         All settings with which it is loaded by `name`.
     sizes
-        Numbers of sites along the longer side; empty for its own size.
+        Numbers of sites along the longer side; empty for the size in the experiment.
     json_file, picture
         Files to write.
     """
@@ -561,7 +561,7 @@ REPEATS = 7
 MAX_REPEATING_S = 2.0
 """Maximum duration of all repetitions in seconds."""
 MAX_SOLVING_S = 60.0
-"""Duration in seconds above which smaller tolerances are left out."""
+"""Duration in seconds of a measurement after which smaller tolerances are omitted."""
 COMPILED = "pbdkit.stepping.numba_engine.engine"
 """Module of the compiled engine."""
 SOLVERS = ("scipy.sparse.linalg", "scipy.sparse.csgraph", "numba")
@@ -660,7 +660,8 @@ def _largest_norm(u: Floats) -> float:
 
 
 def _settle(job: Task) -> Task:
-    """Measure the solver for each tolerance, the loosest first, until one takes too long."""
+    """Measure the solver for each tolerance, the largest first, until a measurement takes too
+    long."""
     imports, rows = _import(*SOLVERS), []
     for tolerance in job["tolerances"]:
         settings = [*job["settings"], f"solver.tolerance={tolerance:g}"]

@@ -28,8 +28,8 @@ def standard_streams() -> Iterator[None]:
 
     A failed write to standard output raises WriteError, or NoReaderError if the reader has closed
     it. A failed write to standard error is ignored. Closed standard descriptors are opened on the
-    null device. Otherwise the next file would get a number to which other programs and libraries
-    write. Streams that replace those of Python are kept.
+    null device, because otherwise the next open file would get the number of a standard descriptor,
+    to which other programs and libraries write. Streams that replace those of Python are kept.
     """
     if os.name != "posix":
         yield

@@ -420,7 +420,7 @@ class StrainEnergy(Diagnostic):
         return (Variable("strain_energy", (), "strain energy", ENERGY.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return E t times the energy of the rule."""
+        """Return the energy of the rule, multiplied by Young's modulus and the thickness."""
         return (self.youngs_modulus * self.thickness * now.forces.energy(),)
 
 
@@ -428,11 +428,11 @@ class Reaction(Diagnostic):
     """Reaction force of each leader group; 0 while the group is inactive.
 
     The reaction is minus the sum of neighbour forces and loads on the particles of the group; for a
-    particle in two groups, half of these forces is assigned to each. A group that leads along some
-    axes only has no reaction along the others; forces from obstacles on its particles are included
-    along its own axes. Under the natural frame the reactions of all groups sum to zero, or to minus
-    the loads and the forces of obstacles. Frame points exert forces too; at the corners of
-    prescribed edges these forces are artefacts of the frame, and a warning is issued.
+    particle in two groups, half of these forces is assigned to each. A group with motion prescribed
+    along some axes only has no reaction along the others; forces of obstacles on its particles are
+    included along the prescribed axes. Under the natural frame the reactions of all groups sum to
+    zero, or to minus the loads and the forces of obstacles. Frame points exert forces too; at the
+    corners of prescribed edges these forces are artefacts of the frame, and a warning is issued.
     """
 
     type: Literal["reaction"] = "reaction"
@@ -452,7 +452,7 @@ class Reaction(Diagnostic):
             raise ExperimentError(f"'{self.type}' requires leader groups; the experiment has none")
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return E t times the reactions."""
+        """Return the reactions, multiplied by Young's modulus and the thickness."""
         return (self.youngs_modulus * self.thickness * reactions(now),)
 
 
@@ -575,7 +575,7 @@ def reactions(now: Moment) -> Floats:
     Returns
     -------
     NDArray
-        Reactions, (leader group, axis); 0 along axes along which the group does not lead.
+        Reactions, (leader group, axis); 0 along axes on which no motion is prescribed.
     """
     forces, groups = forces_on_particles(now), now.leader_groups()
     touching = now.touching()
@@ -673,7 +673,8 @@ class ContactForces(Diagnostic):
     On a follower that touches one obstacle, f = max(0, -F·n) n balances the force F of neighbours
     and loads along the outward normal n of the obstacle. On a follower that touches several
     obstacles, or an edge where two sides of one meet, contact forces along all normals balance F
-    together. On a particle that leads along one axis they balance F along the other.
+    together. On a particle with prescribed motion along one axis they balance F along the other
+    axis.
     """
 
     type: Literal["contact"] = "contact"
@@ -692,7 +693,8 @@ class ContactForces(Diagnostic):
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return E t times the contact forces, by obstacle and by particle."""
+        """Return contact forces by obstacle and by particle, times Young's modulus and
+        thickness."""
         forces, touching = forces_on_particles(now), now.touching()
         on_particles, sums = 0.0 * forces, np.zeros((len(touching), 2))  # NaN at frame points.
         size = self.youngs_modulus * self.thickness

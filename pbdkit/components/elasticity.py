@@ -154,8 +154,8 @@ def rectangle_springs(c: Stiffness, a: float, b: float) -> tuple[float, float, f
     Returns
     -------
     tuple
-        Stiffnesses over modulus and thickness of the springs along an edge a, along an edge b, and
-        along a diagonal.
+        Stiffnesses over modulus and thickness of the springs along an edge of length a, along an
+        edge of length b, and along a diagonal.
 
     Notes
     -----
@@ -222,7 +222,7 @@ def torn_pull(d: Vector, r: Vector, w: Weights, t: Torn) -> Vector:
     """Return the force of a bond in damaged cells.
 
     The stiffness of a cell is K = (1 - m) K_whole + Σ_b (m - D_b) K_b with the damage D_b of each
-    of its bonds b, the maximum m of these, and the springs K_b of the cell.
+    of its bonds b, the maximum m of the D_b, and the stiffness K_b of the spring along b.
     """
     left, right = w.left * (1.0 - t.left), w.right * (1.0 - t.right)
     whole = left + right
@@ -377,7 +377,7 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
 
     @staticmethod
     def apply(total: Sums, here: Here, p: Parameters) -> Vector:
-        """Return (Σ W)⁻¹ Σ W d, or no move where there is no cell."""
+        """Return (Σ W)⁻¹ Σ W d, or a move of zero where there is no cell."""
         return mean_move(total)
 
     @staticmethod

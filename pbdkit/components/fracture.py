@@ -447,8 +447,8 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
         """Return the constants of the softening law and of the bonds of a cell.
 
         `release` is 2 energy / onset times the stiffness along x over the squared modulus along x,
-        a length; `along_y` and `across` are compliances over that along x, `stiff_y` and
-        `stiff_across` stiffnesses over that along x; `x0` to `y2` are the bonds of a cell.
+        a length; `along_y` and `across` are compliances divided by that along x, `stiff_y` and
+        `stiff_across` stiffnesses divided by that along x; `x0` to `y2` are the bonds of a cell.
 
         Raises
         ------

@@ -198,8 +198,8 @@ forces."""
 
 @property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
 def moves_rigidly_for_nothing(subject: Subject) -> None:
-    """With known forces and free edges, a small rigid motion of a body causes no force, whatever
-    bonds are broken."""
+    """If forces are defined and edges are free, a small rigid motion of a body causes no force,
+    whatever bonds are broken."""
     _check_stiffness(
         subject,
         resistance_to_rigid_motions,
@@ -213,8 +213,8 @@ def moves_rigidly_for_nothing(subject: Subject) -> None:
 
 @property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
 def acts_both_ways_alike(subject: Subject) -> None:
-    """With known forces and free edges, the stiffness is symmetric (Maxwell and Betti): forces have
-    no resultant, and derive from an energy."""
+    """If forces are defined and edges are free, the stiffness is symmetric (Maxwell and Betti):
+    forces have no resultant, and derive from an energy."""
     _check_stiffness(
         subject,
         lambda _, K: asymmetry(K),
@@ -225,7 +225,7 @@ def acts_both_ways_alike(subject: Subject) -> None:
 
 @property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
 def gives_no_energy_back(subject: Subject) -> None:
-    """With known forces and free edges, no displacement from rest has a negative energy."""
+    """If forces are defined and edges are free, no displacement from rest has a negative energy."""
     _check_stiffness(
         subject,
         lambda _, K: energy_given_back(K),
@@ -249,8 +249,8 @@ def _check_stiffness(
 
 @property_of(FollowerRule, FramePolicy, FractureModel)
 def does_not_stiffen_by_breaking(subject: Subject) -> None:
-    """With known forces and free edges, no displacement requires more force after bonds have
-    softened or broken."""
+    """If forces are defined and edges are free, no displacement requires more force after bonds
+    have softened or broken."""
     for solid in _solids(subject):
         for (_, K), (what, K_damaged) in pairwise(solid.stages):
             if (increase := stiffening(K, K_damaged)) > _rounding(solid.scene):

@@ -471,7 +471,7 @@ def test_dataset_is_fitted_like_the_file_with_its_columns(tmp_path):
     for wrong, said in (
         (table.rename(ux="u_x"), "measured: the dataset has no variable 'ux'"),
         (table.where(table.ux != table.ux[3]), "finite ones only"),
-        (table.assign(uy=("other", [0.0])), r"need one size: x \d+, y \d+, ux \d+, uy 1$"),
+        (table.assign(uy=("other", [0.0])), r"must have one size, got x \d+, y \d+, ux \d+, uy 1$"),
     ):
         with pytest.raises(pbdkit.ExperimentError, match=said):
             pbdkit.fit(fit, measured=wrong)

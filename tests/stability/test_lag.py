@@ -195,7 +195,7 @@ def test_recommended_speed_keeps_the_lag_below_a_bond():
 def test_check_prints_no_lag_where_there_is_none(call):
     figures = json.loads(call("check", "stability/oscillation", "--json").out)
     assert figures["lag"] is figures["lag_reached"] is None
-    assert "behind equilibrium" not in call("check", "stability/oscillation", "--verbose").out
+    assert "units from equilibrium" not in call("check", "stability/oscillation", "--verbose").out
 
 
 def test_case_22_bonds_of_a_fast_test_stretch_nine_times_the_equilibrium():

@@ -148,7 +148,7 @@ def test_no_step_is_repeated_if_every_step_is_recorded(monkeypatch):
     monkeypatch.setattr(Guard, "last_good", again)
     ds = diverged(solver={"type": "stepping", "relaxation": 1.5}, record={"every": 1})
     assert int(ds.time[-1]) > 0
-    assert "kept is" not in ds.stop_reason
+    assert "the last recorded state is" not in ds.stop_reason
 
 
 def test_stop_during_the_search_for_the_last_good_state_keeps_records():
@@ -176,7 +176,7 @@ def test_state_with_a_diagnostic_that_is_not_finite_is_not_kept():
     solver = {"type": "stepping", "relaxation": 1.5}
     ds = diverged(diagnostics=[Vanishing()], solver=solver, record={"every": 5000})
     assert ds.time.values.tolist() == [0]
-    assert "kept is" not in ds.stop_reason
+    assert "the last recorded state is" not in ds.stop_reason
 
 
 def test_divergence_with_changing_neighbours_keeps_its_records():

@@ -301,7 +301,7 @@ def test_members_with_a_lost_log_are_reported(small, tmp_path, run_only):
         if without_log:
             (tmp_path / stores.DATABASE).write_bytes(without_log)
         run_only.clear()
-        with pytest.warns(pbdkit.PbdkitWarning, match="although 2 members were"):
+        with pytest.warns(pbdkit.PbdkitWarning, match="contains 0 of 2|although 2"):
             same(first, swept(small, **asked))
         assert len(run_only) == 2
 
