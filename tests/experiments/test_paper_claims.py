@@ -14,12 +14,12 @@ import pbdkit
 
 CORRECTED = {
     "FEM but in a much shorter time": "not reproduced",
-    "in accordance with results obtained by FEM": "reproduced only with `elastic` and `natural`",
-    "standard Cauchy model": "reproduced only with `elastic` and `natural`",
-    "isotropic … elastic behaviour": "reproduced only with distance-weighted on the hexagonal",
+    "in accordance with results obtained by FEM": "reproduced only with the rule `elastic` and the frame",
+    "standard Cauchy model": "reproduced only with the rule `elastic` and the frame",
+    "isotropic … elastic behaviour": "reproduced only with the rule distance-weighted on the hexagonal",
     "simulate Hook law": "not reproduced",
     "subject to Hook law [PE1]": "reproduced only with the hexagonal lattice",
-    "behaviour of different materials": "reproduced only with `elastic`",
+    "behaviour of different materials": "reproduced only with the rules `elastic`",
     "plastic-like": "not reproduced",
     "between the GPU cores": "reproduced only with threads of a processor",
     "in a less pronounced way": "reproduced only with late times",
