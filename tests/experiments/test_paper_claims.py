@@ -14,9 +14,9 @@ import pbdkit
 
 CORRECTED = {
     "FEM but in a much shorter time": "not reproduced",
-    "in accordance with results obtained by FEM": "reproduced only with the rule `elastic` and the frame",
-    "standard Cauchy model": "reproduced only with the rule `elastic` and the frame",
-    "isotropic … elastic behaviour": "reproduced only with the rule distance-weighted on the hexagonal",
+    "in accordance with results obtained by FEM": "reproduced only with the rule `elastic` and",
+    "standard Cauchy model": "reproduced only with the rule `elastic` and",
+    "isotropic … elastic behaviour": "reproduced only with the rule distance-weighted on the hex",
     "simulate Hook law": "not reproduced",
     "subject to Hook law [PE1]": "reproduced only with the hexagonal lattice",
     "behaviour of different materials": "reproduced only with the rules `elastic`",
