@@ -40,7 +40,7 @@ def _method(
     call.__doc__ = re.sub(
         r"(-{10}\n) +\w+ : .*\n( {8}.*\n)+", r"\1", function.__doc__ or "", count=1
     )
-    return call  # type: ignore[return-value]  # its first parameter has a name
+    return call  # type: ignore[return-value]  # `accessor` is also a keyword
 
 
 def _with_figure(function: Callable[P, Axes | list[Axes]]) -> Callable[P, Axes | Figure]:

@@ -50,7 +50,7 @@ class AccessorFinder:
             sys.meta_path.remove(self)
 
         # The loader belongs to this import alone, so that its method can be replaced.
-        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]  # on purpose
+        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]  # of this loader
         return spec
 
 

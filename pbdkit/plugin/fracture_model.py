@@ -260,7 +260,7 @@ class SoftensCells(RenewsBonds):
 
     @staticmethod
     @abstractmethod
-    def update(  # type: ignore[override]  # receives the cells too
+    def update(  # type: ignore[override]  # cells are arguments, too
         d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
     ) -> tuple[Number, ...]:
         """Return the new values of the numbers that change, in their order, elementwise.

@@ -87,7 +87,7 @@ class Vector(_Plane[T]):
     def _of(self, components: list[Any]) -> Self:
         return tuple.__new__(type(self), components)
 
-    def __add__(self, other: Vector[Any]) -> Self:  # type: ignore[override]  # no concatenation
+    def __add__(self, other: Vector[Any]) -> Self:  # type: ignore[override]  # adds, as arrays do
         return self._of([a + b for a, b in zip(cast(Any, self), other, strict=True)])
 
     def __sub__(self, other: Vector[Any]) -> Self:
@@ -96,10 +96,10 @@ class Vector(_Plane[T]):
     def __neg__(self) -> Self:
         return self._of([-component for component in cast(Any, self)])
 
-    def __mul__(self, factor: Number) -> Self:  # type: ignore[override]  # no repetition
+    def __mul__(self, factor: Number) -> Self:  # type: ignore[override]  # scales, as arrays do
         return self._of([component * factor for component in cast(Any, self)])
 
-    def __rmul__(self, factor: Number) -> Self:  # type: ignore[override]  # no repetition
+    def __rmul__(self, factor: Number) -> Self:  # type: ignore[override]  # scales, as arrays do
         return self._of([factor * component for component in cast(Any, self)])
 
     def __truediv__(self, divisor: Number) -> Self:
