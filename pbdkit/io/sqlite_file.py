@@ -66,8 +66,15 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
         check_same_thread=False,
         uri=True,
     )
-    for setting in ("trusted_schema = OFF", "cell_size_check = ON", "synchronous = FULL"):
-        connection.execute(f"PRAGMA {setting}")
+    settings = ["trusted_schema = OFF", "cell_size_check = ON"]
+    if mode != "ro":  # SQLite reads the database to set this, which may need to be rolled back.
+        settings.append("synchronous = FULL")
+    try:
+        for setting in settings:
+            connection.execute(f"PRAGMA {setting}")
+    except sqlite3.Error:
+        connection.close()
+        raise
     return connection
 
 

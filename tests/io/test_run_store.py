@@ -409,6 +409,29 @@ def test_a_journal_that_names_another_file_is_refused(
     assert Path("precious").exists()
 
 
+def test_store_is_read_as_of_its_last_commit_after_a_kill_within_a_transaction(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The journal, from which SQLite restores the last commit, remains beside the database."""
+    path = tmp_path / "killed" / "out.nc.run"
+    path.parent.mkdir()
+    monkeypatch.setattr(run_store, "journal_mode", lambda path: "TRUNCATE")
+    with RunStore(tmp_path / path.name, mode="rwc") as store:
+        store.commit([("a", b"1" * 9000)])
+        store._file.execute("PRAGMA cache_size = 1")
+        store._file.execute("BEGIN IMMEDIATE")
+        store._file.execute("UPDATE pieces SET data = ? WHERE key = 'a'", (b"2" * 90_000,))
+        for file in sqlite_file.files_of(tmp_path / path.name):
+            if file.exists():
+                (path.parent / file.name).write_bytes(file.read_bytes())
+    before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
+    assert before.keys() == {"out.nc.run", "out.nc.run-journal"}
+    for mode in ("ro", "rw"):
+        with RunStore(path, mode=mode) as store:
+            assert store.piece("a") == b"1" * 9000
+        assert ({f.name: f.read_bytes() for f in path.parent.iterdir()} == before) == (mode == "ro")
+
+
 def test_store_on_a_network_uses_a_journal_without_shared_memory(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
