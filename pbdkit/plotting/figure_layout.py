@@ -196,14 +196,23 @@ class Page:
         """
         bar = self._bar(scale, text) if scale else None
         legend = self._legend(handles) if handles else None
+        self._place(bar, legend, larger)
         for _ in range(3):  # The space around the panels and their size depend on each other.
-            self._grid = self._best_grid(larger)
-            self._place_panels()
-            self._place_keys(bar, legend)
-            self._measure()
+            before = self._space()
+            self._measure(bar)
+            if self._space() == before:
+                break
+            self._place(bar, legend, larger)
+
+    def _place(self, bar: Any, legend: Legend | None, larger: float) -> None:
+        """Place panels, texts, colour bar and legend with the present space around the panels."""
         self._grid = self._best_grid(larger)
         self._place_panels()
         self._place_keys(bar, legend)
+
+    def _space(self) -> tuple[float, ...]:
+        """Return all measured lengths that the placement depends on."""
+        return (*self._before, *self._after, *self._around, self._overhang)
 
     def _best_grid(self, larger: float) -> PanelGrid:
         """Return the grid with the largest panels and few empty places."""
@@ -252,7 +261,9 @@ class Page:
     def _place_texts(self, page: Any) -> None:
         block, y = self._block, self._panels.labels[1]
         middle = block.get_points().mean(axis=0)
-        ticks = self._drawn(self.axes, for_layout_only=True)
+        # A panel with its ticks and the height of its title; the width of a title is not included.
+        # It is measured here only, as the ticks of many panels take the most time of a layout.
+        ticks = self._narrow = self._drawn(self.axes, for_layout_only=True)
         upright = block.height + 0.3 >= len(y) / CHARACTERS_PER_IN
         across, up = self._labels
         across.set(position=np.array((middle[0], ticks.y0)) / page, ha="center", va="top")
@@ -307,7 +318,7 @@ class Page:
         """Place the colour bar beside or below the panels, and the legend below all."""
         block, page = self._block, self.figure.get_size_inches()
         middle = block.get_points().mean(axis=0)
-        low = self._drawn([*self.axes, self._labels[0]]).y0 - 0.08
+        low = min(self._narrow.y0, self._drawn([self._labels[0]]).y0) - 0.08
         if bar and bar.orientation == "vertical":
             length, x0 = min(block.height - 0.12, BAR_LENGTH_IN), block.x1 + self._overhang
             place = np.array((x0 + GAP_IN, middle[1] - length / 2, BAR_WIDTH_IN, length))
@@ -326,15 +337,20 @@ class Page:
         boxes = [box for artist in artists if (box := artist.get_tightbbox(renderer, **options))]
         return Bbox(Bbox.union(boxes).get_points() / self.figure.dpi)
 
-    def _measure(self) -> None:
+    def _measure(self, bar: Any) -> None:
         """Measure the space around the panels."""
-        texts = [text for text in self.figure.texts if text.get_text()]
-        drawn = self._drawn([*self.figure.axes, *texts, *self.figure.legends])
+        bars = [bar.ax] if bar else []
+        titles = [ax.title for ax in self.axes]
+        texts = [text for text in (*titles, *self.figure.texts) if text.get_text()]
+        drawn = self._drawn([*bars, *texts, *self.figure.legends])
+        drawn = Bbox.union([self._narrow, drawn])
         self._before = np.subtract(self._block.min, drawn.min) + EDGE_IN
         self._after = np.subtract(drawn.max, self._block.max) + EDGE_IN
         # If titles are wider than the panels, the page is made wider, and the panels keep their
         # width.
-        narrow = self._drawn(self.figure.axes, for_layout_only=True)
+        narrow = self._narrow
+        if bars:
+            narrow = Bbox.union([narrow, self._drawn(bars, for_layout_only=True)])
         x0 = min(narrow.x0, self._drawn([self._labels[1]]).x0)
         self._around = self._before + self._after
         self._around[0] = narrow.x1 - x0 - self._block.width + 2 * EDGE_IN
