@@ -75,7 +75,7 @@ def bodies():
 
 @pytest.fixture(scope="module")
 def torn():
-    return pbdkit.run("paper/f2", progress=False)
+    return pbdkit.run(pbdkit.load("paper/f2", settings=["steps=20"]), progress=False)
 
 
 def drawn_texts(figure, monkeypatch):
@@ -125,7 +125,7 @@ def figure_of(axes):
 LOOKS = {
     "kinds": {},
     "a field or dots": {"color": "u_x"},
-    "13 panels": {"color": "u", "time": range(13)},
+    "7 panels": {"color": "u", "time": range(7)},
     "bonds in a given size": {"color": "broken_step", "figsize": (4.0, 9.0)},
     "two in a given size": {"time": [0, 12], "figsize": (7.0, 6.5)},
     "numbers": {"numbers": True},
@@ -136,7 +136,7 @@ TRIED = [
     for m, look in enumerate(LOOKS)
     if (n + m) % 3 != 2
 ]
-TRIED += [("50 x 50", "13 panels"), ("50 x 50", "kinds"), ("ring", "bonds in a given size")]
+TRIED += [("50 x 50", "7 panels"), ("50 x 50", "kinds"), ("ring", "bonds in a given size")]
 TRIED += [("ring", "a field or dots"), ("ring", "two in a given size")]
 
 
@@ -162,8 +162,8 @@ def test_labels_with_units_fit_the_space(monkeypatch):
 
 
 def test_plots_are_in_the_units_of_the_user():
-    plate = pbdkit.run(pbdkit.load("modelling/composite-plate", settings=["units.length=0.5 mm"]),
-                       progress=False)  # fmt: skip
+    coarse = ["units.length=2 mm"]
+    plate = pbdkit.run(pbdkit.load("modelling/composite-plate", settings=coarse), progress=False)
     drawn, again = (
         plot(ds, color="u_x", filled=True, dpi=80) for ds in (plate, plate.pbd.physical())
     )
@@ -188,33 +188,34 @@ def image_of(ax):
 def test_fields_of_both_signs_are_neutral_at_zero(bodies):
     ds = bodies("50 x 50")
     signed = ds.assign(stress_xx=ds.pe1 - 0.3 * float(ds.pe1.max()))
-    image = image_of(plot(signed, "stress_xx"))
+    image = image_of(plot(signed, "stress_xx", dpi=50))
     low, high = image.get_clim()
     assert low == -high
     assert image.cmap.name == "RdBu_r" or np.allclose(image.cmap(0.5)[:3], 0.97, atol=0.01)
-    one = image_of(plot(signed, "stress_xx", vmin=-0.1, vmax=0.3))
+    one = image_of(plot(signed, "stress_xx", vmin=-0.1, vmax=0.3, dpi=50))
     assert one.get_clim() == (-0.1, 0.3)
     neutral = one.cmap(one.norm(0.0))
     assert np.allclose(neutral[:3], 0.97, atol=0.02)
-    above = image_of(plot(ds, "pe1"))
-    below = image_of(plot(ds.assign(pe1=-ds.pe1), "pe1"))
+    above = image_of(plot(ds, "pe1", dpi=50))
+    below = image_of(plot(ds.assign(pe1=-ds.pe1), "pe1", dpi=50))
     assert (above.get_clim()[0], below.get_clim()[1]) == (0.0, 0.0)
     assert above.cmap(0.0) == below.cmap(1.0)
 
 
 def test_all_panels_share_scale_and_extent(torn):
-    axes = plot(torn, "pe1_intact", [0, 10, 400])
+    axes = plot(torn, "pe1_intact", [0, 10, 20])
     assert len({ax.collections[-1].get_clim() for ax in axes}) == 1
     assert len({(ax.get_xlim(), ax.get_ylim()) for ax in axes}) == 1
-    assert [ax.get_title() for ax in axes] == ["step 0", "step 10", "step 400"]
-    given = plot(torn, "pe1_intact", [0, 400], vmin=0.0, vmax=5.0, cmap="magma")
+    assert [ax.get_title() for ax in axes] == ["step 0", "step 10", "step 20"]
+    given = plot(torn, "pe1_intact", [0, 20], vmin=0.0, vmax=5.0, cmap="magma")
     assert {ax.collections[-1].get_clim() for ax in given} == {(0.0, 5.0)}
     assert {ax.collections[-1].get_cmap().name for ax in given} == {"magma"}
 
 
 def test_every_panel_has_contents():
     """At the last step of a sheet that came to rest there is next to nothing to see in colour."""
-    sheet = pbdkit.run("paper/a", progress=False)
+    last = pbdkit.load("paper/a", settings=["record={at: [10, 400]}"])
+    sheet = pbdkit.run(last, progress=False)
     for ax in plot(sheet, "pe1", [10, 400], contours=True):
         pixels = image_of(ax).get_array()
         assert np.isfinite(np.ma.filled(pixels, np.nan)).mean() > 0.3
@@ -265,7 +266,7 @@ def test_overlapping_numbers_are_thinned(bodies, monkeypatch):
 
 
 REFUSED = {
-    "not recorded": ({"time": 7000}, "step 7000 was not recorded; the nearest recorded: 400"),
+    "not recorded": ({"time": 7000}, "step 7000 was not recorded; the nearest recorded: 20"),
     "no time": ({"time": []}, "a figure requires at least one time"),
     "misspelt": (
         {"color": "pe1_intat"},
@@ -465,13 +466,13 @@ def test_missing_values_outside_the_outline_cause_no_jumps():
 def test_plots_draw_into_given_axes(torn):
     figure = Figure((8, 4), layout="constrained")
     axes = figure.subplots(1, 2)
-    assert plot(torn, "pe1", [0, 400], ax=axes)[0] is axes[0]
+    assert plot(torn, "pe1", [0, 20], ax=axes)[0] is axes[0]
     assert torn.pbd.plot(time=8, ax=Figure().add_subplot()).get_title() == "paper/f2, step 8"
     assert isinstance(torn.pbd.plot(time=[0, 8]), Figure)
 
 
 def test_two_runs_side_by_side_share_scale_and_extent(torn):
-    other = pbdkit.run("paper/f1", progress=False)
+    other = pbdkit.run(pbdkit.load("paper/f1", settings=["steps=8"]), progress=False)
     one, two = compare(torn, other, "pe1_intact", 8)
     assert one.get_xlim() == two.get_xlim()
     assert one.collections[-1].get_clim() == two.collections[-1].get_clim()
