@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.untrusted_files import try_reading
 
 Call = Callable[..., Any]
 TORN = ["--set=leaders.1.motion.velocity=[1.2, 0.0]", "--set=steps=12"]
@@ -26,6 +27,25 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.raises(SystemExit):
         main(["run", "paper/d1", "-o", str(path), "--quiet", *TORN])
     return path
+
+
+@pytest.fixture
+def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read a file in a separate process for the first command only: what comes of it depends on the
+    bytes of the file alone."""
+    outcomes: dict[bytes, pbdkit.StorageError | None] = {}
+
+    def trying(path: Path) -> None:
+        content = path.read_bytes()
+        if content not in outcomes:
+            try:
+                outcomes[content] = try_reading(path)
+            except pbdkit.StorageError as error:
+                outcomes[content] = error
+        if outcomes[content]:
+            raise outcomes[content]
+
+    monkeypatch.setattr("pbdkit.io.open.try_reading", trying)
 
 
 def attribute(name: str, value: Any) -> Callable[[Any], None]:
@@ -68,14 +88,20 @@ CRAFTED: dict[str, Callable[[Any], None]] = {
 }
 
 
+REFUSED = ["no position", "positions not finite", "bonds of nobody", "no JSON", "nested JSON"]
+"""Files that `pbdkit explain` refuses."""
+
+
+@pytest.mark.usefixtures("read_once")
 @pytest.mark.parametrize("name", CRAFTED)
 def test_crafted_file_is_plotted_or_refused_in_one_line(name: str, sound: Path, call: Call) -> None:
     shutil.copy(sound, "crafted.nc")
     with netCDF4.Dataset("crafted.nc", "a") as file:
         CRAFTED[name](file)
+    damaged = name in REFUSED
     for arguments in (["explain"], ["plot", "--color", "pe1"], ["report", "--force"]):
         result = call(arguments[0], "crafted.nc", *arguments[1:])
-        assert result.code in (0, 2, 6), result.err
+        assert result.code in ((2, 6) if damaged and arguments == ["explain"] else (0, 2, 6)), result
         assert len(result.err) < 1000
         warning, *fault = result.err.splitlines()
         assert warning.startswith("warning: crafted.nc: has no seal")
@@ -85,17 +111,7 @@ def test_crafted_file_is_plotted_or_refused_in_one_line(name: str, sound: Path, 
             assert "crafted.nc" in line
 
 
-REFUSED = ["no position", "positions not finite", "bonds of nobody", "no JSON", "nested JSON"]
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_damaged_file_is_not_explained(name: str, sound: Path, call: Call) -> None:
-    shutil.copy(sound, "crafted.nc")
-    with netCDF4.Dataset("crafted.nc", "a") as file:
-        CRAFTED[name](file)
-    assert call("explain", "crafted.nc").code in (2, 6)
-
-
+@pytest.mark.usefixtures("read_once")
 @pytest.mark.parametrize("seed", range(12))
 def test_file_with_overwritten_bytes_is_read_or_refused(seed: int, sound: Path, call: Call) -> None:
     random, damaged = np.random.default_rng(seed), bytearray(sound.read_bytes())
@@ -113,9 +129,8 @@ def test_truncated_file_is_refused(sound: Path, call: Call) -> None:
     whole = sound.read_bytes()
     for length in (0, 10, 1000, len(whole) // 2, len(whole) - 1000):
         Path("cut.nc").write_bytes(whole[:length])
-        assert call("explain", "cut.nc").code == 6
-        with pytest.raises(pbdkit.StorageError, match=r"cut\.nc"):
-            pbdkit.open("cut.nc")
+        refused = call("explain", "cut.nc")
+        assert (refused.code, refused.err.startswith("pbdkit: cut.nc: ")) == (6, True)
 
 
 def test_file_without_the_end_of_its_seal_gives_a_warning(sound: Path, call: Call) -> None:
