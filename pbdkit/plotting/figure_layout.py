@@ -54,6 +54,8 @@ TITLE_IN = 0.26
 """Space for the title above each panel in inches."""
 EDGE_IN = 0.08
 """Space at the edge of the page in inches."""
+SAME_PLACE_IN = 1e-9
+"""Difference in inches below which two places are the same: that of rounding."""
 BAR_LENGTH_IN = 3.4
 """Maximum length of a colour bar in inches."""
 BAR_WIDTH_IN = 0.14
@@ -200,7 +202,7 @@ class Page:
         for _ in range(3):  # The space around the panels and their size depend on each other.
             before = self._space()
             self._measure(bar)
-            if self._space() == before:
+            if np.allclose(self._space(), before, rtol=0.0, atol=SAME_PLACE_IN):
                 break
             self._place(bar, legend, larger)
 
