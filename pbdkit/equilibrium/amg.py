@@ -1,9 +1,9 @@
-"""Algebraic multigrid for the sparse matrices of particles with known positions, written with scipy
-alone.
+"""Algebraic multigrid for sparse matrices of particles with known positions. It uses scipy only.
 
-The basis functions of a coarser grid are hats, bilinear in the plane and trilinear in space, around
-points of twice the spacing; where a crack cuts a hat, each connected piece is a separate function.
-Matrices of coarser grids are Galerkin products. docs/decisions/0010 compares the result with pyamg.
+The points of a coarser grid have twice the spacing. Around each point is a basis function, a hat,
+which is bilinear in the plane and trilinear in space. Where a crack cuts a hat, each connected
+piece of the hat is a basis function of its own. Matrices of coarser grids are Galerkin products.
+docs/decisions/0010 compares the result with pyamg.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ STRONG = 0.01
 """Ratio of an off-diagonal entry to the geometric mean of both diagonal entries, above which two
 particles are strongly coupled."""
 ROUNDS = 12
-"""Number of power iterations for the largest eigenvalue."""
+"""Number of power iterations that estimate the largest eigenvalue."""
 MARGIN = 1.1
-"""Safety factor of the largest eigenvalue."""
+"""Safety factor by which the estimated largest eigenvalue is multiplied."""
 BAND = 5.0
-"""Ratio of the largest eigenvalue to the smallest of those that relaxation damps."""
+"""Ratio of the largest eigenvalue to the smallest eigenvalue of the modes that relaxation damps."""
 SINGULAR = 1e-9
 """Relative singular value below which pseudo-inverses discard a mode."""
 
 
 @dataclass(frozen=True)
 class _Level:
-    """One grid. `prolongs` interpolates values of the next grid to this one, `own` contains the
-    inverses of the diagonal blocks, and `largest` is the largest eigenvalue of their product with
-    the matrix."""
+    """One grid. `prolongs` is the matrix that interpolates values of the next coarser grid to this
+    one. `own` contains the inverses of the diagonal blocks of the matrix, and `largest` is the
+    largest eigenvalue of the product of `own` and the matrix."""
 
     matrix: Any
     own: Any
@@ -60,9 +60,9 @@ class _Level:
 
 class SparseGrids:
     """Approximation of A⁻¹ r by one V-cycle in single precision. The matrix has `axes` unknowns for
-    each particle, stored next to each other; `places` and `led` (particle, axis of space) are the
-    positions of particles and leaders; `held` marks prescribed unknowns, which are not
-    interpolated."""
+    each particle, which are stored next to each other. The arrays `places` and `led`, (particle,
+    axis of space), are the positions of the particles and of the leaders. `held` marks prescribed
+    unknowns, which are not interpolated."""
 
     def __init__(
         self, matrix: Any, axes: int, places: Floats, led: Floats, held: Mask | None = None
@@ -90,8 +90,8 @@ class SparseGrids:
         )
 
     def __call__(self, r: Floats) -> Floats:
-        """Return one cycle from zero; r is scaled, since single precision would lose tiny
-        values."""
+        """Return the result of one cycle that starts from zero. r is scaled first, since tiny
+        values would underflow in single precision."""
         scale = float(np.abs(r).max(initial=0.0))
         if not 0.0 < scale < np.inf:
             return r.copy()
@@ -120,9 +120,10 @@ def _spacing(places: Floats) -> Floats:
 
 
 def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
-    """Return the hats, (unknown, unknown of the next grid), and the points at which they are
-    centred. `at` and `led` are in units of the next grid. A point has no hat if a leader is nearer
-    to it than any other particle."""
+    """Return the hats as a matrix, (unknown, unknown of the next grid), and the points at which the
+    hats are centred. The positions `at` of the particles and `led` of the leaders are in units of
+    the spacing of the next grid. A point has no hat if a leader is nearer to it than any other
+    particle."""
     from scipy.sparse import csr_array, eye_array, kron
 
     low = np.floor(np.minimum(at.min(axis=0), led.min(axis=0, initial=0.0))).astype(int) - 1
@@ -150,8 +151,8 @@ def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
 
 
 def _free(hats: Any, held: Mask) -> tuple[Any, Mask]:
-    """Return the hats of free unknowns, and a mask of the held unknowns of the next grid: an
-    unknown is held there if the nearest unknown of this grid is held."""
+    """Return the hats of free unknowns, and a mask of the held unknowns of the next grid. An
+    unknown of the next grid is held if the nearest unknown of this grid is held."""
     led_weights, free_weights = (_chosen(mask) @ hats for mask in (held, ~held))
     below = (led_weights.max(axis=0).toarray() > free_weights.max(axis=0).toarray()).ravel()
     return (free_weights @ _chosen(~below)).tocsr(), below
@@ -165,8 +166,8 @@ def _chosen(mask: Mask) -> Any:
 
 
 def _nearest(at: Floats, low: Indices, shape: tuple[int, ...]) -> Floats:
-    """Return the distance of each point of the next grid from the nearest place in an adjacent
-    cell."""
+    """Return the distance of each point of the next grid from the nearest of the positions `at` in
+    the cells around the point."""
     distances = np.full(int(np.prod(shape)), np.inf)
     cell = np.floor(at)
     for corner in product((0, 1), repeat=at.shape[1]):
@@ -176,8 +177,9 @@ def _nearest(at: Floats, low: Indices, shape: tuple[int, ...]) -> Floats:
 
 
 def _pieces(A: Any, axes: int, row: Indices, point: Indices, count: int) -> tuple[int, Indices]:
-    """Return the number of pieces and the piece of each entry of hats. The entries of a hat belong
-    to one piece if their particles are connected by bonds."""
+    """Return the number of pieces into which cracks divide the hats, and the piece to which each
+    entry of the hats belongs. The entries of a hat belong to one piece if their particles are
+    connected by bonds."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import connected_components
 

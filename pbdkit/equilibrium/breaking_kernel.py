@@ -1,14 +1,16 @@
-"""Equilibria of linear rules with breaking bonds, in one compiled call for an increment or several.
-The kernel moves the body to equilibrium, updates and breaks bonds, and repeats both.
+"""Equilibria of linear rules with breaking bonds. One compiled call computes one increment or
+several: it moves the body to equilibrium, updates and breaks bonds, and repeats this until no bond
+changes.
 
 The system is A c = r with a band matrix A = 1 - (step operator). It has one unknown for each
-follower and axis or, if the axes are independent and have equal matrices, one for each follower,
-and a right side for each axis: `wide` is the number of unknowns of a follower. Row i of a band
-holds A[i, i - half] to A[i, i + half]. A is factorised in place into L, with ones on the diagonal,
-and U, without pivoting. A row of the factors depends on earlier rows only: if bonds have changed,
-only the rows from the first affected follower on are assembled and factorised again. The entries of
-A are the moves at rest for a unit displacement of each neighbour, which is exact for linear rules.
-The general path takes 20 times as long (docs/decisions/0010).
+follower and axis. If the axes are independent and have equal matrices, it has one unknown for each
+follower instead, and one right side for each axis. `wide` is the number of unknowns of a follower.
+Row i of a band holds A[i, i - half] to A[i, i + half]. A is factorised in place into L, with ones
+on the diagonal, and U, without pivoting. A row of the factors depends on earlier rows only. If
+bonds have changed, it is therefore sufficient to assemble and factorise the rows from the first
+affected follower on. The entries of A are computed from the moves that a unit displacement of each
+neighbour causes in a body at rest; for linear rules they are exact. The same equilibria take 20
+times as long without this kernel (docs/decisions/0010).
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ from pbdkit.stepping.numba_engine.sweeps import write_bond_pass, write_general
 from pbdkit.stepping.state import State, unmoved_state
 
 SAME = 1e-12
-"""Difference of entries, relative to a move, that counts as rounding."""
+"""Two entries are regarded as equal if their difference, relative to a move, is at most this
+number."""
 SAFETY = 3.0
 """Safety factor of the estimated norm of A⁻¹."""
 
@@ -73,8 +76,8 @@ def are_alike(blocks: Any) -> Any:
 
 
 def assemble(band: Any, blocks: Any, pattern: Any, first: int, wide: int) -> None:
-    """Assemble the rows of A from follower `first` on. A follower that does not move has a row of
-    zeros, of which the diagonal becomes 1."""
+    """Assemble the rows of A from follower `first` on. The row of a follower that does not move
+    would contain only zeros; its diagonal entry is set to 1."""
     first_entry, slot, column, weight = pattern
     half, inner = band.shape[1] // 2, wide if wide > 1 else 1
     for e in range(first, len(blocks)):
@@ -133,10 +136,10 @@ def solve(band: Any, inverse: Any, x: Any) -> None:
 def refactor(
     work: Any, blocks: Any, pattern: Any, factors: Any, facts: Any, first: int, is_uniform: bool
 ) -> None:
-    """Update the factors from follower `first` on. `facts` contains the number of unknowns of a
-    follower, the norm of A⁻¹ estimated from random signs, times a safety factor, the largest
-    diagonal entry, and the half-bandwidth in followers; `is_uniform` is true if frame points follow
-    equally along all axes."""
+    """Update the factors from follower `first` on. The entries of `facts` are, in order: the number
+    of unknowns of a follower; the norm of A⁻¹, estimated from random signs and multiplied by a
+    safety factor; the largest diagonal entry; and the half-bandwidth, counted in followers.
+    `is_uniform` is true if frame points follow in the same way along all axes."""
     diagonal, inverse, signs = factors
     count, axes = blocks.shape[0], blocks.shape[2]
     wide = 1 if is_uniform and are_alike(blocks) else axes
@@ -217,8 +220,8 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
 
 def _is_plain(scene: Scene) -> bool:
     """Return whether the kernel supports all features of the scene. It does not support loads,
-    cuts, fields, time-dependent parameters, leaders along one axis, and cells that soften one after
-    the other."""
+    cuts, spatially varying or time-dependent parameters, leaders along one axis only, and fracture
+    models in which cells soften one after the other."""
     experiment, constants = scene.experiment, scene.constants
     varies = any(
         (
@@ -251,9 +254,10 @@ Entry = tuple[Indices, Indices, Indices, Floats]
 @dataclass(frozen=True)
 class Pattern:
     """Couplings of the followers. `place` is the flat place of each follower. The entries from
-    `first[e]` to `first[e + 1]` belong to follower e. The coupling to the follower `column` is the
-    derivative of the move of e with respect to its neighbour along `slot` (or, if `slot` is the
-    last one, to itself), times `weight` (entry, axis, axis)."""
+    `first[e]` to `first[e + 1]` belong to follower e. An entry couples e to the follower `column`.
+    Its value is the derivative of the move of e with respect to the displacement of its neighbour
+    along `slot`, times `weight` (entry, axis, axis). If `slot` is the last one, the derivative is
+    with respect to the displacement of e itself."""
 
     place: Indices
     first: Indices
@@ -317,9 +321,9 @@ def _entries(scene: Scene, place: Indices) -> Iterator[Entry]:
 
 
 def _followed(scene: Scene, places: Indices) -> Iterator[tuple[Indices, Indices, Floats]]:
-    """Generate the indices of those places that are frame points, with a body place that each point
-    follows, and its weight. The first body place of each point is generated first, then the second
-    of each, and so on."""
+    """Generate triples of arrays: the indices of those places that are frame points, a body place
+    that each of these points follows, and the weight of this body place. The first triple contains
+    the first body place of each point, the second triple the second one, and so on."""
     if (frame := scene.frame) is None:
         return
     point_at = np.full(scene.raster.kind.size, -1)
@@ -337,22 +341,22 @@ def _followed(scene: Scene, places: Indices) -> Iterator[tuple[Indices, Indices,
 
 
 UNFINISHED = 0
-"""Result of a call: bonds may change further."""
+"""Result of a call: bonds may still change."""
 SETTLED = 1
 """Result of a call: no bond changes any more."""
 FAILED = 2
 """Result of a call: the band matrix is not accurate enough. Followers are at the last
 equilibrium."""
 ROWS = "int64(0)", "int64(kind.shape[1])"
-"""Arguments for all rows of the lattice."""
+"""Arguments that stand for all rows of the lattice."""
 
 
 def write_settling(plan: Plan) -> tuple[str, list[str]]:
     """Return the source of a module with ``run(arrays, step, tolerance, slack, most)``.
 
-    The function computes at most `most` equilibria, to within the length `tolerance`, and ignores
-    relative changes of state variables up to `slack`. It returns the number of changes of bonds,
-    and the result.
+    The function computes at most `most` equilibria. Their error is at most the length `tolerance`,
+    and relative changes of state variables of at most `slack` are ignored. It returns the number of
+    changes of bonds, and the result.
     """
     (level,) = plan.levels
     general = write_general(plan, level, None)
@@ -403,7 +407,8 @@ def _write_derivative(plan: Plan, general: Function) -> Function:
 
 
 def _bonds(plan: Plan, pattern: str) -> list[str]:
-    """Return the pattern once for each state variable of bonds, with # replaced by its number."""
+    """Return copies of a pattern of source text, one for each state variable of bonds, in which #
+    is replaced by the number of the variable."""
     return [pattern.replace("#", str(n)) for n in range(plan.bonds)]
 
 
@@ -497,10 +502,11 @@ a second."""
 
 
 class Settler:
-    """Kernel for a linear rule, with its band matrix. Nothing else is stored between two
-    increments. The matrix depends on the bonds alone, to the last bit.
+    """Kernel for a linear rule, with its band matrix, which is all that is stored between two
+    increments. All bits of the matrix are determined by the bonds, so that a resumed run has the
+    same results.
 
-    Raises PluginError for parts that cannot be compiled.
+    Raises PluginError if functions of the rule or the fracture model cannot be compiled.
     """
 
     def __init__(self, scene: Scene, tolerance: float, watch: Watch) -> None:
@@ -520,7 +526,7 @@ class Settler:
         size = np.array(scene.raster.shape[1:])
         box = np.stack([np.zeros_like(size), size], axis=1).ravel().astype(np.int64)
         self._constant = constant_arrays(plan) | {"box": box}
-        if plan.tears:  # Every follower counts as marked; marks are written but not read.
+        if plan.tears:  # Every follower is treated as marked; marks are written but not read.
             self._constant["torn"] = np.zeros(scene.raster.shape, np.uint8)
         self._roles: tuple[bool, ...] = ()
         self._of_roles: Arrays = {}
@@ -587,7 +593,8 @@ class Settler:
         planes = [f"{name}_{c}" for name in ("v", "still") for c in self._plan.axes]
         signs = np.random.default_rng(0).choice([-1.0, 1.0], count * axes)
         return {
-            # The first entries are runs of a single place, one for each follower.
+            # The first entries describe one run for each follower, which consists of a single
+            # place.
             "runs": np.concatenate([alone, self._runs]).astype(np.int64),
             "body": np.array(self._body, np.int64) + np.array([0, count, count]),
             "place": pattern.place,

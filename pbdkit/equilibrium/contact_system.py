@@ -1,8 +1,8 @@
 """Linear system of an equilibrium in contact with obstacles, by an active set.
 
-A step displaces followers to y = u + move. Those inside an obstacle are projected onto x, the
-nearest point outside in the metric S of the particle (stepping/contact.py). The derivative T =
-∂x/∂y is 1 for a free particle, 0 for a particle at a corner where faces meet, and
+A step displaces followers to y = u + move. A follower with y inside an obstacle is projected onto
+x, the nearest point outside in the metric S of the particle (stepping/contact.py). The derivative T
+= ∂x/∂y is 1 for a free particle, 0 for a particle at a corner where faces meet, and
 
     T = t tᵀ S / (t·S t - κ n·S (x - y))
 
@@ -11,9 +11,9 @@ linearisation is
 
     Ã = 1 - T (1 - A), with the matrix A of the body alone,
 
-so that corrections leave particles in contact on the outline, along which they are free. This is a
-semi-smooth Newton iteration (Hintermüller, Ito and Kunisch, SIAM J. Optim. 13, 2002), which ends
-when the active set is constant.
+so that a correction moves a particle in contact only along the outline of the obstacle. This is a
+semi-smooth Newton iteration (Hintermüller, Ito and Kunisch, SIAM J. Optim. 13, 2002). It ends when
+the active set, the set of particles in contact, no longer changes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from pbdkit.stepping.state import State
 
 WEAK = 1e-6
 """Stiffness of the weak springs that hold particles at their current positions, relative to the
-stiffness with which its bonds hold a particle."""
+stiffness of the bonds of a particle."""
 NO_FACE = -1
 """Index of a missing face."""
 REMEDY = "constrain it with a leader group, or use solver: {type: stepping}"
@@ -92,8 +92,8 @@ class ContactSystem(System):
         ]
 
     def _part(self, matrix: Any, members: Indices, held: bool) -> Subsystem:
-        """Return the system of a part. A part that is held has an inverse. If it has a free motion
-        nevertheless, it is treated like a floating part."""
+        """Return the system of a part. The matrix of a held part can be inverted. A part that is
+        held but nevertheless has a free motion is treated like a floating part."""
         part_matrix = matrix if len(members) == matrix.shape[0] else matrix[members][:, members]
         if held:
             coordinates = Coordinates(2, self._X[members[::2] // 2], self._led)
@@ -108,8 +108,8 @@ class ContactSystem(System):
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound: computed from the inverse, or from a solution if some part has no
-        inverse."""
+        """Kind of the bound: computed from the inverse matrices or, if the inverse of some part is
+        not available, from a solution."""
         ways = {part.bound_kind for _, part in self._parts}
         return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
 
@@ -170,9 +170,9 @@ class ContactSystem(System):
         return math.inf
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the bound: another solution, for the remaining moves, plus the effect of rounding.
-        Rounding affects the displacements of all followers, and the positions of those in
-        contact."""
+        """Return the bound on the distance: the size of the solution for the remaining moves, plus
+        the effect of rounding. Rounding affects the displacements of all followers, and also the
+        positions of the followers in contact."""
         r, far = self._table(moves), [0.0]
         for n, (members, part) in enumerate(self._parts):
             far.append(part.farthest(r[members], rounding * self._share_of_places))
@@ -189,7 +189,7 @@ class ContactSystem(System):
         return self._spreads[n]
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """Raise ExperimentError if a floating part has moves."""
+        """Raise ExperimentError if the moves of a floating part exceed their rounding error."""
         r = self._table(moves)
         for members in self._floats:
             if np.abs(r[members]).max(initial=0.0) > 8 * rounding:
@@ -201,7 +201,8 @@ class ContactSystem(System):
             raise self._not_unique(members)
 
     def is_loose(self, moves: Floats, rounding: float) -> bool:
-        """Return whether a part that is not yet constrained has moves."""
+        """Return whether particles of a floating part, which no leader or obstacle holds yet, still
+        move."""
         r = self._table(moves)
         return any(np.abs(r[members]).max(initial=0.0) > 8 * rounding for members in self._floats)
 
@@ -210,8 +211,8 @@ class ContactSystem(System):
         return self._planes(np.where(self._on_outlines, self._table(moves), 0.0))
 
     def solve_loose(self, moves: Floats, most: float) -> Floats:
-        """Return a correction of at most `most`, with weak springs on all parts: it moves floating
-        parts towards obstacles."""
+        """Return a correction of at most `most`, computed with weak springs on all parts. It moves
+        floating parts towards obstacles."""
         matrix = self._matrix + WEAK * _one(self._matrix)
         coordinates = Coordinates(2, self._X, self._led)
         correction = ConstrainedSubsystem(matrix, "lu", coordinates, self._watch).solve(
@@ -245,8 +246,10 @@ def hold(
 ) -> tuple[Indices, Floats]:
     """Return the faces on which followers at flat places rest, and T of each follower.
 
-    The followers are moved from displacements u. Faces are (follower, 2), NO_FACE where there is
-    none; of more than two faces the first two are used. T is (follower, axis, axis).
+    The followers rest at the positions to which a step moves them from the displacements u. The
+    faces are an array (follower, 2) with NO_FACE for a missing face; if a follower rests on more
+    than two faces, the first two are returned. T, the derivative ∂x/∂y of the projection, is
+    (follower, axis, axis).
     """
     y, codes = contact.positions(u, place), contact.led(math.ceil(moment))
     roles = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]

@@ -67,7 +67,8 @@ class Certificate:
     bound : str
         Kind of the bound.
     linearised : bool
-        Whether the rule is not linear. The bound is then of first order, with a factor of 2.
+        True if the rule is not linear. The bound is then computed from the linearisation and
+        multiplied by a safety factor of 2.
     """
 
     method: str
@@ -113,7 +114,8 @@ UNKNOWN = Certificate(
 
 
 class UnconvergedError(Exception):
-    """The best state found is not an equilibrium; the error has its error bound."""
+    """The best state found is not an equilibrium. The exception contains the error bound of this
+    state."""
 
     def __init__(self, reason: str, certificate: Certificate = UNKNOWN) -> None:
         super().__init__(reason)
@@ -134,9 +136,9 @@ def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
 
 
 def _displacement_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
-    """Return the largest displacement that changes of the loads cause, linearised at rest; 0 if
-    nothing holds the body against them. If obstacles prevent every displacement, return the largest
-    move of the loads without obstacles."""
+    """Return the largest displacement that changes of the loads cause, computed by the
+    linearisation at rest; 0 if nothing holds the body against the loads. If obstacles prevent every
+    displacement, return the largest move that the loads cause without obstacles."""
     steps, moves, ways = scene.experiment.steps, Moves(scene), [0.0]
     rest = replace(rest, u=np.zeros(rest.u.shape))
     moments = {*scene.loads.changes(steps), *bends_of(scene)} if scene.loads else ()
@@ -166,22 +168,22 @@ LINEAR = 1e-9
 """Ratio of the moves after a correction to those before it, below which the rule counts as
 linear."""
 FIRST_ORDER = 2.0
-"""Safety factor of bounds of first order."""
+"""Safety factor of bounds that are computed from a linearisation."""
 ACCURACY = 1e-8
 """Relative accuracy of linear systems; the bound includes the remaining error."""
 
 CONTRACTION = 0.1
 """Largest ratio of the moves after a correction to those before it for which the linearisation is
-valid. Further corrections, each smaller by this ratio, then add up to at most a ninth of the
-first."""
+valid. Further corrections, each of them this ratio times the previous one, then add up to at most a
+ninth of the first correction."""
 TOO_NONLINEAR = "the rule is too nonlinear between the state and equilibrium for a bound"
 """Reason for an infinite distance under a rule that is too nonlinear."""
 
 
 @dataclass(frozen=True)
 class PredictedEquilibrium:
-    """Predicted equilibrium `u` with its error bound; `obstacle` is the reason for an infinite
-    distance."""
+    """Predicted equilibrium `u` with its error bound. If the distance of the bound is infinite,
+    `obstacle` is the reason."""
 
     u: Floats
     certificate: Certificate
@@ -193,12 +195,12 @@ class ErrorBound:
 
     The correction c, with A c = move, leads from u to the equilibrium. Its error follows from the
     moves at u + c: distance ≤ max ‖c‖ + (bound on ‖A⁻¹‖) · ‖move(u + c)‖. If the rule is not
-    linear, A is linearised at u; the second term is then a bound of first order and is doubled, and
-    the correction has to reduce the moves to a tenth.
+    linear, A is the linearisation at u. The second term then neglects terms of higher order and is
+    doubled, and the correction has to reduce the moves to a tenth.
 
-    A prediction depends on the state alone, so that a resumed run has the predictions of the
-    uninterrupted one. Only factors of matrices are stored between two predictions, since iterative
-    solvers depend on earlier solutions.
+    A prediction depends on the state only, so that a resumed run has the same predictions as an
+    uninterrupted one. For this reason only factors of matrices are stored between two predictions:
+    the results of iterative solvers would depend on earlier solutions.
     """
 
     def __init__(self, scene: Scene, scale: float, watch: Watch) -> None:
@@ -270,7 +272,7 @@ class ErrorBound:
     def _correction(
         self, state: State, system: System, moves: Floats, anew: bool
     ) -> tuple[Floats | None, str]:
-        """Return the correction; None, with the reason, if no equilibrium is known."""
+        """Return the correction, or None with the reason why no equilibrium can be predicted."""
         try:
             if anew:
                 system.refuse_moving_floats(moves, self._moves.rounding(state.u))
@@ -291,27 +293,28 @@ class ErrorBound:
 
 
 FINEST = 256
-"""The next check follows after at least the number of steps since the first check, divided by this
-number."""
+"""The interval to the next check is at least the number of steps since the first check, divided by
+this number."""
 COARSEST = 4
-"""The next check follows after at most the number of steps since the first check, divided by this
-number."""
+"""The interval to the next check is at most the number of steps since the first check, divided by
+this number."""
 OVERDUE = 4
 """A bound is computed, even if steps do not shrink (because of rounding, or vibrations), when the
 number of steps since the first check has increased by this factor."""
 NEVER = 2**62
-"""Number of a step that no run reaches."""
+"""Step after the end of any run."""
 
 
 @dataclass
 class Pace:
     """Schedule of the checks for a steady state.
 
-    If the modes of a symmetric step decay by ρ or faster, the sizes of its steps decay at a rate of
-    at least -ln ρ, which decreases. The distance is extrapolated from two checks: distance ≈ ρ / (1
-    - ρ) · ‖last step‖, with ρ from the ratio of the sizes of two steps. The extrapolated distance
-    is too small, so that checks are early rather than late; it is exact once a single mode remains.
-    The estimate determines when a bound is computed, and not its value.
+    If the step operator is symmetric and all its eigenvalues are at most ρ, the displacements of
+    successive steps decay at a rate of at least -ln ρ, which decreases during the run. The distance
+    is extrapolated from two checks: distance ≈ ρ / (1 - ρ) · ‖last step‖, where ρ is determined
+    from the ratio of the sizes of two steps. The extrapolated distance is too small as long as
+    several modes remain, and exact for a single mode. Checks are therefore early rather than late.
+    The estimate determines when a bound is computed, and not the value of the bound.
     """
 
     next_look: int
@@ -322,7 +325,7 @@ class Pace:
     rate: float = 0.0
     """Rate of decay in each step; 0 if there is none."""
     seen: tuple[int, float] | None = None
-    """Step of the last check, and size of that step."""
+    """Step of the last check, and the norm of its displacements."""
     bounded: tuple[int, float] | None = None
     """Step of the last bound, and its distance."""
     overdue: int | None = None
@@ -335,7 +338,8 @@ class Pace:
             self.rate = _rate(self.seen, (step, size))
         self.seen = (step, size)
         elapsed = step - self.begin
-        # Two states within the tolerance are at most twice the tolerance apart.
+        # Two states with a distance of at most the tolerance from equilibrium differ by at most
+        # twice the tolerance.
         short = longest <= 2.0 * self.tolerance
         if short and self.overdue is None:
             self.overdue = OVERDUE * elapsed
@@ -376,7 +380,8 @@ def _distance(length: float, rate: float) -> float:
 
 
 def _steps_until(value: float, wanted: float, rate: float) -> float:
-    """Return the number of steps in which a decaying value reaches another."""
+    """Return the number of steps in which a value that decays at this rate decreases to the wanted
+    value."""
     if value <= wanted:
         return 0.0
     return math.log(value / wanted) / rate if rate > 0.0 and math.isfinite(value) else math.inf
@@ -386,9 +391,10 @@ class SteadyStateMonitor:
     """Detection of the steady state of a run.
 
     In a steady state roles are constant, leaders rest, the distance of all followers from
-    equilibrium is within the tolerance, and no bond can break before equilibrium is reached. If the
-    step depends on the state before it, a body may vibrate about its equilibrium: the displacement
-    that momentum and frame delay may still cause is added to the distance.
+    equilibrium is within the tolerance, and no bond can break before equilibrium is reached. With
+    momentum or a frame delay, a step also depends on the previous state, and a body near its
+    equilibrium may still vibrate about it. The displacement that they may still cause is therefore
+    added to the distance.
     """
 
     def __init__(self, scene: Scene, settle: Settle, start: State, watch: Watch) -> None:
@@ -403,13 +409,13 @@ class SteadyStateMonitor:
         self._carrying = _carrying(scene)
         unended = "leaders do not come to rest before its end"
         self.obstacle = "there are too few steps" if ends else unended
-        """Reason why the last check found no steady state."""
+        """Reason why the state at the last check was not a steady state."""
 
     def look(self, state: State) -> Certificate | None:
         """Return the error bound if the end of a step is a steady state.
 
         Raises StoppedError if the user interrupts. If there is no bound or the user interrupts, the
-        schedule is unchanged, so that another check has the same result.
+        schedule is not changed, so that repeating the check has the same result.
         """
         pace, certificate = replace(self.pace), None
         try:
@@ -445,15 +451,15 @@ class SteadyStateMonitor:
             return (
                 f"{at} the distance from equilibrium, {distance:.2g}, exceeds {self._tolerance:.2g}"
             )
-        ahead = 2.0 * distance  # The distance applies to both ends of a bond.
+        ahead = 2.0 * distance  # Each end of a bond can move by the distance.
         if self._fracturing and self._fracturing.may_break(outlook.u, state, ahead):
             return f"{at} a bond may break within the remaining distance of {distance:.2g}"
         return ""
 
 
 def _carrying(scene: Scene) -> float:
-    """Return the displacement that may follow the last step, relative to that step: |b| / (1 - |b|)
-    for the momentum b, since each further step is b times the one before, plus the delay of the
-    frame."""
+    """Return a bound on the displacement after the last step, divided by the displacement in that
+    step. For the momentum b it is |b| / (1 - |b|), because each further displacement is b times the
+    previous one. The frame delay is added."""
     memory = abs(scene.experiment.stepping.memory)
     return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + scene.lag

@@ -1,16 +1,17 @@
-"""Compiled loops over the rows of grids: coarsening, updates of fields in iterations, relaxation.
+"""Compiled loops over the rows of grids. They coarsen a grid, update the fields of an iteration,
+and relax.
 
 A grid has two arrays (row, place): `code` is the index of the stencil in `own`, -1 where no
-particle is free; `kind` is 0 outside, 1 at free particles, 2 at leaders. `halved` are the axes
-along which the next grid has half the places. Along these axes place n of the next grid coincides
-with place 2n - 1 of this grid, along the other axes with place n. Fields are planes (axis, row,
-place), zero where no particle is free; the outermost ring is never free.
+particle is free; `kind` is 0 outside, 1 at free particles, 2 at leaders. The next grid is the next
+coarser one. It has half the places along the axes `halved`: there its place n coincides with place
+2n - 1 of this grid. Along the other axes its place n coincides with place n. Fields are planes
+(axis, row, place), zero where no particle is free; the outermost ring is never free.
 
-A row consists of runs of places, from `begin` to `end`, that share the stencil `same`, and of lone
-places with stencils `own[which]`. A stencil is 3 × 3 places, row by row, of 4 numbers: xx, xy, yx,
-yy. Even rows and odd rows are relaxed alternately; all places of a row are relaxed from the same
-state. Sums are computed row by row, so that the result does not depend on the number of rows
-processed at a time.
+A row consists of runs and lone places. A run contains the places from `begin` to `end`, which all
+have the stencil `same`; a lone place has the stencil `own[which]`. A stencil has 3 × 3 places, row
+by row, with 4 numbers each: xx, xy, yx, yy. Relaxation alternates between the even and the odd
+rows; all places of a row are updated simultaneously. Sums are computed row by row, so that the
+result does not depend on the number of rows processed at a time.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ import numpy as np
 from numba import njit
 
 KEPT = globals().get("KEPT", False)
-"""True if numba stores the compiled functions on disk."""
+"""True if numba caches the compiled functions on disk."""
 
 
 @njit(cache=KEPT)
 def runs(code, first, begin, end, lone, place, which):
-    """Fill the lists of a grid; return the numbers of runs and lone places. Lists that are too
-    short are not filled."""
+    """Fill the lists of runs and lone places of a grid, and return how many there are of each.
+    Lists that are too short are not filled."""
     r = s = 0
     for i in range(code.shape[0]):
         first[i], lone[i] = r, s
@@ -52,8 +53,9 @@ def runs(code, first, begin, end, lone, place, which):
 
 @njit(cache=KEPT)
 def coarse_kinds(kind, halved, out):
-    """Compute the kinds of the next grid. A place outside is free if free places interpolate from
-    it, unless leaders are nearer."""
+    """Compute the kinds of the next grid. A place of the next grid that lies outside the body is
+    free if values at free places of this grid are interpolated from it, unless leaders are
+    nearer."""
     a1, b1 = halved
     for n in range(1, out.shape[0] - 1):
         for m in range(1, out.shape[1] - 1):
@@ -73,8 +75,8 @@ def coarse_kinds(kind, halved, out):
 @njit(cache=KEPT)
 def coarse_codes(code, kind, halved, out):
     """Compute the codes of the next grid, and return the largest. The code is -1 where no particle
-    is free, and 0 where all stencils around are the most frequent one; all other places are
-    numbered from 1."""
+    is free, and 0 where all stencils of this grid around the place are the most frequent one. All
+    other places are numbered from 1."""
     count = 0
     a1, b1 = halved
     for n in range(out.shape[0]):
@@ -97,8 +99,10 @@ def coarse_codes(code, kind, halved, out):
 
 @njit(cache=KEPT)
 def beside(q, half):
-    """Return the two places of the next grid on either side of distance q, and the weight of the
-    first. Places are indices of a stencil: -1, 0 or 1."""
+    """Return the two places of the next grid between which a place of this grid lies, and the
+    weight of the first of them in the interpolation. The place of this grid is q places away from
+    the one that coincides with the centre of a coarse stencil. The results are counted from that
+    centre: -1, 0 or 1. With `half` the next grid has half the places along the axis."""
     if not half:
         return q, q, 1.0
     return (q - 1) // 2 if q % 2 else q // 2, (q + 1) // 2, 0.5 if q % 2 else 1.0
@@ -106,7 +110,7 @@ def beside(q, half):
 
 @njit(cache=KEPT)
 def galerkin(code, stencils, coarse, halved, out):
-    """Compute out[k], the stencil of Pᵀ K P at the place of the next grid with the number k."""
+    """Compute out[k], the stencil of Pᵀ K P at the place of the next grid that has the code k."""
     a1, b1 = halved
     for n in range(1, coarse.shape[0] - 1):
         for m in range(1, coarse.shape[1] - 1):
@@ -135,8 +139,8 @@ def galerkin(code, stencils, coarse, halved, out):
 
 @njit(cache=KEPT)
 def asymmetry(code, stencils):
-    """Return the largest entry of K - Kᵀ. For the most frequent stencil one pair in each direction
-    suffices."""
+    """Return the largest entry of K - Kᵀ. Of the places with the most frequent stencil, one pair of
+    neighbours in each direction is sufficient."""
     worst, is_checked, unchecked = 0.0, np.zeros(9, np.bool_), 9
     for i in range(1, code.shape[0] - 1):
         for j in range(1, code.shape[1] - 1):
@@ -173,9 +177,10 @@ def symmetrise(code, stencils):
 
 @njit(cache=KEPT)
 def balance(code, stencils, factor):
-    """Compute the row factors that make K as symmetric as possible, starting from the neighbours of
-    places with a factor that is not 0. Return the number of places without a factor, afterwards and
-    before."""
+    """Compute the row factors that make K as symmetric as possible. Places that already have a
+    factor, which is not 0, keep it; from them the computation spreads to their neighbours, until no
+    further factor can be determined. Return the number of places without a factor after and before
+    the call."""
     initial = 0
     for i in range(code.shape[0]):
         for j in range(code.shape[1]):
@@ -228,8 +233,8 @@ FAST = {"error_model": "numpy", "nogil": True, "cache": KEPT, "fastmath": True}
 
 @njit(**FAST)
 def descend(a, p, q, x, r, share, out, sums):
-    """Compute x += a p, r -= a q and out = share · r in the precision of `out`. `sums`, by row, are
-    r · r and the largest |a p|."""
+    """Compute x += a p, r -= a q, and out = share · r in the precision of `out`. For each row,
+    `sums` receives r · r and the largest |a p|."""
     sums[:] = 0.0
     for v in range(2):
         for i in range(x.shape[1]):
@@ -257,7 +262,7 @@ def turn(share, z, beta, p):
 
 @njit(**FAST)
 def dot(a, b, sums):
-    """Compute sums, by row, of a · b."""
+    """Compute the scalar product a · b of each row."""
     sums[:] = 0.0
     for v in range(2):
         for i in range(a.shape[1]):
@@ -300,8 +305,8 @@ def prolong(first, begin, end, lone, place, coarse, halved, x):
 
 @njit(**FAST)
 def differences(still, moved, place, number, share, axis, out):
-    """Write share · (still - moved) at flat places into entry `number` of their stencils, as the
-    derivative with respect to an axis. Return the largest value."""
+    """Write share · (still - moved) at flat places into entry `number` of their stencils. This is
+    the derivative with respect to a displacement along `axis`. Return the largest value."""
     largest = 0.0
     for n in range(place.size):
         for v in range(2):
@@ -336,14 +341,15 @@ def run_fields():
 
 
 Grid = namedtuple("Grid", "first begin end lone place which same own inverse own_inverse")
-"""Grid as an argument of kernels: for each row the `first` run and the first `lone` place, with the
-total numbers at the end; the stencils, and the inverses of their diagonal blocks."""
+"""Grid as an argument of kernels. It contains for each row the indices of the `first` run and of
+the first `lone` place, followed by the total numbers of runs and lone places; and it contains the
+stencils and the inverses of their diagonal blocks."""
 
 
 @njit(**FAST)
 def around(x, i, lo, hi):
-    """Return the rows before, at and after a run, along x and y, from one place before the run to
-    one after."""
+    """Return views of the row of a run and of the rows before and after it, for the components
+    along x and y. The views extend from one place before the run to one place after it."""
     lo, hi = lo - 1, hi + 1
     previous, following = (
         (x[0, i - 1, lo:hi], x[1, i - 1, lo:hi]),
@@ -385,7 +391,7 @@ def of_lone(grid, e, x, i):
 
 @njit(**FAST)
 def product(grid, x, out, sums):
-    """Compute out = K x; sums, by row, are x · K x."""
+    """Compute out = K x, and x · K x of each row in `sums`."""
     for i in range(grid.first.size - 1):
         part = 0.0
         for e in range(grid.first[i], grid.first[i + 1]):
@@ -450,7 +456,7 @@ def relax(grid, b, x, row, weight, start, upwards):
     is a buffer for one row."""
     rows = grid.first.size - 1
     for i in range(1 if upwards else 0, rows + 1, 2):
-        # Row i, and row i - 1, between two rows that are now relaxed.
+        # Relax row i, then row i - 1, since both rows next to row i - 1 are relaxed by then.
         if i < rows:
             if start:
                 clear(x, i)
@@ -509,7 +515,7 @@ def whole_residual(grid, i, b, x, out):
 
 @njit(**FAST)
 def add_rows(sums, row, share, anew):
-    """Compute sums (+)= share · row for both axes."""
+    """Add share · row to `sums` for both axes or, with `anew`, replace `sums` by it."""
     for v in range(2):
         to, of = sums[v], row[v]
         if anew:
@@ -522,7 +528,8 @@ def add_rows(sums, row, share, anew):
 
 @njit(**FAST)
 def scaled(grid, same, table, moves, out):
-    """Compute out = S moves at free places, with S by stencil as 4 numbers."""
+    """Multiply the moves at free places by S. The 2 × 2 matrix S of a place is given by its
+    stencil, as 4 numbers."""
     for i in range(grid.first.size - 1):
         for e in range(grid.first[i], grid.first[i + 1]):
             lo, hi = grid.begin[e], grid.end[e]

@@ -1,7 +1,7 @@
 """Krylov iterations on stencils, preconditioned by multigrid, with estimates of their error.
 
-The cycle is computed in single precision and everything else in double precision, which does not
-increase the number of iterations.
+The multigrid cycle is computed in single precision, and everything else in double precision. Single
+precision in the cycle does not increase the number of iterations.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from pbdkit.equilibrium.system import ALL, Rows
 MAX_ITERATIONS = 400
 """Maximum number of iterations."""
 ALIKE = 1e-13
-"""Relative size below which the part of a field that is linearly independent of the others is
-regarded as zero."""
+"""Relative singular value (`rcond` of `lstsq`) below which combinations of fields are discarded,
+because the fields are nearly linearly dependent."""
 SLOWEST = 0.9
-"""Largest ratio of successive jumps from which the distance is extrapolated."""
+"""The distance is extrapolated from successive jumps only if their ratio is at most this number."""
 
 
 def best_of(krylov: LatticeKrylov, near: Sequence[Floats], b: Floats) -> Floats | float:
-    """Return the Galerkin solution of K x = b in the span of some fields, 0 if there is none.
+    """Return the Galerkin solution of K x = b in the span of the fields `near`, or 0 if there are
+    no fields.
 
     The residual is orthogonal to the fields; where K is symmetric the energy is minimal. b is
     overwritten with the residual.

@@ -1,10 +1,11 @@
 """Linear system of an equilibrium, solved on the stencils of the lattice.
 
-The error e of a state satisfies K e = r. Some iterations remove most of it. The energy of the
-remaining error is at most rᵀ B r / λ, with the multigrid cycle B and the smallest eigenvalue λ of B
-K, which conjugate gradients estimate (Lanczos). The displacement of a place is at most √(g ·
-energy), where g is the compliance of the place, extrapolated from coarse grids. These are estimates
-and not rigorous bounds; for safety λ is halved.
+The error e of a state satisfies K e = r. A few iterations remove most of the error. The energy of
+the remaining error is at most rᵀ B r / λ, where B is the multigrid cycle and λ is the smallest
+eigenvalue of B K. λ is estimated from the coefficients of conjugate gradients (Lanczos). The
+displacement of a place is at most √(g · energy), where g is the compliance of the place and is
+extrapolated from coarse grids. λ and g are estimates, so that the bound is not rigorous; for safety
+λ is halved.
 
 The slowest mode of the steps is computed by inverse iteration, v ← A⁻¹ v.
 """
@@ -69,8 +70,8 @@ ENOUGH = 8
 
 
 def compliance(grids: Multigrid | PartedGrids) -> float:
-    """Estimate the largest displacement of a place under a unit load. From the coarsest grid to the
-    next finer one it increases by a certain amount; the same increase is assumed for each finer
+    """Estimate the largest displacement of a place under a unit load. The increase from the
+    coarsest grid to the next finer one is computed; the same increase is assumed for each further
     grid."""
     coarse, last = grids.whole, len(grids) - 1
     axis, place, displacement = coarse.softest
@@ -117,13 +118,14 @@ TURN = 3
 
 @dataclass(frozen=True)
 class SlowMode:
-    """Slowest mode of the steps as planes, and its slowness 1 / (1 - λ) with the eigenvalue λ."""
+    """Mode of the steps that decays most slowly. `planes` are its displacements, (axis, sublattice,
+    cell, cell), and `slowness` is 1 / (1 - λ) with its eigenvalue λ."""
 
     planes: Floats
     slowness: float
 
     def improved(self, system: System, accuracy: float) -> SlowMode:
-        """Return the mode after one inverse iteration, with an accuracy relative to the result."""
+        """Return the mode after one inverse iteration, which is solved with a relative accuracy."""
         force = self.planes / np.abs(self.planes).max()
         planes = system.solve(force, accuracy * self.slowness)
         return SlowMode(planes, float((planes * planes).sum() / (planes * force).sum()))
@@ -144,12 +146,12 @@ def softest(grids: Multigrid, krylov: type[LatticeKrylov]) -> tuple[Floats, floa
 
 
 LOOKS_AHEAD = 2
-"""Number of iterations for a bound."""
+"""Number of iterations that remove most of an error before the remainder is bounded."""
 SAFETY = 2.0
 """Divisor of the estimated eigenvalue λ."""
 NEAR = 0.01
-"""An iteration has removed most of an error if the estimated distance is at most this fraction of
-its first jump."""
+"""An iteration counts as having removed most of an error if the estimated distance from the
+solution is at most this fraction of the first jump of the iteration."""
 TURNS = 6
 """Number of inverse iterations."""
 
@@ -185,12 +187,13 @@ class LatticeSystem(System):
 
     @property
     def methods(self) -> str:
-        """Names of multigrid and of the iteration that it preconditions."""
+        """Names of the multigrid method and of the iteration that is preconditioned by it."""
         return f"multigrid, {self._solver.name}"
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound: by energy for a symmetric matrix, otherwise by the iteration."""
+        """Kind of the bound: for a symmetric matrix it is computed from the energy of the error,
+        otherwise from the jumps of the iteration."""
         return "energy" if self._symmetric else "iteration"
 
     @property
@@ -215,7 +218,7 @@ class LatticeSystem(System):
         return self._planes(self._to_share(self._pull(moves), share, fields))
 
     def pushed_by(self, led: Floats) -> Floats | None:
-        """Return -S⁻¹ K led."""
+        """Return -S⁻¹ K led, the moves of followers for displacements `led` of their leaders."""
         if not self._has_leaders:
             return None
         pull, out = (
@@ -229,8 +232,8 @@ class LatticeSystem(System):
         return self._planes(out)
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """Return Sᵀ K⁻ᵀ weights, the solution with the transpose of A⁻¹ = K⁻¹ S. For a symmetric K
-        the same grids are used, otherwise those of the transpose."""
+        """Return Sᵀ K⁻ᵀ weights, the solution with the transpose of A⁻¹ = K⁻¹ S. If K is symmetric,
+        the grids of K are used, otherwise grids of Kᵀ."""
         b, out = free_field_of(self._matrix, weights), self._grids.grid().field(np.float64)
         solver = self if self._symmetric else self._transposed
         x = solver._to_share(b, share, ())
@@ -266,14 +269,15 @@ class LatticeSystem(System):
         )
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
-        """Return the relative mismatch of forces."""
+        """Return the mismatch relative to K c, in which moves are converted to forces."""
         solver, pull = self._solver, self._solver.product(field_of(self._matrix, c))
         difference = self._pull(after) - self._pull(before) + pull
         return math.sqrt(solver.dot(difference, difference) / solver.dot(pull, pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the sum of the error that some iterations remove, of a bound on the remaining
-        error, and of a bound on the effect of rounding. Rounding errors are taken to be random."""
+        """Return the sum of three terms: the error that a few iterations remove, a bound on the
+        remaining error, and a bound on the effect of rounding. Rounding errors are assumed to be
+        random."""
         remainder, length = self._tracked(self._pull(moves))
         if self._spread is None:
             self._spread = self._spread_of_rounding()
@@ -296,9 +300,10 @@ class LatticeSystem(System):
         """Do nothing: the whole body is held."""
 
     def is_stable(self) -> bool:
-        """Return whether the matrix has no negative eigenvalue. For a symmetric matrix, conjugate
-        gradients from the load and from a random right side meet no negative curvature. For other
-        matrices the sign of the eigenvalues nearest to 0 is checked."""
+        """Return whether the matrix has no negative eigenvalue. A symmetric matrix is regarded as
+        such if conjugate gradients encounter no negative curvature, neither for the load nor for a
+        random right side. For other matrices the sign of the eigenvalues nearest to 0 is
+        checked."""
         v = self._rows.random(self._shape)
         if self._symmetric:
             try:
@@ -364,8 +369,8 @@ class LatticeSystem(System):
 
 
 FAITHFUL = 1e-3
-"""Largest relative difference between moves and products with stencils that are computed by
-differences."""
+"""Stencils that are computed by differences of moves are accepted if products with them differ from
+the moves by at most this relative amount."""
 
 
 def lattice_system(

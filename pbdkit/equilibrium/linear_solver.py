@@ -1,12 +1,13 @@
 """Direct and iterative solvers of linear systems of particles with known coordinates.
 
-Small matrices are inverted. Narrow ones are factorised as bands by LAPACK, with particles in rows
-across the shorter side of the body. Others are factorised by SuperLU, in an order with little
-fill-in: nested dissection (A. George, Nested dissection of a regular finite element mesh, SIAM J.
-Numer. Anal. 10, 1973). A strip that no coupling crosses divides the body in two; both halves are
-divided in the same way, and the strip is eliminated last. SuperLU itself does not offer this order.
-Large systems are solved by iteration, with multigrid (amg.py) as preconditioner.
-docs/decisions/0010 contains measurements.
+Small matrices are inverted. Matrices of narrow bodies are factorised as band matrices by LAPACK;
+their unknowns are ordered row by row across the shorter side of the body. Other matrices are
+factorised by SuperLU, with the unknowns in the order of nested dissection, which causes little
+fill-in (A. George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10,
+1973). In this order a strip, which is wide enough that no coupling crosses it, divides the body
+into two halves. Both halves are divided in the same way, and the strip is eliminated last. SuperLU
+itself does not offer this order. Large systems are solved by iteration, with multigrid (amg.py) as
+preconditioner. docs/decisions/0010 contains measurements.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ LARGEST_LU = 30_000
 LARGEST_COUPLED_LU = 200_000
 """Number of unknowns up to which `auto` selects an LU factorisation if the axes are coupled."""
 WIDEST_BAND = 120
-"""Largest half-bandwidth that is factorised as a band. Beyond it, for a square body, the factors of
-a band matrix take more memory than sparse ones, and soon more time."""
+"""Largest half-bandwidth that is factorised as a band. For wider bands, the band factors of a
+square body need more memory than sparse factors and, for slightly wider ones, also more time."""
 PIVOT_THRESHOLD = 0.1
 """A diagonal entry is used as a pivot if it is at least this fraction of the largest entry of its
 column."""
@@ -52,7 +53,7 @@ FEWEST = 1000
 LEAF = 40
 """Number of places up to which a part is not divided."""
 TINY = 1e-300
-"""Smallest reach of couplings; it is positive, so that the reach can be a divisor."""
+"""Lower bound on the reach of couplings. It is positive because the reach is used as a divisor."""
 WIDEST = 0.25
 """Largest fraction of all places in the first strip of a dissection."""
 
@@ -61,9 +62,9 @@ WIDEST = 0.25
 class Coordinates:
     """Coordinates of the unknowns, `axes` for each particle, stored next to each other.
 
-    These are the positions of particles and of leaders, (particle, axis of space), and a mask of
-    the `held` unknowns; their rows and columns have no entry except the diagonal one. The mask is
-    None if no unknown is held.
+    The class contains the positions of the particles and of the leaders, (particle, axis of space),
+    and a mask of the `held` unknowns. The row and the column of a held unknown contain only the
+    diagonal entry. The mask is None if no unknown is held.
     """
 
     axes: int
@@ -128,11 +129,11 @@ class BandLU(LinearSolver):
             raise np.linalg.LinAlgError(f"the pivot of unknown {info} is zero")
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Return the solution by the factors."""
+        """Return the solution, computed with the factors."""
         return self._by_factors(b, 0)
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """Return the solution by the transposed factors."""
+        """Return the solution, computed with the transposed factors."""
         return self._by_factors(b, 1)
 
     def _by_factors(self, b: Floats, trans: int) -> Floats:
@@ -187,11 +188,11 @@ class SparseLU(LinearSolver):
             raise np.linalg.LinAlgError(str(error)) from None
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Return the solution by the factors."""
+        """Return the solution, computed with the factors."""
         return self._by_factors(b, "N")
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """Return the solution by the transposed factors."""
+        """Return the solution, computed with the transposed factors."""
         return self._by_factors(b, "T")
 
     def _by_factors(self, b: Floats, how: str) -> Floats:
@@ -203,8 +204,8 @@ class SparseLU(LinearSolver):
 
 
 class PreconditionedKrylov(LinearSolver):
-    """Conjugate gradients for symmetric matrices, GMRES for others; `grids` returns the multigrid
-    preconditioner of a matrix, or None."""
+    """Conjugate gradients for symmetric matrices, and GMRES for others. The function `grids`
+    returns the multigrid preconditioner of a matrix, or None."""
 
     def __init__(
         self,
@@ -254,8 +255,8 @@ class PreconditionedKrylov(LinearSolver):
         return np.asarray(x)
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """Return the solution with the preconditioner of the transpose, unless the matrix is
-        symmetric."""
+        """Return the solution. If the matrix is not symmetric, a preconditioner is built for its
+        transpose."""
         return (self if self._symmetric else self._transposed).solve(b, accuracy)
 
     @cached_property
@@ -273,8 +274,9 @@ def linear_solver(
     """Return a solver for a matrix that uses the given method; `auto` selects LU up to a certain
     number of unknowns, and multigrid above.
 
-    `coordinates` are those of the unknowns. Multigrid requires them, and LU uses them for the order
-    of elimination. Raises LinAlgError if a factorisation finds the matrix to be singular.
+    `coordinates` are the coordinates of the unknowns. Multigrid requires them, and LU uses them to
+    determine the order of elimination. Raises LinAlgError if a factorisation finds the matrix to be
+    singular.
     """
     size, coupled = matrix.shape[0], coordinates is not None and coordinates.axes > 1
     if method == "auto":
@@ -313,8 +315,8 @@ def is_nearly_symmetric(matrix: Any) -> bool:
 
 def dissected(matrix: Any, places: Floats) -> Indices | None:
     """Return the unknowns of a sparse matrix in the order of nested dissection. `places` (unknown,
-    axis) are their positions; unknowns of one place are adjacent. Return None if couplings extend
-    too far, or if there are few places."""
+    axis) are their positions; unknowns at the same place are adjacent in this order. Return None if
+    couplings extend too far, or if there are so few places that the order saves no time."""
     fresh = np.ones(len(places), bool)
     fresh[1:] = (places[1:] != places[:-1]).any(axis=1)
     sites, every = places[fresh], np.arange(np.count_nonzero(fresh))
@@ -351,8 +353,8 @@ def _dissect(places: Floats, members: Indices, reach: Floats, order: list[Indice
 def _halves(
     places: Floats, members: Indices, reach: Floats
 ) -> tuple[Indices, Indices, Indices] | None:
-    """Return the members below and above a strip across the longer side, and those in the strip;
-    None if one side is empty."""
+    """Return the members on either side of a strip across the longer side of the part, and the
+    members in the strip. Return None if there is no member on one of the sides."""
     positions = places[members]
     sides = np.ptp(positions, axis=0)
     axis = int(sides[1] / reach[1] > sides[0] / reach[0])

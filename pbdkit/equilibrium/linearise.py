@@ -48,11 +48,12 @@ def linearised(
     moves: Moves | None = None,
     rows: Rows = ALL,
 ) -> System:
-    """Return the linear system of a scene at a state, with the roles of the step that contains a
-    moment, by a method of the solver. `moves` are reused if given.
+    """Return the linear system of a scene at a state. The roles are those of the step that contains
+    the moment, and the system is solved by `method`, a method of the solver settings. A given
+    evaluation of `moves` is reused.
 
-    For a scene that is distributed among processes, the only system is the one on stencils. Raises
-    ExperimentError if there is no unique solution, or none on stencils.
+    A scene that is distributed among processes has a system on stencils only. Raises
+    ExperimentError if there is no unique solution, or if such a scene has no system on stencils.
     """
     if rows.strip:
         return _shared(scene, state, math.ceil(moment), watch, rows)
@@ -70,8 +71,8 @@ def linearised(
 
 
 def mismatch_at_rest(scene: Scene, moves: Moves, size: float, method: str, watch: Watch) -> float:
-    """Return the nonlinearity of the moves: System.mismatch of the linearisation at rest, for
-    random displacements of a given size."""
+    """Return a measure of the nonlinearity of the moves: the result of `System.mismatch` for the
+    linearisation at rest and random displacements of a given size."""
     start, steps = initial_state(scene), scene.experiment.steps
     rest = replace(start, u=np.zeros_like(start.u))
     with one_thread():
@@ -89,8 +90,8 @@ def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> 
 
 
 class _Replaceable(System):
-    """System that is replaced by another once its iteration makes no progress, unless the body is
-    unstable at a state that is not at rest."""
+    """System that is replaced by a second one when its iteration stagnates. It is not replaced if
+    the state is not at rest and the body is unstable there."""
 
     def __init__(self, system: System, otherwise: Callable[[], System], *, at_rest: bool) -> None:
         self._system, self._otherwise, self._past = system, otherwise, 0

@@ -1,8 +1,9 @@
-"""Load stepping: from the initial state of a scene to the equilibrium of its last step.
+"""Load stepping from the initial state of a scene to the equilibrium of its last step.
 
 The load is divided into increments if bonds can break or rules are not linear. In each increment
-the body is moved to equilibrium and bonds that are too long break, repeatedly, until no bond
-changes.
+the body is moved to equilibrium and bonds that are too long break; both are repeated until no bond
+changes. A moment is a time in steps; since increments may end within a step, it need not be an
+integer.
 """
 
 from __future__ import annotations
@@ -46,9 +47,9 @@ def finder_of(
     compiles: bool = True,
     rows: Rows = ALL,
 ) -> Finder:
-    """Return the search for equilibria of a scene, from its initial state. `compiles` is false if
-    many scenes with different parameters follow, for which compiling the moves takes more time than
-    it saves."""
+    """Return a `Finder`, which searches for the equilibria of a scene, starting from its initial
+    state. `compiles` should be false for the first of many scenes with different parameters,
+    because compiling the moves of each of them takes more time than it saves."""
     settings, scale = scene.experiment.solver.equilibrium, scale_of(scene, start, rows)
     length = settings.tolerance * scale
     return Finder(scene, length, scale, settings.method, watch or Watch(), compiles, rows)
@@ -59,9 +60,9 @@ SAMPLES = 16
 
 
 def events(scene: Scene) -> list[int]:
-    """Return the ends of steps, from 0 to the last change of the load, between which each leader
-    moves by a single formula, roles and bonds to cut are constant, and loads and parameters change
-    linearly."""
+    """Return the steps at which the loading changes its form, from 0 to the last change of the
+    load. Between two successive ones each leader moves according to a single formula, no role
+    changes, no bond is cut, and loads and parameters are linear functions of the step."""
     steps, last = scene.experiment.steps, last_event(scene)
     steps_of_events = {0, last, *bends_of(scene), *(cut.at - 1 for cut in scene.experiment.cuts)}
     for change in scene.loads.changes(steps) if scene.loads else ():
@@ -101,8 +102,8 @@ def moments(scene: Scene, count: int) -> list[float]:
 
 
 def _in_parts(count: int, ways: list[float]) -> list[float]:
-    """Return the number of increments in each interval, in proportion to the path of the leaders
-    there, or one in each interval if all paths are zero."""
+    """Return the number of increments in each interval. It is proportional to the path of the
+    leaders in the interval; if all paths are zero, it is one."""
     whole = sum(ways)
     return [count * way / whole if whole > 0.0 else 1.0 for way in ways]
 
@@ -122,7 +123,8 @@ def _way(scene: Scene, begin: int, end: int) -> float:
 
 
 def spacings(scene: Scene) -> int:
-    """Return the longest path of an obstacle in lattice spacings, at least 1."""
+    """Return the length of the longest path of an obstacle in lattice spacings, rounded up, and at
+    least 1."""
     ways = [way_of(barrier, scene.experiment.steps) for barrier in scene.barriers]
     return max(1, math.ceil(max(ways, default=0.0) / spacing_of(scene)))
 
@@ -136,11 +138,12 @@ def changes(scene: Scene, steps: int) -> list[int]:
 
 
 VALUES_A_CALL = 200_000_000
-"""Number of values times steps in a call of an engine. A call takes a few tenths of a second."""
+"""Maximum of the number of values of the state times the number of steps in a call of an engine.
+Such a call takes a few tenths of a second."""
 GROWING = 1e-6
 """A mode grows if its eigenvalue exceeds 1 by more than this number."""
 RECORD_LAST = "; or record the equilibrium of the last step only, `record: {{at: [{}]}}`"
-"""Remedy for equilibria of intermediate steps that do not exist."""
+"""Remedy if the equilibrium of an intermediate step does not exist."""
 MOST_SETTLINGS = 2000
 """Maximum number of changes of bonds in an increment."""
 TINY = 1e-9
@@ -151,7 +154,7 @@ REMEDY = (
     "To continue from there, use solver: {type: stepping, relaxation: auto, memory: auto}; "
     "record: {increments: true} keeps the equilibria within steps"
 )
-"""Remedy for a body that came apart."""
+"""Remedy for a body that has broken into parts."""
 MOST_ROUNDS = 40
 """Maximum number of rounds of steps that are made if an equilibrium cannot be followed."""
 STEPS_A_ROUND = 50
@@ -159,17 +162,18 @@ STEPS_A_ROUND = 50
 
 
 class Reached(NamedTuple):
-    """Moment on the path to the last equilibrium, and whether `state` is an equilibrium there.
+    """Point on the path to the last equilibrium: the moment, the state, and `at_rest`, which is
+    true if the state is an equilibrium at this moment.
 
-    The moment and the working state determine everything that follows. `state` is the working state
-    or, for linear rules without fracture, a copy of it at equilibrium.
+    The rest of the path is determined by the moment and the working state. `state` is the working
+    state or, for linear rules without fracture, a copy of it at equilibrium.
     """
 
     moment: float
     state: State
     at_rest: bool
     is_last: bool = False
-    """True if nothing remains to be computed."""
+    """True for the last point of the path."""
 
 
 Way = Generator[Reached, None, Certificate]
@@ -188,17 +192,18 @@ def increments(
     stops: Sequence[int] = (),
 ) -> Way:
     """Move a scene, in place, from its initial state, or from its state at the moment `since`, to
-    the equilibrium of its last step, and yield the states on the way. The equilibria of `stops`,
-    which are steps before the last one, are included.
+    the equilibrium of its last step, and yield the states on the way. These include the equilibria
+    at the steps `stops`, which are earlier than the last step.
 
-    The body is in equilibrium before each change of roles or loads, so that floating parts, and
-    leaders that start later, are at the positions to which slow loading moves them. Floating parts
-    under a load are moved by steps. If bonds can break, and for rules that are not linear, leaders
-    and loads move in increments, within steps too: the body is moved to equilibrium and bonds that
-    are too long break, repeatedly, until no bond breaks.
+    Before each change of roles or loads the body is moved to equilibrium. Floating parts, and
+    particles that become leaders later, are then at the positions to which slow loading moves them.
+    Floating parts under a load are moved by steps. If bonds can break or the rule is not linear,
+    motions and loads are divided into increments, which may be parts of a step. In each increment
+    the body is moved to equilibrium and bonds that are too long break; both are repeated until no
+    bond breaks.
 
     Raises ExperimentError if there is no equilibrium, UnconvergedError, SeparatedError, and
-    StoppedError on interruption; the state is then the last one reached.
+    StoppedError on interruption. After an exception `state` is the last state reached.
     """
     settings, steps = scene.experiment.solver.equilibrium, scene.experiment.steps
     for n, driven in enumerate(scene.driven):
@@ -221,7 +226,8 @@ def increments(
 def settle(
     scene: Scene, state: State, watch: Watch | None = None, finder: Finder | None = None
 ) -> Certificate:
-    """Move a state to the last equilibrium in one call, by a finder if one exists."""
+    """Move a state to the last equilibrium in one call. A given `finder` is used; otherwise one is
+    built."""
     way = increments(scene, state, watch or Watch(), finder=finder)
     while True:
         try:
@@ -232,8 +238,8 @@ def settle(
 
 
 def settle_at_step(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
-    """Move a state, in place, to equilibrium with leaders, loads and parameters as they are at its
-    step, and break bonds that are too long there.
+    """Move a state, in place, to the equilibrium with the leaders, loads and parameters of its
+    step, and break bonds that are too long in that equilibrium.
 
     Raises ExperimentError if there is no equilibrium, and UnconvergedError.
     """
@@ -287,8 +293,8 @@ def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int])
 
 
 def _steps_shrink(scene: Scene, step: int) -> bool:
-    """Return whether steps with the roles of a step have no growing mode; True if the spectrum is
-    not known."""
+    """Return whether no mode grows if steps are made with the roles of the given step. Return True
+    if the spectrum cannot be computed."""
     if excess(scene) or scene.experiment.neighbours.nearness():
         return True
     operator = step_operator(scene.at(step), step=step)
@@ -299,8 +305,8 @@ def _steps_shrink(scene: Scene, step: int) -> bool:
 
 
 def _step_to(last: int, state: State, scene: Scene, finder: Finder) -> Iterator[Reached]:
-    """Make steps, in calls that are short enough for interruptions. The displacement of floating
-    parts under a load depends on the number of steps."""
+    """Make all steps up to `last`, in calls that are short enough for interruptions. All steps are
+    needed because the displacement of floating parts under a load depends on their number."""
     watch, first, engine = finder.watch, state.step, chosen_engine(scene)
     watch.begin("stepping while loads act on unconstrained parts")
     a_call = max(1, int(VALUES_A_CALL / state.u.size))
@@ -344,8 +350,8 @@ def _load(
     since: float,
     stops: Sequence[int],
 ) -> Way:
-    """Move in increments to the last motion or change of roles or loads, and break bonds after
-    each."""
+    """Move in increments to the last motion or the last change of roles or loads, and break bonds
+    after each increment."""
     certificate: Certificate | None = None
     last = every[-1]
     every = sorted({*every, *(stop for stop in stops if stop < last)})
@@ -367,7 +373,7 @@ def _load(
                 # made.
                 _settle_bonds_at(scene, state, finder, since, since, max_changes, step)
             settled, changes = quick.settle(state, moment, max_changes) if quick else (False, 0)
-            if not settled or moment == last:  # It has an error bound.
+            if not settled or moment == last:  # It was an equilibrium.
                 remaining = max(1, max_changes - changes)
                 certificate = _settle_bonds_at(scene, state, finder, since, moment, remaining)
             _refuse_thrown_off(scene, state, farthest)
@@ -386,7 +392,7 @@ def _load(
         since = moment
         if moment < last:
             yield Reached(moment, state, at_rest=True)
-    # Nothing changes any more: all later recorded steps are the same equilibrium.
+    # Nothing changes after this moment: the equilibrium is the same at all later recorded steps.
     for stop in (stop for stop in stops if stop >= last):
         state.step = stop
         yield Reached(stop, state, at_rest=True, is_last=True)
@@ -414,8 +420,9 @@ def _refuse_thrown_off(scene: Scene, state: State, farthest: float) -> None:
 def _is_worth_keeping(
     state: State, moment: float, finder: Finder, error: NoEquilibriumError | UnconvergedError
 ) -> bool:
-    """Return whether the state of a failed increment is an equilibrium except for the tolerance: it
-    has an error bound, and no bond breaks or changes in it."""
+    """Return whether the state of a failed increment is an equilibrium of which only the error
+    bound exceeds the tolerance. The error bound must exist, and no bond may break or change in the
+    state."""
     if not (isinstance(error, UnconvergedError) and finder.linear and moment == int(moment)):
         return False
     if not math.isfinite(error.certificate.distance):
@@ -428,8 +435,8 @@ def _is_worth_keeping(
 def _parting(
     scene: Scene, before: State, failed: State, between: tuple[float, float], error: Exception
 ) -> str:
-    """Return the message for a body that came apart between two moments: position, cause and
-    remedy."""
+    """Return the message for a body that broke into parts between two moments. It contains
+    position, cause and remedy."""
     since, moment = between
     assert before.broken_step is not None
     assert failed.broken_step is not None
@@ -466,7 +473,7 @@ def _settle_bonds_at(
 ) -> Certificate:
     """Move to equilibrium until no bond changes any more, at most `max_changes` times.
 
-    Bonds break in a `step`, by default that of the moment.
+    Bonds that break are recorded with `step` or, by default, with the step of the moment.
     """
     fracturing = Fracturing.of(scene.at(moment))
     for _ in range(max_changes):
@@ -484,9 +491,10 @@ def _settle_bonds_at(
 
 
 def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: float) -> Certificate:
-    """Move from the equilibrium of a moment to that of a later one, in parts of the increment that
-    are small enough for the equilibrium to change continuously. If no part is small enough
-    (snap-through), make steps; if bonds broke, make implicit steps at once."""
+    """Move from the equilibrium at one moment to the equilibrium at a later moment. The increment
+    is divided into parts that are so small that the equilibrium changes continuously. If no part is
+    small enough (snap-through), steps are made. If bonds have just broken, implicit steps are made
+    without dividing the increment."""
     reached, part = since, moment - since
     while True:
         target = moment if reached + part > moment - TINY * part else reached + part
@@ -518,7 +526,7 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
 
 def _relaxed(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
     """Make implicit steps from a state in which bonds have broken, with leaders at their positions
-    of a moment."""
+    at a moment."""
     placed, state.starts = prescribe(scene, state, moment)
     place(state.u, placed)
     certificate = finder.relax(state, moment)
@@ -536,7 +544,8 @@ def _nearby(finder: Finder, state: State, moment: float, before: State) -> Certi
 def _stepped(
     scene: Scene, state: State, finder: Finder, moment: float, failed: UnconvergedError
 ) -> Certificate:
-    """Make steps with leaders at their positions of a moment, until an equilibrium is near.
+    """Make steps with leaders at their positions at a moment, until the state is close enough to an
+    equilibrium for Newton's method.
 
     Raises UnconvergedError if no stable equilibrium is reached.
     """
@@ -560,8 +569,9 @@ def _stepped(
 
 
 def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int) -> bool:
-    """Return whether bonds break or change at the equilibrium. Changes within the tolerance are
-    discarded, so that the error bound applies to the bonds as they are."""
+    """Return whether bonds break or change at the equilibrium. Changes of state variables within
+    the tolerance are discarded, so that the bonds remain those for which the error bound was
+    computed."""
     values_before = [value.copy() for value in state.bond_values]
     broken = broken_bonds(state)
     fracturing.break_bonds(state.u, state, step, in_turn=True)

@@ -3,10 +3,10 @@
 The basis functions of a coarser grid are bilinear hats; its stencils are Galerkin products. If one
 direction is much stiffer than the other, only that direction is coarsened.
 
-If there are several processes, each has a strip of rows of the finer grids, with a halo that is
-wide enough for a cycle without communication; every process has all rows of the coarser grids. The
-processes communicate twice in a cycle: at its beginning, and to gather the residuals on the first
-grid that is not distributed.
+If there are several processes, each stores a strip of rows of the finer grids, and all rows of the
+coarser grids. The halo of a strip is so wide that a cycle can be computed on the finer grids
+without communication. The processes therefore communicate only twice in a cycle: at its beginning,
+and when the residuals are gathered on the finest grid that is not distributed.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ EVERY = slice(None)
 
 
 class StencilGrid:
-    """One grid: its `code` and `kind` as in StencilMatrix, its `stencils`, and the lists of its
-    rows for kernels. Corrections leave `held` components unchanged."""
+    """One grid: its `code` and `kind` as in StencilMatrix, its `stencils`, and the lists of runs
+    and lone places that kernels use. Corrections do not change the `held` components."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class StencilGrid:
         self.unknowns = 2 * (int((end - begin).sum()) + lone_count)
 
     def given(self, precision: type[np.floating[Any]]) -> Any:
-        """Return the grid as the argument of kernels, in a precision."""
+        """Return the grid as an argument of kernels, with numbers of the given precision."""
         middle = self._inverses
         same = tuple(tuple(map(precision, row)) for row in self.stencils[0].reshape(3, 12))
         stencils, inverse = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
@@ -86,8 +86,8 @@ class StencilGrid:
         return np.zeros((2, *self.code.shape), precision)
 
     def halved(self, rows: int) -> tuple[int, int]:
-        """Return the axes along which the next grid has half the places, for a lattice of `rows`
-        rows."""
+        """Return the axes along which the next coarser grid has half the places. `rows` is the
+        number of rows of the whole grid."""
         along = [np.abs(_stiffness(self.stencils[0], axis)) for axis in range(2)]
         columns = self.code.shape[1]
         if rows <= MIN_PLACES or columns <= MIN_PLACES:
@@ -97,7 +97,7 @@ class StencilGrid:
         return int(along[0] > along[1]), int(along[1] > along[0])
 
     def coarser(self, halved: tuple[int, int], known: slice = EVERY) -> StencilGrid:
-        """Return the next grid; places outside the rows `known` are empty."""
+        """Return the next coarser grid. Its places outside the rows `known` are empty."""
         shape = [
             coarser_size(n) if half else n for n, half in zip(self.code.shape, halved, strict=True)
         ]
@@ -144,8 +144,8 @@ class StencilGrid:
 
 
 class GridLevel:
-    """One grid with the arrays of a cycle, in single precision; `halved` are the axes along which
-    the next one has half the places."""
+    """One grid with the arrays of a cycle, in single precision. `halved` are the axes along which
+    the next coarser grid has half the places."""
 
     def __init__(self, grid: StencilGrid, halved: tuple[int, int] = (0, 0)) -> None:
         self.grid, self.given, self.halved = grid, grid.given(PRECISION), halved
@@ -210,13 +210,13 @@ SINGULAR = 1e-12
 
 
 class FloatingError(Exception):
-    """Leaders leave a motion of the body free."""
+    """A motion of the body is not constrained by leaders."""
 
 
 class Multigrid(Grids):
     """Hierarchy of grids in one process.
 
-    Raises FloatingError if leaders leave a motion of the body free.
+    Raises FloatingError if a motion of the body is not constrained by leaders.
     """
 
     def __init__(self, grid: StencilGrid) -> None:
@@ -237,7 +237,8 @@ class Multigrid(Grids):
 
     def is_definite(self) -> bool:
         """Return whether a symmetric matrix is positive definite on the coarsest grid and in each
-        diagonal block. If it is not definite there, it is not definite on the finest grid."""
+        diagonal block. If it is not positive definite there, it is not positive definite on the
+        finest grid either."""
         K = (self._coarsest + self._coarsest.T) / 2.0
         return self.grid().is_definite_alone() and bool(np.linalg.eigvalsh(K)[0] > 0.0)
 
@@ -250,7 +251,7 @@ class Multigrid(Grids):
         return self._levels[depth].grid
 
     def cycle(self, r: Floats, depth: int = 0) -> Floats:
-        """Return one V-cycle from the grid at a depth on."""
+        """Return the result of one V-cycle that begins on the grid at a depth."""
         level = self._levels[depth]
         if depth == len(self._levels) - 1:
             x = self._inverse @ r[:, self._at[0], self._at[1]].T.ravel()
@@ -263,7 +264,7 @@ class Multigrid(Grids):
 
     @property
     def whole(self) -> Multigrid:
-        """The hierarchy of grids that are not distributed: here all of them."""
+        """The hierarchy of grids that are not distributed; in one process these are all grids."""
         return self
 
     @property
@@ -299,14 +300,14 @@ class Multigrid(Grids):
 
 
 SMALL = 100 * COARSEST
-"""Number of unknowns below which a grid is not distributed: more than four times that of the
-coarsest grid, so that at least two grids are not distributed."""
+"""Number of unknowns below which a grid is not distributed. It is more than four times the number
+of unknowns of the coarsest grid, so that at least two grids are not distributed."""
 
 
 class PartedGrids(Grids):
-    """Hierarchy of grids of which each process has a strip.
+    """Hierarchy of grids for several processes, each of which stores a strip of the finer grids.
 
-    Raises FloatingError if leaders leave a motion of the body free.
+    Raises FloatingError if a motion of the body is not constrained by leaders.
     """
 
     def __init__(self, grid: StencilGrid, rows: Rows, strip: Strip) -> None:
@@ -319,7 +320,7 @@ class PartedGrids(Grids):
             self._strips.append(strip)
             self._levels.append(GridLevel(level.grid.coarser(level.halved, strip.known)))
         self.whole = Multigrid(self._joined())
-        """Grids that every process has as a whole."""
+        """Grids of which every process stores all rows."""
 
     def _unknowns(self) -> int:
         rows, code = self._strips[-1].own, self._levels[-1].grid.code
@@ -361,8 +362,8 @@ class PartedGrids(Grids):
         return not self._rows.communicator.any(not alone) and self.whole.is_definite()
 
     def cycle(self, r: Floats, depth: int = 0) -> Floats:
-        """Return one V-cycle from the finest grid; the halo of r is updated. The result is valid in
-        the rows of the process and in those adjacent to them."""
+        """Return the result of one V-cycle that begins on the finest grid, after updating the halo
+        of r. The result is valid in the rows of the process and in the adjacent rows."""
         assert depth == 0
         self._rows.exchange_halo(r)
         right_sides = [r, *(level.b for level in self._levels[1:])]

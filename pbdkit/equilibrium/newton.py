@@ -1,8 +1,8 @@
 """Search for the equilibrium of given roles, bonds and obstacles.
 
-Linear rules need one linearisation, at rest. For other rules Newton's iteration starts from the
-previous equilibrium, pseudo-transient continuation is used for bodies after bonds have broken,
-and an active set of constrained particles for bodies in contact with obstacles.
+For linear rules a single linearisation, at rest, is sufficient. For other rules there are three
+methods: Newton's iteration from the previous equilibrium, pseudo-transient continuation after bonds
+have broken, and an active set of constrained particles in contact with obstacles.
 """
 
 from __future__ import annotations
@@ -46,10 +46,12 @@ MOST_CORRECTIONS = 12
 MAX_PROPOSED_TOLERANCE = 0.1
 """Largest tolerance that messages propose."""
 CONTRACTION = 0.5
-"""Largest ratio of a correction to the previous one. Below this ratio Newton's iteration converges
-to the only equilibrium nearby (Deuflhard, Newton Methods for Nonlinear Problems, 2004)."""
+"""Largest accepted ratio of a correction to the previous one. With smaller ratios Newton's
+iteration converges, and the equilibrium is the only one nearby (Deuflhard, Newton Methods for
+Nonlinear Problems, 2004)."""
 MAX_REUSE_RATIO = 0.02
-"""Largest ratio of errors after and before a correction for which a linearisation is used again."""
+"""A linearisation is used again if the ratio of the error after a correction to the error before it
+is at most this number."""
 MAX_CORRECTION_RTOL = 1e-3
 """Largest relative error of corrections."""
 NOT_LINEAR = "the rule declares itself linear, but its moves differ from the linearisation"
@@ -57,11 +59,11 @@ NOT_LINEAR = "the rule declares itself linear, but its moves differ from the lin
 NUDGE = 1e-6
 """Displacement of leaders, in lattice spacings, for derivatives with respect to the load."""
 SHARE = 0.25
-"""Fraction of the tolerance that the errors of linear systems may use."""
+"""Fraction of the tolerance that is reserved for the errors of linear systems."""
 UNSTABLE = "the equilibrium is not stable"
 """Message for an unstable equilibrium."""
 ROUNDING = "rounding errors limit the relative distance"
-"""Message for a tolerance that rounding prevents."""
+"""Message for a tolerance that cannot be reached because of rounding."""
 MAX_ROUNDING_RATIO = 1e5
 """Largest ratio of the distance to the rounding error up to which rounding is regarded as the
 reason why the search does not converge. Above it the body may be near a limit point, and a smaller
@@ -73,25 +75,28 @@ MAX_MOVE = 0.2
 MIN_DAMPING = 1e-10
 """Smallest damping, relative to the stiffness of a particle in the interior at rest."""
 MIN_DAMPING_RATIO = 0.05
-"""Smallest ratio of a damping to the one before."""
+"""Smallest ratio of a damping to the previous one."""
 DAMPING_FACTOR = 0.5
-"""If moves decrease, a damping is this factor times the ratio of the moves, times the damping
-before."""
+"""If moves decrease, the next damping is the current one, times the ratio of the new moves to the
+old ones, times this factor."""
 MAX_DAMPING_RATIO = 2.0
-"""Largest ratio of a damping to the one before."""
+"""Largest ratio of a damping to the previous one."""
 NEGLIGIBLE_STIFFNESS = 1e-6
-"""Stiffness, in the units of the damping, below which motions are excluded from an error bound."""
+"""Motions with a smaller stiffness, in the units of the damping, are excluded from an error
+bound."""
 MAX_SOFT_RATIO = 100.0
-"""A bound without soft motions is computed if the moves are at most this number times the moves of
-soft motions within the tolerance."""
+"""A bound that excludes soft motions is computed only if the moves are small: at most this number
+times the moves that a soft motion of the size of the tolerance causes."""
 
 
 @dataclass(frozen=True)
 class Finder:
-    """Search for equilibria of a scene to within a length, by a method of the solver.
+    """Search for equilibria of a scene. `method` is the method of the solver settings, and
+    `tolerance` the largest distance from equilibrium, a length.
 
-    Relative values refer to the length `scale`; `compiles` is passed to `Moves`; `rows` are those
-    of the scene; `at_rest` is the last system at rest, and `rest` are the data on which it depends.
+    Relative values are lengths divided by `scale`. `compiles` is passed to `Moves`, and `rows` are
+    the rows of the scene within this process. `at_rest` contains the last system that was
+    linearised at rest, and `rest` the data on which it depends.
     """
 
     scene: Scene
@@ -125,13 +130,15 @@ class Finder:
         return off <= LINEAR
 
     def at(self, moment: float) -> Finder:
-        """Return the finder with the parameters of a moment."""
+        """Return the finder with the parameters at a moment, which is a time in steps and need not
+        be an integer."""
         scene = self.scene.at(moment)
         return self if scene is self.scene else replace(self, scene=scene)
 
     def find(self, state: State, moment: float) -> Certificate:
         """Move the followers of `state`, in place, to the equilibrium with the roles, loads and
-        parameters of a moment, by the linearisation at rest, which is exact for linear rules.
+        parameters of a moment. Corrections are computed with the linearisation at rest, which is
+        exact for linear rules.
 
         Raises ExperimentError if a part has no equilibrium, UnconvergedError and StoppedError.
         """
@@ -140,7 +147,7 @@ class Finder:
 
     def relax(self, state: State, moment: float) -> Certificate:
         """Move the followers by implicit steps to the equilibrium that sufficiently small steps
-        approach, for rules that are not linear and a state in which bonds have just broken.
+        approach. This method is used for rules that are not linear, after bonds have just broken.
 
         Raises UnconvergedError.
         """
@@ -149,8 +156,9 @@ class Finder:
 
     def follow(self, state: State, moment: float, before: State) -> Certificate:
         """Move the followers by Newton's iteration, for rules that are not linear and a small
-        change of the load since the equilibrium `before`. Each correction has to be much smaller
-        than the last, so that no other equilibrium is nearer; the result is stable."""
+        change of the load since the equilibrium at the moment `before`. Each correction has to be
+        much smaller than the previous one, so that no other equilibrium is nearer. The result is
+        stable."""
         with one_thread():
             try:
                 return _Newton(self.at(moment), state, moment, before).run()
@@ -160,9 +168,9 @@ class Finder:
 
 @dataclass(frozen=True)
 class Rest:
-    """Data that determine a system at rest. If they are unchanged, a later search uses the system
-    again: the scene with its parameters, the leading groups, the bonds, and the methods of the
-    solver."""
+    """Data that determine a system at rest: the scene with its parameters, the leader groups that
+    act, the bonds, and the methods of the solver. If they are unchanged, a later search uses the
+    system again."""
 
     scene: Scene
     leads: tuple[bool, ...]
@@ -178,7 +186,7 @@ class Rest:
         return cls(finder.scene, leads, bonds, methods)
 
     def serves(self, other: Rest) -> bool:
-        """Return whether both data determine the same system."""
+        """Return whether these data and `other` determine the same system."""
         same = self.scene is other.scene and (self.leads, self.methods) == (
             other.leads,
             other.methods,
@@ -197,7 +205,7 @@ class Search(ABC):
         self._system = self._linearised(at, what)
         self._residual = self._moves()
         self._last_distance: tuple[float, Floats | None, System | None] = math.inf, None, None
-        """The last distance, with the moves and the system to which it belongs."""
+        """The last distance, with the moves and the system for which it was computed."""
 
     @abstractmethod
     def run(self) -> Certificate:
@@ -213,7 +221,7 @@ class Search(ABC):
         return certificate
 
     def _floor(self) -> float:
-        """Return the distance caused by rounding of the moves alone."""
+        """Return the part of the distance that is caused by rounding of the moves."""
         with suppress(StuckError):
             nothing = np.zeros_like(self._residual)
             distance = self._system.distance(nothing, self._rounding())
@@ -284,8 +292,8 @@ class Search(ABC):
 
     @property
     def _wanted(self) -> float:
-        """Accuracy of linear systems, which leaves a part of the tolerance for the other terms of
-        the error bound."""
+        """Required accuracy of linear systems. It is a fraction of the tolerance; the rest is for
+        the other terms of the error bound."""
         return SHARE * self._finder.tolerance
 
     def _rounding(self) -> float:
@@ -296,8 +304,8 @@ class Search(ABC):
 
 
 def _reachable(share: float) -> str:
-    """Return the remedy for a relative bound: a tolerance that can be reached or, if none can, the
-    reason."""
+    """Return the end of the message about a tolerance that is not reached: a tolerance for which
+    the relative bound `share` suffices or, if there is none, the cause."""
     tolerance = 10.0 ** math.ceil(math.log10(share / SHARE)) if 0.0 < share < math.inf else 1.0
     if tolerance < MAX_PROPOSED_TOLERANCE:
         return f"; set solver.tolerance: {tolerance:.0e}"
@@ -315,7 +323,8 @@ class _Linear(Search):
         self._owed: State | None = state.copy()
 
     def _linearised(self, at: State, what: str) -> System:
-        """Return the system, which is factorised once for the same roles, parameters and bonds."""
+        """Return the system. It is factorised again only if roles, parameters or bonds have
+        changed."""
         systems = self._finder.at_rest
         if systems and self._finder.rest:
             rest = Rest.of(self._finder, at, self._moment, systems[0].methods)
@@ -329,7 +338,7 @@ class _Linear(Search):
         self._linear = True
         start = self._residual, self._state.u, self._state.previous
         if self._finder.rows.communicator.any(any(planes.any() for planes in start)):
-            self._correct()  # Otherwise the initial state is the equilibrium.
+            self._correct()  # Otherwise the initial state is already the equilibrium.
         return self._certified()
 
     def _correct(self) -> None:
@@ -349,7 +358,7 @@ class _Linear(Search):
 
 
 class _Newton(Search):
-    """Newton's iteration from an equilibrium nearby."""
+    """Newton's iteration that starts from an equilibrium nearby."""
 
     def __init__(self, finder: Finder, state: State, moment: float, before: State) -> None:
         super().__init__(finder, state, moment, before, "following the load")
@@ -370,8 +379,8 @@ class _Newton(Search):
         return certificate
 
     def _go_ahead(self) -> None:
-        """Predict the equilibrium at the end of the increment from the previous equilibrium, by
-        extrapolating the moves for a small part of the increment."""
+        """Predict the equilibrium at the end of the increment from the previous equilibrium. The
+        moves are computed for a small part of the increment and extrapolated."""
         nudge = NUDGE * self._finder.scene.neighbourhood.nudge_unit
         moves, part = (
             self._finder.moves,
@@ -407,7 +416,7 @@ class _Newton(Search):
             previous, size = size, float(np.abs(correction).max(initial=0.0))
             if not size <= CONTRACTION * min(previous, self._load_change or math.inf):
                 if size <= self._floor():
-                    return  # The difference is rounding.
+                    return  # The difference is only rounding.
                 reason = "corrections do not decrease"
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
@@ -416,10 +425,10 @@ class _Newton(Search):
 
 class _Relaxing(Search):
     """Pseudo-transient continuation (Kelley and Keyes, 1998): implicit steps, (A + damping) c =
-    move, with a damping that decreases with the moves.
+    move, with a damping that is reduced as the moves become smaller.
 
-    Floating parts, and parts that are connected by one bond only, are moved by implicit steps
-    alone.
+    Floating parts, and parts that are connected by one bond only, have free motions. They are
+    therefore moved by implicit steps only.
     """
 
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
@@ -462,7 +471,8 @@ class _Relaxing(Search):
         return certificate
 
     def _is_near(self) -> bool:
-        """Return whether the tolerance is reached except for motions of almost no stiffness."""
+        """Return whether the tolerance is reached if motions of almost no stiffness are excluded
+        from the error bound."""
         longest, tolerance = self._finder.rows.max_norm(self._residual), self._finder.tolerance
         if longest > MAX_SOFT_RATIO * NEGLIGIBLE_STIFFNESS * tolerance:
             return False
@@ -474,8 +484,8 @@ class _Relaxing(Search):
 MAX_SETS = 60
 """Maximum number of changes of the active set."""
 MIN_PART = 2.0**-6
-"""Smallest fraction of a correction that is tried. Fractions are tried if the complete correction
-would separate particles from obstacles that hold them."""
+"""Smallest fraction of a correction that is applied. Fractions are applied if the complete
+correction would separate particles from obstacles that hold them."""
 
 
 def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:
@@ -492,9 +502,9 @@ def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:
 
 
 class _ContactSearch(Search):
-    """Newton's iteration with an active set: particles that would enter an obstacle are
-    constrained, until the set is complete. Parts that are not yet constrained are moved by weak
-    springs."""
+    """Newton's iteration with an active set, which contains the particles in contact. Particles
+    that would enter an obstacle are added to the set and constrained, until the set does not change
+    any more. Floating parts that no obstacle holds yet are moved with weak springs."""
 
     def run(self) -> Certificate:
         """Correct until the active set and the state converge.
@@ -523,13 +533,13 @@ class _ContactSearch(Search):
             while (
                 not loose and part > MIN_PART and system.is_loose(self._residual, self._rounding())
             ):
-                part /= 2.0  # A larger part would remove particles from obstacles that hold them.
+                part /= 2.0  # A larger one would separate particles from obstacles.
                 self._go(-part * correction)
                 system = self._newest()
         if went_loose:
             system.refuse_floats()
-        # Particles in contact are placed on the outline, as after a step; the linear solution
-        # leaves them beside it.
+        # A step would place particles in contact exactly on the outline. The linear solution moves
+        # them along its tangent, so that they have to be placed on it.
         self._shift(system.of_held(self._residual))
         certificate = self._certified()
         if not system.is_stable():

@@ -1,8 +1,9 @@
 """Linear system of an equilibrium as a block-triangular sparse matrix.
 
-If x and y are not coupled there are two diagonal blocks, often equal; if only one is coupled to the
-other (mixed coordinates), it is solved first. Within a block, all particles that leaders hold are
-solved together. Each floating part has a singular matrix and is solved separately.
+If the axes x and y are not coupled, there are two diagonal blocks, which are often equal. If only
+one of the axes depends on the other (mixed-coordinate rule), the axis that does not depend on the
+other is solved first. Within a block, all particles that leaders hold, directly or through bonds,
+are solved together. Each floating part has a singular matrix and is solved separately.
 """
 
 from __future__ import annotations
@@ -36,30 +37,31 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 SAFETY = 3.0
-"""Safety factor of estimates that can be too small."""
+"""Safety factor by which estimates are multiplied that can be too small."""
 ACCURACY = 1e-9
 """Relative accuracy of solutions; a second correction improves it if necessary."""
 ROUGH = 1e-3
-"""Relative accuracy of solutions that are used for a bound only."""
+"""Relative accuracy of solutions from which only a bound is computed."""
 TURNS = 20
 """Number of inverse iterations."""
 SOFT = 1e10
 """Norm of A⁻¹ above which a part may be floating."""
 TOO_SOFT = 1e13
-"""Norm of A⁻¹, rigid modes excluded, above which rigid modes cannot be distinguished from soft
+"""Norm of A⁻¹ outside the rigid modes, above which soft modes cannot be distinguished from rigid
 modes in double precision."""
 NOTHING = 64.0 * float(np.finfo(float).eps)
-"""Rounding error of A y and of the push on a rigid mode y, relative to the terms that cancel."""
+"""A sum of terms that cancel counts as zero if its size, relative to the terms, is at most this
+number. Such sums are A y and the load on y, for a rigid mode y."""
 RANDOM_SHARE = 0.1
 """Smallest component along one mode that a normalised vector of random numbers is assumed to have,
 multiplied by the square root of the number of unknowns."""
 SHIFT = 1e-13
-"""Number that is added to the diagonal of a large singular matrix, relative to its largest
-entry."""
+"""Number that is added to the diagonal of a large singular matrix, relative to the largest entry of
+the matrix."""
 MODES = 6
-"""Number of modes among which the kernel of a matrix is searched first."""
+"""Number of modes that are computed at first in order to find the kernel of a matrix."""
 MAX_MODES = 96
-"""Maximum number of modes among which the kernel is searched."""
+"""Maximum number of modes that are computed in order to find the kernel."""
 LARGEST_FALLBACK = 400_000
 """Number of unknowns up to which an LU factorisation replaces an iteration that makes no
 progress."""
@@ -70,12 +72,14 @@ class DriftingError(Exception):
 
 
 class TooSoftError(DriftingError):
-    """In double precision a softly held part cannot be distinguished from a floating part."""
+    """A part is held so softly that it cannot be distinguished from a floating part in double
+    precision."""
 
 
 class Subsystem(ABC):
-    """Linear system A x = r of a part, with a solver for its unknowns and for the borders of A.
-    Without a solver only the state at rest is an equilibrium."""
+    """Linear system A x = r of a part. It has a solver for its unknowns and for the additional rows
+    and columns by which a singular A is bordered. If there is no solver, the only equilibrium that
+    can be computed is the state at rest."""
 
     def __init__(
         self, size: int, solver: LinearSolver | None, watch: Watch, borders: int = 0
@@ -83,12 +87,12 @@ class Subsystem(ABC):
         self._size, self._solver, self._watch, self._borders = size, solver, watch, borders
 
     is_stuck = False
-    """True if an iteration makes no progress and there is no alternative."""
+    """True if an iteration makes no progress and no other method can replace it."""
 
     @abstractmethod
     def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """Return the x to which steps from x = 0 converge; `owed` is the change of the invariants,
-        `rounding` the error of r.
+        """Return the x to which steps from x = 0 converge. `owed` is the change of the invariants
+        that the previous state causes, and `rounding` the rounding error of r.
 
         Raises DriftingError if there is no such x.
         """
@@ -120,9 +124,9 @@ class Subsystem(ABC):
         return "inverse" if isinstance(self._solver, Dense) else "solution"
 
     def is_stable(self) -> bool:
-        """Return whether no eigenvalue is negative. All eigenvalues of small matrices are computed,
-        and those nearest to 0 of others, since eigenvalues change sign through 0 as the load
-        increases."""
+        """Return whether no eigenvalue is negative. All eigenvalues of a small matrix are computed.
+        Of a large matrix only the eigenvalues nearest to 0 are computed, because an eigenvalue
+        passes through 0 when it becomes negative as the load increases."""
         if self._solver is None or self._borders:
             return True
         if isinstance(self._solver, Dense):
@@ -154,8 +158,8 @@ class Subsystem(ABC):
     def spread_of(self, some: Mask) -> float:
         """Return the maximum norm of A⁻¹ for right-hand sides that are zero outside some unknowns.
 
-        It is computed from the inverse if available. Otherwise it is estimated with random signs,
-        which resemble rounding errors.
+        The norm is computed from the inverse if it is available. Otherwise it is estimated from the
+        solution for random signs as the right side, because rounding errors have random signs too.
         """
         if self._solver is None:
             return math.inf if some.any() else 0.0
@@ -164,8 +168,8 @@ class Subsystem(ABC):
             return float(inverse[:, some].sum(axis=1).max(initial=0.0))
         self._watch.begin("bounding the error")
         signs = np.random.default_rng(0).choice([-1.0, 1.0], self._size) * some
-        # The accuracy is sufficient for the softest mode, which is a small part of the random
-        # numbers.
+        # The softest mode is only a small component of the random numbers. The accuracy is chosen
+        # such that it is resolved.
         accuracy = min(ROUGH, RANDOM_SHARE / math.sqrt(max(1, self._size)))
         return SAFETY * float(np.abs(self._inverted(signs, accuracy)).max(initial=0.0))
 
@@ -212,8 +216,8 @@ class ConstrainedSubsystem(Subsystem):
     def _solved(
         self, b: Floats, accuracy: float, most: float, *, transposed: bool = False
     ) -> Floats:
-        """Return the solution. An LU factorisation replaces an iteration that leaves a residual of
-        more than `most`, if the method permits this."""
+        """Return the solution. If the residual of an iteration remains larger than `most`, the
+        iteration is replaced by an LU factorisation where the method of the solver permits this."""
         matrix = self._matrix.T if transposed else self._matrix
         for _ in range(2):
             assert self._solver is not None
@@ -231,8 +235,8 @@ class ConstrainedSubsystem(Subsystem):
         return x
 
     def _inverted(self, r: Floats, accuracy: float = ROUGH) -> Floats:
-        """Return A⁻¹ r with a low accuracy; infinity if an iteration makes no progress, since its
-        result is no bound."""
+        """Return A⁻¹ r with a low accuracy. Return infinity if an iteration makes no progress,
+        because no bound can be computed from its result."""
         x = self._solved(r, accuracy, 2.0 * accuracy)
         return np.full_like(x, math.inf) if self._is_short else x
 
@@ -251,12 +255,12 @@ class ConstrainedSubsystem(Subsystem):
 
 
 class SingularSubsystem(Subsystem):
-    """Linear system of a part with modes that no step changes: the invariants Yᵀ u, with Yᵀ A = 0,
-    are constant.
+    """Linear system of a floating part. Steps do not change its invariants Yᵀ u, where the columns
+    of Y are the vectors y with yᵀ A = 0.
 
-    `before` is the part of A that multiplies the state before the last one. It contributes to the
-    invariants, K = Yᵀ (1 + before). The system is A x + Y μ = r, K x = k. There is no solver if
-    modes grow or other modes have almost no stiffness.
+    `before` is the matrix that multiplies the state before the last one, which contributes to the
+    invariants: K = Yᵀ (1 + before). The system is A x + Y μ = r, K x = k. It has no solver if a
+    mode grows, or if a mode that is not rigid has almost no stiffness.
     """
 
     def __init__(self, matrix: Any, before: Any, watch: Watch) -> None:
@@ -305,13 +309,13 @@ class SingularSubsystem(Subsystem):
 
 def _left_kernel(matrix: Any) -> Floats:
     """Return an orthonormal basis, (unknown, mode), of all y with yᵀ A = 0 within rounding. For
-    large matrices it is computed by inverse iteration, in which vectors outside the kernel shrink
-    by SHIFT / λ each time."""
+    large matrices it is computed by inverse iteration. Compared with vectors of the kernel, each
+    iteration multiplies a mode with the eigenvalue λ by about SHIFT / λ."""
     size = matrix.shape[0]
     largest = float(abs(matrix).max()) if size else 0.0
     if not largest > 0.0:
         return np.eye(size)
-    # A = 1 - (step operator): terms of size 1 cancel, however small the result is.
+    # A is 1 minus the step operator: terms of size 1 cancel even if the result is tiny.
     nothing = NOTHING * max(1.0, float(abs(matrix).sum(axis=1).max()))
     if size <= DENSE:
         vectors, values, _ = np.linalg.svd(dense(matrix))
@@ -335,8 +339,8 @@ def _left_kernel(matrix: Any) -> Floats:
 
 @dataclass
 class DiagonalBlock:
-    """Unknowns of one axis, or of both if they are coupled, divided into parts. `into` is the
-    coupling to the axis solved before."""
+    """Unknowns of one axis, or of both axes if they are coupled, divided into parts. `into` is the
+    coupling to the axis that was solved before."""
 
     axes: list[int]
     parts: list[tuple[Indices, Subsystem]]
@@ -357,8 +361,8 @@ SOFT_MESSAGE = (
 
 
 class MatrixSystem(System):
-    """Linear system by a method of the solver, direct or iterative. With `damping` it is the system
-    of an implicit step, (A + damping) c = move."""
+    """Linear system that is stored as a sparse matrix and solved by a direct or an iterative
+    method. With `damping` it is the system of an implicit step, (A + damping) c = move."""
 
     def __init__(
         self,
@@ -381,7 +385,7 @@ class MatrixSystem(System):
         self._both = both = operator.couplings_steady
         first = 1 if both.couples(0, 1) else 0
         self._blocks = [] if both.couples(first, 1 - first) else [self._block([first])]
-        # If the axes are coupled, the invariants of one contain displacements along the other.
+        # If the axes are coupled, the invariants of one axis contain displacements along the other.
         parts = [part for block in self._blocks for _, part in block.parts]
         floats = any(isinstance(part, SingularSubsystem) for part in parts)
         if not self._blocks or (floats and both.couples(1 - first, first)):
@@ -402,8 +406,8 @@ class MatrixSystem(System):
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound: computed from the inverse, or from a solution if some part has no
-        inverse."""
+        """Kind of the bound: computed from the inverse matrices or, if the inverse of some part is
+        not available, from a solution."""
         if self._damping:
             return "damped"
         ways = {part.bound_kind for block in self._blocks for _, part in block.parts}
@@ -426,7 +430,7 @@ class MatrixSystem(System):
         return planes
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """Raise ExperimentError if a floating part has moves."""
+        """Raise ExperimentError if the moves of a floating part exceed their rounding error."""
         table = self._table(moves)
         for block in self._blocks:
             for members, part in block.parts:
@@ -444,7 +448,7 @@ class MatrixSystem(System):
 
     @property
     def is_stuck(self) -> bool:
-        """True if the iteration of any part makes no progress."""
+        """True if the iteration for some part makes no progress."""
         return any(part.is_stuck for block in self._blocks for _, part in block.parts)
 
     def solve(
@@ -515,8 +519,8 @@ class MatrixSystem(System):
             return float(np.linalg.norm(difference) / np.linalg.norm(pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the bound: another solution, for the remaining moves, plus the effect of
-        rounding."""
+        """Return the bound on the distance: the size of the solution for the remaining moves, plus
+        the effect of rounding."""
         table, bounds = self._table(moves), np.zeros(2)
         for block in self._blocks:
             r = table[:, block.axes].ravel()
@@ -539,8 +543,8 @@ class MatrixSystem(System):
         return f"{len(numbers)} particles (with number {numbers[0]})"
 
     def _following(self, first: int) -> DiagonalBlock:
-        """Return the block of the other axis. If both are equal, it uses the solvers of the
-        first."""
+        """Return the block of the other axis. If both blocks are equal, it shares the solvers of
+        the first one."""
         other, leader_couplings = 1 - first, self._operator.couplings_leader
         coupled = self._both.couples(other, first)
         into = self._both.entries([other], [first]).matrix() if coupled else None
@@ -559,14 +563,15 @@ class MatrixSystem(System):
         leader_entries = self._operator.couplings_leader.entries(axes)
         count, label = connected(matrix, strongly=False)
         guided, alone = self._guided[:, axes].ravel(), np.zeros(count, bool)
-        # A prescribed component has no couplings: it is grouped with its particle, or left out.
+        # A prescribed component has no couplings. It belongs to the part of its particle or, if the
+        # particle has no other component, to no part.
         alone[label[guided]] = True
         if len(axes) > 1:
             label = np.where(guided, label.reshape(-1, 2)[:, ::-1].ravel(), label)
         has_leader = np.zeros(count, bool)
         has_leader[label[leader_entries.rows[leader_entries.values != 0.0]]] = True
-        # Followers that leaders hold, directly or not, are solved together, and each floating part
-        # separately.
+        # Followers that leaders hold, directly or through bonds, are solved together, and each
+        # floating part separately.
         groups = [np.flatnonzero((has_leader & ~alone)[label])] if has_leader.any() else []
         groups += [np.flatnonzero(label == n) for n in np.flatnonzero(~has_leader & ~alone)]
         block = DiagonalBlock(axes, [])
@@ -577,8 +582,8 @@ class MatrixSystem(System):
         return block
 
     def _part(self, matrix: Any, axes: list[int], members: Indices, held: bool) -> Subsystem:
-        """Return the system of a part. A part that is held has an inverse, unless leaders leave it
-        a free motion."""
+        """Return the system of a part. The matrix of a held part can be inverted, unless a motion
+        of the part is not constrained by leaders."""
         if held:
             coordinates = self._coordinates(axes, members)
             with suppress(np.linalg.LinAlgError):
@@ -606,7 +611,7 @@ class MatrixSystem(System):
 
     def _coordinates(self, axes: list[int], members: Indices) -> Coordinates:
         """Return the coordinates of these unknowns. If the unknowns belong to one axis, particles
-        that are prescribed along it are listed with the leaders."""
+        with a prescribed component along this axis are listed with the leaders."""
         where, is_guided = members[:: len(axes)] // len(axes), self._guided[:, axes]
         positions = self._X[is_guided[:, 0]] if len(axes) == 1 else self._X[:0]
         guided = is_guided[where].ravel() if len(axes) > 1 and is_guided.any() else None

@@ -1,9 +1,9 @@
 """Stiffness of an equilibrium as stencils on the primitive cells of a lattice.
 
-K = -∂force/∂u, or -∂move/∂u, of the followers. Most followers have the same stencil, 3 × 3 places
-with a 2 × 2 matrix each, which is stored once. Frame points are replaced by the body particles that
-they follow. Prescribed components of guided particles are constrained: their rows and columns are
-empty. Rows are scaled if this makes K symmetric.
+K is -∂force/∂u, or -∂move/∂u, of the followers. A stencil has 3 × 3 places with a 2 × 2 matrix
+each. Most followers have the same stencil, which is stored once. Frame points are eliminated: their
+displacements are replaced by those of the body particles that they follow. The rows and columns of
+prescribed components of guided particles are empty. Rows are scaled if this makes K symmetric.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 CANDIDATES = 16
-"""Number of most frequent stencils of each process among which the most frequent stencil overall is
-selected."""
+"""Number of stencils that each process proposes, its most frequent ones; the most frequent stencil
+of the whole lattice is selected from them."""
 SAME = 1e-12
 """Relative difference up to which two stencils are regarded as equal."""
 
@@ -50,8 +50,8 @@ def kernels() -> SimpleNamespace:
 def most_first(
     code: Integers, stencils: Floats, scale: Floats, rows: Rows
 ) -> tuple[NDArray[np.int32], Floats, Floats]:
-    """Return the code, stencils and scales such that the most frequent stencil is number 0 and
-    includes all stencils that are equal to it."""
+    """Return code, stencils and scales, renumbered such that the most frequent stencil is number 0.
+    All places with an equal stencil get the number 0 too."""
     tables = stencils, scale
     frequent = _most(code[..., rows.own, :], tables, rows)
     differences = [
@@ -119,19 +119,19 @@ class PrimitiveRaster:
 
     @property
     def is_the_scenes(self) -> bool:
-        """True if its places are the same as those of the scene's raster."""
+        """True if the places of this raster are the same as those of the scene's raster."""
         return len(self.scene.raster.cell.sites) == 1
 
     def places(self, place: Indices) -> Indices:
-        """Return the flat places of particles, from those on the scene's raster."""
+        """Convert flat places of particles on the scene's raster to flat places on this one."""
         if self.is_the_scenes:
             return place
         places: Indices = np.ravel_multi_index(tuple(self.index(place).T), self.shape)
         return places
 
     def index(self, place: Indices) -> Indices:
-        """Return the places of particles as (row, place), from flat places on the scene's
-        raster."""
+        """Convert flat places of particles on the scene's raster to places (row, place) on this
+        one."""
         if self.is_the_scenes:
             return np.stack(np.unravel_index(place, self.shape), axis=-1)
         raster = self.scene.raster
@@ -144,7 +144,8 @@ class PrimitiveRaster:
 
 
 def primitive_step(scene: Scene, slot: Slot) -> Index:
-    """Return the step of a slot in the primitive basis."""
+    """Return the difference of the site indices of a neighbour and the particle, in the primitive
+    basis."""
     return scene.neighbourhood.cell.primitive_step(slot.source, slot.target, slot.cell)
 
 
@@ -159,22 +160,24 @@ FREE = 1
 LED = 2
 """Kind of a place with a leader."""
 NUDGE = 1e-7
-"""Displacement for difference quotients, in lattice spacings. Their errors by rounding and
-curvature are about 1e-7 for displacements of up to a hundred spacings."""
+"""Displacement for difference quotients, in lattice spacings. The quotients have errors of about
+1e-7, which are caused by rounding and curvature, if the displacements of the body are at most a
+hundred spacings."""
 NOISE = 1e-5
-"""Ratio to the largest entry below which an entry counts as zero."""
+"""An entry counts as zero if its ratio to the largest entry is smaller than this number."""
 SINGULAR = 1e-14
 """Relative size below which a determinant counts as zero."""
 
 
 @dataclass(frozen=True)
 class StencilMatrix:
-    """Matrix of stencils. `code` (row, place) is the number of the stencil in `stencils` (number,
-    place, 4), with the entries xx, xy, yx, yy; -1 where no particle is free, 0 for the most
-    frequent stencil. `kind` distinguishes free places and leaders. `scale` (number, 4) maps moves
-    to K c. `at` and `place` are the flat places of the followers on this raster and on that of the
-    scene, None if both are the same. `held` (axis, row, place) are constrained components, None if
-    there are none."""
+    """Matrix of stencils. `stencils` is an array (number, place, 4) with the entries xx, xy, yx,
+    yy. `code` (row, place) is the number of the stencil of a place: 0 for the most frequent
+    stencil, and -1 where no particle is free. `kind` distinguishes free places and leaders. `scale`
+    (number, 4) contains for each stencil the 2 × 2 matrix that maps moves to K c. `at` are the flat
+    places of the followers on this raster, and `place` those on the scene's raster; they are None
+    if both rasters have the same places. `held` (axis, row, place) marks constrained components,
+    and is None if there are none."""
 
     code: NDArray[np.int32]
     kind: NDArray[np.int8]
@@ -197,8 +200,9 @@ class StencilMatrix:
 def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> StencilMatrix | None:
     """Assemble the matrix at a state with the roles of a step.
 
-    Returns None if there is no such matrix: in space, on lattices with several sites in a primitive
-    cell, for longer bonds, for nested rules, and for frame points that follow distant particles.
+    Returns None if the matrix cannot be stored as stencils. This is so in space, on lattices with
+    several sites in a primitive cell, if bonds extend beyond adjacent primitive cells, for nested
+    rules, and if frame points follow distant particles.
     """
     grid = PrimitiveRaster.of(scene)
     if grid is None or scene.inner or scene.experiment.neighbours.nearness():
@@ -207,12 +211,13 @@ def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> S
 
 
 def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> StencilMatrix | None:
-    """Assemble the matrix by differences of the moves, for a ninth of the particles at once:
-    particles of one of nine groups are three places apart, so that no stencil contains two of them.
-    Each follower has a separate stencil.
+    """Assemble the matrix by differences of the moves. The particles are divided into nine groups,
+    each with one particle in every 3 × 3 places, so that no stencil contains two particles of a
+    group. All particles of a group are displaced simultaneously. Each follower has a separate
+    stencil.
 
-    The stencil of a particle is wrong if the particle depends on more distant ones; the result has
-    to be compared with moves.
+    The stencil of a particle is wrong if its move depends on particles outside the stencil. The
+    caller therefore has to compare products with moves.
     """
     grid = PrimitiveRaster.of(scene)
     kind = kinds_of_places(scene.raster, scene.leading, step)
@@ -222,7 +227,8 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     body = np.flatnonzero((kind == FOLLOWER) | (kind == LEADER))
     code = np.full(kind.size, -1, np.int32)
     group, groups = (_number(grid.index(particles).T % 3 - 1) for particles in (place, body))
-    # numbers[n, g] is the index of the particles of group n in the stencils of group g.
+    # numbers[n, g] is the index in a stencil at which the stencils of particles of group g contain
+    # a particle of group n.
     ways = np.stack(np.unravel_index(np.arange(WINDOW), (3, 3)))
     numbers = _number((ways[:, :, None] - ways[:, None] + 1) % 3 - 1)
     stencils, every = np.empty((len(place), WINDOW, 2, 2)), np.arange(len(place))
@@ -245,8 +251,8 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
 def _on(
     grid: PrimitiveRaster, code: Integers, led: Any, stencils: Floats, scale: Floats
 ) -> StencilMatrix:
-    """Return the matrix on a raster of primitive cells, from data by flat place of the scene's
-    raster."""
+    """Return the matrix on a raster of primitive cells. The data are given by flat place of the
+    scene's raster."""
     kind = np.select([code >= 0, led], [FREE, LED], OUTSIDE).astype(np.int8)
     if grid.is_the_scenes:
         shape = grid.shape
@@ -273,7 +279,8 @@ class _Assembly:
         self._count = 0
 
     def matrix(self, rows: Rows) -> StencilMatrix | None:
-        """Return the matrix; None if a frame point depends on a particle outside the window."""
+        """Return the matrix; None if a frame point depends on a particle outside the stencils of
+        its neighbours."""
         is_calibrated = material_of(self._scene.experiment.rule) is not None
         answers = ("move", "force") if is_calibrated else ("move",)
         fits, every = True, by_sublattice(self._scene, self._followers)
@@ -294,7 +301,8 @@ class _Assembly:
         return _on(self._grid, code.ravel(), self._kind == LEADER, stencils, scale)
 
     def _add(self, place: Indices, responses: list[LinearResponse]) -> bool:
-        """Add the stencils of one sublattice; return whether they fit into the window."""
+        """Add the stencils of one sublattice. Return False if an entry lies outside the 3 × 3
+        places of a stencil."""
         moves, answers = responses[0], responses[-1]
         stencils = np.zeros((len(answers.centre), WINDOW, 2, 2))
         stencils[:, OWN] = -answers.centre
@@ -319,8 +327,9 @@ class _Assembly:
     def _shown(
         self, place: Indices, answers: LinearResponse, own: Floats
     ) -> tuple[Indices, Floats] | None:
-        """Return the indices of particles with frame points as neighbours, and their stencils with
-        the contributions of these points; None if a contribution lies outside the window."""
+        """Return the indices of the particles that have frame points as neighbours, and the
+        stencils of these particles with the contributions of the frame points. Return None if a
+        contribution lies outside the 3 × 3 places of a stencil."""
         frame, raster = self._scene.frame, self._scene.raster
         steps = [(slot, slot_step(raster.shape, slot)) for slot in answers.neighbours]
         sees = np.zeros(len(place), bool)
@@ -358,7 +367,7 @@ class _Assembly:
 
 
 def _number(way: Any) -> Any:
-    """Return the index in a stencil of the place that is one step from the centre."""
+    """Return the index in a stencil of the place at `way`, (row, place), from the centre."""
     return 3 * (way[0] + 1) + way[1] + 1
 
 
@@ -406,9 +415,9 @@ def constrained(matrix: StencilMatrix, held: Held | None) -> StencilMatrix:
 def with_held(
     code: NDArray[np.int32], stencils: Floats, held: Held
 ) -> tuple[NDArray[np.int32], Floats, NDArray[np.intp]]:
-    """Return code and stencils, and for each stencil the index of the one that it replaces. Places
-    adjacent to constrained components have separate stencils, without the columns of those
-    components; the rows of constrained components have a diagonal entry."""
+    """Return code and stencils, and for each stencil the index of the stencil that it replaces.
+    Places adjacent to constrained components get separate stencils, in which the columns of those
+    components are empty. The row of a constrained component has only a diagonal entry."""
     from scipy.ndimage import binary_dilation
 
     is_adjacent = binary_dilation(held.any(axis=0), structure=np.ones((3, 3))) & (code >= 0)
@@ -436,8 +445,9 @@ def without_held(code: NDArray[np.int32], stencils: Floats, held: Held) -> Float
 
 
 def coarser_held(kind: NDArray[np.int8], held: Held, halved: tuple[int, int], below: Any) -> Held:
-    """Return the constrained components of the next grid, of kinds `below`: those at places that
-    coincide with a place where this grid has a constrained component."""
+    """Return the constrained components of the next coarser grid, which has the kinds `below`. A
+    component is constrained there if it is constrained at the place of this grid that coincides
+    with its place."""
     coarse = np.zeros((2, *below.shape), bool)
     for axis, component in enumerate(held):
         kinds, out = np.where(component, LED, kind).astype(np.int8), np.zeros_like(below)
@@ -447,9 +457,11 @@ def coarser_held(kind: NDArray[np.int8], held: Held, halved: tuple[int, int], be
 
 
 EXACT = 1e-9
-"""Relative difference up to which a matrix from derivatives counts as symmetric."""
+"""Relative difference up to which a matrix that is computed from derivatives counts as
+symmetric."""
 DIFFERENCED = 1e-5
-"""Relative difference up to which a matrix from differences counts as symmetric."""
+"""Relative difference up to which a matrix that is computed by differences of moves counts as
+symmetric."""
 DIGITS = 13
 """Number of digits of row factors; further digits are rounding errors."""
 
@@ -467,8 +479,8 @@ def balanced(
 ) -> tuple[StencilMatrix, bool]:
     """Return the matrix with rows scaled such that it is symmetric, and whether that is possible.
 
-    Rows of particles with fewer neighbours have larger weights and are scaled. A remaining
-    difference is divided equally between both sides.
+    A particle with fewer neighbours has larger weights, so that its row has to be scaled. If K was
+    computed by differences, it is then replaced by the mean of K and Kᵀ.
     """
     if is_symmetric(matrix, rows=rows):
         return matrix, True
@@ -509,8 +521,8 @@ def _factors(matrix: StencilMatrix, rows: Rows) -> Floats | None:
 
 
 def transposed(matrix: StencilMatrix) -> StencilMatrix:
-    """Return Kᵀ, with separate stencils for all places with a neighbour that does not have the most
-    frequent stencil; `scale` is that of K."""
+    """Return Kᵀ. A place keeps the most frequent stencil only if it and all its neighbours have it;
+    all other places get separate stencils. `scale` is the scale of K."""
     code, (row, place) = matrix.code, np.nonzero(matrix.code >= 0)
     neighbours = np.stack(
         [code[row + s // 3 - 1, place + s % 3 - 1] for s in range(WINDOW)], axis=1
@@ -528,16 +540,16 @@ def transposed(matrix: StencilMatrix) -> StencilMatrix:
 
 
 def leads_one_way(matrix: StencilMatrix, rows: Rows = ALL) -> bool:
-    """Return whether one axis is coupled to the other but not the reverse, so that they are better
-    solved one after the other."""
+    """Return whether one axis depends on the other but not the reverse. It is then better to solve
+    for the axes one after the other."""
     ways = matrix.stencils[..., 1], matrix.stencils[..., 2]
     return len({rows.communicator.any(bool(way.any())) for way in ways}) > 1
 
 
 def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: Rows = ALL) -> bool:
-    """Return whether the body is held and has no crack. Every connected part has to be adjacent to
-    a leader, or to contain `held` components, along each axis; two neighbours have to be bonded, or
-    to have a common neighbour."""
+    """Return whether the body is held and has no crack. The body is held if, along each axis, every
+    connected part is adjacent to a leader or contains `held` components. It has no crack if any two
+    adjacent particles are bonded or have a common neighbour."""
     from scipy.ndimage import binary_dilation, label
 
     bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
@@ -553,7 +565,8 @@ def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: 
 
 
 def _reached(parts: Any, count: int, led: Any, rows: Rows) -> bool:
-    """Return whether all parts contain leaders, across the rows of all processes."""
+    """Return whether all parts contain leaders. Parts are connected across the rows of all
+    processes."""
     while True:
         reached = np.zeros(count + 1, bool)
         reached[parts[led]] = True
@@ -571,8 +584,9 @@ def _reached(parts: Any, count: int, led: Any, rows: Rows) -> bool:
 def _apart(
     matrix: StencilMatrix, bonds: NDArray[np.bool_], places: tuple[Indices, ...], s: int
 ) -> bool:
-    """Return whether some of the particles with a separate stencil are separated from their
-    neighbour at place s of that stencil."""
+    """Return whether some particle with a separate stencil is separated from its neighbour at place
+    s of the stencil. Two particles are separated if they are neither bonded nor bonded to a common
+    neighbour."""
     row, place = places
     down, along = s // 3 - 1, s % 3 - 1
     is_present = matrix.kind[row + down, place + along] != OUTSIDE
@@ -581,7 +595,7 @@ def _apart(
         return False
     first = matrix.code[row[pairs], place[pairs]]
     second = matrix.code[row[pairs] + down, place[pairs] + along]
-    linked = second < 0  # A leader: nothing moves it.
+    linked = second < 0  # A leader cannot be separated, as its position is prescribed.
     for t in range(9):
         a, b = t // 3 - 1 - down, t % 3 - 1 - along
         if max(abs(a), abs(b)) <= 1:

@@ -1,10 +1,10 @@
 """Linear system of an equilibrium, A c = move with A = 1 - (step operator), and its parts.
 
-`Moves` evaluates the right side by the rule; `System` is the interface of the solvers. `Rows` are
-the rows of the lattice within a process, with the collective operations among the processes that
-share the lattice. Fields are (…, row, place); sums over the whole lattice are computed row by row,
-so that they do not depend on the number of processes. Moves and displacements are planes, (axis,
-sublattice, cell, cell), as in a state.
+`Moves` evaluates the right side by means of the rule. `System` is the interface of the solvers.
+`Rows` describes the rows of the lattice that a process stores, and offers the collective operations
+among the processes that share the lattice. Fields are arrays (…, row, place). Sums over the whole
+lattice are computed row by row, so that they do not depend on the number of processes. Moves and
+displacements are planes, (axis, sublattice, cell, cell), as in a state.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from pbdkit.stepping.state import State
 from pbdkit.stepping.step import Step
 
 LARGEST_BY_NUMPY = 20_000
-"""Number of particles beyond which moves are evaluated by the compiled engine."""
+"""Number of particles above which moves are evaluated by the compiled engine."""
 ROUNDING = 4 * float(np.finfo(float).eps)
 """Relative rounding error of a move."""
 
@@ -47,9 +47,9 @@ ROUNDING = 4 * float(np.finfo(float).eps)
 class Moves:
     """Evaluation of the moves of a scene's followers.
 
-    Moves include relaxation but not momentum; frame points follow the body, and obstacles are at
-    their positions at a given moment. With `compiles` the moves of large bodies are compiled, which
-    takes seconds and saves time if many states of one scene are evaluated.
+    Moves include relaxation but not momentum. Frame points follow the body, and obstacles have
+    their positions at the given moment. With `compiles` the evaluation is compiled for large
+    bodies. Compiling takes seconds and saves time if many states of one scene are evaluated.
     """
 
     def __init__(self, scene: Scene, *, compiles: bool = True) -> None:
@@ -91,8 +91,8 @@ class Moves:
         return moves
 
     def rounding(self, u: Floats) -> float:
-        """Return the rounding error of a move at displacements u; with obstacles it includes that
-        of positions."""
+        """Return the rounding error of a move at displacements u; with obstacles it includes the
+        rounding error of positions."""
         reach = self.contact.reach if self.contact else 0.0
         return ROUNDING * max(float(np.abs(u).max()), reach)
 
@@ -151,17 +151,18 @@ def coarser_size(size: int) -> int:
 
 
 def outside(rows: slice, count: int) -> tuple[slice, slice]:
-    """Return the ranges before and after `rows`, which are some of `count` rows."""
+    """Return the ranges of rows before and after the range `rows`, for a grid of `count` rows."""
     first, last, _ = rows.indices(count)
     return slice(0, first), slice(last, count)
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of a grid of `count` rows that a process stores, by their indices in the grid. Arrays
-    start at row `low`; the process owns rows `begin` to `end`, and has the stencils of rows `first`
-    to `last`. `low` is even if rows are halved, so that row n of the next grid lies at 2n - 1 in
-    the arrays too; this holds for `depth` coarser grids."""
+    """Rows that a process stores of a grid of `count` rows, given by their indices in the grid. The
+    arrays of the process start at row `low`. It owns the rows `begin` to `end`, and has the
+    stencils of the rows `first` to `last`. If the next coarser grid has half the rows, `low` is
+    even, so that row n of that grid coincides with row 2n - 1 also if rows are counted from the
+    start of the arrays. This is so for `depth` coarser grids."""
 
     count: int
     low: int
@@ -182,8 +183,8 @@ class Strip:
         return slice(self.first - self.low, max(self.first, self.last) - self.low)
 
     def coarser(self, half: int) -> Strip:
-        """Return the rows of the next grid. A stencil there depends on two rows on either side of
-        its place if rows are halved, otherwise on one."""
+        """Return the rows of the next coarser grid. If it has half the rows, a stencil of that grid
+        depends on two rows of this grid on either side of its place, otherwise on one."""
         if not half:
             first = self.first + 1 if self.first else 0
             last = self.last - 1 if self.last < self.count else self.last
@@ -201,8 +202,8 @@ class Strip:
 
 
 class Rows:
-    """Rows of a grid within one process: all of them or, in `pbdkit.mpi.driver`, a strip of the
-    rows that the processes of a communicator share."""
+    """Rows of a grid that a process stores. These are all rows or, in `pbdkit.mpi.driver`, a strip
+    of them if the processes of a communicator share the grid."""
 
     strip: Strip | None = None
     """The strip; None for all rows."""
@@ -228,11 +229,12 @@ class Rows:
         return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
 
     def whole(self, numbers: Array) -> Array:
-        """Gather numbers, (..., row), of the rows of this process; return those of all rows."""
+        """Gather numbers, (..., row), of the rows of each process, and return the numbers of all
+        rows."""
         return numbers
 
     def total(self, numbers: Array) -> float:
-        """Return the sum of one number for each row."""
+        """Return the sum of numbers, one for each row, over the rows of all processes."""
         return float(self.whole(numbers).sum())
 
     def size(self, field: Array) -> int:
@@ -258,14 +260,15 @@ ALL: Final = Rows()
 def _libraries(with_scipy: bool) -> ThreadpoolController:
     """Return a controller of the libraries loaded so far.
 
-    The argument distinguishes the time after scipy has loaded a library of its own.
+    The result is cached for each value of the argument: true after scipy has loaded a library of
+    its own.
     """
     return ThreadpoolController()
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """Limit the loaded libraries of linear algebra to one thread. The order of their sums, and so
-    the last digits, depends on the number of threads."""
+    """Limit the loaded libraries of linear algebra to one thread. Otherwise the order of summation,
+    and therefore the last digits of results, would depend on the number of threads."""
     loaded = _libraries("scipy.linalg" in sys.modules)
     limits: AbstractContextManager[object] = loaded.limit(limits=1, user_api="blas")
     return limits
@@ -274,15 +277,15 @@ def one_thread() -> AbstractContextManager[object]:
 ACCURACY = 1e-2
 """Relative accuracy of rough solutions."""
 FAR = 8.0
-"""Ratio of the assumed size of a solution to its actual size above which the solution is computed
-again."""
+"""A solution is computed again if the assumed size is more than this number times the actual
+size."""
 TURNS = 4
-"""Maximum number of repetitions."""
+"""Maximum number of times that a solution is computed again."""
 
 
 PUSH = 1e-10
-"""Relative error of moves, for instance of moves computed by differences, up to which a load on a
-floating part is ignored."""
+"""A load on a floating part is ignored if its ratio to the moves is at most this number, since
+moves may have an error of this size, for instance if they are computed by differences."""
 
 
 class StuckError(Exception):
@@ -323,7 +326,8 @@ class System(ABC):
 
     @property
     def amplification(self) -> float:
-        """Ratio of moves, and their rounding, to the displacements that cause them."""
+        """Largest ratio of a move to the displacement that causes it. The rounding errors of moves
+        are multiplied by it."""
         return 1.0
 
     @abstractmethod
@@ -332,8 +336,9 @@ class System(ABC):
     ) -> Floats:
         """Solve for the correction c with an error of at most `tolerance`, a length.
 
-        `owed` is the state if the step depends on the state before it: the invariants of floating
-        parts then have to change. `rounding` is the rounding error of the moves.
+        `owed` is given if the step also depends on the previous state: it is the current state, by
+        which the invariants of floating parts have to change. `rounding` is the rounding error of
+        the moves.
 
         Raises ExperimentError if a floating part is under a load.
         """
@@ -341,12 +346,13 @@ class System(ABC):
     @abstractmethod
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
         """Return x with A x = moves, with an error of at most `share` times the largest entry of x.
-        Similar solutions `near`, for instance of similar systems, save iterations."""
+        Fields `near` that resemble the solution, for instance solutions of similar systems, save
+        iterations."""
 
     @abstractmethod
     def pushed_by(self, led: Floats) -> Floats | None:
-        """Return the moves of followers for displacements of their leaders, to first order; None if
-        the system does not contain leaders."""
+        """Return, to first order, the moves of followers that displacements of their leaders cause.
+        Return None if the system does not contain leaders."""
 
     @abstractmethod
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
@@ -355,7 +361,7 @@ class System(ABC):
 
     @abstractmethod
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
-        """Return ‖A c + after - before‖ / ‖A c‖, which measures the nonlinearity: `before` and
+        """Return ‖A c + after - before‖ / ‖A c‖, a measure of the nonlinearity, where `before` and
         `after` are the moves before and after a displacement c."""
 
     @abstractmethod
@@ -365,12 +371,12 @@ class System(ABC):
 
     @abstractmethod
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
-        """Raise ExperimentError if a floating part has moves: its equilibrium is defined for linear
-        rules only."""
+        """Raise ExperimentError if the moves of a floating part exceed their rounding error,
+        because the equilibrium of such a part is defined for linear rules only."""
 
     @abstractmethod
     def is_stable(self) -> bool:
-        """Return whether no eigenvalue of A that is examined is negative. A small disturbance of
+        """Return whether none of the examined eigenvalues of A is negative. A small disturbance of
         the solution then decays if the relaxation is small enough."""
 
 
