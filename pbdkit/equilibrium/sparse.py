@@ -503,8 +503,8 @@ class MatrixSystem(System):
         return self._planes(solution)
 
     def _owed(self, state: State) -> Floats | None:
-        """Return the displacements that followers have yet to receive, (follower, axis), if the
-        step depends on the state before: before · (u(t-1) - u(t)); else None."""
+        """Return before · (u(t-1) - u(t)), (follower, axis), by which the previous state changes
+        the invariants. Return None if a step does not depend on the previous state."""
         if not self._operator.couplings_previous.parts:
             return None
         u, previous = self._table(state.u), self._table(state.previous)

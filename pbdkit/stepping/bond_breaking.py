@@ -1,4 +1,4 @@
-"""Breaking and cutting of bonds in a step, and cells that soften one after the other."""
+"""Breaking and cutting of bonds in a step, and softening of one cell after the other."""
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ from pbdkit.stepping.state import State, cut_bonds
 from pbdkit.stepping.step import Call, Hindrance, Mode, Operation, Reach, Step
 
 Home = tuple[Any, ...]
-"""Type of the index of bonds in planes: plane and cells."""
+"""Type of the index of bonds in the arrays of bonds: the plane, and a slice of cells along each
+axis."""
 DIRECTIONS = 8
 """Number of directions in which the ends of a bond are displaced to test whether it may break."""
 TIE_RTOL = 1e-6
-"""Relative difference of loads up to which cells begin to soften together."""
+"""Cells begin to soften together if their loads differ by at most this relative amount."""
 MAX_DAMAGE_CHANGE = 1e-3
-"""Change of damage up to which further cells may begin to soften."""
+"""Further cells may begin to soften only if the damage of no cell changes by more than this."""
 
 
 class Fracturing:
-    """Fracture model of a scene on its planes of bonds."""
+    """Fracture model of a scene, evaluated on its planes of bonds: arrays with one entry for each
+    bond along a slot."""
 
     @classmethod
     def of(cls, scene: Scene) -> Self | None:
-        """Return the fracture of a scene; None if the model breaks no bonds."""
+        """Return the fracture model of a scene in this form; None if the model breaks no bonds."""
         return cls(scene) if scene.experiment.fracture.can_break else None
 
     def __init__(self, scene: Scene) -> None:
@@ -58,10 +60,11 @@ class Fracturing:
         self, m: NDArray[Any], state: State, step: int, *, in_turn: bool = False
     ) -> None:
         """Update the state variables of bonds in the intermediate configuration m, in place, and
-        mark bonds that break, with their length.
+        record the step and the length of the bonds that break.
 
-        With `in_turn`, only the cells with the largest load begin to soften, and only once the
-        damage of the cells that already soften is nearly constant.
+        With `in_turn` cells soften one after the other: only the cells with the largest load begin
+        to soften, and only when the damage of the cells that already soften has become nearly
+        constant.
         """
         assert state.broken_step is not None
         assert state.broken_length is not None
@@ -79,10 +82,11 @@ class Fracturing:
                 state.broken_length[part.home][breaks] = length(current)
 
     def may_break(self, u: NDArray[Any], state: State, within: float) -> bool:
-        """Return whether any bond breaks at u, or at a configuration in which the relative
-        displacement of its ends differs by less than `within`.
+        """Return whether any bond breaks at u, or would break if the relative displacement of its
+        ends differed by less than `within` from its value at u.
 
-        Eight directions are tested, on an octagon around the circle.
+        Eight changes of the relative displacement are tested: the corners of an octagon that
+        contains the circle with this radius.
         """
         radius = within / np.cos(np.pi / DIRECTIONS)
         angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
@@ -97,7 +101,8 @@ class Fracturing:
         self, m: NDArray[Any], state: State, when: str, nudge: Vector | None = None
     ) -> Iterator[_Renewed]:
         """Generate the bonds of each slot, block by block, with updated state variables. They are
-        updated in place, or in copies if all differences are changed by a `nudge`."""
+        updated in place, or in copies if the relative displacements of the ends of all bonds are
+        changed by a `nudge`."""
         assert state.broken_step is not None
         for n, slot, block, breakable in self._breakable:
             target, source = block.seen_through(slot).of(m), block.of(m)
@@ -120,9 +125,9 @@ class Fracturing:
             )
 
     def _hold_back(self, previous: list[NDArray[Any]], parts: Sequence[_Renewed]) -> None:
-        """Restore the state variables of cells that would begin to soften, except those with the
-        largest load; restore all of them while the damage of cells that have begun still
-        changes."""
+        """Restore the state variables of cells that would begin to soften, except the cells with
+        the largest load. As long as the damage of cells that already soften still changes, restore
+        the state variables of all cells that would begin."""
         change, largest = 0.0, 0.0
         sides = [[name.endswith(side) for name in self._numbers] for side in ("_left", "_right")]
         waiting = []
@@ -182,8 +187,8 @@ class CutBonds(Operation):
         cut_bonds(self.scene, step.state.broken_step, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write nothing: a step with a cut is always the first of a call, and is prepared before
-        it."""
+        """Write nothing: a step with a cut is always the first step of a call, and the cut is made
+        before the call."""
 
     def reads(self, state: State) -> bool:
         """Return whether the next step begins with a cut."""
@@ -228,12 +233,12 @@ class BreakBonds(Operation):
         self._fracturing.break_bonds(step.u, step.state, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write the pass over bonds, or leave it to the sweep."""
+        """Write the pass over bonds, unless the sweep over particles includes it."""
         kernel.judge_bonds()
 
     def reach(self, axis: int) -> Reach:
-        """Return the reach of a pass over bonds that precedes the moves of particles, which read
-        its result."""
+        """Return the reach of a pass over bonds. The pass precedes the moves of particles, because
+        they read its result."""
         scene, fracture = self.scene, self.scene.experiment.fracture
         if not (isinstance(fracture, RenewsBonds) or scene.tears):
             return Reach()
@@ -242,8 +247,8 @@ class BreakBonds(Operation):
         return Reach(back=back, ahead=ahead, below=forward, above=backward)
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if the model softens cells: their stress depends on particles beyond the
-        reach of a pass."""
+        """Return a reason if the model softens cells, because the stress of cells depends on
+        particles beyond the reach of a pass."""
         if mode is Mode.RANKS_AT_REST:
             return BREAKS_AT_REST
         softens = isinstance(self.scene.experiment.fracture, SoftensCells)

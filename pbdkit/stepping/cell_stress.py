@@ -1,4 +1,5 @@
-"""Stress of the cells beside bonds, for fracture models that soften cells by it."""
+"""Stress of the cells beside bonds, for fracture models in which cells soften according to their
+stress."""
 
 from __future__ import annotations
 
@@ -22,9 +23,9 @@ from pbdkit.stepping.state import shown
 class CellBeside:
     """Cell on one side of the bonds along a slot.
 
-    `corners` contains the sublattice of each corner and the number of repeat cells, along each
-    axis, from the start of a bond to the corner. `rates` are the coefficients of the mean gradient
-    of the displacement, Σ_k (u_k - u_0) ⊗ rates_k, where k runs over all corners except the first.
+    `corners` contains for each corner its sublattice and the number of repeat cells, along each
+    axis, from the start of a bond to the corner. The mean gradient of the displacement is Σ_k (u_k
+    - u_0) ⊗ rates_k, where k runs over all corners except the first, which is corner 0.
     """
 
     corners: tuple[tuple[int, Index], ...]
@@ -32,8 +33,9 @@ class CellBeside:
     side: Side
 
     def gradient(self, u: NDArray[Any], home: Block) -> list[Any]:
-        """Return the gradient at bonds that start at places of a block, as xx, xy, yx, yy: the
-        first letter is the component of the displacement, the second the axis."""
+        """Return the gradient at bonds that start at places of a block, as the components xx, xy,
+        yx, yy. The first letter is the component of the displacement, the second letter the axis of
+        the derivative."""
         first, *corners = (Vector(*shown(self._at(corner, home).of(u))) for corner in self.corners)
         d = [other - first for other in corners]
         return [
@@ -69,7 +71,8 @@ def sum_in_order(terms: list[Any]) -> Any:
 class CellStresses:
     """Cells beside the bonds of a scene with a fracture model that softens cells.
 
-    `ratios` are the components of the stiffness over Young's modulus, constant or of each cell.
+    `ratios` are the components of the stiffness divided by Young's modulus; they are constant or
+    vary from cell to cell.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -87,8 +90,8 @@ class CellStresses:
 
     @cached_property
     def ratios_by_cell(self) -> Stiffness:
-        """Ratios of each cell, (kind, sublattice, cell, cell), if cells differ in stiffness; those
-        of the rule at places without a cell."""
+        """Ratios of each cell, (kind, sublattice, cell, cell), if cells differ in stiffness. Places
+        without a cell have the ratios of the rule."""
         rule: Any = self._scene.experiment.rule
         base: Any = material_of(rule)
         planes = {name: self._cells.weight * value for name, value in base._asdict().items()}
@@ -97,14 +100,16 @@ class CellStresses:
                 planes[name] = planes[name] + plane
         has_stiffness = planes["xx"] > 0.0
         planes = {n: np.where(has_stiffness, v, getattr(base, n)) for n, v in planes.items()}
-        # In plane strain xy over xx is ν / (1 - ν), and σ_zz over σ_xx + σ_yy is ν.
+        # In plane strain the ratio of the stiffnesses xy and xx is ν / (1 - ν), and σ_zz = ν (σ_xx
+        # + σ_yy).
         share = (
             planes["xy"] / planes["xx"]
             if rule.through_thickness()
             else np.zeros(has_stiffness.shape)
         )
         components = dict(planes)
-        # Cells that a border cuts then have the same stiffness along both axes.
+        # Cells that are cut by a border between regions then have the same stiffness along both
+        # axes.
         if base.xx == base.yy:
             components["xx"] = components["yy"] = (planes["xx"] + planes["yy"]) / 2.0
         modulus = Stiffness(**components).own_modulus(share / (1.0 + share))
@@ -116,7 +121,7 @@ class CellStresses:
         return linear_stress if self._scene.experiment.rule.linear else turned_stress
 
     def beside(self, slot: Slot) -> tuple[CellBeside, CellBeside]:
-        """Return the cells to the left and to the right of a slot."""
+        """Return the cells to the left and to the right of the bonds along a slot."""
         first, second = (_beside(self._scene, slot, side) for side in self.tiling.beside[slot])
         return first, second
 
@@ -186,6 +191,7 @@ def _elastic(xx: Any, yy: Any, shear: Any, c: Any) -> Any:
 
 
 def tried(model: object, ones: Any) -> tuple[CellStress, ...]:
-    """Return cells for a test of a model's functions, as many as the functions receive."""
+    """Return the cells with which a model's functions are tested, as many as the functions
+    receive."""
     stress = CellStress(ones, 0.5 * ones, 0.25 * ones, ones)
     return (stress, stress) if isinstance(model, SoftensCells) else ()

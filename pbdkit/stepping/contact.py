@@ -1,13 +1,13 @@
 """Frictionless contact with obstacles: after each step, particles inside an obstacle are projected
 onto its outline.
 
-A rule moves a particle by S⁻¹ · force, with a 2 × 2 matrix S of the particle. For calibrated rules
-S is the stiffness by which its neighbours hold it; for springs it is a multiple of the identity. A
-particle is projected onto the nearest point outside all obstacles in the metric S. With the normal
-n at that point the displacement is proportional to S⁻¹ n, or to a combination of S⁻¹ n for several
-normals where obstacles meet, so that the remaining force in equilibrium is along the normals. If S
-is a multiple of the identity, the projection is orthogonal. A guided particle is moved along its
-free axis alone.
+A rule moves a particle by S⁻¹ · force, where S is a 2 × 2 matrix of the particle. For calibrated
+rules S is the stiffness of the force that restores the particle if its neighbours stay; for springs
+it is a multiple of the identity. A particle is projected onto the nearest point outside all
+obstacles in the metric S. With the normal n at that point the displacement is proportional to S⁻¹
+n, or to a combination of S⁻¹ n for several normals where obstacles meet, so that the remaining
+force in equilibrium is along the normals. If S is a multiple of the identity, the projection is
+orthogonal. A guided particle is moved along its free axis only.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from pbdkit.stepping.state import State, unmoved_state
 from pbdkit.stepping.step import PUSHED_BY_COURSES, Call, Cells, Hindrance, Mode, Operation, Step
 
 NUDGE = 0.01
-"""Displacement in lattice constants by which the restoring move of a particle is measured."""
+"""Displacement of a particle, in lattice constants, for which its restoring move is evaluated."""
 SAME = 1e-9
 """Relative difference below which two entries of a matrix count as equal."""
 PARTICLES = 16384
-"""Number of particles that are evaluated at once."""
+"""Number of particles that are evaluated in one block."""
 
 
 def stiffnesses(scene: Scene, place: Indices) -> Floats:
@@ -82,7 +82,8 @@ def compliance(scene: Scene) -> Floats | None:
     """Return C = S⁻¹ of every particle, scaled for each particle: (xx xy yy, sublattice, cell,
     cell).
 
-    None if C is a multiple of the identity for all particles, as for rules without forces.
+    Returns None if C is a multiple of the identity for all particles, or if the rule defines no
+    forces.
     """
     if material_of(scene.experiment.rule) is None:
         return None
@@ -103,8 +104,8 @@ def compliance(scene: Scene) -> Floats | None:
 Touching = list[tuple[Indices, Floats]]
 """Type of the rows on the outline of each obstacle, with the normals there, (row, axis)."""
 FREE = 0
-"""Code of particles that are free along both axes. Code 1 is for particles led along x, 2 for
-particles led along y."""
+"""Code of particles that are free along both axes. Particles that are led along x only have the
+code 1, and along y only the code 2."""
 ALL_LED = 3
 """Code of particles that are led along both axes."""
 
@@ -112,8 +113,8 @@ ALL_LED = 3
 class Contact:
     """Obstacles of a scene and the particles of its body.
 
-    Particles that cannot reach the box of an obstacle with their displacements are not evaluated.
-    The order of the obstacles does not matter.
+    Only particles are evaluated that can lie in the bounding box of an obstacle, given the range of
+    all displacements. The result does not depend on the order of the obstacles.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -131,8 +132,8 @@ class Contact:
         return compliance(self._scene)
 
     def led(self, step: int) -> NDArray[np.int8] | None:
-        """Return the code of the axes along which particles lead in a step, (sublattice, cell,
-        cell); None if none can be guided."""
+        """Return for each particle the code of the axes along which it is led in a step,
+        (sublattice, cell, cell). Return None if no particle can be guided."""
         scene = self._scene
         if not has_guides(scene.leading):
             return None
@@ -147,8 +148,8 @@ class Contact:
 
     def push_out(self, u: Floats, moment: float) -> None:
         """Push the body's particles out of the obstacles at the end of a step, or at a moment
-        within it; `u` are planes, with guided particles placed along their led axes. Leaders may be
-        moved, too, and are placed afterwards."""
+        within it. `u` is changed in place; its guided particles are already placed along their led
+        axes. Leaders may be pushed, too, and are therefore placed again afterwards."""
         outlines, places = self._outlines(moment), [np.empty(0, np.intp)]
         for outline in outlines:
             for block in self._blocks():
@@ -171,7 +172,7 @@ class Contact:
 
     def ways_of_masses(self, u: Floats, place: Indices, moment: float) -> Floats:
         """Return the displacements, (axis, place), that push particles with isotropic response out
-        of the obstacles, from displacements u."""
+        of the obstacles. The particles have the displacements u."""
         X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
         at = np.stack([a + b for a, b in zip(X, u, strict=True)])
         return self._ways(at, _alike(len(place)), np.zeros(len(place), np.int8), moment)
@@ -200,15 +201,16 @@ class Contact:
         return np.stack([a + b for a, b in zip(X, u.reshape(len(u), -1)[:, place], strict=True)])
 
     def compliance_at(self, place: Indices) -> Floats:
-        """Return C of particles at flat places, (xx xy yy, place)."""
+        """Return the directional response C = S⁻¹ of particles at flat places, (xx xy yy, place). A
+        flat place is the index of a particle in a flattened raster."""
         if self.compliance is None:
             return _alike(len(place))
         C: Floats = self.compliance.reshape(3, -1)[:, place]
         return C
 
     def touched_at_rest(self, moment: float) -> Iterator[tuple[NDArray[np.intp], ...]]:
-        """Generate the cells of particles that are pushed in their reference positions, one array
-        for each axis."""
+        """Generate the cells of particles that obstacles would push out of their reference
+        positions, one array for each axis."""
         still = np.zeros((2, *self._scene.raster.shape))
         for _, outline in outlines_at(self._scene.barriers, moment):
             for block in self._blocks():
@@ -218,11 +220,12 @@ class Contact:
                     yield tuple(n + a for n, a in zip(np.nonzero(inside), near.start, strict=True))
 
     def touching(self, state: State, moment: float) -> Touching:
-        """Return the rows of the followers on the outline of each obstacle at a moment, guided
-        particles included, and the normals there, (row, axis).
+        """Return for each obstacle the followers on its outline at a moment, as rows of the table
+        of particles, and the normals at these particles, (row, axis). Guided particles are
+        included.
 
-        The tolerance is the rounding error and 1e-9 of a lattice constant. Rows at which two faces
-        meet occur twice.
+        A particle counts as lying on the outline if its distance is at most the rounding error plus
+        1e-9 of a lattice constant. The row of a particle at a corner of two faces occurs twice.
         """
         scene, raster, step = self._scene, self._scene.raster, math.ceil(moment)
         kinds = kinds_at(raster, scene.leading, step)
@@ -252,7 +255,8 @@ class Contact:
         return [block for block in blocks if block]
 
     def _near(self, block: Block, u: Floats, box: Floats) -> Block | None:
-        """Return the part of a block with particles that may lie in the box; u are planes."""
+        """Return the part of a block that contains all particles that may lie in the box; `u` are
+        the displacements of the block."""
         raster = self._scene.raster
         low, high = np.array([[np.fmin.reduce(p, axis=None) for p in u],
                               [np.fmax.reduce(p, axis=None) for p in u]])  # fmt: skip
@@ -261,7 +265,7 @@ class Contact:
             return None
         at = raster.cell.basis[block.sublattice]
         low, high = self._ends(block)
-        # An infinite box is bounded by that of the body here, plus a margin.
+        # An infinite box is replaced by the bounding box of the block, plus a margin.
         corner = np.clip(corner, low - 1.0, high + 1.0)
         corners = np.array([[corner[i, 0], corner[j, 1]] for i, j in product((0, 1), repeat=2)])
         cells = (corners - at) @ self._inverse - raster.first
@@ -272,7 +276,7 @@ class Contact:
         return Block(block.sublattice, tuple(first.tolist()), tuple(last.tolist()))
 
     def _inside(self, block: Block, u: Floats, outline: Outline) -> Mask:
-        """Return which of the body's particles in a block are inside."""
+        """Return which of the body's particles in a block are inside an obstacle."""
         X, low = self._scene.raster.reference_planes(block), outline.box
         x, y = (a + b for a, b in zip(X, block.of(u), strict=True))
         near = (x >= low[0]) & (y >= low[1]) & (x <= low[2]) & (y <= low[3])
@@ -310,11 +314,12 @@ class PushOut(Operation):
         return bool(scene.barriers)
 
     def apply(self, step: Step) -> None:
-        """Push particles after they have moved and guided ones have been placed."""
+        """Push particles after the rule has moved them and guided particles have been placed."""
         self.contact.push_out(step.new, step.number)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write a function of rows, which skips rows that reach no box of an obstacle."""
+        """Write a function that moves the particles of a range of rows. It skips rows that do not
+        overlap the bounding box of any obstacle."""
         kernel.over_rows("push_out", lambda out: self._write(kernel, out))
 
     def functions(self) -> dict[str, Callable[..., Any]]:
@@ -322,8 +327,8 @@ class PushOut(Operation):
         return {"leave": leave}
 
     def arrays(self, call: Call) -> dict[str, Any]:
-        """Return the outlines of the obstacles, with points and boxes step by step, the response of
-        particles, and the axes along which they lead."""
+        """Return the outlines of the obstacles with their points and bounding boxes in each step,
+        the response of the particles, and the axes along which they are led."""
         moments = [[o for _, o in outlines_at(self.scene.barriers, step)] for step in call.moments]
         walls = [Walls.of(outlines) for outlines in moments]
         boxes = np.array([[outline.box for outline in outlines] for outlines in moments])
@@ -339,7 +344,8 @@ class PushOut(Operation):
         return arrays | ({} if codes is None else {"led_axes": codes})
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of particles that are pushed in their reference positions."""
+        """Generate the cells of particles that obstacles would push out of their reference
+        positions."""
         for step in call.moments:
             yield from self.contact.touched_at_rest(step)
 
@@ -352,8 +358,8 @@ class PushOut(Operation):
         return [at for each in self.scene.barriers for at in each.group.events(steps)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if state variables change: the response of particles is computed from
-        their initial values."""
+        """Return a reason if state variables change, because the response of particles is computed
+        from the initial values of the state variables."""
         reasons = {
             Mode.GPU: "obstacles push",
             Mode.COURSES: PUSHED_BY_COURSES,
@@ -391,8 +397,8 @@ class PushOut(Operation):
 
 
 def _each_near(low: str, high: str) -> Lines:
-    """Return the head of a loop over the obstacles that sets `near` if the range between two
-    positions may overlap the box of an obstacle; ranges with NaN do not overlap."""
+    """Return the head of a loop over the obstacles. It sets `near` to whether the range between two
+    positions may overlap the bounding box of the obstacle; ranges with NaN do not overlap."""
     return [
         "for w in range(wall_kind.size):",
         f"    if {low}x > edges[w, 2] or {high}x < edges[w, 0] or "

@@ -1,13 +1,15 @@
-"""GPU engine (numba-cuda): kernels that make many steps in a launch, and the state on the device.
+"""GPU engine (numba-cuda). Its kernels make many steps in a launch, and the state stays on the
+device.
 
-A thread moves one particle after the other, by the same lines of code as in row sweeps, but on flat
-arrays. Every place belongs to a group: group 0 has no followers; the particles of the next groups,
-one for each sublattice and kind of row, have all neighbours; in the last groups, one for each
-sublattice, neighbours may be missing. Threads are synchronised between the operations of a step, so
-that no thread reads what another one writes.
+A thread moves one particle after the other. The lines of code are the same as in sweeps over rows,
+but use flat arrays. Every place belongs to a group. Group 0 has no followers. The next groups, one
+for each sublattice and kind of row, contain the particles that have all their neighbours. The last
+groups, one for each sublattice, contain the particles that may lack neighbours. Threads are
+synchronised between the operations of a step, so that no thread reads a value while another one
+writes it.
 
-The state stays on the device and is fetched at the end of a call. Kernels do not contract products
-and sums (written against numba-cuda 0.30; see `_uncontracted`).
+The state is copied from the device at the end of a call. Kernels do not contract a product and a
+sum to one operation with a single rounding (written against numba-cuda 0.30; see `_uncontracted`).
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ from pbdkit.stepping.state import State, unmoved_state
 from pbdkit.stepping.step import Call
 
 THREAD = ("me", "threads")
-"""Arguments of functions: the index of the thread, and the number of threads."""
+"""Names of two arguments of functions: the index of the thread, and the number of threads."""
 Whole = Sequence[tuple[int, int]]
 """Type of the groups of particles that have all neighbours, as (sublattice, kind)."""
 
@@ -96,7 +98,7 @@ def breakable_bonds(plan: Plan) -> NDArray[np.uint8]:
 
 
 def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None) -> Function:
-    """Return the function by which a thread moves its particles, one after the other."""
+    """Return the function with which a thread moves its particles, one after the other."""
     out = Function(plan.shared, f"sweep{level.number}", *THREAD)
     out.add(0, *sweeps.parameters(plan, level), "base = 0", *_aliases(plan, level))
     for s, kind in whole:
@@ -124,7 +126,7 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
 
 
 def write_bonds(plan: Plan) -> Function:
-    """Return the function by which a thread updates and breaks its bonds, plane after plane."""
+    """Return the function with which a thread updates and breaks its bonds, plane after plane."""
     out = Function(plan.shared, "judge_bonds", *THREAD)
     out.add(0, sweeps.parameters(plan, plan.levels[-1])[-1])
     out.add(0, "cells = flat_broken.size // len(ends)", "for n in range(len(ends)):")
@@ -141,7 +143,8 @@ def write_bonds(plan: Plan) -> Function:
 
 
 def _aliases(plan: Plan, level: Level) -> list[str]:
-    """Return lines that alias the rows of a particle to the whole arrays."""
+    """Return lines that assign the whole arrays to the names that the rows of a particle have in
+    row sweeps."""
     n = level.number
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
@@ -163,8 +166,8 @@ def _cells(plan: Plan) -> list[str]:
 
 
 def _steps(plan: Plan, kind: int, s: int, k: int, slot: Slot) -> list[str]:
-    """Return lines for the differences in flat arrays to a neighbour, to the home of its bond, and
-    to the cells beside the bond."""
+    """Return lines for index offsets in flat arrays: from a particle to its neighbour, to the place
+    at which their bond is stored, and to the cells beside the bond."""
     lines = [f"w{s}_{k} = away[{s}, {k}]"]
     if plan.bonds or plan.limits or plan.bonds_first:
         lines.append(f"v{s}_{k} = bonds_away[{s}, {k}]")
@@ -217,31 +220,33 @@ def flattened(arrays: Arrays) -> Arrays:
 
 
 class ThreadWriter(PlanWriter):
-    """Writer of what one of many threads does in a step. Threads are synchronised between
-    operations on different places."""
+    """Writer of the part of a step that one of many threads executes. Threads are synchronised
+    between operations on different places."""
 
     _list = ""
-    """List of particles in the last loop written since the last synchronisation."""
+    """Name of the list of particles over which the last loop was written, if no synchronisation was
+    written after it."""
 
     def __init__(self, plan: Plan, out: Function, passes: Passes, wait: str) -> None:
         super().__init__(plan, out, passes)
         self._wait = wait
 
     def begin(self) -> None:
-        """Write the first lines of operations, and copy state variables before the step changes
-        them."""
+        """Write the first lines of operations, and lines that copy state variables before the step
+        changes them."""
         self.out.add(1, *self.plan.opening("moment"))
         for m in self.plan.kept:
             self.out.add(1, f"for e in {self.plan.over(f'flat_own{m}.size')}:")
             self.out.add(2, f"flat_was{m}[e] = flat_own{m}[e]")
 
     def end(self) -> None:
-        """Exchange the displacements before and after the step."""
+        """Write lines that swap the arrays of the displacements before the step and after it."""
         u, v = (", ".join(self.each(f"flat_{name}_@")) for name in "uv")
         self.out.add(1, f"{u}, {v} = {v}, {u}")
 
     def wait(self) -> None:
-        """Synchronise all threads, unless nothing was written since the last synchronisation."""
+        """Write a synchronisation of all threads, unless the last line written is a
+        synchronisation."""
         if not self.out.lines[-1].endswith(self._wait):
             self.out.add(1, self._wait)
         self._list = ""
@@ -283,8 +288,9 @@ class ThreadWriter(PlanWriter):
 
 def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]:
     """Return the source of a module with ``run(step, count, ...)``, which makes `count` steps, and
-    the names of the other arguments, which are arrays. With `alone` a single block is launched,
-    which synchronises its own threads only and takes much less time."""
+    the names of the other arguments, which are arrays. With `alone` a single block is launched. It
+    has to synchronise only its own threads, which takes much less time than a synchronisation of
+    several blocks."""
     events = sweeps.write_events(plan) if plan.judged else None
     judge = write_bonds(plan) if plan.bonds_first else None
     moves = [write_sweep(plan, level, whole, events) for level in plan.levels]
@@ -357,8 +363,7 @@ def make_kernel(source: str, functions: Mapping[str, DeviceFunction], threads: i
     most `threads` threads."""
     scope = vars(ModuleType("kernel"))
     scope |= words(_on_device) | {name: _on_device(of) for name, of in functions.items()}
-    # The device code is linked at once, since the driver could contract operations in code that is
-    # linked later.
+    # Linking with optimisation (`lto`) is off, since the driver could then contract operations.
     options = {} if is_simulated() else {"lto": False, "launch_bounds": threads}
     scope.update(cuda=cuda, part=_on_device, kernel=cuda.jit(**options))
     exec(compile(source, "<kernel>", "exec"), scope)
@@ -366,7 +371,8 @@ def make_kernel(source: str, functions: Mapping[str, DeviceFunction], threads: i
 
 
 def text_of(run: Any, arguments: tuple[Any, ...], device: tuple[int, int]) -> str:
-    """Return the kernel as PTX for arguments of these types, on devices of a compute capability.
+    """Return the text of the kernel (PTX) for arguments of these types, on devices with a given
+    compute capability.
 
     Raises PbdkitError if products and sums could be contracted.
     """
@@ -395,13 +401,14 @@ def launcher(run: Any, blocks: int, threads: int) -> Any:
 
 
 def most_blocks(run: Any, threads: int) -> int:
-    """Return the number of blocks of `threads` threads that the device can hold at once."""
+    """Return the number of blocks of `threads` threads that can be resident on the device
+    simultaneously."""
     (kernel,) = run.overloads.values()
     return int(kernel.max_cooperative_grid_blocks(threads))
 
 
 def is_simulated() -> bool:
-    """Return whether numba runs kernels in Python: NUMBA_ENABLE_CUDASIM."""
+    """Return whether numba's simulator runs kernels in Python (NUMBA_ENABLE_CUDASIM)."""
     return bool(cuda.config.ENABLE_CUDASIM)
 
 
@@ -415,9 +422,9 @@ def _on_device(function: DeviceFunction) -> Any:
 
 @contextmanager
 def _uncontracted() -> Iterator[None]:
-    """Compile kernels in this context without contracting products and sums, as numpy rounds:
-    libNVVM's option fma=0, for which numba-cuda 0.30 has no switch. The text of a kernel shows
-    whether it has an effect."""
+    """Compile kernels in this context without contracting products and sums, so that they round as
+    numpy does. For this the option fma=0 of libNVVM is set, for which numba-cuda 0.30 has no
+    switch. Whether it has an effect is checked in the text of the kernel."""
     if is_simulated():
         yield
         return
@@ -443,8 +450,9 @@ def _checked(text: str) -> str:
 
 @cache
 def _complete_ufuncs() -> None:
-    """Add functions of numpy that numba-cuda 0.30 lacks in kernels, such as `np.sqrt`, from the
-    library of the device, or else from numba."""
+    """Add the functions of numpy that numba-cuda 0.30 does not support in kernels, such as
+    `np.sqrt`. They are taken from the library of the device or, if it does not have them, from
+    numba."""
     from numba.cuda import mathimpl, ufuncs
     from numba.cuda.np import ufunc_db
 
@@ -477,8 +485,8 @@ SIMULATED_THREADS = 8
 class GpuStepper(Engine):
     """Engine that steps a scene with its own kernel on the first GPU.
 
-    A state that does not come from this engine is sent to the device, and the state is fetched at
-    the end of a call. All particles are moved in every step.
+    A state that was not computed by this engine is copied to the device, and the state is copied
+    back at the end of a call. All particles are moved in every step.
     """
 
     name = "gpu"
@@ -488,7 +496,7 @@ class GpuStepper(Engine):
         self._program = program_of(scene)
         self._last: State | None = None
         self._sent: Arrays = {}
-        """Arrays of operations that are on the device."""
+        """Arrays of operations that are already on the device."""
         kernel = kernel_of(scene)
         self._plan, self._names = kernel.plan, kernel.names
         self._device: Arrays = {}
@@ -526,7 +534,7 @@ class GpuStepper(Engine):
         return min(most_blocks(self._run, THREADS), -(-size // THREADS)), THREADS
 
     def _begin(self, state: State) -> None:
-        """Send all arrays that steps change."""
+        """Copy all arrays that steps change to the device."""
         planes = changing_planes(self._plan, state)
         if self._plan.judged:
             planes |= flattened({"lost": lost_bits(self._scene, state)})
@@ -535,7 +543,7 @@ class GpuStepper(Engine):
         self._send(planes)
 
     def _fetch(self, state: State) -> None:
-        """Copy what steps have changed into the arrays of a state."""
+        """Copy the values that steps have changed from the device to the arrays of a state."""
         for name, array in changing_planes(self._plan, state).items():
             if name in self._device:
                 self._device[name].copy_to_host(array)
@@ -563,14 +571,15 @@ class GpuStepper(Engine):
             self._numbered = scene
 
     def _send_call(self, call: Call) -> None:
-        """Send the arrays of operations for a call, except those that are on the device already."""
+        """Copy the arrays of operations for a call to the device, except those that are already on
+        it."""
         arrays = call_arrays(self._plan, self._program, call, by_rows=False)
         changed = {name: a for name, a in arrays.items() if self._sent.get(name) is not a}
         self._sent |= changed
         self._send(flattened(changed))
 
     def _send(self, arrays: Arrays) -> None:
-        """Send the constant arrays of the kernel."""
+        """Copy the constant arrays of the kernel to the device."""
         self._device |= {
             name: cuda.to_device(array) for name, array in arrays.items() if name in self._names
         }

@@ -1,4 +1,5 @@
-"""Detection of diverging runs within a hundred steps, and recovery of the last good state."""
+"""Detection of divergence at most a hundred steps after it occurs, and recovery of the last good
+state."""
 
 from __future__ import annotations
 
@@ -14,23 +15,25 @@ from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state
 
 EVERY = 100
-"""Interval of checks in steps; recorded steps are checked, too."""
+"""Number of steps between two checks; recorded steps are checked, too."""
 KEPT_EVERY = 5000
 """Minimum number of steps between two copies of the state. Steps after a copy are repeated to find
 the last good state."""
 MAX_RELATIVE_SIZE = 1e6
-"""Limit of displacements in units of `size`; a run in which a displacement exceeds it diverges."""
+"""Limit of displacements, relative to `size`. A run with a larger displacement is reported as
+diverging."""
 SAMPLES = 64
 """Number of moments at which the motion of a leader group is evaluated."""
 
 
 @dataclass
 class Guard:
-    """Check of states against divergence, in two passes over the displacements.
+    """Check of states for divergence. A check needs two passes over the displacements.
 
     A state is good if no displacement exceeds `size`, the sum of the size of the body, its initial
-    displacements and its leaders' motions. `next_look` is the latest step of the next check,
-    `good_step` the last good step, `good_copy` a copy of a good state.
+    displacements and its leaders' motions. The next check is made at the step `next_look` or
+    before. `good_step` is the last step with a good state, and `good_copy` a copy of an earlier
+    good state.
     """
 
     size: float
@@ -46,8 +49,9 @@ class Guard:
 
     def look(self, scene: Scene, state: State, *, note: bool = True) -> None:
         """Raise FloatingPointError, with particle and step, if a displacement is not finite or
-        exceeds the limit. With `note` false the result is not stored: for checks at steps that
-        depend on the length of the run."""
+        exceeds the limit. With `note` false the result is not stored. This is necessary for checks
+        at steps that depend on the length of the run, because stored results must not depend on
+        it."""
         largest = self.most(state)
         if note:
             self.next_look = next_multiple(state.step)
@@ -77,8 +81,9 @@ class Guard:
     def last_good(
         self, scene: Scene, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]
     ) -> State | None:
-        """Return the last good state before a step; None if `stopping` returns true. The steps from
-        the copy on are repeated, at most `patience` of them in one call of the engine."""
+        """Return the last good state before a step; None if `stopping` returns true. The steps
+        after the stored copy of a good state are repeated, at most `patience` of them in one call
+        of the engine."""
         state, self.good_copy = self.good_copy or initial_state(scene), None
         while state.step < self.good_step and not stopping():
             state = engine.advance(state, min(patience, self.good_step - state.step))
@@ -97,7 +102,7 @@ def next_multiple(step: int) -> int:
 
 
 def size_of(scene: Scene) -> float:
-    """Return the size of the body and its leaders' motions together."""
+    """Return the size of the body plus the largest distances of its leaders' motions."""
     ends = scene.raster.body_ends()
     spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
     local = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
@@ -112,7 +117,7 @@ def most_of(state: State) -> float:
 
 
 def way_of(leading: Leading | Barrier, steps: int) -> float:
-    """Return the largest distance of a group from its start, at some moments."""
+    """Return the largest distance of a group from its start, at `SAMPLES` moments of its motion."""
     group = leading.group
     last, rests = group.last(steps) - group.from_ + 1, group.motion.rests_after()
     # The moments do not depend on the length of the run.

@@ -1,5 +1,5 @@
-"""Choice of engine and number of threads for a scene, with the reason. Engines that are not chosen
-are not imported."""
+"""Choice of the engine and the number of threads for a scene, with the reason of the choice.
+Engines that are not chosen are not imported."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def what_gpus_lack(scene: Scene) -> str:
 
 
 PATIENCE_S = 3.0
-"""Estimated time of the numpy engine in seconds above which the compiled engine is faster in total
-(measured: .5 s to import numba and load a kernel, 1 to 5 s to compile one)."""
+"""If the numpy engine is estimated to need more than this time, in seconds, the compiled engine is
+faster in total. It was measured that numba needs .5 s to be imported and to load a kernel, and 1 to
+5 s to compile one."""
 CALL_S = 25e-6
 """Time of the numpy engine for each step and slot, in seconds (measured)."""
 VALUE_S = 2.5e-9
@@ -46,8 +47,8 @@ KERNEL_S = 2e-9
 """Time of kernels for each step and particle, in seconds (measured: 1 to 2 ns, with 4 or 8
 neighbours in motion)."""
 MIN_PARTICLES_OF_TWO_THREADS = 100_000
-"""Number of particles from which two threads are faster than one (measured: 40 000), with a
-margin."""
+"""Number of particles from which two threads are faster than one. The measured value is 40 000; a
+margin is added."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +143,8 @@ def what_kernels_lack(scene: Scene) -> str:
 
 
 def _about_passes(scene: Scene) -> str:
-    """If several steps per pass over the memory would be faster but are not possible, return the
-    reason; otherwise an empty text."""
+    """Return the reason if several steps in a pass over the memory would be faster but are not
+    possible; otherwise return an empty text."""
     why = exceeds_cache(scene) and single_steps(scene)
     return f"; one step per pass over the memory: {why}" if why else ""
 

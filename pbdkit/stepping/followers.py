@@ -44,10 +44,10 @@ class Followers(ABC):
         """Write the displacements of all body particles into `new`, from the intermediate
         configuration m.
 
-        On entry `new` contains the displacements of the step before, from which the momentum is
-        computed. Particles without neighbours stay; values of leaders are overwritten later.
-        `state` is the state at the end of the step before; state variables of particles are updated
-        in place.
+        On entry `new` contains the displacements at the beginning of the previous step, from which
+        the momentum is computed. Particles without neighbours stay. The values of leaders are
+        overwritten later. `state` is the state at the end of the previous step; its state variables
+        of particles are updated in place.
         """
 
 
@@ -85,8 +85,8 @@ class SlotFollowers(Followers):
         ]
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Move the particles block by block. All blocks read m alone, so that their order does not
-        matter."""
+        """Move the particles block by block. No block reads displacements that another block
+        writes, so that the order of the blocks does not matter."""
         loads = self._scene.loads
         acting = loads.at(state.step + 1, m.dtype) if loads else None
         for around, evaluator, total, values in self._summed(m, state):
@@ -108,7 +108,7 @@ class SlotFollowers(Followers):
         return self._of_all(Evaluator.force, m, state)
 
     def _of_all(self, function: Callable[..., Any], m: Floats, state: State) -> Floats:
-        """Return the values of a function of the summed contributions at all particles, zero for
+        """Evaluate a function of the summed contributions at all particles. Its value is zero at
         particles without neighbours."""
         out = np.zeros_like(m)
         for around, evaluator, total, arguments in self._summed(m, state):
@@ -138,8 +138,8 @@ class SlotFollowers(Followers):
         return -0.5 * float((u * forces).sum())
 
     def _seen(self, m: Floats, state: State) -> Floats:
-        """Return the vectors from which the rule computes differences: displacements, or the moves
-        of its inner rule."""
+        """Return the vectors of which the rule receives differences: displacements, or the moves of
+        its inner rule."""
         if self._inner is None:
             return m
         z = self._inner.moves(m, state)
@@ -152,8 +152,8 @@ class SlotFollowers(Followers):
         """Generate every block with its summed contributions and the values at its particles."""
         planes, previous = self._seen(m, state), state
         if shares_particles(self._scene.experiment.rule):
-            # State variables of neighbours are those before the step, also in blocks that have been
-            # updated.
+            # Neighbours have the state variables from before the step, also in blocks that are
+            # already updated.
             previous = replace(
                 state, particle_values=tuple(v.copy() for v in state.particle_values)
             )
@@ -169,9 +169,10 @@ def _write(plane: Floats, value: Any, where_: Mask | None, otherwise: Any) -> No
 class GatheringFollowers(Followers):
     """Followers of a scene with re-evaluated neighbours.
 
-    The same `gather` and `apply` run on tables with a row for each pair of neighbours and each
-    particle. Neighbours of the reference configuration are summed first, in the order of their
-    slots and with the rest offsets of the slots, so that a body at rest stays exactly at rest.
+    `gather` is called with a table that has a row for each pair of neighbours, and `apply` with a
+    table that has a row for each particle. Particles that are neighbours in the reference
+    configuration are summed first, in the order of their slots and with the rest offsets of the
+    slots. For this reason a body at rest stays exactly at rest.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -184,7 +185,8 @@ class GatheringFollowers(Followers):
         self._centred = X.each(np.subtract, scene.middle)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Move all particles from m; bonds do not break in such scenes."""
+        """Move all particles from the intermediate configuration m. In scenes with re-evaluated
+        neighbours bonds do not break."""
         flat, count = new.reshape(len(new), -1), len(self._place)
         u, previous = m.reshape(len(m), -1)[:, self._place], flat[:, self._place]
         j, k, rest = self._search.pairs(m)
@@ -235,13 +237,14 @@ class MoveFollowers(Operation):
 
     def apply(self, step: Step) -> None:
         """Move the particles from the intermediate configuration. Values that are not finite are
-        reported when they are recorded."""
+        not reported here, but when they are recorded."""
         quiet = np.errstate(all="ignore", invalid=step.invalid)
         with quiet, blaming(self.scene.experiment.rule, f"at step {step.number}"):
             self._followers.move(step.u, step.new, step.state)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write a sweep for each rule, the innermost first."""
+        """Write a sweep over the particles for each rule. The sweep of the innermost rule is
+        written first."""
         for level in range(self.sweeps() - 1):
             kernel.sweep(level)
             for frame in FollowFrame.of(self.scene):
@@ -249,12 +252,13 @@ class MoveFollowers(Operation):
         kernel.sweep(self.sweeps() - 1)
 
     def sweeps(self) -> int:
-        """Return the number of rules, inner ones included."""
+        """Return the number of rules, including inner rules."""
         return len(list(_levels(self.scene)))
 
     def reach(self, axis: int) -> Reach:
-        """Return the distance of neighbours and, if the rule has an inner rule, the distances up to
-        which the moves of the inner rule are computed before particles move."""
+        """Return the largest distance of neighbours. If the rule has an inner rule, the result also
+        contains the distances up to which the moves of the inner rule are computed before particles
+        move."""
         reach = self.scene.neighbourhood.reach_in_cells[axis]
         if not self.scene.inner:
             return Reach(reach)
@@ -264,7 +268,7 @@ class MoveFollowers(Operation):
         return Reach(reach, far, far, reach, reach)
 
     def carries(self) -> Indices:
-        """Return the differences along all slots."""
+        """Return the differences between the cells of two neighbours, for all slots."""
         return np.array([slot.cell for slots in self.scene.neighbourhood.slots for slot in slots])
 
     def arrays(self, call: Call) -> dict[str, Any]:
@@ -302,7 +306,8 @@ class MoveFollowers(Operation):
         return self.scene.loads.changes(steps) if self.scene.loads else []
 
     def bends(self, steps: int) -> list[int]:
-        """Return the kinks of time-dependent parameters, and of loads while they act."""
+        """Return the moments at which the slope of a time-dependent parameter, or of a load that
+        acts, changes."""
         courses = self.scene.experiment.courses.values()
         spans = [(course, 0, steps) for course in courses]
         for loading in self.scene.loads.each if self.scene.loads else ():
@@ -330,8 +335,8 @@ class MoveFollowers(Operation):
         return self._hindrance_of_courses() if mode is Mode.COURSES else None
 
     def _hindrance_of_courses(self) -> Hindrance | None:
-        """Return a reason if time-dependent parameters are not the same for all particles: kernels
-        read them from arrays that all particles share."""
+        """Return a reason if time-dependent parameters are not the same for all particles, because
+        kernels read them from arrays that have one value for all particles."""
         scene = self.scene
         courses = scene.experiment.courses
         fields = [field for field, _ in courses if field != "solver"]
@@ -356,7 +361,7 @@ def _is_mixed(scene: Scene) -> bool:
 
 
 def _levels(scene: Scene) -> Iterator[Scene]:
-    """Generate the scene and those of its inner rules, the innermost last."""
+    """Generate the scene, then the scene of its inner rule, and so on to the innermost rule."""
     yield scene
     if scene.inner:
         yield from _levels(scene.inner)

@@ -41,15 +41,15 @@ class FollowFrame(Operation):
         return Reach(apart=int(self._spans[axis].max()))
 
     def carries(self) -> Indices:
-        """Return the differences of repeat cells between a neighbour of a frame point and the
-        particle that the point follows."""
+        """Return the differences of repeat cells between a neighbour of a frame point and a
+        particle that the point follows. A motion propagates by these differences."""
         frame, kinds = self.scene.frame, self.scene.raster.kind
         assert frame
         places = frame.place[frame.map.point], frame.body_place
         at, body = (np.stack(np.unravel_index(p, kinds.shape)[1:], axis=1) for p in places)
         steps = [np.zeros((0, self.scene.axes), np.intp)]
         for slot in chain(*self.scene.neighbourhood.slots):
-            # Slots lead from the particle at `neighbour` to the frame point.
+            # These slots lead from the particle at `neighbour` to the frame point.
             neighbour = at - slot.cell
             inside = ((neighbour >= 0) & (neighbour < kinds.shape[1:])).all(axis=1)
             follows = kinds[(slot.source, *neighbour[inside].T)] == FOLLOWER
@@ -80,7 +80,7 @@ class FollowFrame(Operation):
 
     @property
     def _first(self) -> Indices:
-        """Index of the first entry of each point in the map."""
+        """Index in the map of the first entry of each point."""
         assert self.scene.frame
         return np.searchsorted(self.scene.frame.map.point, np.arange(len(self.scene.frame.place)))
 
@@ -90,8 +90,8 @@ class FollowFrame(Operation):
         return np.stack([index[1], index[-1]])
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if the map changes, because it is then stored on the host, for the whole
-        lattice."""
+        """Return a reason if the map changes with time, because it is then stored on the host and
+        for the whole lattice."""
         reasons = {
             Mode.COURSES: "the weights of the frame are time-dependent",
             Mode.RANKS: "a frame that depends on time-dependent parameters of the rule",
@@ -100,13 +100,13 @@ class FollowFrame(Operation):
         return Hindrance(reasons[mode], "frame") if changes else None
 
     def emit_for(self, kernel: KernelWriter, planes: str) -> None:
-        """Write the lines for planes that contain the moves of an inner rule instead of
-        displacements."""
+        """Write the lines that move frame points, for arrays that contain the moves of an inner
+        rule instead of displacements."""
         kernel.follow(self.mapped(kernel), planes)
 
     def mapped(self, kernel: KernelWriter) -> Callable[[str], Lines]:
-        """Return a function of planes that gives the lines for t_@, the displacement of frame point
-        f."""
+        """Return a function that maps the name of the arrays of displacements to the lines that
+        compute t_@, the displacement of frame point f."""
 
         def lines(planes: str) -> Lines:
             start = kernel.each(f"t_@ = {kernel.number(0.0)}")
@@ -116,7 +116,8 @@ class FollowFrame(Operation):
         return lines
 
     def _terms(self, kernel: KernelWriter, planes: str) -> Iterator[tuple[str, str]]:
-        """Generate, for each axis, its name and the term of an entry of the map."""
+        """Generate for each axis its name and the expression for the term that an entry of the map
+        contributes."""
         frame = self.scene.frame
         assert frame
         for a, c in enumerate(kernel.each("@")):

@@ -1,8 +1,8 @@
-"""Kernels: their functions, and the interface of the writers to which operations add lines.
+"""Functions of kernels, and the interface of the writers to which operations add lines.
 
-A writer stands for one way of executing a step: on the whole lattice, on a tile in a pass of
-several steps, or on the threads of a GPU. Operations write the same lines in all cases; the writer
-adds loops around these lines, and synchronisation between operations.
+There is a writer for each way of executing a step: on the whole lattice, on a tile in a pass of
+several steps, or on the threads of a GPU. Operations write the same lines in all cases. The writer
+adds loops around these lines and, on a GPU, synchronisation between operations.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ Lines = list[str]
 
 
 class Function:
-    """Function of a kernel: its lines, and its arguments. The function's own arguments come first;
-    shared ones follow if a line uses them."""
+    """Function of a kernel with its lines and arguments. The arguments `own` come first. They are
+    followed by those names of `shared`, which all functions may use, that occur in a line."""
 
     def __init__(self, shared: Sequence[str], name: str, *own: str) -> None:
         self.shared, self.name, self.own = shared, name, own
@@ -30,8 +30,8 @@ class Function:
 
     @property
     def used(self) -> list[str]:
-        """Shared names that occur in the lines of the function, with or without the prefix of flat
-        arrays."""
+        """Shared names that the function uses. A name also counts as used if it occurs in a line
+        with the prefix of flat arrays."""
         words = self._words() - set(self.own)
         return [name for name in self.shared if {name, f"flat_{name}"} & words]
 
@@ -45,7 +45,7 @@ class Function:
         return ["", "", "@part", head, *lines]
 
     def call(self, *own: str) -> str:
-        """Return a call of the function, with these values for the arguments that are not
+        """Return a call of the function in which `values` are passed for the arguments that are not
         shared."""
         return f"{self.name}({', '.join([*own, *self.used])})"
 
@@ -56,10 +56,10 @@ class Function:
 class KernelWriter(ABC):
     """Writes a step of a kernel, operation by operation.
 
-    In the lines of operations `flat_u_x` are the displacements along x before the step, by flat
-    place, `flat_v_x` those after it, `flat_own0` is the first state variable of particles, and
-    `flat_was0` its value before the step. In a pattern `@` stands for the name of an axis, `#` for
-    its number.
+    The lines of operations use the names of arrays with an entry for each flat place. `flat_u_x`
+    are the displacements along x before the step, and `flat_v_x` those after the step. `flat_own0`
+    is the first state variable of particles, and `flat_was0` its value before the step. In a
+    pattern `@` stands for the name of an axis, and `#` for its number.
     """
 
     keeps_before: ClassVar[bool] = True
@@ -79,11 +79,13 @@ class KernelWriter(ABC):
 
     @abstractmethod
     def row(self, array: str, first: str) -> str:
-        """Return the part of an array that belongs to columns j0 to j1 of a row of particles."""
+        """Return an expression for the part of an array in columns j0 to j1 of a row of
+        particles."""
 
     @abstractmethod
     def places(self, sublattice: str) -> Lines:
-        """Return the reference position of particle j of a row, axis by axis."""
+        """Return expressions for the reference position of particle j of a row, one for each
+        axis."""
 
     @abstractmethod
     def is_given(self, array: str) -> bool:
@@ -106,11 +108,12 @@ class KernelWriter(ABC):
 
     @abstractmethod
     def over_rows(self, name: str, write: Callable[[Function], None]) -> None:
-        """Write a function of rows, and its call for those rows that motion has reached. Its
-        arguments are the rows, `first_row` to `last_row`, and `moment`, the index of the step in
-        the call."""
+        """Write a function of rows, and its call for those rows that motion has reached. The
+        arguments of the function are `first_row` and `last_row`, the range of the rows, and
+        `moment`, the index of the step in the call."""
 
     @abstractmethod
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Write a loop over the frame points f of some planes. `mapped` are the lines that compute
-        their displacements t_@, with `lag` from the planes before the step."""
+        """Write a loop over the frame points f that writes their values in the arrays `planes`.
+        `mapped` gives the lines that compute the values t_@. With `lag` they are computed from the
+        displacements before the step."""

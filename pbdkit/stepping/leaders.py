@@ -1,14 +1,14 @@
-"""Leaders in a step: prescribed displacements and directions, and the free component of guided
-particles.
+"""Leaders in a step: their prescribed displacements and directions, and the free components of
+guided particles.
 
-A rule's move is S⁻¹ · force, with a 2 × 2 matrix S of the particle. If a guided particle is led
-along axes l and free along axes f, its move along f is
+The move of a rule is S⁻¹ · force, where S is a 2 × 2 matrix of the particle. If a guided particle
+has prescribed motion along axes l and is free along axes f, its move along f is
 
     m_f + S_ff⁻¹ S_fl m_l.
 
-This follows from S m = force, because the guide exerts no force along f. S is computed for
-calibrated rules; the moves of other rules are not corrected. S_fl is zero on straight edges, and
-nonzero at corners and in cut cells.
+This follows from S m = force, because the constraint along l exerts no force along f. S is computed
+for calibrated rules; the moves of other rules are not corrected. S_fl is zero on straight edges,
+and nonzero at corners and in cut cells.
 
 Forces on leaders that move by Newton's law are computed by numpy, in every engine.
 """
@@ -57,7 +57,7 @@ class Clamps:
     Attributes
     ----------
     numbers
-        State variables that store the components of the prescribed directions.
+        Indices of the state variables that store the components of the prescribed directions.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -67,8 +67,8 @@ class Clamps:
 
     def turn(self, state: State, step: int) -> Indices:
         """Turn the directions of clamped leaders in place by the rotation of their motions in a
-        step, and return their flat places. A particle of several groups is turned by the first of
-        them."""
+        step, and return their flat places. A particle that belongs to several groups is turned by
+        the first of them."""
         places = [np.zeros(0, np.intp)]
         for leading in self._leading:
             if leading.group.leads(step):
@@ -102,21 +102,23 @@ def _angle(leading: Leading, step: int) -> float:
 
 
 STRAIGHT = 1e-12
-"""Magnitude of S_ff⁻¹ S_fl up to which it is treated as zero."""
+"""S_ff⁻¹ S_fl is treated as zero up to this magnitude."""
 Slants = dict[tuple[int, int], tuple[Indices, Floats]]
-"""Type of the flat places of guided particles, by (free axis, led axis), with factors: the move
-along the led axis, times the factor, is added to the move along the free axis."""
+"""Type of a table by (free axis, led axis). An entry contains flat places of guided particles and a
+factor for each: the move of the particle along the led axis, times the factor, is added to its move
+along the free axis."""
 
 
 class Guidance:
-    """Guided particles of a scene in each step, computed once for each set of active groups.
+    """Guided particles of a scene in each step. They are computed once for each set of groups that
+    act.
 
     Attributes
     ----------
     has_guides
         Whether particles may be guided.
     slanted
-        Whether a move along one axis may add to that along another.
+        Whether a prescribed move along one axis may contribute to the free move along another axis.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -130,12 +132,14 @@ class Guidance:
         return self._at(step)[0]
 
     def slants(self, step: int) -> Slants:
-        """Return the factors of guided particles for each pair of axes."""
+        """Return the factors by which the free moves of guided particles are corrected, for each
+        pair of axes."""
         return self._at(step)[1]
 
     def correct(self, new: Floats, u: Floats, step: int) -> None:
-        """Correct the displacements of guided particles along free axes in place: their moves from
-        u along led axes are multiplied by the factors and added."""
+        """Correct the displacements `new` of guided particles along free axes, in place. The moves
+        from u to `new` along led axes are multiplied by the factors and added to the displacements
+        along free axes."""
         if not self.slanted:
             return
         flat, origin = new.reshape(len(new), -1), u.reshape(len(u), -1)
@@ -178,7 +182,7 @@ class Guidance:
 
 
 MAX_ITERATIONS = 60
-"""Number of iterations of the power method for the largest stiffness."""
+"""Maximum number of iterations of the power method that computes the largest stiffness."""
 
 
 class NewtonForces:
@@ -187,7 +191,7 @@ class NewtonForces:
     Attributes
     ----------
     numbers
-        Numbers of these groups.
+        Indices of the groups that move by Newton's law.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -197,7 +201,7 @@ class NewtonForces:
         self.numbers = tuple(masses)
         self._parts = {n: _parts(scene, each.place) for n, each in masses.items()}
         self._contact = Contact(scene) if masses and scene.barriers else None
-        # A rule with an inner rule is evaluated at all particles.
+        # If a rule has an inner rule, it is evaluated at all particles of the scene.
         self._followers = SlotFollowers(scene) if masses and scene.inner else None
 
     def share(self, n: int) -> Floats:
@@ -224,8 +228,8 @@ class NewtonForces:
 
     def stopped(self, n: int, velocity: Floats, u: Floats, step: int) -> tuple[Floats, Floats]:
         """Return the velocities and displacements, (axis, particle), of a group's particles after
-        obstacles have pushed them out at the end of a step. The push is also added to the velocity,
-        unless an obstacle appears in that step."""
+        obstacles have pushed them out at the end of a step. The displacement by the obstacles is
+        also added to the velocity, unless an obstacle appears in that step."""
         leading = self._scene.leading[n]
         if self._contact is None or len(leading.axes) < self._scene.axes:
             return velocity, u
@@ -253,7 +257,8 @@ class NewtonForces:
 
 
 def _parts(scene: Scene, place: Indices) -> list[tuple[Indices, Surroundings]]:
-    """Return the indices of the particles of each sublattice, with their surroundings."""
+    """Return for each sublattice the indices of its particles among `place`, and the particles with
+    their neighbours."""
     size = scene.raster.kind.size // len(scene.raster.kind)
     parts = []
     for s in np.unique(place // size).tolist():
@@ -266,10 +271,11 @@ def prescribe(
     scene: Scene, state: State, moment: float, forces: NewtonForces | None = None
 ) -> tuple[Leaders, Starts]:
     """Return the leaders of a step with their displacements at its end, or at a moment within it,
-    and the starts of motions.
+    and the starts of the motions of all groups.
 
-    The starts are displacements; for groups that move by Newton's law they are velocities, which
-    are computed with the forces at the end of the step before.
+    The start of a motion is the displacement of the particles when the group began to act. For a
+    group that moves by Newton's law it is replaced by the velocity, which is computed with the
+    forces at the end of the previous step.
     """
     leaders: Leaders = []
     starts: list[Floats | None] = []
@@ -329,7 +335,7 @@ def _refuse_contradiction(scene: Scene, leaders: Leaders, step: int) -> None:
 
 
 def is_cut_short(leading: Leading | Barrier, steps: int) -> bool:
-    """Return whether a group leads in the last step, before the end of its motion."""
+    """Return whether the last of `steps` steps lies before the end of a group's motion."""
     rests = leading.group.motion.rests_after()
     has_ended = rests is not None and leading.group.from_ - 1 + rests <= steps
     return leading.group.leads(steps) and not has_ended
@@ -344,7 +350,8 @@ def place(u: Floats, leaders: Leaders) -> None:
 
 
 def placed(u: Floats, leaders: Leaders) -> Leaders:
-    """Return leaders with the displacements u at the same places and axes."""
+    """Return the leaders at the same places and along the same axes, with the displacements that u
+    has there."""
     flat = u.reshape(len(u), -1)
     return [Placed(at, np.array([flat[a, at] for a in axes]), axes) for at, _, axes in leaders]
 
@@ -352,8 +359,8 @@ def placed(u: Floats, leaders: Leaders) -> Leaders:
 class LeaderOperation(Operation):
     """Base class of operations on leaders.
 
-    A kernel has one list of leaders or, if particles may be guided, one for each axis. The names of
-    the lists differ in their endings.
+    A kernel has a single list of leaders or, if particles may be guided, a list for each axis. The
+    names of these lists differ in their endings.
     """
 
     @classmethod
@@ -363,13 +370,14 @@ class LeaderOperation(Operation):
 
     @property
     def endings(self) -> dict[str, str]:
-        """Endings of the names of lists, with the axes along which their particles lead."""
+        """Endings of the names of lists, with the axes along which the particles of the list are
+        led."""
         axes = "xyz"[: self.scene.axes]
         return {f"_{c}": c for c in axes} if has_guides(self.scene.leading) else {"": axes}
 
 
 class PlaceLeaders(LeaderOperation):
-    """Place the leaders at their prescribed displacements, which gives the intermediate
+    """Place the leaders at their prescribed displacements. The result is the intermediate
     configuration."""
 
     @cached_property
@@ -399,40 +407,40 @@ class PlaceLeaders(LeaderOperation):
         ]
 
     def end_pass(self, kernel: KernelWriter) -> None:
-        """Write lines that place the leaders of the last step but one, because their displacements
-        are read after the pass."""
+        """Write lines that place the leaders as prescribed in the last step but one, because these
+        displacements are read after the pass."""
         for end, axes in self.endings.items():
             lines = kernel.each(f"flat_v_@[leaders{end}[e]] = target{end}[#, e]", axes)
             kernel.listed(f"leaders{end}", *lines)
 
     def reads(self, state: State) -> bool:
-        """Return whether a motion begins in the next step: its start is then read from the
+        """Return whether a motion begins in the next step, because its start is then read from the
         state."""
         groups = zip(self.scene.leading, state.starts, strict=True)
         return any(begin is None and each.group.leads(state.step + 1) for each, begin in groups)
 
     def prepare(self, call: Call) -> None:
-        """Compute the displacements and the starts of motions."""
+        """Compute the prescribed displacements and the starts of motions."""
         leaders, call.starts = prescribe(self.scene, call.state, call.step, self._forces)
         call.leaders, call.state = [leaders], replace(call.state, starts=call.starts)
 
     def is_foreseeable(self, step: int) -> bool:
-        """Return whether groups have no common particles. If they have, displacements are not
+        """Return whether no particle belongs to two groups. Otherwise displacements are not
         computed in advance, so that a contradiction is reported in the step in which it occurs."""
         return not self.scene.leaders_overlap
 
     def foresee(self, call: Call, step: int) -> None:
-        """Compute the displacements in a later step."""
+        """Compute the prescribed displacements in a later step."""
         call.leaders.append(prescribe(self.scene, call.state, step)[0])
 
     def entries(self, call: Call) -> dict[str, Entries]:
-        """Return the leaders of each list, their displacements (step, axis, leader), and space for
-        those before the step."""
+        """Return for each list its leaders, their prescribed displacements (step, axis, leader),
+        and an array for their displacements before the step."""
         lists, real = {}, call.state.u.dtype
         for end, names in self.endings.items():
             axes = tuple("xyz".index(name) for name in names)
             at, u = _along(axes, call.leaders)
-            if self.scene.leaders_overlap:  # The last of several groups places a particle.
+            if self.scene.leaders_overlap:  # The last group of a particle places it.
                 last = len(at) - 1 - np.unique(at[::-1], return_index=True)[1]
                 at, u = at[np.sort(last)], u[..., np.sort(last)]
             u = np.asarray(u, real)
@@ -452,7 +460,7 @@ class PlaceLeaders(LeaderOperation):
         return np.concatenate([leading.place for leading in self.scene.leading])
 
     def sweeps(self) -> int:
-        """Return 1 if groups move by Newton's law: the forces on them are evaluated before
+        """Return 1 if groups move by Newton's law, because the forces on them are evaluated before
         particles move."""
         return int(any(leading.share is not None for leading in self.scene.leading))
 
@@ -466,7 +474,7 @@ class PlaceLeaders(LeaderOperation):
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
         """Return a reason if groups move by Newton's law, because the forces on them are computed
-        on the host, from state variables on the host."""
+        on the host and from state variables that are on the host."""
         if not any(isinstance(leading.group.motion, Newton) for leading in self.scene.leading):
             return None
         reasons = {Mode.GPU: "leaders move by Newton's law", Mode.COURSES: PUSHED_BY_COURSES}
@@ -474,8 +482,8 @@ class PlaceLeaders(LeaderOperation):
 
 
 def _along(axes: tuple[int, ...], steps: Sequence[Leaders]) -> tuple[Indices, Floats]:
-    """Return the places of the leaders along all of some axes, and their displacements, (step,
-    axis, leader)."""
+    """Return the places of the particles that are led along all of `axes`, and their prescribed
+    displacements, (step, axis, leader)."""
 
     def along(each: Placed) -> Floats:
         return each.u if each.axes == axes else each.u[[each.axes.index(a) for a in axes]]
@@ -487,8 +495,8 @@ def _along(axes: tuple[int, ...], steps: Sequence[Leaders]) -> tuple[Indices, Fl
 
 
 class GuideLeaders(LeaderOperation):
-    """Place guided particles along their led axes in the new displacements, so that momentum adds
-    nothing along these axes."""
+    """Set the new displacements of guided particles along their led axes to the prescribed ones.
+    Momentum then does not change them along these axes."""
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -496,7 +504,7 @@ class GuideLeaders(LeaderOperation):
         return has_guides(scene.leading)
 
     def apply(self, step: Step) -> None:
-        """Place the guided particles in the displacements after the step."""
+        """Set the prescribed components of the displacements after the step."""
         place(step.new, step.leaders)
 
     def emit(self, kernel: KernelWriter) -> None:
@@ -506,14 +514,14 @@ class GuideLeaders(LeaderOperation):
             kernel.listed(f"leaders{end}", *lines)
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if state variables change: the response of particles is computed from
-        their initial values."""
+        """Return a reason if state variables change, because the response of particles is computed
+        from the initial values of the state variables."""
         reasons = {Mode.GPU: "leaders lead along an axis", Mode.COURSES: PUSHED_BY_COURSES}
         return Hindrance(reasons[mode], "leaders") if mode in reasons else None
 
 
 class GuideToObstacles(GuideLeaders):
-    """Place guided particles along their led axes before obstacles push them."""
+    """Place guided particles along their led axes before obstacles push the particles out."""
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -544,8 +552,8 @@ class TurnDirections(DirectionOperation):
         step.directions = [(value, places, value[places]) for value in values]
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write nothing: directions are rotated before a call, and a call contains no later step
-        that rotates them."""
+        """Write nothing: directions are rotated before a call, and only the first step of a call
+        may rotate them."""
 
     def prepare(self, call: Call) -> None:
         """Rotate the directions in the first step of a call."""
@@ -556,8 +564,8 @@ class TurnDirections(DirectionOperation):
         return not self._clamps.turning(step)
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if directions rotate: the GPU does not receive directions that change on
-        the host."""
+        """Return a reason if directions rotate, because directions that change on the host are not
+        copied to the GPU."""
         return Hindrance("leaders are clamped", "leaders") if mode is Mode.GPU else None
 
 
@@ -580,13 +588,13 @@ class HoldDirections(DirectionOperation):
         return {"clamps": Entries(call.clamps, {})}
 
     def prescribed_numbers(self) -> tuple[int, ...]:
-        """Return the state variables that are components of directions."""
+        """Return the indices of the state variables that are components of directions."""
         return self._clamps.numbers
 
 
 class CorrectGuided(Operation):
-    """Correct the free component of the moves of guided particles by the effect of the prescribed
-    component."""
+    """Correct the moves of guided particles. The prescribed component of a move has an effect on
+    the free component, which is added."""
 
     makes_moves = True
 
@@ -596,7 +604,8 @@ class CorrectGuided(Operation):
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
-        """Return whether moves along one axis may add to those along another."""
+        """Return whether a prescribed move along one axis may contribute to the free move along
+        another axis."""
         return Guidance(scene).slanted
 
     def apply(self, step: Step) -> None:
@@ -626,16 +635,17 @@ class CorrectGuided(Operation):
 
 
 class HoldLeaders(LeaderOperation):
-    """Place the leaders again after the rule has moved them, and restore their displacements before
-    the step."""
+    """Place the leaders again after the rule has moved them. Also restore the displacements that
+    they had before the step, since `PlaceLeaders` has overwritten them."""
 
     def apply(self, step: Step) -> None:
-        """Place and restore the leaders after all particles have moved."""
+        """Place the leaders, and restore their displacements before the step, after all particles
+        have moved."""
         place(step.new, step.leaders)
         place(step.u, step.origins)
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write loops that place and restore the leaders."""
+        """Write loops that place the leaders and restore their displacements before the step."""
         for end, axes in self.endings.items():
             lines = kernel.each(f"flat_v_@[leaders{end}[e]] = target{end}[#, e]", axes)
             if kernel.keeps_before:

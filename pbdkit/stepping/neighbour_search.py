@@ -13,7 +13,7 @@ from pbdkit.scene.scene import Scene
 
 
 class NeighbourSearch:
-    """Search of neighbours within the radius of a `pbdkit.plugin.Nearness`.
+    """Search of neighbours within the radius that a `pbdkit.plugin.Nearness` defines.
 
     Parameters
     ----------
@@ -52,13 +52,13 @@ class NeighbourSearch:
         both = np.concatenate([pairs, pairs[:, ::-1]])
         j, k = both[np.isin(both[:, 0], self.body)].T
         rank, rest = self._of_slots(j, k)
-        # One key for (j, slot, k) sorts faster than three.
+        # Sorting by one combined key is faster than sorting by three keys.
         order = np.argsort((j * (len(self._rest[0]) + 1) + rank) * len(self.place) + k)
         return j[order], k[order], rest[:, order]
 
     def _of_slots(self, j: Indices, k: Indices) -> tuple[Indices, Floats]:
-        """Return the slot of each pair, or the number of slots if it has none, and the rest offset,
-        (axis, pair)."""
+        """Return the slot of each pair, and its rest offset, (axis, pair). For a pair without a
+        slot the number of slots is returned in place of the slot."""
         s, *cells = self._site
         sizes = np.array(self._rank.shape[2:])[:, None]
         step = np.stack([n[k] - n[j] for n in cells]) + sizes // 2
@@ -71,8 +71,9 @@ class NeighbourSearch:
 
 
 def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
-    """Return two tables: the slot by (sublattice, sublattice, difference of cells along each axis),
-    or the number of slots if there is none; and the rest offset by slot, (axis, slot)."""
+    """Return two tables. The first contains the slot by (sublattice, sublattice, difference of
+    cells along each axis), or the number of slots if there is no such slot. The second contains the
+    rest offset by slot, (axis, slot)."""
     slots = [slot for each in neighbourhood.slots for slot in each]
     reach, size = neighbourhood.reach_in_cells, len(neighbourhood.slots)
     rank = np.full((size, size, *(2 * n + 1 for n in reach)), len(slots))

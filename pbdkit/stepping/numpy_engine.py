@@ -1,4 +1,4 @@
-"""Interface of engines, and the numpy engine: the reference of all others."""
+"""Interface of engines, and the numpy engine, which is the reference for all other engines."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ class Engine(ABC):
 
 
 class Stepper(Engine):
-    """Engine that applies the operations of a step by numpy and stores no state."""
+    """Engine that applies the operations of a step with numpy and stores no state."""
 
     name = "numpy"
 
     def __init__(
         self, scene: Scene, sweep: MoveFollowers | None = None, *, strict: bool = False
     ) -> None:
-        """Create the engine; if `strict`, the first operation of the rule that gives NaN raises
-        FloatingPointError."""
+        """Create the engine. If `strict` is true, FloatingPointError is raised by the first
+        operation of the rule that gives NaN."""
         self._scene = scene
         self._invalid: Literal["raise", "ignore"] = "raise" if strict else "ignore"
         self._program = program_of(scene, sweep)
@@ -48,7 +48,7 @@ class Stepper(Engine):
         """Engine with the parameters of the last step."""
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """Make the steps, each with the parameters at its end."""
+        """Make the steps. Each step uses the values that the parameters have at its end."""
         for _ in range(steps):
             scene = self._scene.at(state.step + 1)
             if scene is not self._scene and scene is not self._numbered._scene:

@@ -29,8 +29,8 @@ class OperateOnParticles(Operation):
 
     @classmethod
     def of(cls, scene: Scene) -> Sequence[Self]:
-        """Return an operation of a step for each particle operation of the scene, in their
-        order."""
+        """Return an operation of a step for each particle operation of the scene, in the order of
+        the experiment."""
         return [cls(scene, number) for number in range(len(scene.operations))]
 
     def apply(self, step: Step) -> None:
@@ -75,8 +75,8 @@ class OperateOnParticles(Operation):
         return {f"operands{self._number}": self._operated.place}
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of those particles that the operation moves if the body is in the
-        reference configuration."""
+        """Generate the cells of particles that the operation moves out of the reference
+        configuration."""
         yield self._moved_at_rest
 
     @cached_property

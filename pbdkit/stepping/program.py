@@ -40,7 +40,7 @@ ORDER: tuple[type[Operation], ...] = (
     HoldLeaders,
     FollowFrame,
 )
-"""Operations in the order of a step, which is defined here alone."""
+"""Types of operations in the order of a step. The order is defined only here."""
 MAX_FORESEEN = 64
 """Maximum number of steps for which the displacements of leaders are computed in advance."""
 MAX_VALUES = 2**20
@@ -52,8 +52,8 @@ def program_of(
     sweep: MoveFollowers | None = None,
     kinds: Iterable[type[Operation]] = ORDER,
 ) -> Program:
-    """Return the operations that a scene needs, in the order of a step. `sweep` replaces the one
-    that moves the followers."""
+    """Return the operations that a scene needs, in the order of a step. A given `sweep` is used as
+    the operation that moves the followers."""
     operations: list[Operation] = []
     for kind in kinds:
         operations += [sweep] if sweep and kind is MoveFollowers else kind.of(scene)
@@ -61,7 +61,7 @@ def program_of(
 
 
 def prepare(program: Program, state: State) -> Call:
-    """Prepare a call of a kernel with the step after a state."""
+    """Return the data for a call of a kernel, prepared for the step that follows a state."""
     call = Call(state)
     for operation in program:
         operation.prepare(call)
@@ -69,8 +69,8 @@ def prepare(program: Program, state: State) -> Call:
 
 
 def foresee(program: Program, call: Call, end: int) -> int:
-    """Prepare a call for the steps up to `end` that need no further work on the host; return their
-    number."""
+    """Prepare a call for further steps, up to `end`, as long as they need no other work on the
+    host. Return the number of steps of the call."""
     step, limit = call.step, end - call.state.step
     steady = steady_steps(program, step, limit)
     if steady > 1:
@@ -86,33 +86,35 @@ def foresee(program: Program, call: Call, end: int) -> int:
 
 
 def reach_of(scene: Scene, axis: int) -> Reach:
-    """Return the distances along an axis at which any operation reads what others write."""
+    """Return the largest distances along an axis over which operations read values that other
+    operations write."""
     distances = (operation.reach(axis) for operation in program_of(scene))
     return Reach(*map(max, zip(Reach(), *distances, strict=True)))
 
 
 def steady_steps(program: Program, step: int, most: int, foreseeable: bool = False) -> int:
     """Return the number of equal steps from `step` on, from 1 to `most`. Steps are equal if leaders
-    and obstacles stay, loads and parameters are constant, and bonds are cut at most at the
-    beginning of the first.
+    and obstacles do not move, loads and parameters are constant, and no bonds are cut except at the
+    beginning of the first step.
 
-    Leaders may move if their motion is `foreseeable`.
+    With `foreseeable`, steps also count as equal if leaders have motions that can be computed in
+    advance.
     """
     change = min(operation.next_change(step, foreseeable) for operation in program)
     return int(min(most, change - step))
 
 
 def last_event(scene: Scene) -> int:
-    """Return the last step of the run, at least 1, in which leaders or obstacles move, roles, loads
-    or parameters change, or bonds are cut."""
+    """Return the last step of the run, at least 1, in which something changes: leaders or obstacles
+    move, roles, loads or parameters change, or bonds are cut."""
     events = (operation.events(scene.experiment.steps) for operation in program_of(scene))
     return max([1, *chain(*events), *bends_of(scene)])
 
 
 def bends_of(scene: Scene) -> list[int]:
-    """Return the moments of the run between which parameters and forces change linearly. The end of
-    the run is one of them if they still change there. Kinks of a load are included only while the
-    load acts."""
+    """Return the steps between which parameters and forces are linear functions of the step. The
+    last step of the run is included if parameters or forces still change at it. The steps at which
+    the slope of a load changes are included only while the load acts."""
     bends = (operation.bends(scene.experiment.steps) for operation in program_of(scene))
     return [*chain(*bends)]
 
@@ -129,6 +131,6 @@ def hindrance(scene: Scene, mode: Mode) -> Hindrance | None:
 
 
 def reason_against(scene: Scene, mode: Mode) -> str:
-    """Return that reason as text; empty if there is none."""
+    """Return the reason of `hindrance` as text; the text is empty if there is none."""
     reason = hindrance(scene, mode)
     return reason.reason if reason else ""

@@ -1,8 +1,8 @@
 """Evaluation of rules and fracture models for given neighbours.
 
 Stepping, stability analysis, identification, diagnostics and the conformance suite evaluate the
-functions of rule and fracture model here and nowhere else. Kernels are generated from the same
-functions, and their results are compared with those of this module in tests.
+functions of rules and fracture models only by means of this module. Kernels are generated from the
+same functions; tests compare the results of kernels with those of this module.
 """
 
 from __future__ import annotations
@@ -51,12 +51,13 @@ Cells = tuple[CellStress, ...]
 class Neighbour:
     """Neighbours of particles along one slot, with the arguments of the rule's functions.
 
-    `r` is the rest offset, `w` are the weights of the rule, `present` is true where the neighbour
-    exists (None: everywhere), `broken` where the bond is broken (None: nowhere). With fracture, `c`
-    are the constants and state variables of the bond. `more` are the weights of cells with a
-    different stiffness; their contributions are added. `shared` are the state variables of the
-    particle and of the neighbour, for rules that read both. `torn` is the damage beside the bond,
-    for rules that tear cells; these receive the difference unchanged.
+    `r` is the rest offset, and `w` are the weights of the rule. `present` is true where the
+    neighbour exists; None means everywhere. `broken` is true where the bond is broken; None means
+    nowhere. With fracture, `c` are the constants and state variables of the bond. `more` are the
+    weights of cells that have a stiffness other than that of the rule; their contributions are
+    added. `shared` are the state variables of the particle and of the neighbour, for rules that
+    read both. `torn` is the damage beside the bond, for rules that compute the forces of torn
+    cells; such rules receive the unchanged difference of the displacements.
     """
 
     r: Vector
@@ -82,7 +83,8 @@ class Evaluator:
         self._of_particle = particle_numbers(scene.experiment)
 
     def given(self, p: Any) -> Evaluator:
-        """Return the evaluator with the parameters of the rule at particles."""
+        """Return a copy of the evaluator in which p, the parameters of the rule at particles,
+        replaces its parameters."""
         evaluator = copy(self)
         evaluator._p = p
         return evaluator
@@ -97,7 +99,7 @@ class Evaluator:
         return part
 
     def _of_weights(self, d: Vector, to: Neighbour, w: Any) -> Any:
-        """Return the contribution for a difference and weights."""
+        """Return the contribution of a neighbour for a given difference d and given weights w."""
         rule: Any = self.rule  # Functions of rules differ in their number of arguments.
         if to.torn is not None:
             return rule.torn(d, to.r, w, to.torn, self._p)
@@ -118,8 +120,9 @@ class Evaluator:
         return (self.rule.energy(self.seen(d, u, to), to.r, to.w, self._p),)
 
     def seen(self, d: Vector, u: Vector, to: Neighbour) -> Vector:
-        """Return the difference that the rule receives: softened, or to the fictitious point of a
-        broken bond."""
+        """Return the difference that the rule receives instead of d. At a broken bond it is the
+        difference to the fictitious point, and at a softened bond a combination of both
+        differences."""
         model = self._model
         if to.broken is None and to.c is None:
             return d
@@ -206,13 +209,14 @@ class Evaluator:
         return [Neighbour(slot.rest, weights[slot], shared=shared) for slot in slots]
 
     def at_rest(self, slots: Sequence[Slot]) -> Any:
-        """Return the move of a particle at rest with all these neighbours."""
+        """Return the move, at rest, of a particle that has a neighbour along each of the slots and
+        no broken bond."""
         u = vector(np.zeros(self._scene.axes))
         parts = [self.contribution(u, u, to) for to in self.everywhere(slots)]
         return self.move(summed((part, None) for part in parts), Here(u, own=self.initial_own()))
 
     def initial_own(self) -> Any:
-        """Return the initial state variables of a particle, if they are not drawn at random."""
+        """Return the initial state variables of a particle. They must not be drawn at random."""
         initial = (number.initial for number in self._of_particle)
         return self._scene.constants.of_particle(*initial)
 
@@ -220,7 +224,7 @@ class Evaluator:
 def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
     """Return the sum of contributions of the neighbours that are present, in their order.
 
-    The sum is a plain number if every contribution is one and no neighbour is missing.
+    The sum is a plain number if every contribution is a plain number and no neighbour is missing.
     """
     total: Contributions | None = None
     for part, present in parts:
@@ -245,8 +249,8 @@ Contributing = Callable[[Vector, Vector, Neighbour], Contributions]
 class Surroundings:
     """Particles of one sublattice with their neighbours.
 
-    `slots` are those of the sublattice; `movable` is where particles of the body have a neighbour
-    (None: everywhere).
+    `slots` are the slots of the sublattice. `movable` is true where a particle of the body has a
+    neighbour; None means everywhere.
     """
 
     def __init__(self, scene: Scene, where: Where, sublattice: int) -> None:
@@ -272,7 +276,7 @@ class Surroundings:
 
     @cached_property
     def _reference(self) -> tuple[Any, Any]:
-        """X and its distance from the middle of the body, if the rule uses them."""
+        """X and the distance of X from the middle of the body, if the rule uses them."""
         if not self._scene.experiment.rule.uses_reference:
             return None, None
         local = self._scene.raster.reference_planes(self.where)
@@ -304,27 +308,29 @@ class Surroundings:
 
     @property
     def parameters(self) -> Any:
-        """p of the rule."""
+        """The parameters p of the rule."""
         return self._scene.constants.rule_at(self.where)
 
     def here(self, u: NDArray[Any], state: State) -> Here:
-        """Return the values at the particles."""
+        """Return the values at the particles, which the rule receives as `here`."""
         numbers = self._remembered(self.where, state)
         return Here(vector(shown(self.where.of(u))), *self._reference, numbers)
 
     def own(self, state: State) -> list[NDArray[Any]]:
-        """Return the state variables of the particles; of a block, views into the state."""
+        """Return the state variables of the particles. If the particles are a block, these are
+        views into the state."""
         return [self.where.of(value) for value in state.particle_values]
 
     def sums(self, function: Contributing, u: NDArray[Any], state: State) -> Contributions:
-        """Return Σ function(d, u, neighbour) for functions like the evaluator's `contribution`."""
+        """Return the sum of function(d, u, neighbour) over the neighbours. The function has the
+        signature of `Evaluator.contribution`."""
         u_own = vector(shown(self.where.of(u)))
         parts = zip(self.differences(u), self.neighbours(state), strict=True)
         return summed((function(d, u_own, to), to.present) for d, to in parts)
 
     def _weigh_cells(self, cells: WeighedCells) -> None:
         """Multiply the weights of each slot by the area fractions of the cells beside it, and add
-        the weights of cells that have a stiffness of their own."""
+        the weights of cells that have a stiffness other than that of the rule."""
         precision = self._scene.experiment.stepping.precision
         beside = cells.beside_each(self.slots, self.where, precision)
         self._weights = [
@@ -393,8 +399,8 @@ class Surroundings:
         return tuple(np.where(broken, 1.0, side).astype(precision) for side in softened)
 
     def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:
-        """Return where the bonds along a slot are broken, and their constants if the rule receives
-        them."""
+        """Return a mask of the broken bonds along a slot, and the constants of the bonds if the
+        fracture model receives them."""
         if state.broken_step is None:
             return None, None
         scene = self._scene
@@ -419,8 +425,8 @@ def blocks(scene: Scene) -> list[Surroundings]:
 
 
 def presence(raster: Raster, place: Where, slots: Sequence[Slot]) -> list[Mask | None]:
-    """Return for each slot where the neighbour exists, None if it exists at every place with a
-    particle."""
+    """Return for each slot a mask of the places at which the neighbour exists. It is None if the
+    neighbour exists at every place with a particle."""
     nobody = place.of(raster.kind) == EMPTY
     planes = (place.seen_through(slot).of(raster.kind) != EMPTY for slot in slots)
     return [None if (present | nobody).all() else present for present in planes]

@@ -1,4 +1,5 @@
-"""State of a run, passed from step to step. It is complete: a run continues from it exactly."""
+"""State of a run, passed from step to step. It is complete, so that a run continued from it has the
+same results as an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ def break_crossed(
 
 
 def cut_bonds(scene: Scene, broken: BrokenSteps | None, step: int) -> bool:
-    """Make the cuts at the beginning of a step in place; return whether there are any."""
+    """Cut the bonds that are cut at the beginning of a step, in place. Return whether there are any
+    cuts in this step."""
     segments = [cut.segment for cut in scene.experiment.cuts if cut.at == step]
     if segments:
         assert broken is not None
@@ -61,15 +63,16 @@ class State:
     """State of a run at the end of a step.
 
     `u` is the displacement, (axis, sublattice, cell, cell), zero at places without particles.
-    `previous` is the displacement at the end of the step before, from which momentum and PE2 are
-    computed; the next step is written into it. `broken_step`, (plane, cell, cell), is the step at
-    which each bond broke, -1 for intact bonds, and `broken_length` the length of the bond in the
-    intermediate configuration of that step, 0 for intact and cut bonds; both arrays are None if no
-    bond can break. `starts` contains an entry for each leader group: the displacements at which its
-    motion started, (axis, particle), the velocities of a group that moves by Newton's law, or None
-    if the group has not begun. `bond_values` are the state variables of the fracture model for each
-    bond, with the shape of `broken_step`, and `particle_values` those of the rule for each
-    particle, (sublattice, cell, cell).
+    `previous` is the displacement at the end of the previous step, from which momentum and PE2 are
+    computed; the next step is written into this array. `broken_step`, (plane, cell, cell), is the
+    step at which each bond broke, and -1 for intact bonds. `broken_length` is the length of the
+    bond in the intermediate configuration of that step, and 0 for intact and cut bonds. Both arrays
+    are None if no bond can break. `starts` contains an entry for each leader group: the
+    displacements at which its motion started, (axis, particle), or the velocities of a group that
+    moves by Newton's law. The entry is None if the group has not begun. `bond_values` are the state
+    variables of the fracture model for each bond, with the shape of `broken_step`.
+    `particle_values` are the state variables of the rule for each particle, (sublattice, cell,
+    cell).
     """
 
     step: int
@@ -82,8 +85,9 @@ class State:
     particle_values: Values = ()
 
     def copy(self, over: State | None = None) -> State:
-        """Return a copy. If another state of the same scene is given, it is overwritten, because
-        allocating memory takes several times as long as copying."""
+        """Return a copy. If another state `over` of the same scene is given, its arrays are
+        overwritten and used for the copy, because allocating memory takes several times as long as
+        copying."""
         if over is None:
             return replace(self, **{name: _copied(part) for name, part in vars(self).items()})
         for mine, target in zip(self.arrays(), over.arrays(), strict=True):
@@ -97,7 +101,8 @@ class State:
         return layouts[0] == layouts[1] and len(self.starts) == len(other.starts)
 
     def map(self, function: Callable[[Any], Any], starts: tuple[Any, ...]) -> State:
-        """Return a state with the result of a function for each array, and with these starts."""
+        """Return a state in which each array is replaced by the result of a function of it. The
+        starts are replaced by `starts`."""
         names = [each.name for each in fields(self) if each.name not in ("step", "starts")]
         parts = {name: _mapped(function, getattr(self, name)) for name in names}
         return replace(self, starts=starts, **parts)
@@ -144,8 +149,8 @@ def started(scene: Scene, numbers: Sequence[Remembered], shape: Sequence[int]) -
 
 def initial_state(scene: Scene) -> State:
     """Return the state at time 0: the body has its initial displacements, frame points follow, and
-    bonds across cracks and initial cuts are broken at step 0. The displacements of the step before
-    are equal to the initial ones."""
+    bonds across cracks and initial cuts are broken at step 0. The displacements of the previous
+    step are set equal to the initial ones."""
     experiment, state = scene.experiment, unmoved_state(scene, scene.raster.shape[1:])
     if not experiment.initial.at_rest:
         _displace(scene, state.u.reshape(scene.axes, -1))
@@ -234,7 +239,8 @@ def renew(
 
 
 def shown(values: Iterable[Any]) -> tuple[Any, ...]:
-    """Return read-only views of arrays, for components; other values unchanged."""
+    """Return read-only views of arrays, which are passed to components. Other values are returned
+    unchanged."""
     return tuple(_read_only(value) if isinstance(value, np.ndarray) else value for value in values)
 
 

@@ -1,7 +1,8 @@
 """Operations of a step, one for each feature of a scene (listed in ARCHITECTURE.md).
 
-Engines interpret the list of operations without naming a feature: numpy applies one operation after
-the other, kernels consist of the lines that operations emit. `stepping/program.py` has the order.
+Engines process the list of operations and do not depend on features: numpy applies one operation
+after the other, and kernels consist of the lines that operations emit. The order of the operations
+is defined in `stepping/program.py`.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Mode(Enum):
 PUSHED_BY_COURSES = (
     "the motion of masses, obstacles or leaders along an axis depends on time-dependent parameters"
 )
-"""Reason why kernels do not support some time-dependent parameters."""
+"""Reason why kernels do not support the time-dependent parameters of some scenes."""
 
 
 class Hindrance(NamedTuple):
@@ -79,19 +80,19 @@ class Hindrance(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """Distances along an axis, in repeat cells, over which an operation reads values that others
-    write.
+    """Distances along an axis, in repeat cells, over which an operation reads values that other
+    operations write.
 
     Parameters
     ----------
     reach
         Distance of neighbours.
     back, ahead
-        Distances behind and ahead of a particle up to which bonds are updated, or moves of an inner
-        rule computed, before the particle moves.
+        Distances behind and ahead of a particle. Up to these distances bonds are updated, or moves
+        of an inner rule are computed, before the particle moves.
     below, above
-        Distances below and above a particle up to which displacements are read for these bonds or
-        moves.
+        Distances below and above a particle up to which displacements are read in order to update a
+        bond or to compute a move of an inner rule.
     apart
         Distance of frame points from the particles that they follow.
     """
@@ -105,14 +106,14 @@ class Reach(NamedTuple):
 
     @property
     def step(self) -> int:
-        """Distance by which each step of a pass follows the one before."""
+        """Distance by which each step of a pass follows the previous step."""
         sees = max(self.reach, self.above + self.ahead, self.below + self.back)
         return max(sees + self.apart, self.back + self.ahead)
 
     @property
     def sight(self) -> int:
-        """Distance up to which a step reads displacements for bonds, or for moves of an inner
-        rule."""
+        """Distance up to which a step reads displacements, for its moves or in order to update
+        bonds or compute moves of an inner rule."""
         return max(self.reach - self.ahead, self.above)
 
 
@@ -125,14 +126,16 @@ class Step:
     number
         Number of the step.
     u
-        Displacements at the end of the step before. While particles move, leaders are in place:
-        the intermediate configuration.
+        Displacements at the end of the previous step. While particles move, leaders have their
+        prescribed displacements, so that `u` is the intermediate configuration.
     new
-        On entry the displacements of one step earlier; at the end those of this step.
+        On entry the displacements at the beginning of the previous step; at the end those after
+        this step.
     state
-        State at the beginning. State variables of bonds and particles are updated in place.
+        State at the beginning of the step. State variables of bonds and particles are updated in
+        place.
     invalid
-        Treatment of operations of the rule that give NaN.
+        Treatment of arithmetic operations of the rule that give NaN.
     leaders, origins
         Leaders with the prescribed displacements, and with their displacements before the step.
     starts
@@ -154,15 +157,15 @@ class Step:
 
 @dataclass(slots=True)
 class Call:
-    """Data for one call of a kernel that computes several steps; the operations prepare them on the
-    host.
+    """Data for one call of a kernel that computes several steps. They are prepared by the
+    operations on the host.
 
     Parameters
     ----------
     state
         State before the first step.
     leaders
-        Leaders in each step; a single entry is valid for all steps.
+        Leaders in each step of the call. If there is only one entry, it is valid for all steps.
     starts
         Starts of the motions of leader groups.
     clamps
@@ -184,12 +187,12 @@ class Call:
 
     @property
     def moments(self) -> range:
-        """Numbers of the steps that differ in the displacements of leaders."""
+        """Numbers of the steps for which the leaders have separate displacements."""
         return range(self.step, self.step + len(self.leaders))
 
 
 class Entries(NamedTuple):
-    """List of particles that the lines of an operation go through.
+    """List of particles over which the lines of an operation loop.
 
     Parameters
     ----------
@@ -210,14 +213,14 @@ Cells = tuple[Indices, ...]
 class Operation(ABC):
     """Part of a step that belongs to one feature of a scene.
 
-    Subclasses define `apply` and `emit`. The other methods have defaults for a feature that reads
-    no neighbours, is the same in each step and does not move a body at rest; subclasses override
-    those that differ.
+    Subclasses define `apply` and `emit`. The other methods have defaults, which describe a feature
+    that reads no neighbours, is the same in each step and does not move a body at rest. Subclasses
+    override the methods for which this is not true.
     """
 
     makes_moves: ClassVar[bool] = False
-    """True if the operation contributes to the move of a particle from given positions. These moves
-    vanish in equilibrium; the other operations place particles, or change bonds."""
+    """True if the operation contributes to the moves of particles, which vanish in equilibrium.
+    Other operations place particles, or change bonds."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -234,19 +237,21 @@ class Operation(ABC):
 
     @abstractmethod
     def apply(self, step: Step) -> None:
-        """Compute the part of a step by numpy, in place. Every engine reproduces it."""
+        """Carry out this operation for one step with numpy, in place. All engines give the same
+        result."""
 
     @abstractmethod
     def emit(self, kernel: KernelWriter) -> None:
-        """Write the part of a step into a kernel."""
+        """Write the lines of this operation into a kernel."""
 
     def opening(self, step: str) -> Lines:
-        """Return lines at the beginning of a step; `step` is the index of the step in the call."""
+        """Return lines that are placed at the beginning of a step. `step` is the index of the step
+        in the call."""
         return []
 
     def end_pass(self, kernel: KernelWriter) -> None:
-        """Write lines that complete the displacements before the last step of a pass of several
-        steps."""
+        """Write lines that are executed after a pass of several steps. They complete the
+        displacements that the body had before the last step."""
         return
 
     def functions(self) -> dict[str, Callable[..., Any]]:
@@ -254,8 +259,8 @@ class Operation(ABC):
         return {}
 
     def component(self) -> Component | None:
-        """Return the component to which these functions belong; None for those of the rule and the
-        fracture model, and for built-in ones."""
+        """Return the component to which the functions of `functions` belong. Return None if they
+        belong to the rule, the fracture model or pbdkit itself."""
         return None
 
     def numbers(self) -> dict[str, tuple[str, ...]]:
@@ -301,8 +306,8 @@ class Operation(ABC):
         return
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of particles at rest that the operation moves in a call, without their
-        neighbours."""
+        """Generate the cells of the particles at rest that the operation itself moves in a call.
+        Their neighbours, which move in later steps, are not included."""
         yield from ()
 
     def fixed_places(self) -> Indices:
@@ -315,18 +320,18 @@ class Operation(ABC):
         return Reach()
 
     def sweeps(self) -> int:
-        """Return the number of successive times that the operation evaluates neighbours in a
+        """Return how many times, one after the other, the operation evaluates neighbours in a
         step."""
         return 0
 
     def carries(self) -> Indices:
-        """Return the differences of repeat cells, (difference, axis), by which a motion of a
-        particle propagates in a step."""
+        """Return the differences of repeat cells, (difference, axis), by which the motion of a
+        particle propagates in one step."""
         return np.zeros((0, self.scene.axes), np.intp)
 
     def next_change(self, step: int, foreseeable: bool = False) -> float:
         """Return the first step after `step` in which the operation changes; infinity if there is
-        none. Motions that are foreseeable (see `is_foreseeable`) are not included."""
+        none. With `foreseeable`, motions that `foresee` can prepare are not included."""
         return math.inf
 
     def events(self, steps: int) -> list[int]:
@@ -334,7 +339,8 @@ class Operation(ABC):
         return []
 
     def bends(self, steps: int) -> list[int]:
-        """Return the moments of a run between which its parameters change linearly."""
+        """Return the steps of a run between which the parameters of the operation are linear
+        functions of the step."""
         return []
 
     def hindrance(self, mode: Mode) -> Hindrance | None:

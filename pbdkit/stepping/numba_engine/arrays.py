@@ -1,5 +1,6 @@
-"""Arrays of kernels: constants of a scene, bit masks of broken bonds, and runs of particles that
-all have their neighbours and whole cells."""
+"""Arrays of kernels: constants of a scene, bit masks of broken bonds, and runs. A run is a range of
+adjacent particles of a row that are computed by the same code, for instance because all their
+neighbours are present."""
 
 from __future__ import annotations
 
@@ -57,7 +58,7 @@ def constant_arrays(plan: Plan) -> Arrays:
         arrays |= sweeps.stress_arrays(scene, real)
     for operation in program_of(scene):
         for name, values in operation.constants().items():
-            # One value more, so that no array is empty.
+            # One value is added, so that no array is empty.
             arrays[name] = np.array([*values, 0.0], real)
         for name, place in operation.lists().items():
             arrays |= list_arrays(plan, name, Entries(place, {}), by_rows=True)
@@ -70,8 +71,8 @@ def constant_arrays(plan: Plan) -> Arrays:
 def list_arrays(plan: Plan, name: str, entries: Entries, *, by_rows: bool) -> Arrays:
     """Return a list of particles with its values.
 
-    Passes of several steps require `by_rows`: the list is then sorted by rows, and the first index
-    of each row and the columns are returned too.
+    Passes of several steps require `by_rows`. The list is then sorted by rows, and the index at
+    which each row begins and the columns of the particles are returned too.
     """
     if not by_rows:
         return {name: entries.place, **entries.values}
@@ -91,7 +92,7 @@ def call_arrays(plan: Plan, program: Program, call: Call, *, by_rows: bool) -> A
 
 
 def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
-    """Return displacements u, those of the step before, and the state variables of a state."""
+    """Return the displacements of a state, those of the previous step, and the state variables."""
     return {
         **dict(zip([*plan.each("u_@"), *plan.each("v_@")], [*u, *v], strict=True)),
         **{f"bond{n}": value for n, value in enumerate(state.bond_values)},
@@ -102,8 +103,8 @@ def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
 
 
 def _of_frame(frame: Frame, order: Indices, real: np.dtype[Any]) -> Arrays:
-    """Return the frame points in a given order, and one after the other their entries in the
-    frame's map."""
+    """Return the frame points in a given order, and their entries in the frame's map, point after
+    point."""
     counts = np.bincount(frame.map.point, minlength=len(frame.place))
     entry = np.argsort(np.argsort(order)[frame.map.point], kind="stable")
     return {
@@ -129,7 +130,8 @@ def changing_arrays(plan: Plan) -> Arrays:
 
 
 def _ratios(plan: Plan) -> Arrays:
-    """Return the stiffness of cells over Young's modulus; the values of a cell are contiguous."""
+    """Return the stiffness of cells divided by Young's modulus; the values of a cell are
+    contiguous."""
     stresses, real = CellStresses(plan.scene), plan.scene.experiment.stepping.precision
     if plan.mixed:
         return {"ratios": np.stack(stresses.ratios_by_cell, axis=-1).astype(real)}
@@ -137,8 +139,9 @@ def _ratios(plan: Plan) -> Arrays:
 
 
 def padded(slots: Sequence[tuple[Slot, ...]]) -> list[Slot]:
-    """Return the slots of all sublattices in one list, with equally many for each sublattice:
-    shorter ones are padded by copies of their first slot, which are not used."""
+    """Return the slots of all sublattices in one list. It contains the same number of slots for
+    each sublattice: if a sublattice has fewer slots, copies of its first slot are appended, which
+    are not used."""
     width = max(map(len, slots))
     return [slot for each in slots for slot in (*each, *each[:1] * (width - len(each)))]
 
@@ -146,7 +149,7 @@ def padded(slots: Sequence[tuple[Slot, ...]]) -> list[Slot]:
 def rule_arrays(plan: Plan) -> Arrays:
     """Return the parameters of rules and solver."""
     solver = plan.scene.experiment.stepping
-    # One more, so that no array is empty.
+    # One value is added, so that no array is empty.
     rules = {
         f"rule{n}": [*level.scene.constants.shared, 0.0] for n, level in enumerate(plan.levels)
     }
@@ -155,15 +158,17 @@ def rule_arrays(plan: Plan) -> Arrays:
 
 
 def _stacked(rows: Sequence[dict[str, Any]], real: np.dtype[Any]) -> Arrays:
-    """Return the numbers of all rows by name, (row, ...)."""
+    """Return by name the values of all rows in one array, (row, ...)."""
     stacked = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     return {name: v.astype(real if v.dtype.kind == "f" else int) for name, v in stacked.items()}
 
 
 def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
-    """Return the rest offset and the weights of a slot, the sign of d at the home of its bonds (the
-    end at which a bond is stored), and the differences in flat arrays from a particle to the
-    neighbour, to the home of the bond, and to the area fractions of the cells beside the slot."""
+    """Return the data of a slot by name: its rest offset and weights, the sign by which d is
+    multiplied at the home of a bond, which is the end at which the bond is stored, and index
+    offsets in flat arrays. There is an offset from a particle to its neighbour (`away`), to the
+    entry of their bond (`bonds_away`), and to the area fractions of the cells beside the slot
+    (`cells_away`)."""
     scene, shape = plan.scene, plan.scene.raster.shape
     away, (plane, is_home) = slot_step(shape, slot), scene.neighbourhood.home[slot]
     home = plane - (slot.source if is_home else slot.target)
@@ -185,7 +190,8 @@ def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
 
 
 def _of_plane(plan: Plan, plane: BondPlane) -> dict[str, Any]:
-    """Return source, target and step, rest offset and block of a plane of bonds."""
+    """Return the data of a plane of bonds: the sublattices of both ends and the step of cells
+    between them, the rest offset, and the block of cells that contains bonds."""
     scene, slot = plan.scene, plane.slot
     block = plane_block(scene.raster, plane, inside=plan.softens_cells)
     spans = zip(block.start, block.stop, strict=True) if block else [(0, 0)] * scene.axes
@@ -202,8 +208,8 @@ def bits_for(scene: Scene) -> np.dtype[Any]:
 
 
 def lost_bits(scene: Scene, state: State) -> Bits:
-    """Return a bit mask for each particle; bit k is set at both ends of a broken bond along slot
-    k."""
+    """Return a bit mask for each particle. Bit k of the mask is set if the bond along slot k of the
+    particle is broken."""
     lost = np.zeros(scene.raster.shape, bits_for(scene))
     renew_lost_bits(lost, scene, state, slice(0, lost.shape[1]))
     return lost
@@ -213,7 +219,7 @@ def renew_lost_bits(lost: Bits, scene: Scene, state: State, rows: slice) -> None
     """Update the bit masks of some rows of cells."""
     assert state.broken_step is not None
     around, (height, *across) = scene.neighbourhood, scene.raster.shape[1:]
-    margin, *margins = around.reach_in_cells  # No particle has neighbours beyond it.
+    margin, *margins = around.reach_in_cells  # No neighbour of a particle lies beyond this margin.
     first, last = max(rows.start, margin), min(rows.stop, height - margin)
     stop = tuple(size - n for size, n in zip(across, margins, strict=True))
     for s, slots in enumerate(around.slots):
@@ -228,17 +234,18 @@ def renew_lost_bits(lost: Bits, scene: Scene, state: State, rows: slice) -> None
 
 
 SHORT = 4
-"""Number of particles below which a run is merged into an adjacent, more general one."""
+"""A run of fewer particles is merged into an adjacent run with more general code."""
 Ints = NDArray[np.integer[Any]]
 
 
 def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[int, int], ...]]:
-    """Return the runs of one kind that consecutive rows share, sorted by sublattice, kind and
-    place.
+    """Return the runs, sorted by sublattice, kind of row and place. A run extends over consecutive
+    rows if it has the same kind and the same columns in all of them.
 
     The first array is (run, (leading cells, first row, last row + 1, begin, end)). The second is
-    (group, row, 2): the index of the first run that reaches a row of the first axis, and of the
-    first run that begins there or later. The tuple contains the sublattice and kind of each group.
+    (group, row, 2). It contains for each row of the first axis the index of the first run that
+    includes the row or lies behind it, and the index of the first run that begins in the row or
+    later. The tuple contains the sublattice and the kind of each group.
     """
     runs, starts, groups = list[Ints](), list[Ints](), list[tuple[int, int]]()
     rows = np.arange(scene.raster.shape[1] + 1)
@@ -258,7 +265,7 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
 
 
 def _joined(lines: Ints) -> Ints:
-    """Merge runs at the same place of consecutive rows."""
+    """Merge runs in consecutive rows that have the same columns."""
     *lead, row, begin, end = lines.T
     lines = lines[np.lexsort((row, end, begin, *reversed(lead)))]
     step = np.diff(lines, axis=0)
@@ -270,7 +277,7 @@ def _joined(lines: Ints) -> Ints:
 
 
 def kinds_of(scene: Scene, block: Block, all_general: bool) -> Ints:
-    """Return the kind of row for each place of a block."""
+    """Return the kind of row, which selects the code, for each place of a block."""
     raster, slots = scene.raster, scene.neighbourhood.slots[block.sublattice]
     follows = block.of(raster.kind) == FOLLOWER
     kinds = np.where(follows, sweeps.GENERAL, sweeps.NOBODY)
@@ -293,7 +300,7 @@ def kinds_of(scene: Scene, block: Block, all_general: bool) -> Ints:
 
 
 def _lines_of(kinds: Ints) -> Ints:
-    """Return the runs of one kind, in each row along the last axis."""
+    """Return the maximal runs of places of the same kind in each row along the last axis."""
     padding = [*[(0, 0)] * (kinds.ndim - 1), (0, 1)]
     closed = np.pad(kinds, padding, constant_values=sweeps.NOBODY)
     flat = closed.ravel()
@@ -302,7 +309,7 @@ def _lines_of(kinds: Ints) -> Ints:
         ([sweeps.PLAIN, sweeps.WITH_CELLS], sweeps.GENERAL),
     ):
         begin, end, kind = _stretches(flat)
-        # The last column is empty, so that runs of consecutive rows do not touch.
+        # The last column is empty, so that the runs of one row do not merge with those of the next.
         touches = (np.roll(kind, 1) == neighbour) | (np.roll(kind, -1) == neighbour)
         short = np.isin(kind, kinds_of_short) & (end - begin < SHORT) & touches
         flat = np.repeat(np.where(short, neighbour, kind), end - begin)

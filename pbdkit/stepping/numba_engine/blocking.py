@@ -1,13 +1,14 @@
-"""Passes of several steps over the memory: loops over pieces, tiles and bands, and the writer of a
-step in a tile.
+"""Passes over the memory in which several steps are made: loops over pieces, tiles and bands, and
+the writer of a step in a tile.
 
-The lattice is cut along its last axis into tiles that stay in the cache, and each tile along its
-first axis into bands. In each band all steps of the pass are made one after the other; each step is
-shifted by the distance `Skew` against the step before along both axes (time skewing).
+The lattice is divided along its last axis into tiles that stay in the cache, and each tile along
+the first axis into bands. In each band all steps of the pass are made one after the other. The
+region of each step is shifted against the region of the previous step along both axes (time
+skewing); the class `Skew` contains the distances.
 
-On several threads the rows are cut into pieces, which are computed in parallel. At the ends of a
-piece the number of rows decreases from step to step, because the rows of the next piece must not be
-read. The gaps that remain are computed in parallel afterwards.
+On several threads the rows are divided into pieces, which are computed in parallel. From step to
+step a piece has fewer rows at its ends, because the rows of the adjacent pieces must not be read.
+The gaps that remain between the pieces are computed in parallel afterwards.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from pbdkit.stepping.program import Program
 
 class TileWriter(PlanWriter):
     """Writer of step s of a pass in a tile of a piece, in the rows from i0 to i1 and the columns
-    from j0 to j1. Leaders are placed as far as the step reads; bonds and inner rules are evaluated
-    ahead of the particles that move."""
+    from j0 to j1. Leaders are placed in all rows and columns that the step reads. Bonds and inner
+    rules are evaluated for rows and columns ahead of those in which particles move."""
 
     keeps_before = False
     _is_ahead = True
-    """True while lines are written for the rows and columns ahead of the particles that move."""
+    """True if i0, i1, j0 and j1 must be set to the rows and columns of the particles that move
+    before the next lines are written."""
 
     def __init__(self, plan: Plan, passes: Passes) -> None:
         arguments = "s", "moment", "band_", "tile", "piece", "extent", "boxes"
@@ -37,8 +39,8 @@ class TileWriter(PlanWriter):
         self._skew = Skew(plan.scene).axes
 
     def begin(self) -> None:
-        """Write the position of the step in the tile, and the distance up to which the step reads
-        values."""
+        """Write lines that compute the position of the step in the tile, and the rows and columns
+        that the step reads."""
         out, (rows, columns) = self.out, self._skew
         out.add(0, "i_low, i_high, j_low, j_high = extent", "begin, end, down, up = piece")
         out.add(0, "step = step + s + 1", "bottom, top = begin + s * down, end + s * up")
@@ -53,21 +55,23 @@ class TileWriter(PlanWriter):
         out.add(0, f"j1 = right + {columns.sight}")
 
     def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
-        """Write a loop over the entries in the present rows and columns."""
+        """Write a loop over those entries of a list that lie in the rows from i0 to i1 and the
+        columns from j0 to j1."""
         if not ahead:
             self._keep_to_moving()
         self._loop(name, "e", lines)
 
     def judge_bonds(self) -> None:
-        """Write a call for bonds ahead of the particles that move."""
+        """Write a call that updates the bonds in rows and columns ahead of the particles that
+        move."""
         if judge := self.passes.judge:
             self._keep_to_moving()
             self.out.add(0, judge.call("i0", "i1", "left", "right"))
             self._move_on()
 
     def sweep(self, level: int) -> None:
-        """Write a call for the particles that motion has reached; for an inner rule ahead of the
-        particles that move."""
+        """Write a call for the part of the range that motion has reached. For an inner rule the
+        range is ahead of the particles that move."""
         out, first = self.out, 2 * self.plan.scene.axes - 2
         self._keep_to_moving()
         out.add(0, "box = boxes[s].copy()", f"box[{first}] = max(box[{first}], left)")
@@ -84,10 +88,11 @@ class TileWriter(PlanWriter):
         self.out.add(1, self.rows(name, write).call("r0", "r1", "moment + s"))
 
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Write a loop over the frame points with their last particle in the range. Points with
-        particles on both sides of the end of a piece are computed with the gap."""
+        """Write a loop over the frame points for which the last of the particles that they follow
+        lies in the range. Points that follow particles on both sides of the end of a piece are
+        computed with the gap between the pieces."""
         lines = self.each(f"{planes}_@[points[f]] = t_@")
-        if lag:  # The point has the displacement that was computed for it in the step before.
+        if lag:  # The point gets the displacement that was computed for it in the previous step.
             lines = self.each(f"{planes}_@[points[f]] = lag_@[f]")
         lines = [*lines, *lag_lines(self, mapped, planes)] if lag else [*mapped(planes), *lines]
         self.out.add(0, f"i1 = min(high, top + {self._skew[0].apart} * (up > 0))")
@@ -97,21 +102,22 @@ class TileWriter(PlanWriter):
             self._move_on()
 
     def _loop(self, name: str, e: str, lines: Iterable[str], besides: str = "") -> None:
-        """Write a loop over the entries of a list in the rows from i0 to i1, and columns from j0 to
-        j1."""
+        """Write a loop over the entries of a list in the rows from i0 to i1 and the columns from j0
+        to j1."""
         self.out.add(0, f"first_one = {name}_rows[min(max(i0, i_low), i_high)]")
         self.out.add(0, f"for {e} in range(first_one, {name}_rows[max(min(i1, i_high), i_low)]):")
         self.out.add(1, f"if j0 <= {name}_columns[{e}] < j1{besides}:")
         self.out.add(2, *lines)
 
     def _keep_to_moving(self) -> None:
-        """Return to the rows and columns of the particles that move."""
+        """Write a line that sets the range to the rows and columns of the particles that move."""
         if self._is_ahead:
             self.out.add(0, "i0, i1, j0, j1 = max(low, bottom), min(high, top), left, right")
             self._is_ahead = False
 
     def _move_on(self) -> None:
-        """Shift the range back to the particles that move."""
+        """Write lines that shift the range back, from the rows and columns just evaluated to those
+        evaluated next."""
         out, (rows, columns) = self.out, self._skew
         for edge, slope in (("bottom", "down"), ("top", "up")):
             out.add(0, f"{edge} += {rows.back} if {slope} > 0 else {-rows.ahead} * ({slope} < 0)")
@@ -121,13 +127,15 @@ class TileWriter(PlanWriter):
 
 
 def lag_lines(kernel: KernelWriter, mapped: Callable[[str], Lines], planes: str) -> Lines:
-    """Return the lines of code that give frame point f its displacement one step later."""
+    """Return lines that compute the displacement of frame point f and store it for the next
+    step."""
     return [*mapped(planes), *kernel.each("lag_@[f] = t_@")]
 
 
 def write_piece(plan: Plan, program: Program, passes: Passes) -> list[Function]:
-    """Return the functions for the steps of a pass in a piece, the main one last: rows from `begin`
-    to `end`, with ends that move by `down` and `up` in every step."""
+    """Return the functions that make the steps of a pass in a piece; the last one calls the others.
+    The piece has the rows from `begin` to `end` in the first step. In every further step `begin`
+    changes by `down`, and `end` by `up`."""
     tile = TileWriter(plan, passes)
     tile.begin()
     for operation in program:
@@ -149,7 +157,7 @@ def write_piece(plan: Plan, program: Program, passes: Passes) -> list[Function]:
 
 
 def _exchanged(plan: Plan, call: str) -> str:
-    """Return a call with the arrays before and after a step exchanged."""
+    """Return a call in which the arrays before and after a step are swapped."""
     pairs = [*zip(plan.each("u_@"), plan.each("v_@"), strict=True)]
     pairs += [(f"own{m}", f"was{m}") for m in plan.kept if plan.shares]
     other = dict(pairs) | {v_name: u_name for u_name, v_name in pairs}
@@ -160,13 +168,13 @@ def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> 
     """Write the beginning of a loop over steps. Several steps are made in a pass if more than one
     remains and the part of the lattice that motion has reached does not fit in the cache."""
     out, plan = writer.out, writer.plan
-    # numba would compile a function once for literal arguments and again for int64; therefore all
+    # numba would compile a function once for literal arguments and again for int64. Therefore all
     # arguments are int64.
     out.add(0, "boxes, moment = np.empty((sizes[0], box.size), np.int64), int64(0)")
     out.add(0, "while moment < count:", "    area = 1", "    for e in range(0, box.size, 2):")
     out.add(2, "area *= min(box[e + 1], kind.shape[e // 2 + 1]) - max(box[e], 0)")
     out.add(1, "deep = min(sizes[0], count - moment)")
-    if plan.parallel:  # Pieces have room for the gaps between them.
+    if plan.parallel:  # Pieces must be so high that the gaps between them fit.
         out.add(1, "height = min(box[1], kind.shape[1]) - max(box[0], 0)")
         out.add(1, f"deep = min(deep, height // ({2 * Skew(plan.scene).along[0]} * sizes[4]) - 1)")
     out.add(1, "if deep > 1 and area > sizes[3]:")
@@ -181,8 +189,8 @@ def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> 
         out.add(0, "if deep % 2 == 0:", *(f"    own{m}[:] = was{m}" for m in plan.kept))
     u, v = (", ".join(plan.each(f"{side}_@")) for side in "uv")
     out.add(0, "if deep % 2:", f"    {u}, {v} = {v}, {u}", "moment += deep", "step += deep")
-    # The displacements before the last step contain the leaders as placed in the last step; they
-    # are replaced by those of the last step but one.
+    # In the displacements before the last step, the leaders are placed as in the last step. They
+    # are now placed as in the last step but one.
     out.add(0, *plan.each("flat_v_@ = v_@.reshape(-1)"))
     out.add(0, *plan.opening("moment - 2"))
     out.depth -= 1
@@ -193,8 +201,8 @@ def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> 
 
 
 def _write_pieces(out: Function, plan: Plan, piece: Function) -> None:
-    """Write a call for one piece, or calls for the pieces of the threads and for the gaps between
-    them."""
+    """Write a call for one piece or, on several threads, calls for the pieces and then for the gaps
+    between the pieces."""
     arguments = ("moment", "deep", "extent", "boxes")
     if not plan.parallel:
         out.add(0, piece.call("(i_low, i_high, int64(0), int64(0))", *arguments))
@@ -209,8 +217,8 @@ def _write_pieces(out: Function, plan: Plan, piece: Function) -> None:
 
 
 def _write_extent(out: Function, plan: Plan) -> None:
-    """Write the part of the lattice that each step of a pass has reached, and the largest distance
-    of leaders and frame points from it."""
+    """Write lines that compute the part of the lattice that motion has reached in each step of a
+    pass, and the rows and columns in which leaders and frame points can lie."""
     up, across = Skew(plan.scene).along
     first = 2 * plan.scene.axes - 2
     out.add(0, "for s in range(deep):", "    for e in range(box.size):")

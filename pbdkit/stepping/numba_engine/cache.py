@@ -1,10 +1,10 @@
-"""Cache of compiled kernels: one folder for each, named by a digest of everything that determines
-it.
+"""Cache of compiled kernels. Each kernel has a folder, the name of which is a digest of everything
+that determines the kernel.
 
-The folder contains the source, the files of numba, and the digests of both. Files that do not match
-their digests are not loaded; the kernel is compiled again. If nothing can be stored, or other users
-can write to the folder, a kernel is compiled in memory. Elementwise functions are prepared for
-numba here, and their source is part of the key.
+The folder contains the source, the files of numba, and the digests of both. If a file does not
+match its digest, no file is loaded and the kernel is compiled again. If nothing can be stored, or
+other users can write to the folder, a kernel is compiled in memory. This module also prepares
+elementwise functions for numba; their source is included in the digest.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ def _is_vector(kind: Any) -> bool:
 
 
 def _written(kind: Any, arguments: str, component: str, whole: str = "Vector({})") -> Any:
-    """Return a function of vectors, written out by components; `component` is the pattern of one,
-    with `@` for its name."""
+    """Return a function of vectors that is written out component by component. `component` is the
+    pattern of a component, with `@` for its name."""
     names = kind.instance_class._fields
     parts = [component.replace("@", name) for name in names]
     scope: dict[str, Any] = {"Vector": kind.instance_class}
     function = eval(f"lambda {arguments}: {whole.format(', '.join(parts))}", scope)
-    # numba expects the same signature as that of the overloaded function, annotations included.
+    # numba expects the signature of the overloaded function, including its annotations.
     function.__annotations__ = dict.fromkeys([*arguments.split(", "), "return"], "Any")
     return function
 
 
 @overload(where)
 def _where(condition: Any, yes: Any, no: Any) -> Any:
-    # In compiled code numpy's `where` on scalars takes hundreds of times as long.
+    # numpy's `where` on scalars would take hundreds of times as long in compiled code.
     if _is_vector(yes):
         return _written(yes, "condition, yes, no", "yes.@ if condition else no.@")
 
@@ -98,7 +98,7 @@ for _operation, _sign in (("add", "+"), ("sub", "-"), ("mul", "*"), ("truediv", 
 
 
 def compiled(function: Function) -> Any:
-    """Return the function compiled by numba, with every Python function that it calls.
+    """Return the function, compiled by numba together with every Python function that it calls.
 
     `error_model="numpy"` allows divisions and roots to be vectorised. fastmath is off, so that
     every operation is rounded as in numpy.
@@ -118,9 +118,9 @@ def with_helpers_ready(function: Function) -> Function:
 def source_key(*functions: Function) -> str:
     """Return a digest of the source of functions and of all that they call, constants included.
 
-    Their location is part of it: a stored kernel imports its functions by their modules. If a
-    function reads a value that cannot be identified, the key is unique, so that the kernel is
-    compiled in every process.
+    The location of the functions is included, because a stored kernel imports its functions from
+    their modules. If a function reads a value that cannot be identified, the key is unique, so that
+    the kernel is compiled in every process.
     """
     digest = hashlib.sha256()
     for function in chain.from_iterable(map(_reached, functions)):
@@ -148,12 +148,12 @@ def _content(value: Any) -> str:
 def _source(code: types.CodeType) -> str:
     try:
         return inspect.getsource(code)
-    except (OSError, TypeError):  # The function was not defined in a file, but at a prompt.
+    except (OSError, TypeError):  # The function was defined at a prompt and not in a file.
         return repr((code.co_code, code.co_consts, code.co_names))
 
 
 def _reached(function: Function) -> list[Function]:
-    """Return the function and every Python function that it calls by name, each once."""
+    """Return the function and every Python function that it calls by name, without repetitions."""
     functions = [function]
     for member in functions:
         for value in _names(member).values():
@@ -176,7 +176,7 @@ def _names(function: Function) -> dict[str, Any]:
     modules = [v for v in values.values() if isinstance(v, types.ModuleType)]
     for module in modules:
         if module.__name__.split(".")[0] not in ("numpy", "math", "numba"):
-            # pbdkit's own modules are loaded when first used.
+            # Modules of pbdkit may be loaded only now, at their first use.
             members = {name: getattr(module, name) for name in names if hasattr(module, name)}
             values |= {f"{module.__name__}.{name}": value for name, value in members.items()}
             modules += [v for v in members.values() if isinstance(v, types.ModuleType)]
@@ -186,14 +186,15 @@ def _names(function: Function) -> dict[str, Any]:
 SOURCE = "kernel.py"
 """Name of the file with the source of a kernel."""
 DIGESTS = "digests.json"
-"""Name of the file with the digests of the others."""
+"""Name of the file with the digests of the other files."""
 _loaded: dict[tuple[Path, str], Any] = {}
-"""Kernels of this process, by folder and key. Loading one again would take several milliseconds."""
+"""Kernels that this process has loaded, by folder and key. Loading a kernel again would take
+several milliseconds."""
 
 
 def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[Any, ...]) -> Any:
-    """Return the function `run` of a kernel with this source, from the cache or compiled, after a
-    first call with the arguments.
+    """Return the function `run` of a kernel with this source. The kernel is loaded from the cache
+    or compiled, and is called once with the arguments.
 
     The key covers the source of every function that rule and fracture model call, so that a kernel
     is never used for an edited rule.
@@ -211,8 +212,9 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
 
 
 def cache_folder() -> Path | None:
-    """Return PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; None if it is not writable,
-    or if other users can write to it, because their code could be executed."""
+    """Return PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; None if it is not writable.
+    Also None if other users can write to it, because code that they place there would be
+    executed."""
     folder = _asked_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -238,7 +240,7 @@ def _kept(source: str, key: str, names: dict[str, Any], arguments: tuple[Any, ..
     try:
         if kernel := _found(source, folder, names, arguments):
             return kernel
-        # A process that needs the same kernel meanwhile waits, and then loads it.
+        # Another process that needs the same kernel waits until it is stored, and then loads it.
         with _alone(cache / f".{key}"):
             kernel = _found(source, folder, names, arguments)
             return kernel or _made(source, folder, names, arguments)
@@ -262,7 +264,7 @@ def _made(source: str, folder: Path, names: dict[str, Any], arguments: tuple[Any
         (directory / SOURCE).write_text(source, encoding="utf-8")
         run = _prepared(source, names, arguments, directory)
         (directory / DIGESTS).write_text(json.dumps(_digests(directory)), encoding="utf-8")
-        if not _is_whole(folder):  # No other process has stored it meanwhile.
+        if not _is_whole(folder):  # No other process has stored it in the meantime.
             shutil.rmtree(folder, ignore_errors=True)
             directory.replace(folder)
         return run
@@ -303,7 +305,8 @@ def _digests(folder: Path) -> dict[str, str]:
 def _prepared(
     source: str, names: dict[str, Any], arguments: tuple[Any, ...], folder: Path | None = None
 ) -> Any:
-    """Return the kernel after its first call, compiled or loaded from its folder."""
+    """Return the kernel after its first call. The call compiles the kernel or loads it from its
+    folder."""
     file = str(folder / SOURCE) if folder else "<kernel>"
     module = ModuleType(folder.name if folder else "kernel")
     scope = vars(module)
@@ -319,7 +322,7 @@ def _prepared(
 
 
 def words(made: Callable[[Function], Any]) -> dict[str, Any]:
-    """Return the names that every kernel uses, with their values; functions are converted by
+    """Return the names that every kernel uses, with their values. Functions are converted with
     `made`."""
     kinds: dict[str, Any] = {kind.__name__: kind for kind in KINDS.values()}
     kinds |= {kind.__name__: kind for kind in (Here, Torn, CellStress, Stiffness)}

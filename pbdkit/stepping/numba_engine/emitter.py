@@ -1,8 +1,8 @@
-"""Source of the kernel of a scene: sweeps that move particles, and the loop over steps, to which
-each operation adds its lines.
+"""Source of the kernel of a scene. It consists of sweeps that move particles, and of a loop over
+steps, to which each operation adds its lines.
 
-Rows in which all neighbours exist have rest offsets and steps to neighbours as
-literals; other rows use more general code. Values that differ between runs (parameters, thresholds,
+In the code for rows in which all neighbours exist, rest offsets and index offsets of neighbours are
+literals. Other rows use more general code. Values that differ between runs (parameters, thresholds,
 places) are arguments.
 """
 
@@ -17,7 +17,7 @@ from pbdkit.stepping.numba_engine.plan import Level, Passes, Plan, PlanWriter, g
 from pbdkit.stepping.program import Program, program_of
 
 Groups = Sequence[tuple[int, int]]
-"""Type of the sublattices and kinds of rows that occur."""
+"""Type of the combinations (sublattice, kind of row) that occur."""
 
 
 def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, list[str]]:
@@ -57,7 +57,8 @@ def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tu
 def module_text(
     plan: Plan, functions: Iterable[Function], head: Iterable[str], run: Function
 ) -> str:
-    """Return the source of a module with these functions and `run`, which has its own head."""
+    """Return the source of a module with these functions and `run`, the signature of which is
+    `head`."""
     visible = plan.levels[-1].seen
     kinds = {"Fracture": visible.fracture, "Constants": visible.bond}
     for n, level in enumerate(plan.levels):
@@ -80,7 +81,7 @@ def module_text(
 
 
 def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) -> list[Function]:
-    """Return the functions for the kinds of rows that occur, and last the one that calls them for
+    """Return the functions for the kinds of rows that occur. The last function calls the others for
     all rows."""
     out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
     general, functions = sweeps.write_general(plan, level, events), list[Function]()
@@ -96,14 +97,15 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
 
 
 class LatticeWriter(PlanWriter):
-    """Writer of a step on all cells that motion has reached, operation after operation."""
+    """Writer of a step that is made operation after operation, each on all cells that motion has
+    reached."""
 
     _judging: Function | None = None
-    """Pass over bonds, for the next sweep to include."""
+    """Pass over bonds that the next sweep includes."""
 
     def begin(self) -> None:
-        """Write the names that the lines of operations use, and extend the box that motion has
-        reached."""
+        """Write lines that define the names in the lines of operations, and that extend the box
+        that motion has reached."""
         out, plan = self.out, self.plan
         out.add(1, "step += 1")
         planes = ["u_@", "v_@", *(f"z{n}_@" for n in range(len(plan.levels) - 1))]
@@ -117,7 +119,7 @@ class LatticeWriter(PlanWriter):
         out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
 
     def end(self) -> None:
-        """Exchange the displacements before and after the step."""
+        """Write lines that swap the arrays of the displacements before the step and after it."""
         u, v = (", ".join(self.plan.each(f"{name}_@")) for name in "uv")
         self.out.add(1, f"{u}, {v} = {v}, {u}")
 
@@ -126,12 +128,12 @@ class LatticeWriter(PlanWriter):
         self.out.add(1, f"for e in range({name}.size):", *("    " + line for line in lines))
 
     def judge_bonds(self) -> None:
-        """Keep the pass over bonds for the next sweep."""
+        """Store the pass over bonds; the next sweep includes it."""
         self._judging = self.passes.judge
 
     def sweep(self, level: int) -> None:
-        """Write a call for all rows. A pass over bonds alternates with it band by band, so that the
-        data of a band stay in the cache."""
+        """Write a call for all rows. If there is a pass over bonds, pass and sweep alternate band
+        by band, so that the data of a band stay in the cache."""
         sweep, judging, self._judging = self.passes.sweeps[level], self._judging, None
         if judging is None:
             write_pass(self.out, self.plan, 1, sweep, "i0", "i1")
@@ -150,7 +152,7 @@ class LatticeWriter(PlanWriter):
         write_pass(self.out, self.plan, 1, self.rows(name, write), "i0", "i1", "moment")
 
     def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
-        """Write a loop over all points."""
+        """Write a loop over all frame points."""
         source = "flat_u" if lag else planes
         self.out.add(1, "for f in range(points.size):")
         self.out.add(2, *mapped(source), *self.plan.each(f"{planes}_@[points[f]] = t_@"))
@@ -159,7 +161,8 @@ class LatticeWriter(PlanWriter):
 def write_pass(
     out: Function, plan: Plan, depth: int, one: Function, low: str, high: str, *more: str
 ) -> None:
-    """Write a call for rows from `low` to `high`, or for parts of them on all threads."""
+    """Write a call for the rows from `low` to `high`. On several threads it is called for a part of
+    the rows on each thread."""
     if not plan.parallel:
         out.add(depth, one.call(low, high, *more))
         return

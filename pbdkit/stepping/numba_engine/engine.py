@@ -1,13 +1,13 @@
-"""Compiled engine: many steps in one call, on the part of the lattice that motion has reached.
+"""Compiled engine. One call makes many steps, on the part of the lattice that motion has reached.
 
-In the reference configuration the move of a rule is exactly zero; a step can only move particles
-that bear a load or have a neighbour that has moved. If this is known of the scene in advance, the
-box of moved particles is empty at the beginning; otherwise the first step computes every particle
-and detects those that are not at rest. The box, which includes the leaders, then grows in each step
-by the reach of a bond times the number of nested rules. If state variables change, all particles
-are computed in every step.
+If the rule's moves are exactly zero in the reference configuration, a step can only move particles
+that bear a load or have a neighbour that has moved. If the scene guarantees this in advance (see
+`_rests_by_construction`), the box of moved particles is empty at the beginning. Otherwise the first
+step computes every particle and detects those that are not at rest. The box includes the leaders.
+In each step it grows by the reach of a bond times the number of nested rules. If state variables
+change, all particles are computed in every step.
 
-If neighbours are re-evaluated, the kernel is a sweep over their list.
+If neighbours are re-evaluated, the kernel is a sweep over the list of neighbours.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class PairFollowers(Followers):
         self._run = load_blamed(self._plan.levels, source, arguments)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
-        """Move the particles, with neighbours in the order of the numpy engine."""
+        """Move the particles. Neighbours are summed in the same order as by the numpy engine."""
         j, other, rest = self._search.pairs(m)
         first = np.searchsorted(j, np.append(self._search.body, len(self._search.place)))
         rest = np.ascontiguousarray(rest)
@@ -89,8 +89,9 @@ class PairFollowers(Followers):
         self._run(arguments, 0, len(self._search.body), self._chunks)
 
     def _named(self, m: Floats, new: Floats, state: State, **pairs: Any) -> Arrays:
-        """Return the arrays of the kernel by name: `first_pair` by particle of the body, `partner`
-        and `rests` by pair, `place` and `local` by row of the table."""
+        """Return the arrays of the kernel by name. `first_pair` has an entry for each particle of
+        the body, `partner` and `rests` for each pair of neighbours, and `place` and `local` for
+        each row of the table of particles."""
         was = {f"was{n}": state.particle_values[n].copy() for n in self._plan.kept}
         return self._arrays | state_arrays(self._plan, m, new, state) | was | pairs
 
@@ -132,7 +133,7 @@ class MotionExtent:
     box
         Range of cells that have been reached, as `Box`.
     growth
-        Change of the box in a step, (2 axes,).
+        Change of the bounds of the box in a step, (2 · axes,).
     """
 
     def __init__(self, levels: Sequence[Level], program: Program) -> None:
@@ -143,7 +144,7 @@ class MotionExtent:
         self._renews = isinstance(experiment.rule, RenewsParticles) or (
             scene.has_fracture and isinstance(experiment.fracture, RenewsBonds)
         )
-        # A body that is at rest with some parameters may move with others.
+        # A body that is at rest with the current parameters may move when they change.
         self._renews |= any(field != "solver" for field, _ in experiment.courses)
         self._rests = not self._renews and _rests_by_construction(levels)
         self._bond = len(levels) * _growth(program)
@@ -159,8 +160,8 @@ class MotionExtent:
         self._reset(np.zeros_like(self._bond) if self._is_known else self._whole)
 
     def take_in_call(self, call: Call, count: int) -> int:
-        """Extend the box by the disturbances of a call; return how many of the `count` steps the
-        call can make."""
+        """Extend the box by the particles at rest that operations move in a call. Return how many
+        of the `count` steps the call can make."""
         if not self._is_known:
             return count if self._renews else 1
         for operation in self._program:
@@ -169,7 +170,8 @@ class MotionExtent:
         return count
 
     def take_in_rows(self, state: State, rows: slice) -> None:
-        """Extend the box by moved particles in rows of cells that were written by other ranks."""
+        """Extend the box by the moved particles in `rows`, which are rows of cells that other ranks
+        have written."""
         if self._is_known:
             moves = (u[:, :, rows] != 0.0 for u in (state.u, state.previous))
             first, *cells = np.nonzero(np.logical_or(*moves).any(axis=(0, 1)))
@@ -201,9 +203,10 @@ class MotionExtent:
 
 
 def _rests_by_construction(levels: Sequence[Level]) -> bool:
-    """Return whether the reference configuration is known to be an equilibrium: every neighbour is
-    present, all initial displacements are zero, no bond is broken or breaks at rest, the rules'
-    moves are zero, and neither particles nor bonds have state variables."""
+    """Return whether the reference configuration is certainly an equilibrium. This is so if every
+    neighbour is present, all initial displacements are zero, no bond is broken or breaks at rest,
+    the moves of the rules at rest are zero, and neither particles nor bonds have state
+    variables."""
     scene = levels[-1].scene
     experiment, raster, fracture = scene.experiment, scene.raster, scene.experiment.fracture
     cracked = (isinstance(fracture, StartsCracked) and fracture.segments()) or experiment.cuts
@@ -219,7 +222,8 @@ def _rests_by_construction(levels: Sequence[Level]) -> bool:
 
 
 def _stays(scene: Scene) -> bool:
-    """Return whether a particle with all its neighbours stays at rest, and no bond breaks."""
+    """Return whether, at rest, a particle with all its neighbours does not move and no bond
+    breaks."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     still, slots = vector(np.zeros(scene.axes)), scene.neighbourhood.slots
     with blaming(experiment.rule, "to move at rest"):
@@ -243,16 +247,17 @@ def _growth(program: Program) -> Box:
 
 
 BAND = 16384
-"""Number of places at which bonds are updated before the sweep over them, so that their data stay
-in the cache. It is larger on several threads, because of the time to start them."""
+"""Number of places in a band. Bonds are updated in one band and then the sweep moves the particles
+of the band, so that the data stay in the cache. On several threads bands are larger, because
+starting threads takes time."""
 
 
 class CompiledStepper(Engine):
     """Engine that steps a scene with its own kernel.
 
-    Broken bonds are stored in bit masks of the particles, which are recomputed for states that this
-    engine has not computed; all other arrays are those of the numpy engine. If neighbours are
-    re-evaluated, the kernel sweeps over their list.
+    Broken bonds are stored in bit masks of the particles. The masks are recomputed for states that
+    were not computed by this engine. All other arrays are the same as in the numpy engine. If
+    neighbours are re-evaluated, the kernel is a sweep over the list of neighbours.
     """
 
     name = "compiled"
@@ -267,7 +272,7 @@ class CompiledStepper(Engine):
         self._program = program_of(scene)
         self._last: State | None = None
         self._numbered = scene
-        """Scene with the parameters that the arrays contain."""
+        """Scene with the values of the parameters that are in the arrays."""
         levels = levels_of(scene)
         self._extent = MotionExtent(levels, self._program)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
@@ -349,8 +354,7 @@ class CompiledStepper(Engine):
             self._numbered = scene
 
     def _named(self, call: Call) -> Arrays:
-        """Return, by name, the arrays of a kernel that writes steps into the arrays of the
-        state."""
+        """Return by name the arrays of a kernel. Steps are written into the arrays of the state."""
         state = call.state
         return {
             **self._arrays,

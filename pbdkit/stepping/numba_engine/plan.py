@@ -1,5 +1,5 @@
-"""Plan of the kernel of a scene: levels of nested rules, contents of the kernel, expressions of its
-lines, and sizes of passes of several steps."""
+"""Plan of the kernel of a scene. It describes the levels of nested rules, the contents of the
+kernel, the expressions in its lines, and the sizes of passes of several steps."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ from pbdkit.stepping.state import started
 @dataclass(frozen=True)
 class Level:
     """Rule that is evaluated in one sweep, and its scene. The first level acts on displacements,
-    every further one on the moves of the level before."""
+    and every further level on the moves of the previous level."""
 
     number: int
     scene: Scene
@@ -69,7 +69,7 @@ class Level:
 
     @cached_property
     def seen(self) -> VisibleNumbers:
-        """State variables and parameters that the rule receives."""
+        """Names of the state variables and parameters that the rule receives."""
         scene = self.scene
         return numbers_of(scene.experiment, scene.constants, weighs_cells=scene.cells is not None)
 
@@ -80,8 +80,8 @@ class Level:
 
     @property
     def source(self) -> str:
-        """Prefix of the planes on which it acts; the first letter names the vector at a
-        particle."""
+        """Prefix of the names of the arrays on which the rule acts. The first letter is the name of
+        the vector at a particle."""
         return f"z{self.number - 1}" if self.number else "u"
 
     @property
@@ -92,17 +92,17 @@ class Level:
 
 MAX_BITS = 32
 """Number of neighbours of a sublattice up to which code is written slot by slot and broken bonds
-are bits."""
+are stored as bits."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """Plan of the kernel of a scene.
 
-    `levels` are its rules, the last of which moves the particles; `parallel` is true for several
-    threads; `shared` are the names, mostly of arrays, that all functions may use; `apart` is true
-    if bonds are updated in a separate pass for every model; `gpu` is true for a GPU, where threads
-    take one place after the other from flat arrays.
+    `levels` are the nested rules of the scene; the last one moves the particles. `parallel` is true
+    for several threads. `shared` are the names, mostly of arrays, that all functions may use.
+    `apart` is true if bonds are updated in a separate pass for every fracture model. `gpu` is true
+    for a GPU, where each thread processes one place after the other in flat arrays.
     """
 
     scene: Scene
@@ -114,7 +114,7 @@ class Plan:
 
     @property
     def axes(self) -> str:
-        """Names of the axes, a letter each."""
+        """Names of the axes, one letter for each."""
         return "xyz"[: self.scene.axes]
 
     @cached_property
@@ -128,17 +128,17 @@ class Plan:
 
     @property
     def lead(self) -> tuple[str, ...]:
-        """Indices of a row of particles in rasters."""
+        """Expression for the indices of a row of particles in rasters."""
         return ("i", "l")[: self.scene.axes - 1]
 
     @property
     def long(self) -> bool:
-        """True if there are too many neighbours to write them out."""
+        """True if there are too many neighbours to write code for each of them."""
         return max(map(len, self.scene.neighbourhood.slots)) > MAX_BITS
 
     def is_loaded(self, level: Level) -> bool:
-        """Return whether loads are added in the sweep of that level. They act in the last level
-        alone, which moves the particles."""
+        """Return whether loads are added in the sweep of that level. Loads act in the last level
+        only, which moves the particles."""
         return self.scene.loads is not None and level is self.levels[-1]
 
     @property
@@ -175,24 +175,24 @@ class Plan:
 
     @property
     def read(self) -> tuple[str, ...]:
-        """Arrays of the state variables of particles; those from before the step if neighbours read
-        them."""
+        """Names of the arrays from which state variables of particles are read. If rules read state
+        variables of neighbours, these arrays contain the values from before the step."""
         copies, count = self.kept if self.shares else (), len(self.levels[-1].seen.own)
         return tuple(f"was{m}" if m in copies else f"own{m}" for m in range(count))
 
     @property
     def shown(self) -> tuple[str, ...]:
-        """Arrays of the state variables that neighbours read."""
+        """Names of the arrays from which state variables of neighbours are read."""
         return self.read if self.shares else ()
 
     @property
     def limits(self) -> int:
-        """Number of limits that vary in space."""
+        """Number of limits of bonds that vary in space."""
         return len(self.scene.constants.by_bond)
 
     @property
     def mixed(self) -> int:
-        """Number of stiffnesses of cells that differ from that of the rule."""
+        """Number of stiffnesses of cells that differ from the stiffness of the rule."""
         return len(self.scene.cells.mixed) if self.scene.cells else 0
 
     @property
@@ -207,7 +207,8 @@ class Plan:
 
     @property
     def bonds_first(self) -> bool:
-        """True if bonds are updated in a separate pass, and not at both ends by the sweep."""
+        """True if bonds are updated in a separate pass. Otherwise the sweep over particles updates
+        each bond at both of its ends."""
         if self.model is None:
             return False
         renews = isinstance(self.model, RenewsBonds)
@@ -224,11 +225,13 @@ class Plan:
         return "real" if self.scene.experiment.stepping.precision == "float32" else "double"
 
     def over(self, count: str) -> str:
-        """Return a range up to a count; on a GPU the part of one thread."""
+        """Return an expression for the range up to a count or, on a GPU, for the part of this range
+        that belongs to one thread."""
         return f"range(me, {count}, threads)" if self.gpu else f"range({count})"
 
     def renumbered(self, scene: Scene) -> Plan:
-        """Return the plan of a scene that differs in parameters alone."""
+        """Return the plan of a scene that differs from the scene of this plan only in its
+        parameters."""
         levels, below = list[Level](), scene
         for level in reversed(self.levels):
             levels.insert(0, replace(level, scene=below))
@@ -244,8 +247,8 @@ class Plan:
         return f"real({value})" if self.real == "real" else value
 
     def each(self, pattern: str, axes: str = "") -> list[str]:
-        """Return the pattern for each axis, or some, with its name for `@` and its number for
-        `#`."""
+        """Return the lines of a pattern for each of some axes, by default all. `@` is replaced by
+        the name of the axis, and `#` by its number."""
         named = enumerate(axes or self.axes)
         return [pattern.replace("@", c).replace("#", str(a)) for a, c in named]
 
@@ -258,14 +261,15 @@ class Plan:
         return f"Vector({', '.join(map(self.number, values))})"
 
     def row(self, array: str, first: object, step: Sequence[object] | None = None) -> str:
-        """Return columns j0 to j1 of a row, or those a step of cells away."""
+        """Return an expression for columns j0 to j1 of a row or, with `step`, for the cells that
+        are this step away from them."""
         *lead, last = step or [0] * self.scene.axes
         at = [_sum(name, m) for name, m in zip(self.lead, lead, strict=True)]
         return f"{array}[{', '.join([str(first), *at])}, {_sum('j0', last)}:{_sum('j1', last)}]"
 
     def local_places(self, s: str) -> list[str]:
-        """Return expressions for X relative to site (0, 0), with the order of operations of the
-        rasters."""
+        """Return expressions for X relative to site (0, 0), in which the order of operations is the
+        same as in rasters."""
         index = [f"{name} + first[{n}]" for n, name in enumerate((*self.lead, "j + j0"))]
         places = []
         for n, along in enumerate(zip(*self.scene.raster.cell.vectors, strict=True)):
@@ -274,7 +278,8 @@ class Plan:
         return places
 
     def flat(self, s: str) -> str:
-        """Return the place at which a row begins in flat arrays of all sublattices."""
+        """Return an expression for the index at which a row begins in flat arrays of all
+        sublattices."""
         index = s
         for axis, name in enumerate((*self.lead, "j0")):
             index = f"({index}) * kind.shape[{axis + 1}] + {name}"
@@ -286,21 +291,21 @@ def _sum(name: str, step: object) -> str:
 
 
 def listed(texts: Iterable[str]) -> str:
-    """Return the arguments of a named tuple as text."""
+    """Return texts as the arguments of a named tuple."""
     return "".join(f"{text}, " for text in texts)
 
 
 def values(numbers: Sequence[Number], where: dict[Home, str]) -> str:
-    """Return the arguments of a named tuple; `where` maps each home, the place in which numbers are
-    stored, to the pattern of the expression for its n-th number."""
+    """Return the arguments of a named tuple as text. `where` contains, for each kind of place in
+    which numbers are stored, the pattern of the expression for the n-th number stored there."""
     counts = defaultdict[Home, Iterator[int]](count)
     return listed(where[number.home].format(n=next(counts[number.home])) for number in numbers)
 
 
 @dataclass(frozen=True)
 class Passes:
-    """Functions that a step of a kernel calls: the pass over bonds, if it is separate from the
-    moves, the sweep of each level, and those of operations by name."""
+    """Functions that a step of a kernel calls: the pass over bonds, if bonds are not updated by the
+    sweep; the sweep of each level; and functions of operations, by name."""
 
     judge: Function | None
     sweeps: Sequence[Function]
@@ -314,7 +319,8 @@ class PlanWriter(KernelWriter):
         self.plan, self.out, self.passes = plan, out, passes
 
     def rows(self, name: str, write: Callable[[Function], None]) -> Function:
-        """Return a function of rows that belongs to an operation."""
+        """Return the function of an operation that processes a range of rows. If it does not exist,
+        it is written."""
         if name not in self.passes.functions:
             function = Function(self.plan.shared, name, "first_row", "last_row", "moment")
             write(function)
@@ -322,7 +328,7 @@ class PlanWriter(KernelWriter):
         return self.passes.functions[name]
 
     def each(self, pattern: str, axes: str = "") -> Lines:
-        """Return the pattern for each axis, or some."""
+        """Return the lines of a pattern for each of some axes, by default all."""
         return self.plan.each(pattern, axes)
 
     def vector(self, pattern: str) -> str:
@@ -334,7 +340,7 @@ class PlanWriter(KernelWriter):
         return self.plan.number(value)
 
     def row(self, array: str, first: str) -> str:
-        """Return the columns j0 to j1 of a row."""
+        """Return an expression for columns j0 to j1 of a row."""
         return self.plan.row(array, first)
 
     def places(self, sublattice: str) -> Lines:
@@ -347,11 +353,11 @@ class PlanWriter(KernelWriter):
 
 
 DEEP = 16
-"""Number of steps of a pass (measured)."""
+"""Number of steps of a pass: the measured optimum."""
 BAND = 8
-"""Number of rows of a band (measured)."""
+"""Number of rows of a band: the measured optimum."""
 ROW = 24 * 2**10
-"""Number of bytes of a row of a tile (measured)."""
+"""Number of bytes of a row of a tile: the measured optimum."""
 SHORTEST = 256
 """Minimum number of columns of a tile."""
 
@@ -363,8 +369,8 @@ def goes_deep(plan: Plan) -> bool:
 
 def pass_arrays(plan: Plan, pieces: int) -> dict[str, Any]:
     """Return the constant arrays of passes. `sizes` contains the sizes of a pass and the number of
-    pieces. Others describe the sorted frame points: the first index of each row, the columns of the
-    points, and the first rows of the particles that they follow."""
+    pieces. The other arrays describe the sorted frame points: the index at which each row begins,
+    the columns of the points, and for each point the first row of the particles that it follows."""
     scene = plan.scene
     between = math.prod(scene.raster.shape[2:-1])
     tile = max(SHORTEST, ROW // (cell_bytes(scene) * between))
@@ -386,8 +392,8 @@ def frame_order(following: FollowFrame) -> Indices:
 
 
 def banded(plan: Plan, name: str, places: NDArray[np.intp]) -> tuple[Any, dict[str, Any]]:
-    """Return the order of flat places by row and column, and in that order the first index of each
-    row and the columns."""
+    """Return the order of flat places by row and column. Also return, in this order, the index at
+    which each row begins and the columns of the places."""
     index = np.unravel_index(places, plan.scene.raster.shape)
     order = np.lexsort((index[-1], index[1]))
     return order, _listed(plan, name, index[1][order], index[-1][order])
@@ -420,8 +426,8 @@ def levels_of(scene: Scene) -> tuple[Level, ...]:
 
 
 def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
-    """Return the elementwise functions by their names in the kernel; names of functions of a rule
-    end with the number of its level."""
+    """Return the elementwise functions by their names in the kernel. The names of the functions of
+    a rule end with the number of its level."""
     parts: dict[str, Any] = {str(level.number): level.scene.experiment.rule for level in levels}
     if levels[-1].scene.has_fracture:
         parts[""] = levels[-1].scene.experiment.fracture
@@ -445,15 +451,16 @@ def load_blamed(
     arguments: tuple[Any, ...],
     more: Mapping[str, Callable[..., Any]] | None = None,
 ) -> Any:
-    """Return the kernel; `more` are functions in addition to those of the components. Errors of the
-    compiler name the component that causes them."""
+    """Return the kernel. `more` are functions in addition to those of the components. The message
+    of a compiler error contains the name of the component that causes it."""
     with blamed(levels):
         return load_kernel(source, functions_of(levels) | dict(more or {}), arguments)
 
 
 @contextmanager
 def blamed(levels: Sequence[Level]) -> Iterator[None]:
-    """Raise errors of the compiler in this context with the name of the component."""
+    """Add the name of the component to the messages of compiler errors that are raised in this
+    context."""
     try:
         yield
     except Exception as error:
@@ -462,8 +469,8 @@ def blamed(levels: Sequence[Level]) -> Iterator[None]:
 
 
 def _culprit(levels: Sequence[Level], error: BaseException) -> Component:
-    """Return the component of the function that an error of the compiler names; otherwise the
-    rule."""
+    """Return the component to which the function in the message of a compiler error belongs. Return
+    the rule if there is none."""
     functions, text = functions_of(levels).items(), str(error)
     named = [name for name, of in functions if f"function {of.__qualname__} " in text]
     for operation in program_of(levels[-1].scene):

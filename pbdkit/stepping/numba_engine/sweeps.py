@@ -1,17 +1,19 @@
 """Lines of the sweeps that move particles, and of the pass that updates and breaks bonds.
 
-For particles that have all their neighbours the code is written slot by slot, with rest offsets,
-steps and weights as literals, so that the compiler removes terms that cancel. For all others, with
-missing neighbours, cut cells, or up to thousands of slots, it is a loop over slots. The few
-particles at edges are computed one after the other; if there are too many slots to write out, all
-particles of a row are computed slot after slot.
+For particles that have all their neighbours the code is written slot by slot. Rest offsets, index
+offsets and weights are literals in it, so that the compiler removes terms that cancel. For all
+other particles the code is a loop over slots. These are particles with missing neighbours or cut
+cells, of which there are few, and they are computed one after the other. If there are too many
+slots to write code for each of them, up to thousands, the loop over slots is used for all
+particles, and all particles of a row are computed slot after slot.
 
-Few particles are next to damaged cells. They are marked in a plane: the sweep moves all others as
-if no bond could break, and then computes the marked ones in short chunks. Marks are never removed
-and may be set too early, because without damage both computations give the same numbers.
+If the rule computes the forces of torn cells, the few particles next to damaged cells are marked in
+an array. The sweep moves all other particles as if no bond could break, and then computes the
+marked ones in short chunks. Both computations give the same numbers if nothing is damaged. Marks
+may therefore be set too early, and are never removed.
 
 Bonds with state variables that change are updated and broken in a pass before the sweep. Other
-bonds are broken by the sweep, which records the broken ones.
+bonds are tested in the sweep, which records the bonds that break.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ from pbdkit.stepping.numba_engine.plan import Level, Plan, listed, values
 from pbdkit.stepping.state import State
 
 CHUNK = 64
-"""Number of particles of a row that are computed with damage if one of them is marked."""
+"""Number of particles in a chunk of a row. If one of them is marked, the chunk is computed with
+damage."""
 Marks = NDArray[np.uint8]
 
 
@@ -63,8 +66,8 @@ def _numbers_of_damage(plan: Plan) -> list[int]:
 
 
 def _raised(name: str, other: str) -> str:
-    """Return a line for the larger of two values as a conditional expression; unlike `max` it is
-    vectorised."""
+    """Return a line that assigns the larger of two values. It uses a conditional expression
+    because, unlike `max`, it is vectorised."""
     return f"{name} = {name} if {name} > {other} else {other}"
 
 
@@ -83,8 +86,8 @@ def _chosen(plan: Plan, home: str, n: str, on_right: str) -> str:
 
 
 def damage_lines(plan: Plan) -> list[str]:
-    """Return lines for the damage of the cells around the particle at the flat place at_j of
-    sublattice s."""
+    """Return lines that compute the damage of the cells around the particle of sublattice s at the
+    flat place `at_j`."""
     cells, bonds = _table_shape(plan.scene)
     lines = []
     for cell in range(cells):
@@ -99,7 +102,8 @@ def damage_lines(plan: Plan) -> list[str]:
 
 
 def torn_at_slot(plan: Plan) -> list[str]:
-    """Return lines for the damage t beside slot k of the particle."""
+    """Return lines of code that compute t, the damage of the bond along slot k of the particle and
+    of the cells beside this bond."""
     sides = (f"around[slot_cells[s, k, {side}]]" for side in (0, 1))
     plane = "slot_planes[s, k]"
     lines = [f"own = {_damage_at(plan, 'home', plane)}", "other = own"]
@@ -114,9 +118,9 @@ def torn_at_slot(plan: Plan) -> list[str]:
 
 
 class RowDamage:
-    """Damage of the cells and bonds around particles j0 to j1 of a row of sublattice s; these
-    particles have all their neighbours. `lines` compute it in several loops, because a single loop
-    over all these arrays is not vectorised."""
+    """Damage of the cells and bonds around particles j0 to j1 of a row of sublattice s, which have
+    all their neighbours. The lines of code `lines` compute the damage in several loops, because a
+    single loop over so large a number of arrays is not vectorised."""
 
     def __init__(self, plan: Plan, s: int) -> None:
         self._around = plan.scene.neighbourhood.cells_around[s]
@@ -161,7 +165,8 @@ class RowDamage:
             loops.append(f"    damage[{m}, j] = {damage_word(plan, *words, side)}")
 
     def beside(self, slot: Slot) -> str:
-        """Return a line for the damage t beside a slot of the particle j of the row."""
+        """Return a line that computes t, the damage of the bond along a slot of particle j of the
+        row and of the cells beside this bond."""
         plane, at_this_end = self._home[slot]
         ends = (0, 1) if at_this_end else (1, 0)
         home = None if at_this_end else slot
@@ -172,8 +177,8 @@ class RowDamage:
 
 def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
     """Return lines that mark the particles around a damaged bond of plane n. `home` is the index of
-    the bond in flat arrays of bonds, `there` that of the particle at its home in flat arrays of
-    particles."""
+    the bond in flat arrays of bonds. `there` is the index in flat arrays of particles of the end of
+    the bond at which the bond is stored."""
     if not plan.tears:
         return []
     words = (_damage_at(plan, home, "n", side) for side in range(1 + plan.softens_cells))
@@ -185,8 +190,8 @@ def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
 
 
 def stress_lines(plan: Plan, home: str) -> list[str]:
-    """Return lines for the stress of the cells to the `left` and `right` of a bond of plane n, from
-    the flat place of its home."""
+    """Return lines that compute the stress of the cells to the `left` and `right` of a bond of
+    plane n. `home` is the flat place of the end at which the bond is stored."""
     corners = len(plan.scene.neighbourhood.tiling.polygons[0].corners)
     count = len(Stiffness._fields)
     ratio_names = [f"cell_ratios[{m}]" for m in range(count)]
@@ -211,9 +216,11 @@ def stress_lines(plan: Plan, home: str) -> list[str]:
 
 
 def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
-    """Return the tables that the lines of stresses read. For each plane and side they contain the
-    differences of flat places from a bond's home to the corners of the cell, the weights of the
-    corners in the displacement gradient, and the difference to the area fraction of the cell."""
+    """Return the tables that the lines of `stress_lines` read. They have entries for each plane of
+    bonds and each side of a bond. `corner_steps` contains the index offsets, in flat arrays, from
+    the end at which a bond is stored to the corners of the cell, and `body_steps` the index offset
+    to the area fraction of the cell. `corner_rates` contains the weights of the corners in the
+    displacement gradient."""
     assert scene.cells is not None
     stresses, shape = CellStresses(scene), scene.raster.shape
     steps, rates, shares = [], [], []
@@ -239,10 +246,12 @@ def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
 
 
 def tearing_arrays(scene: Scene) -> dict[str, Any]:
-    """Return the tables of damage. For each sublattice and each cell around a particle they contain
-    the difference of flat places to each bond, the plane of the bond, and the side of the bond on
-    which the cell lies; for each sublattice and slot, the plane of the bond and the cells beside
-    it; and for each plane, the differences to the particles around a bond."""
+    """Return the tables with which the damage around a particle is looked up. The tables `cell_...`
+    have entries for each sublattice and each bond of a cell around a particle: the index offset in
+    flat arrays from the particle to the bond, the plane of the bond, and the side of the bond on
+    which the cell lies. The tables `slot_...` have entries for each sublattice and slot: the plane
+    of the bond and the cells beside it. `mark_steps` contains for each plane the index offsets from
+    a bond to the particles around it."""
     around = scene.neighbourhood
     cells, bonds = _table_shape(scene)
     width, sublattices = max(map(len, around.slots)), len(around.slots)
@@ -269,7 +278,8 @@ def tearing_arrays(scene: Scene) -> dict[str, Any]:
 
 
 def _table_shape(scene: Scene) -> tuple[int, int]:
-    """Return the largest number of cells around a particle, and of bonds of such a cell."""
+    """Return the largest number of cells around a particle, and the largest number of bonds of such
+    a cell."""
     around = scene.neighbourhood.cells_around
     return (
         max(len(of.cells) for of in around),
@@ -278,15 +288,16 @@ def _table_shape(scene: Scene) -> tuple[int, int]:
 
 
 def _way(scene: Scene, s: int, bond: CellBond) -> int:
-    """Return the difference between the flat places of a particle of sublattice s and of a bond."""
+    """Return the index offset in flat arrays from a particle of sublattice s to a bond."""
     shape, home = scene.raster.shape, bond.home
     step, sublattice = (slot_step(shape, home), home.target) if home else (0, s)
     return step + (bond.plane - sublattice) * math.prod(shape[1:])
 
 
 def _mark_steps(scene: Scene) -> NDArray[np.int64]:
-    """Return the differences from the flat place of a bond's home to those of all corners of the
-    cells beside it, (plane, step); some are repeated, so that all planes have equally many."""
+    """Return the index offsets in flat arrays from the end at which a bond is stored to all corners
+    of the cells beside the bond, (plane, offset). Some offsets are repeated, so that all planes
+    have the same number of them."""
     around, shape = scene.neighbourhood, scene.raster.shape
     rows = []
     for plane in around.planes:
@@ -310,7 +321,7 @@ def renew_torn_marks(marks: Marks, scene: Scene, state: State, rows: slice) -> N
     """Update the marks of particles near bonds in some rows of cells."""
     assert state.broken_step is not None
     around, (height, *across) = scene.neighbourhood, scene.raster.shape[1:]
-    margin, *margins = around.reach_in_cells  # No particle has neighbours beyond it.
+    margin, *margins = around.reach_in_cells  # No neighbour of a particle lies beyond this margin.
     first, last = max(rows.start - margin, margin), min(rows.stop + margin, height - margin)
     stop = tuple(size - n for size, n in zip(across, margins, strict=True))
     softened = isinstance(scene.experiment.fracture, (Softens, SoftensCells))
@@ -327,33 +338,35 @@ def renew_torn_marks(marks: Marks, scene: Scene, state: State, rows: slice) -> N
 
 
 def _changed(scene: Scene, state: State) -> list[tuple[NDArray[Any], Any]]:
-    """Return the state variables of bonds that change, with their initial values."""
+    """Return those state variables of bonds that change, and their initial values."""
     numbers = zip(bond_numbers(scene.experiment), state.bond_values, strict=True)
     return [(value, number.initial) for number, value in numbers if number.changes]
 
 
 RUNS = ("first_run", "last_run", "first_row", "last_row")
-"""Arguments of functions of rows: a range of runs, and a range of rows of the first axis."""
+"""Arguments of functions that process rows: a range of runs, and a range of rows of the first
+axis."""
 
 
 def parameters(plan: Plan, level: Level) -> list[str]:
-    """Return lines for p of the rule, and of the fracture model. Parameters of the fracture model
-    are literals, because they determine the code."""
+    """Return lines that assign the parameters p of the rule and q of the fracture model. The
+    parameters of the fracture model are literals, because they determine the code."""
     rule = [] if level.fields else [_rule(level)]
     literal = listed(map(plan.number, plan.scene.constants.fracture))
     return [*rule, f"q = Fracture({literal})"] if plan.model else rule
 
 
 def _rule(level: Level) -> str:
-    """Return a line for p of the rule at a particle."""
+    """Return a line that assigns p, the parameters of the rule at a particle."""
     n = level.number
     homes = {Home.SCENE: f"rule{n}[{{n}}]", Home.FIXED_PARTICLE: "g{n}[j]"}
     return f"p = Rule{n}({values(level.seen.rule, homes)})"
 
 
 def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
-    """Write a loop over the rows of runs, as far as motion has reached, with the rows of values at
-    the particles and of their moves; later lines are inside it."""
+    """Write a loop over the rows of runs, limited to the part of the lattice that motion has
+    reached. Its first lines define the arrays of the values at the particles of the row and of
+    their moves. Lines that are added later are inside the loop."""
     out.add(0, *parameters(plan, level), "for n in range(first_run, last_run):")
     *lead, name = plan.lead
     a = len(lead)
@@ -367,7 +380,8 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
 
 
 def write_rows(out: Function, plan: Plan, level: Level, s: str) -> None:
-    """Write the arrays of the values at the particles j0 to j1 of a row, and of their moves."""
+    """Write lines that define the arrays of the values at particles j0 to j1 of a row, and of their
+    moves."""
     n = level.number
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
@@ -383,22 +397,22 @@ def write_rows(out: Function, plan: Plan, level: Level, s: str) -> None:
 
 
 def displacements(plan: Plan, level: Level) -> list[str]:
-    """Return lines for u of the particle, for z, which the rule receives on later levels, and for p
-    if it varies in space."""
+    """Return lines that assign u, the displacement of the particle. They also assign z, the move of
+    the inner rule, if the rule has one, and the parameters p if they vary in space."""
     u, z = (f"{name} = {plan.vector(f'{row}@[j]')}" for name, row in ("uh", "zz"))
     return [u, *([z] if level.number else []), *([_rule(level)] if level.fields else [])]
 
 
 def difference(plan: Plan, level: Level, there: str) -> str:
-    """Return the line of code that computes d from the displacement of the neighbour; `there` is
-    the pattern of its components."""
+    """Return the line of code that computes the difference d from the displacement of the
+    neighbour. `there` is the pattern of the components of this displacement."""
     return f"d = {plan.vector(f'{there} - {level.source[0]}.@')}"
 
 
 def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -> list[str]:
-    """Return lines for d as the rule receives it at slot k: softened, or the difference to the
-    fictitious point. The latter is used if the bond breaks in this step (`breaks`) or broke in an
-    earlier one (`since`)."""
+    """Return lines that replace d by the difference that the rule receives at slot k. If the bond
+    breaks in this step (`breaks`) or broke in an earlier one (`since`), it is the difference to the
+    fictitious point. If the bond is softened, it is a combination of both differences."""
     if plan.model is None or plan.tears:
         return []
     lines = [f"is_lost = {since} >= 0"]
@@ -417,16 +431,17 @@ def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -
 def contributions(
     plan: Plan, level: Level, r: str, weights: str, there: Iterable[str] = (), torn: bool = False
 ) -> str:
-    """Return a line for the contribution of a neighbour, with its state variables if the rule uses
-    them, and with the damage t beside the bond if cells are `torn`."""
+    """Return a line that computes the contribution of a neighbour. The function receives the state
+    variables of the neighbour if the rule uses them, and the damage t beside the bond if cells are
+    `torn`."""
     return _gathered(plan, level, r, weights, there, "c", torn)
 
 
 def more_contributions(
     plan: Plan, level: Level, r: str, weights: Sequence[str], there: Iterable[str] = ()
 ) -> list[str]:
-    """Return lines for the contributions of cells with a different stiffness, with these
-    weights."""
+    """Return lines that compute the contributions of cells with a stiffness other than that of the
+    rule, with these weights."""
     lines = list[str]()
     for w in weights:
         lines.append(_gathered(plan, level, r, w, there, "e", plan.tears))
@@ -459,9 +474,9 @@ def target_lines(
     otherwise: str = "u.@",
 ) -> list[str]:
     """Return lines that set the displacement and the state variables of the particle after the
-    step. `movable` is the condition under which the particle moves (empty: it always does), and
-    `otherwise` its displacement if it does not. `local` are the components of X relative to site
-    (0, 0)."""
+    step. `movable` is the condition under which the particle moves; if it is empty, the particle
+    always moves. `otherwise` is the displacement of a particle that does not move. `local` are the
+    components of X relative to site (0, 0)."""
     n, solver = level.number, plan.scene.experiment.stepping
     sums = _pattern(level, totals, "Vector")
     lines = list[str]()
@@ -507,7 +522,7 @@ def _chosen_target(value: str, where: str, otherwise: str) -> str:
 
 
 def _pattern(level: Level, names: list[str], kind: str) -> str:
-    """Return the names of components; those of a vector are combined."""
+    """Return the names of components; the names of the components of a vector are combined."""
     components, rest = [], iter(names)
     for size in level.parts:
         group = list(islice(rest, size))
@@ -544,8 +559,9 @@ def write_bond_pass(plan: Plan) -> Function:
 
 
 class Judging(NamedTuple):
-    """Lines for bond j of plane n: lines that evaluate it, expressions for whether it breaks and
-    whether its state variables change, and lines that write both."""
+    """Code for bond j of plane n. `look` are lines that evaluate the bond. `breaks` is an
+    expression that is true if the bond breaks, and `differ` an expression that is added to it and
+    is true if a state variable changes. `write` are lines that store the result."""
 
     look: list[str]
     breaks: str
@@ -554,7 +570,8 @@ class Judging(NamedTuple):
 
 
 def judging(plan: Plan, d: str, home: str) -> Judging:
-    """Return the lines for a bond with d of this pattern, and the flat place of its home."""
+    """Return the code for a bond. `d` is the pattern of the components of the difference, and
+    `home` the flat place of the end at which the bond is stored."""
     numbers = plan.levels[-1].seen.bond
     homes = {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]", Home.FIXED_BOND: "x{n}[j]"}
     c = values(numbers, homes)
@@ -587,8 +604,9 @@ def _write_judging(out: Function, plan: Plan) -> None:
             f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
     lines = judging(plan, "n@[j] - h@[j]", "base + j")
-    # Loops that only read are vectorised; the last one writes, and runs if there is anything to
-    # write. The first compares lengths alone, which excludes most bonds in half the time.
+    # Loops that only read are vectorised. The first loop does not test whether bonds can break, and
+    # takes half the time of the second; mostly it finds nothing, and the second is skipped. The
+    # last loop writes, and runs only if there is anything to write.
     out.add(0, "some = 0", "for j in range(j1 - j0):")
     out.add(1, *lines.look, f"some = some | (1 if {lines.breaks}{lines.differ} else 0)")
     out.add(0, "if some:", "    some = 0", "    for j in range(j1 - j0):")
@@ -600,15 +618,15 @@ def _write_judging(out: Function, plan: Plan) -> None:
 
 
 def write_events(plan: Plan) -> Function:
-    """Return the function that records the step and the length of bonds that the sweep has just
-    broken in a row. The length is measured from the end at which a bond is stored; `base` is the
+    """Return the function that records the step and the length of the bonds that the sweep has just
+    broken in a row. The length is computed from the end at which a bond is stored. `base` is the
     first flat place of the row."""
     out = Function(plan.shared, "note_broken", "s", "base", "width")
     out.add(0, "for here in range(base, base + width):")
     out.add(1, "bits = int64(flat_lost[here])", "for k in range(counts[s]):")
     out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
-    # The bond is recorded at the end at which it is stored, or at the other end if the former is
-    # not a particle of the body.
+    # A bond is recorded by the particle at which it is stored, or by the particle at the other end
+    # if the first is not a particle of the body.
     out.add(2, f"ours = signs[s, k] > 0 or flat_kind[there] != {FOLLOWER}")
     out.add(2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:")
     out.add(3, "flat_broken[home] = step")
@@ -618,21 +636,22 @@ def write_events(plan: Plan) -> Function:
 
 
 NOBODY = 0
-"""Kind of rows without followers."""
+"""Kind of row without followers."""
 GENERAL = 1
-"""Kind of rows of particles that may lack neighbours."""
+"""Kind of row for particles that may lack neighbours."""
 PLAIN = 2
-"""Kind of rows of particles that have all their neighbours and whole cells."""
+"""Kind of row for particles that have all their neighbours and no cut cells."""
 WITH_CELLS = 3
-"""Kind of rows of particles that have all their neighbours, and cut cells."""
+"""Kind of row for particles that have all their neighbours, and cut cells."""
 
 
 class Words(NamedTuple):
     """Expressions for one neighbour and its bond.
 
-    They are its displacement, with `@` for the axis; its state variables; the area fractions of the
-    cells beside its slot, none if cells are whole; the state variables and the limits of the bond,
-    with `{n}` for their indices; and the step at which the bond broke.
+    `pattern` is the displacement of the neighbour, with `@` for the axis. `numbers` are the state
+    variables of the neighbour. `shares` are the area fractions of the cells beside the slot; there
+    are none if no cell is cut. `bond` and `limit` are patterns for the state variables and the
+    limits of the bond, with `{n}` for the index. `since` is the step at which the bond broke.
     """
 
     pattern: str
@@ -646,7 +665,8 @@ class Words(NamedTuple):
 def write_row(
     plan: Plan, level: Level, s: int, kind: int, events: Function | None
 ) -> list[Function]:
-    """Return the functions that move the particles of a kind of rows, the main one last."""
+    """Return the functions that move the particles of one kind of row. The last function calls the
+    others."""
     out = Function(plan.shared, f"row{level.number}_{s}_{kind}", *RUNS)
     write_row_loop(out, plan, level, str(s))
     words = _write_neighbours(out, plan, level, s, kind)
@@ -668,7 +688,8 @@ def write_row(
 
 
 def _write_neighbours(out: Function, plan: Plan, level: Level, s: int, kind: int) -> list[Words]:
-    """Write the arrays of the neighbours of a row; return the expressions for each neighbour."""
+    """Write lines that define the arrays of the neighbours of a row, and return the expressions for
+    each neighbour."""
     slots = plan.scene.neighbourhood.slots[s]
     for k, slot in enumerate(slots):
         pattern = plan.row(f"{level.source}_@", slot.target, slot.cell)
@@ -699,9 +720,10 @@ def write_whole(
     mark: str = "",
     damage: RowDamage | None = None,
 ) -> None:
-    """Write the lines, in a loop, for a particle that has all its neighbours, with the expressions
-    for each and for its `lost` bonds. If cells can be torn, particles with a `mark` are not moved
-    or, if `damage` is given, only these are moved."""
+    """Write the lines that move a particle with all its neighbours, inside a loop over particles.
+    `words` are the expressions for each neighbour, and `lost` is the expression for the mask of
+    broken bonds. If cells can be torn, particles with a `mark` are not moved; if `damage` is given,
+    only particles with a mark are moved."""
     out.add(1, *displacements(plan, level))
     if plan.judged:
         out.add(1, f"bits = int64({lost})", "now = bits")
@@ -716,8 +738,8 @@ def write_whole(
 
 
 def write_torn_row(plan: Plan, level: Level, s: int, kind: int) -> Function:
-    """Return the function that moves the marked particles j0 to j1 of such a row. All arrays begin
-    at j0, so that its loops are vectorised."""
+    """Return the function that moves the marked ones of particles j0 to j1 of a row of this kind.
+    All arrays begin at j0, so that the loops are vectorised."""
     out = Function(plan.shared, f"torn{level.number}_{s}_{kind}", *plan.lead, "j0", "j1")
     damage = RowDamage(plan, s)
     out.add(0, *parameters(plan, level))
@@ -740,15 +762,15 @@ def _write_marked(out: Function, torn: Function) -> None:
 def _slot_lines(
     plan: Plan, level: Level, k: int, slot: Slot, words: Words, damage: RowDamage | None
 ) -> list[str]:
-    """Return lines for the contributions of one neighbour."""
+    """Return lines that compute the contributions of one neighbour and add them."""
     bond = {
         Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]",
         Home.BOND: words.bond,
         Home.FIXED_BOND: words.limit,
     }
     c = f"Constants({values(level.seen.bond, bond)})"
-    # A bond is evaluated as at the end at which it is stored, so that both ends agree to the last
-    # bit.
+    # At both ends the bond is evaluated with the signs that d and r have at the end at which it is
+    # stored, so that the results at both ends agree to the last bit.
     _, at_home = plan.scene.neighbourhood.home[slot]
     arguments = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
     literal = level.scene.constants.weights[slot]._asdict()
@@ -769,7 +791,7 @@ def _slot_lines(
 
 
 def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
-    """Return lines for the arrays of the bonds along a slot."""
+    """Return lines that define the arrays of the bonds along a slot."""
     if plan.model is None or plan.tears:
         return []
     plane, at_home = plan.scene.neighbourhood.home[slot]
@@ -782,7 +804,7 @@ def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
 
 
 def _beside(plan: Plan, slot: Slot) -> list[str]:
-    """Return the area fractions of the cells on both sides of a slot."""
+    """Return expressions for the area fractions of the cells on both sides of a slot."""
     assert plan.scene.cells
     rows = []
     for side in plan.scene.cells.tiling.beside[slot]:
@@ -807,8 +829,8 @@ def write_general(plan: Plan, level: Level, events: Function | None) -> Function
 
 
 def write_one(out: Function, plan: Plan, level: Level) -> None:
-    """Write the lines, in a loop, for one particle of sublattice s."""
-    # -0.0 is the neutral element of addition for both signs of zero.
+    """Write the lines that move one particle of sublattice s, inside a loop over particles."""
+    # Sums start from -0.0, because adding it changes neither +0.0 nor -0.0.
     out.add(1, *(f"{t} = {plan.real}(-0.0)" for t in level.totals), "near, at_j = 0, base + j")
     if plan.judged:
         out.add(1, "bits = int64(flat_lost[at_j])", "now = bits")
@@ -840,9 +862,9 @@ def _is_slot_after_slot(plan: Plan) -> bool:
 
 
 def _seen(out: Function, plan: Plan, array: str, away: str) -> str:
-    """Return an expression for a value of an array at the distance `away` from the flat place of
-    the particle: an element, or an element of a row of values if all particles are computed slot
-    after slot. `@` in the name stands for each axis."""
+    """Return an expression for the value of an array at the index offset `away` from the flat place
+    of the particle. It is an element of the flat array or, if all particles of a row are computed
+    slot after slot, an element of a row of values. `@` in the name stands for each axis."""
     if not _is_slot_after_slot(plan):
         return f"flat_{array}[at_j + {away}]"
     row = f"row_{array} = flat_{array}[base + {away}:base + {away} + width]"
@@ -856,7 +878,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     named = {Home.SLOT: f"weights{level.number}[s, k, {{n}}]", Home.CELL: "share_{n}"}
     depth = 1 if _is_slot_after_slot(plan) else 2
     if any(number.home is Home.CELL for number in level.seen.weights):
-        for side in (0, 1):  # Lattices with cut cells have few slots.
+        for side in (0, 1):  # No row is computed slot after slot.
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
     numbers = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
     bonds, limits_ = (0, 0) if plan.tears else (plan.bonds, plan.limits)
@@ -889,7 +911,8 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
 
 
 def _write_mixed(out: Function, plan: Plan, level: Level, shown: Sequence[str]) -> None:
-    """Write the contributions of cells with a different stiffness, which few particles have."""
+    """Write lines for the contributions of cells with a stiffness other than that of the rule. Few
+    particles have such cells."""
     nothing = plan.number(0.0)
     out.add(2, f"if share_0 == {nothing} or share_1 == {nothing}:")
     weights = []
