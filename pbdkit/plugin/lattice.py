@@ -8,7 +8,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, reduce
+from functools import cache, cached_property, lru_cache, reduce
 from operator import add, mul, sub
 from typing import Any
 
@@ -211,6 +211,9 @@ class Cell:
         list of Offset
             Offsets, the shortest first.
         """
+        return list(_offsets_within(_CellAsWritten(repr(self), self), source, radius))
+
+    def _offsets(self, source: int, radius: float) -> list[Offset]:
         sites = self.basis
         cells = np.array(list(self._cells_within(radius + 2 * np.linalg.norm(sites, axis=1).max())))
         rests = (cells @ np.array(self.vectors))[:, None] + (sites - sites[source])
@@ -240,6 +243,20 @@ class Cell:
                 yield from inside((*fixed, n))
 
         yield from inside(())
+
+
+@dataclass(frozen=True)
+class _CellAsWritten:
+    """A cell that equals only cells with the same digits, signs of zero and types."""
+
+    text: str
+    cell: Cell = field(compare=False)
+
+
+@lru_cache(maxsize=64)
+def _offsets_within(written: _CellAsWritten, source: int, radius: float) -> tuple[Offset, ...]:
+    """Return the offsets of a cell; scenes on the same lattice share them."""
+    return tuple(written.cell._offsets(source, radius))
 
 
 class Lattice(Component):

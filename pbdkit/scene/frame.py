@@ -169,12 +169,15 @@ class RasterFrame(FrameSites):
         searched, radius = 0.0, max(math.hypot(*v) for v in self.cell.vectors)
         while (_with_ties(nearest) > searched).any():
             for offset in self.cell.offsets(sublattice, radius):
-                if offset.length > searched:
-                    candidates = np.flatnonzero(offset.length <= _with_ties(nearest))
-                    body = self.body_at(self.site[points[candidates]] + offset.site)
-                    candidates, body = candidates[body >= 0], body[body >= 0]
-                    nearest[candidates] = np.minimum(nearest[candidates], offset.length)
-                    yield points[candidates], body
+                if offset.length <= searched:
+                    continue
+                candidates = np.flatnonzero(offset.length <= _with_ties(nearest))
+                if not len(candidates):
+                    break  # Further offsets are longer.
+                body = self.body_at(self.site[points[candidates]] + offset.site)
+                candidates, body = candidates[body >= 0], body[body >= 0]
+                nearest[candidates] = np.minimum(nearest[candidates], offset.length)
+                yield points[candidates], body
             searched, radius = radius, radius * 1.5
 
 

@@ -225,14 +225,15 @@ def continues_where_it_stopped(subject: Subject) -> None:
     copy = kind.model_validate_json(component.model_dump_json(by_alias=True))
     if any(getattr(copy, name) != getattr(component, name) for name in kind.model_fields):
         raise NotApplicableError("the component is not equal to itself after JSON")
-    scenes = zip(subject.scenes, Subject(copy, subject.parts).scenes, strict=True)
+    copied_subject = Subject(copy, subject.parts)
+    scenes = zip(subject.scenes, copied_subject.scenes, strict=True)
     for n, (scene, rebuilt) in enumerate(scenes):
         start = displacements(scene, n, share=0.4)
         _refuse_difference(initial_state(rebuilt), initial_state(scene), "a repeated run", scene)
-        whole = Stepper(scene).advance(state_with(scene, start), 2 * STEPS)
-        half = Stepper(scene).advance(state_with(scene, start), STEPS)
+        uninterrupted = Stepper(scene)
+        half = uninterrupted.advance(state_with(scene, start), STEPS)
         saved, duplicate = pickle.dumps(half), half.copy()
-        Stepper(scene).advance(half, STEPS)
+        whole = uninterrupted.advance(half, STEPS)
         continued = Stepper(rebuilt).advance(pickle.loads(saved), STEPS)
         _refuse_difference(continued, whole, f"a run continued at step {STEPS}", scene)
         copied = Stepper(rebuilt).advance(duplicate, STEPS)
@@ -243,7 +244,7 @@ def continues_where_it_stopped(subject: Subject) -> None:
             for name in differing(expected, measured):
                 raise PropertyError(f"`{name}` of a run continued at step {STEPS} differs")
     with suppress(PluginError):  # Other properties report the error.
-        _refuse_other_records(subject.scene, Subject(copy, subject.parts).scene)
+        _refuse_other_records(subject.scene, copied_subject.scene)
 
 
 def _refuse_other_records(scene: Scene, rebuilt: Scene) -> None:

@@ -204,7 +204,7 @@ def made(faulty):
 
 @pytest.mark.parametrize("component", SOUND, ids=lambda c: c.type)
 def test_faulty_examples_without_their_fault_pass(component):
-    report = examine(component, **ONE_SITE_AND_TWO)
+    report = examine(component, **ONE_SITE_AND_TWO, **NEAREST)
     assert report.holds, str(report)
 
 
@@ -300,7 +300,8 @@ def test_class_that_lacks_a_method_is_reported():
 
 
 def test_class_is_tested_by_its_first_example():
-    assert examine(rules.Sound) == examine(rules.Sound())
+    first = examine(rules.Sound(), **ONE_SITE_AND_TWO, **NEAREST)
+    assert examine(rules.Sound, **ONE_SITE_AND_TWO, **NEAREST) == first
 
 
 def test_component_of_its_own_lattice_is_tested_on_that():
@@ -316,7 +317,7 @@ def test_without_a_component_there_is_nothing_to_test():
 
 
 ONE_LINE = """
-from my_rules import Mine
+from {module} import Mine
 from pbdkit.testing import conformance
 
 test_conformance = conformance(Mine())
@@ -343,18 +344,20 @@ def pbdkit_components():
 """
 
 
-@pytest.mark.parametrize(("share", "code"), [("0.5", 0), ("1e-9 + 0.5", 1)])
-def test_one_line_suffices_for_pytest(tmp_path, share, code):
-    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "pbdkit.plugin.Vector(1e-9, 0.0) +")
-    (tmp_path / "my_rules.py").write_text(source.replace("SHARE", share))
-    (tmp_path / "test_mine.py").write_text(ONE_LINE)
+def test_one_line_suffices_for_pytest(tmp_path):
+    drifting = SOURCE.replace("SHARE *", "pbdkit.plugin.Vector(1e-9, 0.0) +").replace("mine", "bad")
+    for module, source in {"good": SOURCE, "bad": drifting}.items():
+        (tmp_path / f"{module}_rules.py").write_text(source.replace("SHARE", "0.5"))
+        (tmp_path / f"test_{module}.py").write_text(ONE_LINE.format(module=f"{module}_rules"))
     call = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "."]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == code, done.stdout
-    assert f"FollowerRule mine: 21 properties ran, {code} failed; 3 skipped: it" in done.stdout
+    assert done.returncode == 1, done.stdout
+    for name, failed in {"mine": 0, "bad": 1}.items():
+        summary = f"FollowerRule {name}: 21 properties ran, {failed} failed; 3 skipped: it"
+        assert summary in done.stdout
     assert "does not declare `linear`" in done.stdout
-    if code:
-        assert "FollowerRule mine: rests: a body at rest moves by 1e-09" in done.stdout
+    assert "FollowerRule bad: rests: a body at rest moves by 1e-09" in done.stdout
+    assert re.search(r"^1 failed, 41 passed, 20 skipped", done.stdout, re.MULTILINE), done.stdout
 
 
 def test_plugins_check_tests_a_distribution(install, call):
