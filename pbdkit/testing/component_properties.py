@@ -170,9 +170,9 @@ def survives_pickling(subject: Subject) -> None:
 
 @property_of(Lattice, is_needed=True)
 def has_a_sound_cell(subject: Subject) -> None:
-    """The cell vectors span an area; basis sites differ in index, position and primitive index, and
-    lie within the period, near the position of their index; `primitive` has equal
-    differences for equal offsets, and no gaps."""
+    """The cell vectors span an area. No two basis sites have the same index, position or primitive
+    index. The indices of basis sites lie within the period, and their positions near those of their
+    indices. Equal offsets have equal differences in `primitive`, without gaps."""
     try:
         cell = checked_cell(subject.component)
     except ExperimentError as error:
@@ -217,8 +217,8 @@ def _refuse_miscounted(cell: Cell) -> None:
 
 @property_of(Lattice)
 def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
-    """The origin moves the lattice and does not change its cell: no digit of a run depends on the
-    position of the body."""
+    """The `origin` moves the lattice but does not change its cell: the results of a run do not
+    depend on the position of the body, to the last digit."""
     moved = subject.component.model_copy(update={"origin": (1000.3, -77.1)})
     if moved.cell() != subject.component.cell():
         raise PropertyError("`cell` depends on the origin; remove `self.origin` from it")
@@ -237,8 +237,7 @@ def is_mutual(subject: Subject) -> None:
 
 @property_of(NeighbourMetric)
 def takes_offsets_of_the_cell(subject: Subject) -> None:
-    """Every offset is an offset of the cell: its site index and its opposite agree with the
-    lattice."""
+    """Every offset is one of those that the cell defines, with the same values of all fields."""
     for where, cell, s, shells in _tried(subject):
         for offset in chain(*shells):
             if offset != cell.offset(s, offset.target, offset.cell):
@@ -260,8 +259,8 @@ def takes_sublattices_in_any_order(subject: Subject) -> None:
 
 @property_of(NeighbourMetric, is_needed=True)
 def finds_the_same_anew(subject: Subject) -> None:
-    """Neighbours that are searched at every step are, in the reference configuration, the
-    neighbours on the lattice: a body at rest keeps its neighbours."""
+    """If neighbours are re-evaluated in every step, those found in the reference configuration are
+    the neighbours on the lattice: a body at rest keeps its neighbours."""
     near = subject.component.nearness()
     if near is None:
         raise NotApplicableError("its neighbours do not change")
@@ -357,8 +356,9 @@ def remembered(subject: Subject, scene: Scene) -> tuple[Remembered, ...]:
 
 @property_of(FollowerRule, FractureModel, is_needed=True)
 def draws_what_it_remembers(subject: Subject) -> None:
-    """`draw` returns, by the name of a state variable, one finite value for each bond or particle,
-    which the dtype of the variable can hold; random numbers come from the given generator."""
+    """`draw` returns for the name of a state variable one finite value for each bond or particle,
+    which the dtype of the variable can hold; it takes random numbers from the given generator only.
+    """
     part = subject.component
     for scene in subject.scenes:
         numbers = {number.name: number for number in remembered(subject, scene)}
@@ -823,8 +823,8 @@ def takes_every_point_alone(subject: Subject) -> None:
 
 @property_of(FramePolicy)
 def follows_nearby_particles(subject: Subject) -> None:
-    """Points of a `local` frame follow the particles nearest to them, or particles at a distance in
-    site index of at most twice the number of layers."""
+    """Points of a `local` frame follow the particles nearest to them, or particles at an index
+    distance of at most twice the number of layers."""
     policy = subject.component
     if not policy.local:
         raise NotApplicableError("it does not declare itself `local`")
@@ -853,8 +853,8 @@ def _followed(follow: FrameMap, point: int) -> tuple[list[int], list[Any]]:
 
 @property_of(Diagnostic, is_needed=True)
 def measures_what_it_declares(subject: Subject) -> None:
-    """`measure` returns one array for each variable; its shape is that of the variable's `dims`,
-    and the declared dtype stores its numbers without a change of kind."""
+    """`measure` returns one array for each variable. The array has the shape of the variable's
+    `dims`, and its values can be stored in the declared dtype without a change of kind."""
     diagnostic, scene = subject.component, subject.scene
     own_dimension = diagnostic.own_dimension
     sizes = {"particle": scene.raster.count, "axis": 2, "leader_group": len(scene.leading)}

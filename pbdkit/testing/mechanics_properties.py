@@ -132,8 +132,8 @@ def _times(factor: float, value: Any) -> Any:
 
 @property_of(FollowerRule, FramePolicy, FractureModel)
 def goes_alike_mirrored_and_turned(subject: Subject) -> None:
-    """A body on the square lattice that is reflected, or rotated by a right angle, moves as the
-    original, reflected or rotated, up to rounding; components with `has_axes` are exempt."""
+    """If a body on the square lattice is reflected or rotated by a right angle, its motion is
+    reflected or rotated alike, up to rounding; components with `has_axes` are exempt."""
     if subject.component.has_axes:
         raise NotApplicableError("it declares `has_axes`, and depends on directions")
     scenes = [scene for each in subject.scenes if (scene := _even_scene(each.experiment))][:2]

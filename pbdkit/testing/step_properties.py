@@ -60,8 +60,8 @@ LOAD_ROUNDING = 1e-9
 
 @property_of(FollowerRule)
 def bears_loads_as_forces(subject: Subject) -> None:
-    """A load adds itself to `force`, its contribution to the move does not depend on the positions
-    of neighbours, and a load of zero changes nothing."""
+    """A load increases `force` by the load; its contribution to the move does not depend on the
+    positions of neighbours; a load of zero changes nothing."""
     rule, scene = subject.component, subject.scene
     if not isinstance(rule, Loadable):
         raise NotApplicableError("it does not support loads")
@@ -147,8 +147,8 @@ def _restless(largest: float, where: str) -> str:
 
 @property_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy)
 def follows_translations(subject: Subject) -> None:
-    """A translated body moves as the original, translated, up to rounding; rules with
-    `uses_reference` and frames that derive from `Anchors` are exempt."""
+    """If the initial displacements are translated, all later ones are translated alike, up to
+    rounding; rules with `uses_reference` and frames that derive from `Anchors` are exempt."""
     component, largest = subject.component, 0.0
     anchors = isinstance(component, Anchors)
     for scene in _free(subject):
@@ -196,8 +196,8 @@ def _rule_name(subject: Subject) -> str:
 
 @property_of(FollowerRule, FramePolicy)
 def superposes(subject: Subject) -> None:
-    """With a rule that declares `linear`, the steps from the sum of two displacements are the sum
-    of the steps from each, up to rounding."""
+    """With a rule that declares `linear`, steps from the sum of two displacement fields give the
+    sum of the results for each field, up to rounding."""
     scenes = [scene for scene in subject.scenes if scene.experiment.rule.linear]
     if not scenes:
         raise NotApplicableError(f"{_rule_name(subject)} does not declare `linear`")
@@ -219,8 +219,9 @@ def _apart(state: Floats, reference: Floats, states: Floats) -> float:
 
 @property_of(is_needed=True)
 def continues_where_it_stopped(subject: Subject) -> None:
-    """A run that is saved and continued by a component rebuilt from its JSON is equal to the last
-    bit to an uninterrupted one, as are its records if it is stored and resumed."""
+    """A run that is saved, and continued with a component that is rebuilt from its JSON, gives the
+    results of an uninterrupted run to the last bit. The same holds for the records of a run that is
+    stored and resumed."""
     component, kind = subject.component, type(subject.component)
     copy = kind.model_validate_json(component.model_dump_json(by_alias=True))
     if any(getattr(copy, name) != getattr(component, name) for name in kind.model_fields):
@@ -261,8 +262,8 @@ def _refuse_other_records(scene: Scene, rebuilt: Scene) -> None:
 
 @property_of(*STEPPED, ParticleOperation)
 def is_the_same_compiled(subject: Subject) -> None:
-    """The compiled engine gives the numbers of the numpy engine to the last bit; a component that
-    does not compile is stepped by numpy, with a warning."""
+    """The compiled engine gives the results of the numpy engine to the last bit; if a component
+    cannot be compiled, the numpy engine is used, with a warning."""
     scene = subject.scene
     if reason := obstacle():
         raise NotApplicableError(reason)
@@ -301,8 +302,8 @@ ANGLE = 2.0
 
 @property_of(FollowerRule)
 def follows_rotations(subject: Subject) -> None:
-    """A body without frame, rotated as a whole with the directions of its particles, moves as the
-    original, rotated, up to rounding."""
+    """If a body without frame is rotated together with the directions of its particles, its motion
+    is rotated alike, up to rounding."""
     anywhere = not subject.component.uses_reference
     if not isinstance(subject.component, TurnsParticles):
         raise NotApplicableError("its particles have no directions")
