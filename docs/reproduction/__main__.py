@@ -22,10 +22,10 @@ PREFACE = """# Reproduction of the paper
 This page compares the program with the paper that defines its model: R. dell'Erba (2018,
 [doi](https://doi.org/10.1007/s00161-018-0663-5)). Each claim of the paper that can be tested is
 quoted in a few words and has one of three verdicts: **reproduced** by the shipped case,
-**reproduced only with** a named variant, option or range, or **not reproduced**. Below the
-quotation is the measurement from which the verdict is computed. If a claim failed, it was also
-tested with thresholds, frame delays, shells, neighbour metrics, frames and particles near those of
-the case.
+**reproduced only with** a named variant, option or range, or **not reproduced**. The verdict is
+computed from the measurement below the quotation. A claim that failed was also tested with
+variants of the case: other thresholds, frame delays, shells, neighbour metrics, frames and
+particles.
 
 The paper's time t is step t − 1: its figures at time 401 show step 400. Figure numbers are those of
 the pre-print, and particles have the paper's numbers. The paper does not give all speeds,

@@ -143,9 +143,10 @@ def _anisotropy() -> str:
     return f"""## Anisotropy
 
 One particle in the middle of a sheet of {SIZE} × {SIZE} particles is displaced by 1 along x in one
-step and is a follower afterwards. Its displacement spreads. The diffusivity D is half the growth of
-the second moment of u_x per step, between steps {STEPS // 2} and {STEPS}; the prediction is half
-the mean square of the rest offsets. √(D_x/D_y) is the ratio of the widths of the distribution.
+step and is a follower afterwards. Its displacement spreads. The diffusivity D is half the increase
+per step of the second moment of u_x between steps {STEPS // 2} and {STEPS}. The
+predicted ratio follows from a diffusivity of half the mean square of the rest offsets along each
+axis. The last column is √(D_x/D_y), the ratio of the widths of the distribution along x and y.
 
 | | D_x | D_y | D_x/D_y | predicted | width x / width y |
 | --- | --- | --- | --- | --- | --- |
@@ -165,9 +166,11 @@ The case `rectangular` has all eight neighbours on a rectangular lattice:
 {point_text("rectangular")}```
 
 Only the diffusivity is anisotropic: the body relaxes faster along the axis in which the
-neighbourhood reaches farther. With weighted neighbours a displacement along x causes a displacement
-along y of at most {signs["cross"]:.1g}, and a displacement along y spreads like one along x (within
-{signs["turned"]:.0e}). In an elastic body one would cause shear and the other extension.
+neighbourhood reaches farther. With weighted neighbours the largest displacement along y that a
+displacement along x causes is {signs["cross"]:.1g}. If the middle particle is displaced along y
+instead, u_y spreads exactly as u_x does in the first case (difference at most
+{signs["turned"]:.0e}). In an elastic body the two cases would differ: along the
+same axis one displacement would cause shear and the other extension.
 """
 
 
@@ -190,9 +193,10 @@ def _plasticity() -> str:
     return f"""## Pieces after a fracture
 
 After a fracture the rule of each end of a broken bond uses a fictitious point at m_j + λ R.
-According to the paper an edge recovers its shape if λ = 1, and otherwise loosens or contracts. A
-sheet is torn at a speed of 1.2 per step, and {SETTLED} steps are made. The table gives the final
-strain of the piece at the clamp, between its left and its torn column:
+According to the paper an edge recovers its shape if λ = 1, and otherwise loosens or contracts. Here
+a sheet is torn by a right edge that moves by 1.2 per step, and {SETTLED} steps are made. The
+table gives the final strain of the piece at the clamp, measured from its left column to its torn
+column:
 
 | threshold | {head} |
 | --- | {" | ".join("---" for _ in placements)} |
@@ -202,16 +206,17 @@ strain of the piece at the clamp, between its left and its torn column:
 
 ![The pieces at the clamp, step {SETTLED}: λ = 0.8, 1, 1.2](../pictures/reproduction/{picture})
 
-The remaining strain is λ − 1 and uniform over the piece. It does not depend on the threshold, and
-therefore not on the deformation before the fracture, as a plastic strain would. It is the effect of
-a permanent load on the broken edge:
+The remaining strain is λ − 1 and uniform over the piece. A plastic strain would depend on the
+deformation before the fracture. The remaining strain does not: it is the same for all thresholds.
+It is the effect of a permanent load on the broken edge:
 
 ```yaml
 {torn_text(5.2, 1.2, steps=400)}```
 
-If the right column is released at step 20 instead of being held, it has one broken side and does
-not converge unless λ = 1: at the end of {300} steps it moves by {drift[0.8]:.4f}, {drift[1.0]:.4f}
-and {drift[1.2]:.4f} per step for λ = 0.8, 1 and 1.2. The velocity is (1 − λ)/4 and constant:
+The right column can be released at step 20 instead of being held. It is then a free body with one
+broken side, which comes to rest only if λ = 1. After {300} steps the column moves by
+{drift[0.8]:.4f} per step for λ = 0.8, by {drift[1.0]:.4f} for λ = 1 and by
+{drift[1.2]:.4f} for λ = 1.2. The velocity is (1 − λ)/4 and constant:
 
 ```yaml
 {torn_text(5.2, 1.2, until=20, steps=300)}```

@@ -22,7 +22,8 @@ def section() -> Section:
         ),
         (
             configurations(run("paper/a-lag"), [1, 10, 20, 401], "a-lag-pe1.png"),
-            "Case a with the delayed frame of paper/a-lag, which causes the convexity",
+            "Case a with the delayed frame of paper/a-lag: rows close to the frame are displaced "
+            "less, as in the paper's figure",
         ),
         (
             configurations(a, [2, 10], "a-pe2.png", "pe2"),
@@ -74,29 +75,31 @@ def _fields() -> list[Claim]:
         ),
         Claim(
             "a light convexity … close to the frame the displacements are lower",
-            f"In `paper/a` rows differ by {a.spread():.1g}. In the column left of the leaders the "
-            f"displacement at step 9 is {edge:.3f} at the edge and {middle:.3f} in the middle of "
-            f"`paper/a-lag` (largest difference at any step {lag.spread():.3f}), and {edge_8:.3f} "
-            f"and {middle_8:.3f} in `paper/a-chebyshev` (largest difference "
-            f"{eight.spread():.3f}).",
+            "In `paper/a` the displacements of all rows are equal (difference "
+            f"{a.spread():.1g}). For the other two cases the displacement in the column left of "
+            f"the leaders was compared at step 9. In `paper/a-lag` it is {edge:.3f} at the edge "
+            f"and {middle:.3f} in the middle; the largest difference at any step is "
+            f"{lag.spread():.3f}. In `paper/a-chebyshev` it is {edge_8:.3f} at the edge and "
+            f"{middle_8:.3f} in the middle; the largest difference is {eight.spread():.3f}.",
             a.spread() > 1e-6,
             "`paper/a-lag` or `paper/a-chebyshev`",
             lower and edge_8 < middle_8,
         ),
         Claim(
             "those close to the frame follow with a little delay owing to the rule of the frame",
-            "Within a step the leaders move before the frame. With four neighbours this has no "
-            f"effect, and the difference between the middle and the edge is {a.spread():.1g}. It "
-            f"is {middle_8 - edge_8:.3f} at step 9 with eight neighbours and {middle - edge:.3f} "
-            "with a frame delayed by one step.",
+            "Within a step the leaders move before the frame. With four neighbours this order has "
+            "no effect, and the displacements of the middle and the edge differ by "
+            f"{a.spread():.1g}. At step 9 they differ by {middle_8 - edge_8:.3f} with eight "
+            f"neighbours and by {middle - edge:.3f} with a frame delayed by one step.",
             a.spread() > 1e-6,
             "`paper/a-chebyshev` or `paper/a-lag`",
             middle_8 > edge_8 and middle > edge,
         ),
         Claim(
             "avoid this convexity using a different frame or mirroring the followers",
-            f"With a mirror frame rows differ by {mirrored.spread():.1g} with four neighbours "
-            f"({a.spread():.1g} with the mean frame) and by {mirrored_eight.spread():.3f} with "
+            "With a mirror frame the displacements of the rows differ by "
+            f"{mirrored.spread():.1g} for four neighbours "
+            f"({a.spread():.1g} with the mean frame) and by {mirrored_eight.spread():.3f} for "
             f"eight neighbours ({eight.spread():.3f} with the mean frame).",
             mirrored_eight.spread() < 1e-6,
             "four neighbours (`paper/a` with `frame: {type: mirror}`), which have no convexity "
@@ -133,26 +136,28 @@ def _energy() -> list[Claim]:
         ),
         Claim(
             "this is also evident in Figure 6 where the PE2 is shown",
-            f"PE2 is largest at the leaders: {moving[0, 9]:.3f}, and {moving[0, 8]:.3f} left of "
-            f"them, at step 1; {moving[1, 9]:.3f} and {moving[1, 8]:.3f} at step 9.",
+            f"PE2 is largest at the leaders. At step 1 it is {moving[0, 9]:.3f} there and "
+            f"{moving[0, 8]:.3f} in the column left of them, and at step 9 it is "
+            f"{moving[1, 9]:.3f} and {moving[1, 8]:.3f}.",
             bool((moving[:, 8] > moving[:, 9]).all()),
         ),
         Claim(
             "PE1 [of 67] increases notably when points are pulled but decrease … when they become "
             "followers",
-            "The leaders are released after step 10. PE1 of particle 67 increases until step "
-            f"{peak}, to {fall[0] / pe1[10, LEFT_OF_MIDDLE, ABOVE]:.0f} times its value at step "
-            f"10; it has one maximum. In the column left of the leaders the maximum is at step "
-            f"{peaks[9]}.",
+            "The leaders are released after step 10. PE1 of particle 67 continues to increase "
+            f"until step {peak}, to {fall[0] / pe1[10, LEFT_OF_MIDDLE, ABOVE]:.0f} times its value "
+            "at step "
+            "10, and decreases afterwards. In the column left of the leaders, however, PE1 is "
+            f"largest at step {peaks[9]}.",
             peak <= 11,
             "particles of the column left of the leaders",
             peaks[9] <= 11,
         ),
         Claim(
             "decrease in quite a parabolic-like way",
-            f"{both_text(of_67, peak)}. At the end PE1 decreases by a constant fraction per step: "
-            f"{1 - tail[1] / tail[0]:.1%} at step 150, {1 - tail[-1] / tail[-2]:.1%} at the last "
-            "step.",
+            f"{both_text(of_67, peak)}. At the end PE1 decreases by a constant fraction per step, "
+            f"{1 - tail[1] / tail[0]:.1%} at step 150 and {1 - tail[-1] / tail[-2]:.1%} at the "
+            "last step, as an exponential does.",
             parabolic(both(of_67, peak, 400)),
             f"steps {peak} to 150 of the decrease",
             parabolic(both(of_67, peak, 150)),
@@ -165,8 +170,8 @@ def _energy() -> list[Claim]:
         ),
         Claim(
             "if we change point the shape of the curve remain the same but … more flared",
-            f"The columns {which(list(peaks))} have one maximum each, at steps "
-            f"{which(list(peaks.values()))}; the widths at half height are "
+            f"PE1 of columns {which(list(peaks))} has one maximum each, at steps "
+            f"{which(list(peaks.values()))}. The widths of the curves at half of their height are "
             f"{which(list(widths.values()))} steps.",
             list(widths.values()) == sorted(widths.values(), reverse=True),
         ),

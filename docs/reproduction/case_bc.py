@@ -66,33 +66,34 @@ def _claims_b() -> list[Claim]:
     return [
         Claim(
             "lateral contraction can be seen",
-            f"At step 99 the distance of the outer rows (9 at rest) is {narrow.max():.3f} smaller "
-            f"at column {int(narrow.argmax()) + 1}; with K = +0.004 it is {-wider.min():.3f} "
-            "larger.",
+            "At rest the distance between the outer rows is 9. At step 99 it is smaller by "
+            f"{narrow.max():.3f} at column {int(narrow.argmax()) + 1}; with K = +0.004 it is "
+            f"larger by {-wider.min():.3f}.",
             bool(narrow.max() > 0.01),
         ),
         Claim(
             "there is a relaxation time, because the followers need time",
-            f"Particle 67 reaches half of its contraction of step 100 at step {half_time(b)}, "
-            f"{half_time(b) - 10} steps after the leaders have stopped.",
+            "Particle 67 has half of the displacement −u_y that it has at step 100 already at step "
+            f"{half_time(b)}. This is {half_time(b) - 10} steps after the leaders have stopped.",
             half_time(b) > 11,
         ),
         Claim(
             "[the relaxation time] is due to the rules expression and can be tuned",
-            "K does not change it: half of the contraction is reached at step "
+            "K does not change the relaxation time: half of the contraction is reached at step "
             f"{half_time(strong)} with K = −0.008 and at step {half_time(b)} with −0.004. A "
-            f"relaxation of 0.5 does: step {half_time(slow)}.",
+            "relaxation of 0.5 changes it: half of the contraction is reached at step "
+            f"{half_time(slow)}.",
             half_time(strong) != half_time(b),
             "`solver.relaxation`, which the paper does not have",
             half_time(slow) > half_time(b),
         ),
         Claim(
             "PE1 … here is more evident the edge effect leading to concavity toward left",
-            "Left of the leaders PE1 is larger at the edge than in the middle row by "
-            f"{near[9]:.2%}, {near[19]:.2%} and {near[99]:.1%} at times 10, 20 and 100 "
-            f"({in_a:.2%} in case a): its contours are concave toward the left, visibly at time "
-            "100. In the middle of the sheet they are concave toward the right at that time "
-            f"({middle[99]:.1%}).",
+            "In the column left of the leaders PE1 is larger at the edge than in the middle rows, "
+            f"by {near[9]:.2%}, {near[19]:.2%} and {near[99]:.1%} at times 10, 20 and 100 "
+            f"({in_a:.2%} in case a at time 10). Its contours are therefore concave toward the "
+            "left, which is visible at time 100. In the middle of the sheet the difference at this "
+            f"time is {middle[99]:.1%}, and the contours are concave toward the right.",
             near[99] > 0.02 and near[99] > in_a,
         ),
         Claim(
@@ -128,6 +129,10 @@ def _less(name: str) -> tuple[Floats, list[int]]:
     return y[[9, 19, 99]], [int(s) for s in np.flatnonzero(y > first + 1e-15)]
 
 
+def _listed(values: Floats) -> str:
+    return ", ".join(f"{v:.4f}" for v in values)
+
+
 def _claims_c() -> list[Claim]:
     b, c, wide = run("paper/b"), run("paper/c"), run("paper/c-chebyshev")
     first, _ = _less("paper/b")
@@ -136,25 +141,24 @@ def _claims_c() -> list[Claim]:
     narrow = [narrowing(sheet)[99].max() for sheet in (b, c, wide)]
     less = [float(1 - narrowing(c)[s].max() / narrowing(b)[s].max()) for s in (9, 19, 99)]
     bow = [s.of("pe1")[9, 8, 0] / s.of("pe1")[9, 8, 5] - 1 for s in (b, c)]
-    values = ", ".join(f"{p:.4f} and {q:.4f}" for p, q in zip(first, second, strict=True))
     return [
         Claim(
             "lateral contraction can be seen in a less pronounced way",
             f"The largest contraction at step 99 is {narrow[0]:.3f} in b and {narrow[1]:.3f} in c "
-            f"({narrow[2]:.3f} with 24 neighbours). In c it is smaller than in b by "
+            f"({narrow[2]:.3f} with 24 neighbours). It is smaller in c than in b by "
             f"{less[0]:.1%}, {less[1]:.1%} and {less[2]:.1%} at the paper's times 10, 20 and 100. "
-            f"The verdict requires {SEEN:.0%}, the smallest difference visible in a figure.",
+            f"The verdict requires a difference of {SEEN:.0%}, the smallest one that is visible in "
+            "a figure.",
             min(less) > SEEN,
             "late times (100)",
             less[2] > SEEN,
         ),
         Claim(
             "a lower lateral contraction [of 67], with respect the first gradient case",
-            f"At steps 9, 19 and 99, −u_y of particle 67 in b and in c respectively is {values}. "
-            f"The contraction in c is larger at steps {above[0]} to {above[-1]} and smaller "
-            "afterwards. With 24 "
-            f"neighbours −u_y is {', '.join(f'{v:.4f}' for v in third)}, larger than in b at "
-            f"steps {above_24[0]} to {above_24[-1]}.",
+            "The contraction is measured by −u_y of particle 67 at steps 9, 19 and 99. It is "
+            f"{_listed(first)} in b, and {_listed(second)} in c. It is larger in c than in b at "
+            f"steps {above[0]} to {above[-1]}, and smaller afterwards. With 24 neighbours it is "
+            f"{_listed(third)}, and larger than in b at steps {above_24[0]} to {above_24[-1]}.",
             not above,
             f"steps after {above[-1]}",
             bool(second[2] < first[2]),
@@ -167,15 +171,16 @@ def _claims_c() -> list[Claim]:
         ),
         Claim(
             "the PE1 plot enhances the convexity of the first line of follower",
-            "At step 9 PE1 left of the leaders is larger at the edge than in the middle by "
-            f"{bow[0]:.2%} in b and {bow[1]:.2%} in c.",
+            "At step 9 PE1 in the column left of the leaders is larger at the edge than in the "
+            f"middle, by {bow[0]:.2%} in b and by {bow[1]:.2%} in c.",
             bool(bow[1] > 2 * bow[0] > 0),
         ),
         Claim(
             "its evolution with time is quite different",
-            f"Half of the contraction of step 100 is reached at step {half_time(c)} in c, "
-            f"{half_time(b)} in b and {half_time(wide)} with 24 neighbours. From step 50 to 100 "
-            f"it grows by {c.u[100, 4, 5, 1] / c.u[50, 4, 5, 1] - 1:.0%} in c and "
+            f"Half of the contraction at step 100 is reached at step {half_time(c)} in c, "
+            f"at step {half_time(b)} in b and at step {half_time(wide)} with 24 neighbours. From "
+            "step 50 to 100 the contraction increases by "
+            f"{c.u[100, 4, 5, 1] / c.u[50, 4, 5, 1] - 1:.0%} in c and by "
             f"{b.u[100, 4, 5, 1] / b.u[50, 4, 5, 1] - 1:.0%} in b.",
             half_time(c) < 0.9 * half_time(b),
         ),

@@ -39,9 +39,9 @@ def section() -> Section:
     words = (
         "The right edge moves by 1.2 per step for ten steps and is then held; the thresholds are "
         "5.2, as in cases f and g. These values were chosen here. `paper/d1` has one shell of "
-        "neighbours, `paper/d2` two. A row *separates* in the step in which its leader loses its "
-        "last bond to the adjacent column; *edges first* means that both outermost rows separate "
-        "before every other row."
+        "neighbours, `paper/d2` two. A row *separates* in the step in which the last bond between "
+        "its leader and the adjacent column breaks. *Edges first* means that both outermost rows "
+        "separate before all other rows."
     )
     claims = [*_line(), *_rebound(), *_energy()]
     return Section("Case d: simple fracture", words, claims, pictures, both())
@@ -66,12 +66,14 @@ def _line() -> list[Claim]:
     return [
         Claim(
             "choosing a distance fracture of about 10 units",
-            "Bonds are tested after leaders have moved and before followers move. The longest "
-            f"bond is then {fast:.2f} at 1.2 per step (in step {at}) and {slow:.2f} at 0.35, so "
-            "that no bond breaks at a threshold of 10; the sheet separates at thresholds up to "
-            f"{fast:.2f}. At a threshold of 10 the leaders would have to move until step {late}.",
+            "The lengths of bonds are tested after leaders have moved and before followers move. "
+            f"The longest bond is then {fast:.2f} if the leaders move by 1.2 per step (in step "
+            f"{at}), and {slow:.2f} if they move by 0.35. Therefore no bond breaks at a "
+            f"threshold of 10; the sheet separates at thresholds up to {fast:.2f}. For a bond to "
+            "break "
+            f"at a threshold of 10, the leaders would have to move until step {late}.",
             max(fast, slow) > 10,
-            "1.2 per step for twenty steps instead of ten",
+            "leaders that move by 1.2 per step for twenty steps instead of ten",
             late <= 20,
         ),
         Claim(
@@ -84,15 +86,15 @@ def _line() -> list[Claim]:
             "points close to the frame are detached before the others [first gradient]",
             f"The rows separate at steps {rows['1']} in `paper/d1` and {rows['lag']} in "
             f"`paper/d1-lag`. Thresholds from {THRESHOLDS[0]:g} to {THRESHOLDS[-1]:g} were tried. "
-            "The edges separate first at the following numbers of those thresholds at which all "
-            f"rows separate: {found}.",
+            "Only those at which all rows separate are counted. The number of thresholds at which "
+            f"the edges separate first is: {found}.",
             len(first["one shell"]) == len(sheets_of["one shell"]),
             f"`paper/d1-lag`, at {share['one shell and lag 1']}",
             edges_first(parted(lag)),
         ),
         Claim(
             "points close to the frame are detached before the others [second gradient]",
-            f"The rows of `paper/d2` separate at steps {rows['2']}. Edges are first at "
+            f"The rows of `paper/d2` separate at steps {rows['2']}. The edges separate first at "
             f"{share['two shells']} with two shells and at {share['24 neighbours']} with 24 "
             "neighbours.",
             len(first["two shells"]) == len(sheets_of["two shells"]),
@@ -102,7 +104,8 @@ def _line() -> list[Claim]:
         Claim(
             "this effect is more marked in second gradient case",
             f"At the same threshold the edges separate {_lead(one)} steps before the last row in "
-            f"`paper/d1` and {_lead(two)} step before it in `paper/d2`. Edges are first at "
+            f"`paper/d1` and {_lead(two)} step before it in `paper/d2`. The edges separate first "
+            "at "
             f"{share['one shell']} with one shell, at {share['two shells']} with two, and at "
             f"{share['one shell and lag 1']} with one shell and a delayed frame.",
             len(first["one shell"]) < len(first["two shells"]) == len(sheets_of["two shells"]),
@@ -113,10 +116,10 @@ def _line() -> list[Claim]:
             "time (1, 5, 6, 7 and 100) … (1, 5, 6, 7, 8 and 100) [when it tears]",
             f"The rows separate at time {span('d1')} in `paper/d1` and {span('d2')} in "
             f"`paper/d2`. Thresholds from {TRIED[0]:g} to {TRIED[-1]:g} were tried in steps of "
-            "0.1: the last rows separate after time 5, and not after times 7 (`paper/d1`) and 8 "
-            f"(`paper/d2`), at thresholds of {which(fitting('d1', 'd2'))}. At a threshold of 6 the "
-            "times are "
-            f"{_times('d1', 6.0)} and {_times('d2', 6.0)}.",
+            "0.1. A threshold agrees with the figures if the last row separates after time 5 and "
+            "not later than time 7 in `paper/d1` and time 8 in `paper/d2`. The thresholds "
+            f"{which(fitting('d1', 'd2'))} do. At a threshold of 6 the rows separate at time "
+            f"{_times('d1', 6.0)} in `paper/d1` and {_times('d2', 6.0)} in `paper/d2`.",
             5.2 in fitting("d1", "d2"),
         ),
     ]
@@ -168,16 +171,16 @@ def _rebound() -> list[Claim]:
             f"it decreases to {dip[1]:.3f} at step {dip[0]} while the leaders move, increases to "
             f"{dip[2]:.3f}, and returns. The number of thresholds with a rebound is: {found}.",
             rebound(x_of(two)) is not None,
-            "`paper/d2-frame-bonds` (permanent) or `paper/d2-chebyshev` (during the motion of the "
-            "leaders)",
+            "`paper/d2-frame-bonds` (a permanent rebound) or `paper/d2-chebyshev` (a rebound while "
+            "the leaders move)",
             back[0] > LASTING,
         ),
         Claim(
             "differently from first gradient mode",
-            "The number of thresholds with a rebound is "
-            f"{kinds(swept('one shell'))} with one shell, and there is none in `paper/d2` either. "
+            "With one shell the number of thresholds with a rebound is "
+            f"{kinds(swept('one shell'))}, but `paper/d2` has no rebound either. "
             "If bonds to the frame do not break, there is "
-            f"{'one' if tied_one else 'no'} rebound with one shell, and one with two.",
+            f"{'one' if tied_one else 'no'} rebound with one shell, and one with two shells.",
             rebound(x_of(one)) is None and rebound(x_of(two)) is not None,
             "`paper/d2-frame-bonds` against `paper/d1` with `frame_bonds: false`",
             tied_one is None,
@@ -188,7 +191,7 @@ def _rebound() -> list[Claim]:
             "near the torn column. Without these bonds the piece returns: the largest "
             f"displacement in `paper/d2` at step 400 is {two.residual():.3f}.",
             rebound(x_of(two)) is not None,
-            "`paper/d2-frame-bonds`, where frame points have this effect",
+            "`paper/d2-frame-bonds`, in which frame points have this effect",
             back[0] > LASTING,
         ),
         Claim(
@@ -208,8 +211,8 @@ def _energy() -> list[Claim]:
     return [
         Claim(
             "in the fracture case the pseudo energy plot is less indicative",
-            f"At step 99 PE1 in the column left of the gap is {all_bonds[8]:.1f} with the broken "
-            f"bond and {intact[8]:.4f} without it.",
+            f"At step 99 PE1 in the column left of the gap is {all_bonds[8]:.1f} if the "
+            f"broken bond is included and {intact[8]:.4f} if it is not.",
             bool(all_bonds[8] > 10 * intact[8]),
         ),
     ]

@@ -23,17 +23,17 @@ def section() -> Section:
         ),
         (
             configurations(e, [9, 401], "e-pe1.png", over="rest"),
-            "Figure 17: case e, PE1 at times 9 and 401, over the sheet at rest",
+            "Figure 17: case e, PE1 at times 9 and 401, drawn on the undeformed sheet",
         ),
         (
             configurations(e, [9, 401], "e-pe2.png", "pe2", over="rest"),
-            "Figure 17: case e, PE2 at times 9 and 401, over the sheet at rest",
+            "Figure 17: case e, PE2 at times 9 and 401, drawn on the undeformed sheet",
         ),
         (
             histories(
                 {"two off the leaders": (e, 7, 5), "the rim": (e, 9, 5)}, "e-history.png", 400
             ),
-            "x, y and PE1 of two particles of the row of a leader",
+            "x, y and PE1 of two particles in the row of a leader",
         ),
     ]
     words = (
@@ -75,12 +75,12 @@ def _claims() -> list[Claim]:
         ),
         Claim(
             "the local action principle [is verified]",
-            "The effect arrives later, but does not decay: the displacement of the rim is "
-            f"{rim_share(e, 100):.1%} of that of the leaders at step 100 and permanently "
+            "The rim is displaced later than the leaders, but its displacement does not decay: it "
+            f"is {rim_share(e, 100):.1%} of that of the leaders at step 100, and "
             f"{rim_share(e, 400):.1%} from step 400 on. In a sheet of 40 × 40 it is "
-            f"{late[0]:.1g} at step 8, {late[1]:.1%} at step 400 and {late[2]:.1%} at step 4000: "
-            f"{rim_share(e, 400) / late[2]:.2f} times smaller at four times the distance, in "
-            "proportion to 1/r.",
+            f"{late[0]:.1g} at step 8, {late[1]:.1%} at step 400 and {late[2]:.1%} at step 4000. "
+            "At four times the distance r the final displacement is thus "
+            f"{rim_share(e, 400) / late[2]:.2f} times smaller: it decreases as 1/r.",
             rim_share(e, 400) < 0.02,
             "early times (a particle k layers away does not move before step k)",
             rim_share(e, start - 1) == 0.0,

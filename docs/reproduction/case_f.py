@@ -82,7 +82,7 @@ def _one_shell() -> list[Claim]:
         ),
         Claim(
             "two points of the frame remain in the middle",
-            f"{in_the_gap(f1)} frame points are in the gap at step 400. The number is "
+            f"{in_the_gap(f1)} frame points are in the gap at step 400. This number is "
             f"{which(gaps)} at all thresholds at which the sheet separates "
             f"({which(list(family))}).",
             in_the_gap(f1) == 2,
@@ -96,20 +96,21 @@ def _one_shell() -> list[Claim]:
         ),
         Claim(
             "a different equilibrium configuration is reached",
-            "At step 400 the largest displacement of the piece from its reference is "
-            f"{f1.residual():.2f}; it still moves by {f1.of('pe2')[400].max():.1g} per step.",
+            "At step 400 the largest displacement of the piece from its reference position is "
+            f"{f1.residual():.2f}, and the piece still moves by up to "
+            f"{f1.of('pe2')[400].max():.1g} per step.",
             f1.residual() > 0.5,
         ),
         Claim(
             "this results in a concave final surface",
             f"The outer rows of the torn surface are {dent(f1):.2f} farther right than its "
-            f"middle. Of the thresholds {which(list(family))} the distance exceeds 0.3 at "
+            f"middle rows. Of the thresholds {which(list(family))} this difference exceeds 0.3 at "
             f"{which(dented)}.",
             dent(f1) > 0.3,
         ),
         Claim(
             "a rebound mechanism [of 133] can be outlined",
-            f"x of particle 133 decreases to {back[1]:.3f} at step {back[0]} and increases to "
+            f"x of particle 133 decreases to {back[1]:.3f} at step {back[0]} and then increases to "
             f"{back[2]:.3f}. Of the thresholds {which(list(family))} there is a rebound at "
             f"{which(turning)}.",
             back[0] > 10,
@@ -158,7 +159,7 @@ def _two_shells() -> list[Claim]:
         ),
         Claim(
             "no rebound [of 133]",
-            "x decreases monotonically after the fracture. Of the thresholds "
+            "In `paper/f2` x decreases monotonically after the fracture. Of the thresholds "
             f"{which(list(family))} there is a rebound at {which(turning)}.",
             rebound(x_of(f2)) is None,
         ),
@@ -184,8 +185,9 @@ def _two_shells() -> list[Claim]:
         Claim(
             "cuspidal point in X coordinate [of 133], after about 100 step",
             "There is no cusp in `paper/f2`, and none in `paper/f2-second-fracture`: the second "
-            f"difference of x is at most {kink:.1g} near step {second}, because the broken bond "
-            "does not belong to the piece. In `paper/f2-cusp` (thresholds 5.1) a bond between the "
+            f"difference of x in time is at most {kink:.1g} near step {second}, because the bond "
+            "that breaks in this step does not belong to the piece. In `paper/f2-cusp` (thresholds "
+            "5.1) a bond between the "
             f"piece and the frame breaks at step {cusp}, and twenty steps later x of particle 133 "
             f"decreases {bend:.1f} times as fast as before. {searched} thresholds from 4.9 to 5.3 "
             "were tried; a bond of the piece breaks between steps 60 and 150 at the thresholds "

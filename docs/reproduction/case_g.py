@@ -20,7 +20,7 @@ def section() -> Section:
         ),
         (
             histories(series, "g-133.png", 400, log=True),
-            "x, y and PE1 of particle 133, and of 103 in d2",
+            "x, y and PE1 of particle 133 in paper/f2 and paper/g, and of particle 103 in paper/d2",
         ),
     ]
     words = (
@@ -53,8 +53,8 @@ def _claims_g() -> list[Claim]:
             "also the convexity of the surface fracture is changed … similar to the square lattice",
             "At step 99 the x coordinates of the torn surface span "
             f"{bent['f2']:.2f} with the `mean` frame, {bent['g']:.3f} in this case and "
-            f"{bent['d2']:.3f} on the square lattice. The depth of the concave surface at step "
-            f"400 is {dents[0]:.2f}, {dents[1]:.1g} and {dents[2]:.1g}.",
+            f"{bent['d2']:.3f} on the square lattice. The depth of the concave surface in "
+            f"these three cases is {dents[0]:.2f}, {dents[1]:.1g} and {dents[2]:.1g} at step 400.",
             bent["g"] < bent["f2"] / 2,
         ),
         Claim(

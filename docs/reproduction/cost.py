@@ -20,8 +20,9 @@ def cost() -> list[Claim]:
             "computational costs are low because we do not solve differential equations",
             "A step is one sum over the neighbours, but many steps are needed. A held sheet of "
             f"{', '.join(f'{n} × {n}' for n in sizes)} particles is within 1 % of its equilibrium "
-            f"after {', '.join(map(str, steps))} steps, {growth:.1f} times as many for twice the "
-            "size. A sparse direct solver solves the same equations once.",
+            f"after {', '.join(map(str, steps))} steps. For twice the size the number of steps is "
+            f"{growth:.1f} times as large. A sparse direct solver computes the equilibrium by "
+            "solving the same equations once.",
             growth < 1.5,
             "sheets of about ten particles a side",
             steps[0] < 400,
@@ -40,9 +41,10 @@ def _shared() -> Claim:
         "the job can be parallelized between the GPU cores",
         "Nothing was measured on a GPU. Every follower is computed from the intermediate "
         "configuration alone, so that the work can be divided in any way; two threads of a "
-        f"processor give the same positions (difference in case a: {differ:g}). Two threads are "
-        f"{', '.join(f'{g:.2f} ({n}²)' for n, g in gains.items())} times as fast as one for "
-        "sheets of that size ([performance](performance.md#threads)).",
+        f"processor give the same positions (difference in case a: {differ:g}). For sheets of "
+        "the size in brackets two threads are "
+        f"{', '.join(f'{g:.2f} ({n}²)' for n, g in gains.items())} times as fast as one "
+        "([performance](performance.md#threads)).",
         False,
         "threads of a processor, in sheets of "
         f"{' and '.join(f'{n}²' for n, g in gains.items() if g > 1.5)}; a GPU is not measured",

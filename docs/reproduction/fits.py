@@ -39,10 +39,16 @@ def parabolic(pair: tuple[float, float]) -> bool:
 def both_text(y: Floats, top: int, middle: int = 150, last: int = 400) -> str:
     """Return a text with both R² over the whole decrease and its two parts."""
     parts = ((top, last), (top, middle), (middle, last))
-    return "R² of a parabola and of an exponential with three free parameters each is " + "; ".join(
+    values = [both(y, low, high) for low, high in parts]
+    (parabola, exponential), *others = values
+    (low, high), *rest = parts
+    return (
+        "A parabola and an exponential, each with three parameters, were fitted to the decrease. "
+        f"Their values of R² are {parabola:.5f} (parabola) and {exponential:.5f} (exponential) "
+        f"over steps {low} to {high}; "
+    ) + "; ".join(
         f"{p:.5f} and {e:.5f} over steps {low} to {high}"
-        for low, high in parts
-        for p, e in [both(y, low, high)]
+        for (low, high), (p, e) in zip(rest, others, strict=True)
     )
 
 

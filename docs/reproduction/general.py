@@ -70,9 +70,9 @@ def _rules() -> list[Claim]:
     differ = float(np.abs(loose.u - held.u).max())
     pairs = [_near(loose, step) for step in (0, 10)]
     changed = (
-        "With Euclidean neighbours within 1.5, re-evaluated in every step of case a, "
-        f"{len(pairs[0] - pairs[1])} of {len(pairs[0])} pairs of the body are separated by step "
-        f"10, and {len(pairs[1] - pairs[0])} are new"
+        "In case a with Euclidean neighbours within a radius of 1.5 that are re-evaluated in every "
+        f"step, {len(pairs[0] - pairs[1])} of the initially {len(pairs[0])} pairs of neighbours "
+        f"are separated by step 10, and {len(pairs[1] - pairs[0])} new pairs have formed"
     )
     signs = elastic_signs()
     return [
@@ -93,14 +93,16 @@ def _rules() -> list[Claim]:
         ),
         Claim(
             "considering also the second shell of neighbours we obtain second gradient effects",
-            "The relative stiffness for waves along x with k = 0.5 and 1 is "
-            f"{_pair(plain)} with 4 neighbours, {_pair(soft[('coordination', 2)])} with 8 "
-            f"(equal within {same:.0e}: the second shell has no effect) and "
-            f"{_pair(soft[('chebyshev', 2)])} with 24. Expressed as 1 + l²k² at k = {small[0]:g}, "
-            f"l² is {', '.join(f'{v:.3f}' for v in lengths)}. The verdict assumes an energy with "
-            "l² > 0, which stiffens short waves. If the negative l² of lattice expansions is "
-            "accepted, 24 neighbours have an effect, but the paper's 8 neighbours still have none "
-            "beyond that of 4.",
+            "The stiffness for waves along x, relative to that for infinitely long waves, was "
+            f"computed for k = 0.5 and 1. It is {_pair(plain)} with 4 neighbours, "
+            f"{_pair(soft[('coordination', 2)])} with 8, and "
+            f"{_pair(soft[('chebyshev', 2)])} with 24. The values for 4 and 8 neighbours are equal "
+            f"within {same:.0e}, so that the second shell has no effect. If the stiffness at "
+            f"k = {small[0]:g} is written as 1 + l²k², "
+            f"l² is {', '.join(f'{v:.3f}' for v in lengths)} for 4, 8 and 24 neighbours. The "
+            "verdict assumes an energy with l² > 0, with which short waves are stiffer than long "
+            "ones. If a negative l², as in expansions of a lattice, is accepted too, 24 neighbours "
+            "have an effect, but the paper's 8 neighbours still have the same one as 4.",
             bool((soft[("coordination", 2)] > 1).all()),
             "Chebyshev neighbours",
             bool((soft[("chebyshev", 2)] > 1).all()),
@@ -109,9 +111,10 @@ def _rules() -> list[Claim]:
         energy(),
         Claim(
             "force the followers movement to overcome the baricenter … to oscillate",
-            "With a relaxation of 1.1 and noise of 1e-6 the rows differ by "
-            f"{_rows_differ(past, 100):.1g} after 100 steps and {_rows_differ(past, 200):.1g} "
-            "after 200: the steps diverge instead of oscillating. Momentum causes oscillation: "
+            "With a relaxation of 1.1 and an initial noise of 1e-6 the displacements of the rows "
+            f"differ by {_rows_differ(past, 100):.1g} after 100 steps and by "
+            f"{_rows_differ(past, 200):.1g} after 200: they diverge instead of oscillating. "
+            "Momentum causes oscillation: "
             f"x of particle 67 in `paper/a-memory` crosses its rest position {swings} times by "
             "step 200.",
             False,
@@ -120,14 +123,14 @@ def _rules() -> list[Claim]:
         ),
         Claim(
             "the neighbours can dynamically change to every time step",
-            "Neighbours can be re-evaluated, but the sheet does not hold together. "
+            "Neighbours can be re-evaluated, but the sheet then falls apart. "
             f"{changed}. The final positions differ by up to {differ:.0f} from those with fixed "
             "neighbours; the body is 9 wide."
             if differ > 9
             else f"{changed}. The final positions differ by up to {differ:.1g} from those with "
             "fixed neighbours.",
             0 < differ < 1,
-            "`reevaluate: true`, as an option, and then the sheet does not hold together",
+            "the option `reevaluate: true`, with which the sheet falls apart",
             pairs[0] != pairs[1],
         ),
         Claim(
@@ -138,10 +141,11 @@ def _rules() -> list[Claim]:
         ),
         Claim(
             "anisotropic elastic behaviour",
-            "Only the spreading is anisotropic. With the same neighbours a displacement along x "
-            f"causes a displacement along y of at most {signs['cross']:.1g}, and a displacement "
-            f"along y spreads like one along x (within {signs['turned']:.0e}): extension and shear "
-            "are alike and not coupled, as in diffusion.",
+            "Only the diffusivity is anisotropic. With the neighbours of the previous claim the "
+            "largest displacement along y that a displacement along x causes is "
+            f"{signs['cross']:.1g}. A displacement along y spreads exactly as one along x does "
+            f"(difference at most {signs['turned']:.0e}). Both are properties of diffusion: in an "
+            "elastic body extension and shear would be coupled and have different stiffnesses.",
             max(signs.values()) > 1e-6,
         ),
     ]
@@ -192,16 +196,17 @@ def _shape() -> list[Claim]:
         ),
         Claim(
             "(locally) minimizing an elastic potential",
-            "In case a the sum of squared differences of displacement over all bonds of the body "
-            f"decreases at {int((np.diff(energy[11:]) <= 0).sum())} of {len(energy) - 12} steps "
-            "after the release.",
+            "The sum over all bonds of the squared difference between the displacements of their "
+            f"ends decreases at {int((np.diff(energy[11:]) <= 0).sum())} of {len(energy) - 12} "
+            "steps after the release in case a.",
             bool((np.diff(energy[11:]) <= 0).all()),
         ),
         Claim(
             "automatically takes into account large deformation elasticity",
             "If both end columns are rotated by 90° (`paper/a-rotation`), the body should rotate "
-            f"with them. After convergence particles are up to {error:.2f} away from their rotated "
-            f"positions, on a body 9 wide, and PE1 is {turned.of('pe1')[-1].max():.1f} instead of "
+            "with them. After convergence, particles of this body, which is 9 wide, are up to "
+            f"{error:.2f} away from their rotated positions, and PE1 is "
+            f"{turned.of('pe1')[-1].max():.1f} instead of "
             "0.",
             bool(error < 0.01),
         ),
@@ -221,11 +226,11 @@ def _shape() -> list[Claim]:
         ),
         Claim(
             "varying the distances of the fictitious elements … plastic-like … behaviours",
-            "A plastic strain would depend on the previous deformation. With λ = 1.2 the "
-            f"remaining strain is {', '.join(f'{s:.5f}' for s in stays[1.2])} at thresholds of "
-            f"{which(PULLS)}, for which the right column had moved by {which(ways)} when the "
-            "sheet separated. It is always λ − 1: the effect of a permanent load on the broken "
-            "edge.",
+            "A plastic strain would depend on the previous deformation. At thresholds of "
+            f"{which(PULLS)} the right column had moved by {which(ways)} when the sheet separated. "
+            f"With λ = 1.2 the remaining strains are {', '.join(f'{s:.5f}' for s in stays[1.2])}. "
+            "The remaining strain is always λ − 1, because it is the effect of a permanent load on "
+            "the broken edge.",
             float(np.ptp(stays[1.2])) > 0.01,
         ),
     ]

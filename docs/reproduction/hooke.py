@@ -49,11 +49,12 @@ def hooke() -> Claim:
     return Claim(
         "introduce relative distance between the points into the rule … and simulate Hook law",
         f"If a neighbour moves away by {', '.join(f'{way:g}' for way in WAYS)}, its force "
-        f"increases by {', '.join(f'{r:.2f}' for r in ratios[0])} times this distance, at "
+        f"increases by {', '.join(f'{r:.2f}' for r in ratios[0])} times this displacement, at "
         f"each of the relaxations {', '.join(f'{w:g}' for w in RELAXATIONS)}. The force is "
         "therefore "
-        f"r² (within {off:.0e}), where r is the distance, with the energy Σ r³/3; Hooke's law "
-        "would give a constant factor. In addition, the rule as printed is unstable: noise of "
+        f"r² (within {off:.0e}), where r is the distance of the neighbour, and the energy is "
+        "Σ r³/3. With Hooke's law the factor would be constant. In addition, the rule as printed "
+        "is unstable: noise of "
         f"1e-6 grows to {noisy[0][60]:.2g} in 60 steps at rest. With a relaxation of 0.6 "
         f"(`paper/a-weighted`) it decays to {noisy[1][400]:.1g} in 400 steps.",
         bool(np.ptp(ratios) < 0.01 * ratios.mean()),
@@ -67,11 +68,13 @@ def energy() -> Claim:
     off = max(abs(found / exact - 1) for found, exact in zip(net, elastic, strict=True))
     return Claim(
         "potential energy of material points subject to Hook law [PE1]",
-        f"PE1 divided by the square of the strain ({STRAIN:g}) is {square[0]:.3f} in tension "
-        f"along x and {square[1]:.1g} in shear on the square lattice with 4 neighbours: PE1 does "
-        f"not contain the shear. On the hexagonal lattice it is {net[0]:.3f} and {net[1]:.3f}, "
-        "four times the energy of an elastic sheet with ν = 1/3 and E = 1 "
-        f"({elastic[0]:.3f} and {elastic[1]:.3f}), within {off:.0e}.",
+        "On the square lattice with 4 neighbours, PE1 divided by the square of the strain "
+        f"({STRAIN:g}) is {square[0]:.3f} in tension along x and {square[1]:.1g} in shear: PE1 "
+        "does "
+        f"not contain the shear. On the hexagonal lattice it is {net[0]:.3f} in tension and "
+        f"{net[1]:.3f} in shear. These values agree within {off:.0e} with four times the energy of "
+        "an elastic sheet with ν = 1/3 and E = 1, which is "
+        f"{elastic[0]:.3f} and {elastic[1]:.3f}.",
         square[1] > 0.01,
         "the hexagonal lattice",
         off < 0.01,

@@ -59,14 +59,15 @@ def both() -> str:
         for (name, words), one, two in zip(expected.items(), low, high, strict=True)
     )
     return (
-        "In an earlier version case d had a threshold of 6.0 and the other cases 5.2. The table "
-        "compares the results of an independent implementation at 6.0 with measurements at both "
-        "thresholds:\n\n"
+        "In an earlier version case d had a threshold of 6.0 and the other cases had thresholds of "
+        "5.2. The table compares the results of an independent implementation at 6.0 with results "
+        "of pbdkit at both thresholds:\n\n"
         "| | independent, 6.0 | 5.2 | 6.0 |\n| --- | --- | --- | --- |\n"
         f"{rows}\n\n"
-        "The number of thresholds at which x of particle 103 has a rebound is "
-        f"{kinds(swept('two shells, unbreakable frame bonds'))} with two shells and unbreakable "
-        f"bonds to the frame, and {kinds(swept('24 neighbours'))} with 24 neighbours."
+        "The motion of particle 103 along x was also examined at all thresholds at which the sheet "
+        "separates. With two shells and unbreakable bonds to the frame it has a rebound at "
+        f"{kinds(swept('two shells, unbreakable frame bonds'))}, and with 24 neighbours at "
+        f"{kinds(swept('24 neighbours'))}."
     )
 
 

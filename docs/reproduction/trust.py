@@ -29,10 +29,10 @@ def _settings() -> list[str]:
         "**The text does not define the figures completely.** The speed is 0.35 in table 1 and "
         "1.2 in case a. K, the speed and duration of cases b to g, λ, the order of frame and "
         "followers within a step, and the treatment of bonds to the frame are not given. No bond "
-        "breaks at the given fracture distance of 10. The times of figures 14 and 15 agree with "
-        f"thresholds of {which(fitting('d1', 'd2'))}; those of figures 14, 15, 18, 20 and 22 "
-        "agree with one threshold for cases d, f and g if it is "
-        f"{which(fitting(*FIGURES))}.",
+        "breaks at the given fracture distance of 10. Thresholds of "
+        f"{which(fitting('d1', 'd2'))} agree with the times of figures 14 and 15. The thresholds "
+        "that agree with the times of figures 14, 15, 18, 20 and 22, if cases d, f and g have the "
+        f"same threshold, are {which(fitting(*FIGURES))}.",
         "**The frame has more influence than the rule.** The largest displacement of the torn "
         f"hexagonal sheet at the end is {torn[1]:.2f} with the `mean` frame and {torn[2]:.1g} "
         f"with the `first` frame ({torn[0]:.2f} with one shell and the `mean` frame). That of the "
@@ -40,10 +40,11 @@ def _settings() -> list[str]:
         "cannot. Concave surfaces, rebounds and points in the gap are caused by frame points "
         "that lie between the pieces.",
         "**The edge effects of case a depend on the order of operations.** With four neighbours "
-        f"rows differ by {run('paper/a').spread():.1g}, and with a frame delayed by one step by "
-        f"{run('paper/a-lag').spread():.3f}. With that frame the rows next to it separate first "
-        f"at {len(lagged)} of {len(windows)} thresholds from 5 to 6 in steps of 0.02 "
-        f"({_spans(lagged)}), and all rows together at the others. With two shells and no delay "
+        f"the displacements of the rows differ by {run('paper/a').spread():.1g}, and with a frame "
+        f"delayed by one step by {run('paper/a-lag').spread():.3f}. The separation was tested at "
+        f"{len(windows)} thresholds from 5 to 6 in steps of 0.02. With the delayed frame the rows "
+        f"next to the frame separate first at {len(lagged)} of them ({_spans(lagged)}), and all "
+        "rows separate together at the others. With two shells and no delay "
         f"the rows next to the frame separate first at {len(twice)} thresholds "
         f"({_spans(twice)}).",
         "**The paper's program may have moved its frame one step later.** The convexity of case "
@@ -81,11 +82,11 @@ def _meaning() -> list[str]:
     )
     far = run("paper/b").u[100, :, 9, 1] / run("paper/b").u[100, :, 9, 0].clip(1e-9)
     return [
-        "**A second shell is not a second gradient.** For waves along x, eight neighbours act "
-        "like four with a relaxation 1.5 times as fast (relative stiffness at k = 1: "
-        f"{eight:.4f} and {four:.4f}); 24 neighbours soften short waves more ({soft:.3f}). "
-        "Gradient elasticity with a positive l² in its energy stiffens short waves; the "
-        "expansion of a lattice may have l² < 0.",
+        "**A second shell is not a second gradient.** For waves along x, eight neighbours have "
+        "the same effect as four with 1.5 times the relaxation: the relative stiffness at k = 1 is "
+        f"{eight:.4f} with eight and {four:.4f} with four. With 24 neighbours short waves are "
+        f"softer ({soft:.3f}). In gradient elasticity with a positive l² in its energy, short "
+        "waves are stiffer than long ones; in the expansion of a lattice l² can be negative.",
         "**The model is diffusion.** Each coordinate diffuses independently. A particle k layers "
         "away does not move before step k, and the number of steps to equilibrium grows with the "
         "square of the size. PE1 of particle 67 is largest at step "
@@ -98,9 +99,11 @@ def _meaning() -> list[str]:
         f"({strong:.3f} and {weak:.3f} times as large with 2 and ½ times K) but not to the "
         f"extension: u_y / u_x of the upper row at step 100 varies from {far[1]:.3f} at column 2 "
         f"to {far[8]:.3f} at column 9.",
-        "**Large rotations are not represented.** A rotation by a right angle gives a PE1 of "
-        f"{turned.of('pe1')[-1].max():.1f}; that of a rigid rotation is 0.",
-        "**PE1 after a fracture** measures the gap instead of the body; use `pe1-intact`.",
+        "**Large rotations are not represented.** A rotation of the leaders by a right angle "
+        f"gives a PE1 of {turned.of('pe1')[-1].max():.1f}; for a rigid rotation of the body PE1 "
+        "would be 0.",
+        "**PE1 after a fracture** measures the width of the gap instead of the "
+        "deformation of the body; use `pe1-intact`.",
         "**λ is not a yield stress.** The final strain of the piece is λ − 1 for every "
         "displacement of the leaders, because the broken edge is permanently loaded. A free piece "
         "with one broken side moves forever if λ differs from 1 "

@@ -226,8 +226,9 @@ def _weak(found: list[Data]) -> str:
             f"{1 / (1 + sum(lines)):.0%}",
         ))  # fmt: skip
     head = (
-        "lattice", "rows per part", "k", "time for halo and fewer steps per pass",
-        "time for exchange", "efficiency",
+        "lattice", "rows per part", "k",
+        "additional time due to the halo and to fewer steps per pass",
+        "additional time due to exchanges", "efficiency",
     )  # fmt: skip
     return _table(head, rows)
 
