@@ -27,18 +27,26 @@ PAGES = [ROOT / "README.md", *(page for folder in FOLDERS for page in sorted(fol
 
 
 def blocks(language):
-    return [
-        pytest.param(page, code, id=f"{page.name}-{n}")
-        for page in PAGES
-        for n, code in enumerate(
-            re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.M | re.S)
-        )
-        if page.name != "tutorial.md"  # its blocks build on each other: `plugin/test_documentation`
-    ]
+    """Return the blocks of all pages. A block that a page shares with an earlier one, as the site's
+    first page does with the README, is included once."""
+    found = {}
+    for page in PAGES:
+        if page.name == "tutorial.md":  # `plugin/test_documentation` runs its blocks in one session
+            continue
+        experiments = tuple(blocks_in(page, "yaml"))
+        for n, code in enumerate(blocks_in(page, language)):
+            param = pytest.param(page, code, id=f"{page.name}-{n}")
+            found.setdefault((code, experiments), param)
+    return [*found.values()]
+
+
+def blocks_in(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.M | re.S)
 
 
 COARSER = {
     "fit-fields": {
+        '"lattice": {"type": "square", "a": 1.0}': '"lattice": {"type": "square", "a": 2.0}',
         '["lattice"]["a"] = 1.0': '["lattice"]["a"] = 2.0',
         '"candidates": candidates, "folds": 3': (
             '"candidates": {"2 mm": candidates["2 mm"]}, "folds": 2'
@@ -48,8 +56,12 @@ COARSER = {
 }
 """Changes of pages that take a minute; the site is built from them as they are. Candidates and
 profiles are tested in `fitting/`."""
-FEW = ["--every", "20"]
-"""Steps of a movie: it draws all of them alike."""
+FEWER = {
+    "animate": ["--every", "20"],
+    "run material/dogbone": ["--set", "steps=240", "--set", "fracture.failure=0.002"],
+}
+"""Options of commands that take long: movies of fewer steps, which draw all of them alike, and a
+specimen that breaks in the first steps."""
 
 
 def is_sweep(code):
@@ -59,7 +71,7 @@ def is_sweep(code):
 def save_experiments(page):
     """Save the page's own experiments, each as NAME.yaml in the current folder, and its sweeps,
     which have their name in their first line."""
-    for code in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S):
+    for code in blocks_in(page, "yaml"):
         (name,) = re.findall(r"\A# (\S+)\.yaml" if is_sweep(code) else r"(?m)^name: (\S+)", code)
         Path(f"{name}.yaml").write_text(code)
 
@@ -110,8 +122,12 @@ def test_notebooks_run(page, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("page", "code"), blocks("yaml"))
 def test_experiments_run(page, code):
+    text = page.read_text()
     if is_sweep(code):
-        assert f"$ pbdkit sweep {code.split()[1]}" in page.read_text()
+        assert f"$ pbdkit sweep {code.split()[1]}" in text
+        return
+    (name,) = re.findall(r"(?m)^name: (\S+)", code)
+    if f"\n$ pbdkit run {name}.yaml\n" in text:  # by `test_commands_work_in_their_order`
         return
     experiment = pbdkit.Experiment.build(read_text(code, page.name))
     assert pbdkit.run(experiment, progress=False).attrs["status"] in ("complete", "settled")
@@ -129,7 +145,9 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
             assert_served_until_interrupted(line.removeprefix("$ "))
             continue
         words = shlex.split(line.removeprefix("$ pbdkit "))
-        result = CliRunner().invoke(program, words + FEW * (words[0] == "animate"))
+        for beginning, options in FEWER.items():
+            words += options * (words[: len(beginning.split())] == beginning.split())
+        result = CliRunner().invoke(program, words)
         assert result.exit_code == 0, (line, result.output, result.exception)
     for movie in tmp_path.glob("*.gif"):
         assert_same_movie(ROOT / "docs" / "pictures" / movie.name, movie)
@@ -232,7 +250,7 @@ ELSEWHERE = {
     "nox": "`.ci/run` calls its sessions",
     "pre-commit": "writes into the repository's own hooks",
     "pip install": "`cli/test_plugins_new` and the session `plugins` of nox install so",
-    "python tests/reliability/": "`io/test_checkpoint` runs short samples",
+    "python tests/reliability/": "`io/test_run_store` runs short samples",
     "python tests/benchmarks": "takes an hour; tests/bench runs what it is made of",
     "python docs/reproduction": "half an hour; `experiments/test_paper_reproduction` does",
     "python experiments/": "minutes each; the tests of the plugins run what they show",
