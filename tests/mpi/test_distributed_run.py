@@ -14,6 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar, Literal
 
+import commands_on_ranks
 import h5netcdf
 import numpy as np
 import pytest
@@ -148,7 +149,7 @@ CASES = {
     "everything in motion": {"initial": {"type": "noise", "amplitude": 0.1}, "leaders": []},
     "memory": {"solver": NUMPY | {"relaxation": 0.8, "memory": 0.4}},
     "single precision": {"solver": NUMPY | {"precision": "float32"}},
-    "settling": {"solver": NUMPY | {"settle": {"tolerance": 1e-2}}, "steps": 4000},
+    "settling": {"solver": NUMPY | {"settle": {"tolerance": 0.05}}, "steps": 4000},
     "numbers of particles": {"rule": Tiring(spread=0.1)},
     "numbers of bonds": {"fracture": Weakest(spread=0.1)},
     "damage": {"fracture": {"type": "damage", "onset": 0.1, "failure": 0.4}},
@@ -157,7 +158,7 @@ CASES = {
         "fracture": {"type": "cohesive", "energy": 0.05, "onset": 0.1},
         "initial": {"type": "noise", "amplitude": 0.1},
     },
-    "diverging": {"rule": {"type": "mixed-coordinate", "K": 5.0}, "steps": 400},
+    "diverging": {"solver": NUMPY | {"relaxation": 4.0}, "steps": 400},
     "every diagnostic of bonds": {
         "fracture": {"type": "threshold", "thresholds": [1.4371]},
         "diagnostics": [{"type": t} for t in ("broken", "crack-path", "pe1-intact")],
@@ -302,7 +303,7 @@ def stopping_after(looks):
 def test_resumed_on_another_number_of_processes(sizes, tmp_path, monkeypatch):
     """Stored and recorded data is read piece by piece."""
     for what in ("io.run_store.PART_BYTES", "restart.BLOCK_BYTES"):
-        monkeypatch.setattr(f"pbdkit.{what}", 256)
+        monkeypatch.setattr(f"pbdkit.{what}", 600)
     given_ = sheet(fracture={"type": "damage", "onset": 0.1, "failure": 0.4})
     one, several = tmp_path / "one.nc", tmp_path / "several.nc"
     written(given_, one)
@@ -377,28 +378,43 @@ def pbdkit_on(size, *arguments, folder, **more):
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, **more)
 
 
+SCRIPT = Path(__file__).parents[1] / "reliability" / "rank_runs.py"
+LINES = {
+    "run": ["run", "paper/f2", "--set", "steps=40", "-o", "two.nc"],
+    "diverging": ["run", "paper/a", "--set", "solver.relaxation=2.5", "--set", "steps=200"],
+    "random scenes": [str(SCRIPT), "--trials", "2"],
+}
+
+
+@pytest.fixture(scope="module")
+def launched(tmp_path_factory):
+    """The outcomes of `LINES` in two processes that mpiexec starts, and their folder."""
+    folder = tmp_path_factory.mktemp("launched")
+    found = commands_on_ranks.on_ranks(MPIEXEC, 2, [*LINES.values()], folder)
+    return dict(zip(LINES, found, strict=True)), folder
+
+
 @needs_mpi
-def test_mpiexec_gives_the_file_of_one_process(tmp_path):
-    done = pbdkit_on(3, "run", "paper/f2", "--set", "steps=40", "-o", "three.nc", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("complete: ") == done.stdout.count(" on 3 processes") == 1
+def test_mpiexec_gives_the_file_of_one_process(launched, tmp_path):
+    done, folder = launched[0]["run"], launched[1]
+    assert done.statuses == [0] * 2, done.err
+    assert done.out.count("complete: ") == done.out.count(" on 2 processes") == 1
     written(pbdkit.load("paper/f2", settings=["steps=40"]).model_dump(mode="json", by_alias=True),
             tmp_path / "one.nc")  # fmt: skip
-    assert_same(tmp_path / "one.nc", tmp_path / "three.nc")
-    with h5netcdf.File(tmp_path / "three.nc", "r") as file:
-        assert file.attrs["ranks"] == "3"
+    assert_same(tmp_path / "one.nc", folder / "two.nc")
+    with h5netcdf.File(folder / "two.nc", "r") as file:
+        assert file.attrs["ranks"] == "2"
 
 
 @needs_mpi
-def test_errors_are_printed_once(tmp_path):
-    done = pbdkit_on(2, "run", "paper/f2", "--set", "rule.K=1", folder=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.count("pbdkit: ") == 1
-    assert "rule.K" in done.stderr
-    growing = ["--set", "solver.relaxation=2.5", "--set", "steps=200"]
-    done = pbdkit_on(2, "run", "paper/a", *growing, folder=tmp_path)
-    assert done.returncode == 4
-    assert done.stderr.count("pbdkit: diverged") == 1
+def test_errors_are_printed_once(launched, tmp_path):
+    refused = pbdkit_on(2, "run", "paper/f2", "--set", "rule.K=1", folder=tmp_path)
+    assert refused.returncode == 2
+    assert refused.stderr.count("pbdkit: ") == 1
+    assert "rule.K" in refused.stderr
+    diverged = launched[0]["diverging"]
+    assert diverged.statuses == [4] * 2
+    assert diverged.err.count("pbdkit: diverged") == 1
 
 
 @pytest.mark.parametrize("names", [("PMI_SIZE",), ("OMPI_COMM_WORLD_SIZE", "PMIX_RANK")])
@@ -433,12 +449,10 @@ class Alone:
 
 
 @needs_mpi
-def test_a_sample_of_the_long_trial_on_random_scenes(compiled_at_length):
-    script = Path(__file__).parents[1] / "reliability" / "rank_runs.py"
-    command = [MPIEXEC, "-n", "2", sys.executable, script, "--trials", "2"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "'compared': " in done.stdout
+def test_a_sample_of_the_long_trial_on_random_scenes(launched):
+    done = launched[0]["random scenes"]
+    assert done.statuses == [0] * 2, done.out + done.err
+    assert "'compared': " in done.out
 
 
 @needs_mpi
