@@ -61,7 +61,7 @@ from pbdkit.plugin.fields import (
     unknown_regions,
 )
 from pbdkit.plugin.registry import GIVEN, Registry
-from pbdkit.plugin.rule import material_of
+from pbdkit.plugin.rule import Calibrated, material_of
 from pbdkit.plugin.schedule import Course
 from pbdkit.plugin.units import Scales, Units, given_by_units, of_one_material
 
@@ -356,6 +356,12 @@ def _default(part: str, description: str) -> Any:
     return Field(default={"type": part}, description=description)
 
 
+def _default_frame(parts: dict[str, Any]) -> Any:
+    rule = parts.get("rule")
+    cells = isinstance(rule, FollowerRule) and rule.uses_cells
+    return {"type": "natural" if cells and isinstance(rule, Calibrated) else "mean"}
+
+
 class Experiment(Strict):
     """Experiment: a scene and its run, validated as a whole.
 
@@ -383,7 +389,11 @@ class Experiment(Strict):
     """
 
     version: Version = Field(1, description="Version of the format of experiments.")
-    name: Name = Field(description="Name of the experiment, from which output files are named.")
+    name: Name = Field(
+        "experiment",
+        description="Name of the experiment, from which output files are named; by default the "
+        "name of its file without the suffix.",
+    )
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(
         0, description="Seed of all random numbers."
     )
@@ -403,8 +413,10 @@ class Experiment(Strict):
     rule: Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)] = Field(
         description="Rule by which followers move."
     )
-    frame: Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)] = _default(
-        "mean", "Points around the body in place of neighbours that are missing at its edge."
+    frame: Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)] = Field(
+        default_factory=_default_frame,
+        description="Points around the body in place of neighbours that are missing at its edge; "
+        "by default `natural` with a calibrated rule and `mean` with other rules.",
     )
     fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default(
         "none", "Condition under which bonds break."
@@ -573,9 +585,10 @@ class Experiment(Strict):
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
-        """Return the default parts, as a file would contain them."""
+        """Return the default parts, as a file would contain them, before the rule is known."""
         fields = cls.model_fields.items()
-        return {name: f.default for name, f in fields if isinstance(f.default, dict)}
+        parts = {name: f.default for name, f in fields if isinstance(f.default, dict)}
+        return parts | {"frame": _default_frame({})}
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Experiment) and self.__dict__ == other.__dict__

@@ -83,6 +83,8 @@ def read_experiment(name: str, *, allow_outside: bool = False) -> Source:
     if is_file:
         source = of_kind(EXPERIMENT, read_file(path))
         source.files = FileResolver(path.parent, allow_outside)
+        words = re.findall(r"[A-Za-z0-9_]+", path.stem)
+        source.data.setdefault("name", "-".join(words)[:MAX_TITLE] or "experiment")
         return source
     names = shipped_names()
     if name in names:

@@ -117,7 +117,7 @@ _LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20}
 def report(error: ValidationError, source: Source) -> ExperimentError:
     """Convert a pydantic error to an ExperimentError with one line for each of the first faults."""
     details = [_plainly(fault) for fault in error.errors(include_url=False)]
-    faults = [f for f in details if f["type"] != "too_short" or not _follows(f, details)]
+    faults = [f for f in details if not _follows(f, details)]
     lines = [source.message(*_described(fault)) for fault in faults[:MAX_FAULTS]]
     if len(faults) > MAX_FAULTS:
         lines.append(f"... and {len(faults) - MAX_FAULTS} more")
@@ -179,8 +179,11 @@ def _bound(context: Any) -> float:
 
 
 def _follows(fault: Any, faults: list[Any]) -> bool:
-    """Return whether a list is too short only because some of its items are invalid."""
+    """Return whether a list is too short only because some of its items are invalid, or a default
+    is unknown only because a part on which it depends is invalid."""
     where = fault["loc"]
+    if fault["type"] != "too_short":
+        return bool(fault["type"] == "default_factory_not_called")
     return any(f["loc"][: len(where)] == where and f["loc"] != where for f in faults)
 
 

@@ -8,6 +8,7 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -172,6 +173,31 @@ def test_valid_values_are_read(build: Build, text: str, holds: Callable[[Any], b
 
 
 NAMES = ["../x", "a/../b", "/x", "..", "a..b", "a//b", "a/", "''", "a b", r"a\b", "C:x", "é"]
+
+
+@pytest.mark.parametrize(
+    ("file", "name"), [("bar-2.yaml", "bar-2"), ("a bar.yaml", "a-bar"), ("..bar.yaml", "bar")]
+)
+def test_default_name_is_that_of_the_file(tmp_path: Path, file: str, name: str) -> None:
+    (tmp_path / file).write_text(edited("name: tensile\n", ""))
+    assert pbdkit.load(str(tmp_path / file)).name == name
+
+
+@pytest.mark.parametrize(
+    ("rule", "frame"),
+    [
+        ({"type": "barycentre"}, "mean"),
+        ({"type": "elastic", "poisson_ratio": 0.3}, "natural"),
+        ({"type": "springs"}, "natural"),
+    ],
+)
+def test_default_frame_is_natural_with_calibrated_rules(
+    tensile: dict[str, Any], rule: dict[str, Any], frame: str
+) -> None:
+    del tensile["name"]
+    tensile.pop("frame", None)
+    experiment = pbdkit.Experiment(**tensile | {"rule": rule})
+    assert (experiment.name, experiment.frame.type) == ("experiment", frame)
 
 
 @pytest.mark.parametrize("name", NAMES)
