@@ -139,8 +139,12 @@ def paths_of(rule, frame):
     """Return all parameters with one frame; with others some of the rule, which act on the frame
     too."""
     paths = RULES[rule][2]
-    full = frame == ("mean" if rule in BY_DISTANCE else "natural")
-    return paths if full else paths[: max(1, len(paths) - 3)]
+    return paths if frame == full_frame(rule) else paths[: max(1, len(paths) - 3)]
+
+
+def full_frame(rule):
+    """Return the frame with which all parameters of a rule are compared."""
+    return "mean" if rule in BY_DISTANCE else "natural"
 
 
 class Plain:

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 import sensitivity_cases
+from scene_strategies import AT_LENGTH
 
 import pbdkit
 from pbdkit.equilibrium.system import one_thread
@@ -211,9 +212,9 @@ RULES_AND_FRAMES = [
     (rule, frame)
     for n, rule in enumerate(sensitivity_cases.RULES)
     for m, frame in enumerate(sensitivity_cases.FRAMES)
-    if frame in ("natural", "mean") or (n + m) % 3 == 0
+    if AT_LENGTH or frame == sensitivity_cases.full_frame(rule) or (n + m) % 5 == 0
 ]
-"""Each rule with the natural and the mean frame, where it takes them, and with others in turn."""
+"""Each rule with the frame for which all its parameters are compared, and with others in turn."""
 
 
 @pytest.mark.parametrize(("rule", "frame"), RULES_AND_FRAMES)
@@ -232,8 +233,15 @@ def test_derivatives_and_gradients_match_recomputed_equilibria(rule, frame):
         assert not along > 1e-12, path
 
 
-@pytest.mark.parametrize("frame", ["natural", "mean"])
-@pytest.mark.parametrize("path", sensitivity_cases.MORE)
+@pytest.mark.parametrize(
+    ("path", "frame"),
+    [
+        (path, frame)
+        for n, path in enumerate(sensitivity_cases.MORE)
+        for m, frame in enumerate(("natural", "mean"))
+        if AT_LENGTH or (n + m) % 2
+    ],
+)
 def test_derivatives_by_other_parameters_match_recomputed_equilibria(path, frame):
     given = sensitivity_cases.other_case(frame, sensitivity_cases.MORE[path])
     ((_, size, off, along),) = sensitivity_cases.errors(given, [path])
