@@ -61,11 +61,13 @@ def run(experiment):
 
 @pytest.mark.parametrize("displacement", [[0, 2.0], [0, 1.2], [3.0, 0], [0.5, 4.0]], ids=str)
 def test_springs_follow_slow_loading_without_folding(displacement):
-    found = run(springs(displacement))
+    small = {"columns": 8, "rows": 3}
+    found = run(springs(displacement, **small))
     steps = 200
     velocity = [along / steps for along in displacement]
     slow = springs(
         None,
+        **small,
         leaders=[HOLD, moving(type="velocity", velocity=velocity, steps=steps)],
         steps=20_000,
         record={"every": 20_000},
