@@ -28,7 +28,7 @@ def settling(tolerance, **parts):
     return {"type": "stepping", "settle": {"tolerance": tolerance}} | parts
 
 
-def sheet(columns=9, rows=6, tolerance=1e-4, solver=None, **parts):
+def sheet(columns=7, rows=5, tolerance=1e-4, solver=None, **parts):
     base = {"leaders": PULLED, "steps": 20_000, "record": LAST}
     asked = settling(tolerance, **(solver or {}))
     return experiment(columns, rows, **(base | parts)) | {"solver": asked}
@@ -422,7 +422,7 @@ def test_runs_without_settle_import_no_error_bound():
         "import sys, pbdkit\n"
         "pbdkit.run(pbdkit.load('paper/a', settings=['steps=2']), progress=False)\n"
         "print([m for m in sys.modules if m.startswith('pbdkit.equilibrium.') "
-        "and m.endswith('.settlement')])"
+        "and m.endswith('.error_bound')])"
     )
     done = subprocess.run([sys.executable, "-c", start], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "[]", done.stderr

@@ -32,6 +32,11 @@ sheets = pytest.mark.parametrize(
 )
 
 
+def few_steps(steps):
+    """Parts of a run of which only the first and last states are recorded."""
+    return {"steps": steps, "record": {"every": steps}}
+
+
 def stretched(lattice, neighbours, stretch):
     """Return parts of a 6 x 6 sheet with end columns at their places after a stretch along x, the
     rows of its body, its displacements in equilibrium, and its leaders."""
@@ -57,8 +62,8 @@ def test_affine_leaders_all_round_give_an_affine_interior(lattice, neighbours, r
     outside = (body.site_table() < reach) | (body.site_table() > 6 - reach)
     rim = [n for n in body.body_rows.tolist() if outside[n].any()]
     leaders = [displace([n + 1], *expected[n].tolist()) for n in rim]
-    u = displacements(7, 7, leaders=leaders, steps=400, solver=RELAXED, **parts)[-1]
-    # The slowest mode has decayed by (1 - 0.9 (1 - cos(π/6)))^400 = 1e-22.
+    u = displacements(7, 7, leaders=leaders, **few_steps(300), solver=RELAXED, **parts)[-1]
+    # The slowest mode has decayed by (1 - 0.9 (1 - cos(π/6)))^300 = 1e-17.
     np.testing.assert_allclose(u[body.body_rows], expected[body.body_rows], rtol=0, atol=1e-12)
 
 
@@ -66,7 +71,7 @@ def test_affine_leaders_all_round_give_an_affine_interior(lattice, neighbours, r
 @sheets
 def test_case_1_the_equilibrium_of_a_stretched_sheet_is_affine(lattice, neighbours, stretch):
     parts, inside, expected, leaders = stretched(lattice, neighbours, stretch)
-    u = displacements(6, 6, leaders=leaders, steps=600, solver=RELAXED, **parts)[-1]
+    u = displacements(6, 6, leaders=leaders, **few_steps(400), solver=RELAXED, **parts)[-1]
     np.testing.assert_allclose(u[inside], expected[inside], rtol=0, atol=1e-12 * max(1, stretch))
     assert not u[:, 1].any()
 
@@ -76,8 +81,8 @@ def test_case_1_the_equilibrium_of_a_stretched_sheet_is_affine(lattice, neighbou
 def test_case_2_an_inverted_sheet_has_signed_area_and_a_warning(lattice, neighbours, through):
     parts, _, _, leaders = stretched(lattice, neighbours, -through)
     cells = 50 if lattice == "hexagonal" else 25
-    given = experiment(6, 6, leaders=leaders, steps=600, solver=RELAXED, **parts)
-    given |= {"diagnostics": [{"type": "smallest-cell-area"}], "record": {"every": 600}}
+    given = experiment(6, 6, leaders=leaders, **few_steps(400), solver=RELAXED, **parts)
+    given |= {"diagnostics": [{"type": "smallest-cell-area"}]}
     message = (
         rf"inverted cells: {cells} of {cells} cells .* has -\S+ times its area .* reduce the "
         "displacement of the leaders"
@@ -90,7 +95,7 @@ def test_case_2_an_inverted_sheet_has_signed_area_and_a_warning(lattice, neighbo
 
 def test_case_2_an_almost_flat_sheet_gives_no_warning(recwarn):
     parts, _, _, leaders = stretched("square", "coordination-1", -0.999)
-    given = experiment(6, 6, leaders=leaders, steps=600, solver=RELAXED, **parts)
+    given = experiment(6, 6, leaders=leaders, **few_steps(400), solver=RELAXED, **parts)
     ds = pbdkit.run(given | {"diagnostics": [{"type": "smallest-cell-area"}]}, progress=False)
     assert ds.smallest_cell_area[-1] == pytest.approx(0.001, abs=1e-12)
     assert not recwarn.list
@@ -120,7 +125,7 @@ def test_case_3_a_coupling_beyond_a_million_body_lengths_is_stopped(steps_of):
         pbdkit.run(given, progress=False)
 
 
-@pytest.mark.parametrize(("columns", "speed"), [(20, 0.0035), (12, 0.35)])
+@pytest.mark.parametrize(("columns", "speed"), [(14, 0.0035), (12, 0.35)])
 def test_case_22_the_lag_behind_a_leader_matches_the_formula(columns, speed):
     """The steady lag w solves (1 - P) w = the motion of the equilibrium in a step, less the part
     that the leaders, which move first, pass on within the step: (2v/3N) i (N² - i² - 3/2), N =
