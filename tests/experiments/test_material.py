@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from finite_elements.errors import load, relative_l2
+from scene_strategies import AT_LENGTH
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -198,13 +199,15 @@ def strength(a, notched):
 
 def test_only_a_notched_plate_weakens_on_a_finer_lattice():
     """Strain at a crack's tip grows as 1/√h: the strength falls as √h, the fracture energy as h."""
-    spacings = (0.5, 0.25, 0.125)
+    spacings = (0.5, 0.25, 0.125) if AT_LENGTH else (0.5, 0.25)
     whole = [strength(a, notched=False) for a in spacings[:2]]
     np.testing.assert_allclose(whole, 63.48, rtol=1e-3)
     torn = [strength(a, notched=True) for a in spacings]
-    np.testing.assert_allclose(torn, [21.6, 16.3, 12.0], atol=0.05)
+    np.testing.assert_allclose(torn, [21.6, 16.3, 12.0][: len(torn)], atol=0.05)
     scaled = np.array(torn) / np.sqrt(spacings)
-    assert 1.0 < scaled[2] / scaled[1] < scaled[1] / scaled[0] < 1.08
+    assert 1.0 < scaled[1] / scaled[0] < 1.08
+    if AT_LENGTH:
+        assert 1.0 < scaled[2] / scaled[1] < scaled[1] / scaled[0]
 
 
 def affine(lattice, rule, gradient, a=0.5, **more):

@@ -177,7 +177,7 @@ def test_case_16_divergence_is_predicted_stopped_and_leaves_the_last_state(
 ):
     sparse = experiment(8, 6, leaders=[HOLD_LEFT, pull_right(0.1, 0.0)], steps=3000)
     sparse |= {"solver": {"type": "stepping", "engine": engine} | solver}
-    sparse |= {"initial": {"type": "noise", "amplitude": 1e-3}, "record": {"every": 3000}}
+    sparse |= {"initial": {"type": "noise", "amplitude": 0.05}, "record": {"every": 3000}}
     (tmp_path / "sparse.json").write_text(json.dumps(sparse))
     checked = call("check", str(tmp_path / "sparse.json"))
     assert checked.code == 0
@@ -193,20 +193,20 @@ def test_case_16_divergence_is_predicted_stopped_and_leaves_the_last_state(
         assert ds.status == "diverged"
         assert all(np.isfinite(ds[name]).all() for name in ("position", "u"))
         # The body is 7 wide, a spacing, its leaders go .5, and the noise.
-        assert 1.0 < np.abs(ds.u[-1]).max() <= 8.501
+        assert 1.0 < np.abs(ds.u[-1]).max() <= 8.55
         assert f"the last recorded state is step {int(ds.time[-1])}, the last in which" in end
 
 
 def test_case_16_momentum_1_oscillates_without_growth():
     """Every mode has |μ| = 1 there; what grows begins above."""
-    given = experiment(8, 6, leaders=[HOLD_LEFT, pull_right(0.1, 0.0)], steps=3000)
+    given = experiment(8, 6, leaders=[HOLD_LEFT, pull_right(0.1, 0.0)], steps=1200)
     given |= {"solver": {"type": "stepping", "memory": 1.0}}
     known = pbdkit.analyse(given)
     assert known.stable
     assert known.spectral_radius == pytest.approx(1.0, abs=1e-12)
     u = pbdkit.run(given, progress=False).u.values
     swings = np.abs(u[1:] - u[:-1]).max(axis=(1, 2))
-    assert swings[2500:].max() == pytest.approx(swings[10:510].max(), rel=0.2)
+    assert swings[700:].max() == pytest.approx(swings[10:510].max(), rel=0.2)
 
 
 @pytest.mark.filterwarnings("ignore:leaders. the experiment has neither")

@@ -112,8 +112,8 @@ def test_measured_motion_starts_at_the_current_position(tmp_path):
 
 
 def test_many_points_are_stored_in_the_result(tmp_path):
-    """An attribute of some megabytes."""
-    points = np.random.default_rng(0).uniform(-1.0, 6.0, (30_000, 2)).round(12)
+    """An attribute beyond the 64 kB that HDF5 stores in a header."""
+    points = np.random.default_rng(0).uniform(-1.0, 6.0, (3000, 2)).round(12)
     content = measured([*points.tolist(), (-9, -9), (9, -9), (9, 9), (-9, 9)])
     path = written(tmp_path, "{type: measured, file: data.csv}", content)
     ds = pbdkit.run(path, progress=False)
@@ -122,7 +122,7 @@ def test_many_points_are_stored_in_the_result(tmp_path):
         main(["run", path, "-o", str(out), "--quiet"])
     assert ended.value.code == 0
     with pbdkit.open(str(out)) as kept:
-        assert len(kept.attrs["experiment"]) > 2e6
+        assert len(kept.attrs["experiment"]) > 2e5
         assert np.array_equal(pbdkit.rerun(kept, progress=False).u, ds.u)
 
 

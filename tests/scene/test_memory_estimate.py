@@ -26,7 +26,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES, ids=str)
 def test_memory_and_output_match_the_estimate_of_check(change, tmp_path):
-    settings = ["body.columns=400", "body.rows=300", "steps=4", "record.every=2", "diagnostics=[]"]
+    settings = ["body.columns=240", "body.rows=180", "steps=4", "record.every=2", "diagnostics=[]"]
     scene = build_scene(pbdkit.load("start", settings=[*settings, *CHANGES[change]]))
     said = forecast(scene)
     path = tmp_path / "out.nc"
@@ -88,8 +88,8 @@ CALIBRATED = [
 STRESS = "diagnostics=[{type: stress, youngs_modulus: 1.0}, {type: strain}]"
 ANEW = "neighbours={type: euclidean, radius: 1.2, reevaluate: true}"
 TAKING_MORE = {
-    "neighbours found anew": (200, [ANEW]),
-    "stress and strain": (300, [*CALIBRATED, STRESS]),
+    "neighbours found anew": (140, [ANEW]),
+    "stress and strain": (220, [*CALIBRATED, STRESS]),
 }
 
 

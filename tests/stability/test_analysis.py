@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -173,8 +174,7 @@ def test_the_distance_weighted_rule_is_reported_unstable_with_its_bound(parts, b
     assert any("is stable below" in w for w in Analysis(scene).warnings())
 
 
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize(("lattice", "rule"), in_turn(product(LATTICES, RULES), 2))
 def test_one_percent_inside_the_bound_converges_and_outside_diverges(lattice, rule):
     parts = {"lattice": LATTICES[lattice], "rule": RULES[rule]}
     start = {"type": "noise", "amplitude": 1e-9}
@@ -226,7 +226,7 @@ def test_undamped_mode_is_found():
 
 
 @pytest.mark.parametrize(
-    "name", in_turn([n for n in shipped_names() if "to-failure" not in n], 2, first=1)
+    "name", in_turn([n for n in shipped_names() if "to-failure" not in n], 3, first=1)
 )
 def test_predictions_for_shipped_experiments_hold(name):
     """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are that
