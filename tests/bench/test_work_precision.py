@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.bench import work_precision as measurement
 from pbdkit.bench.work_precision import (
     FLOOR,
     Row,
@@ -23,9 +24,25 @@ FOUR = [("numpy", "float64", 1), ("numpy", "float32", 1), ("compiled", "float64"
 HOLD = {"type": "hold"}
 
 
+def work_here(job, folder, cache):
+    """Run a job in this process: one of its own takes a second to start."""
+    return measurement._without_fault(json.loads(json.dumps(measurement.result_of(job))))
+
+
 @pytest.fixture
-def few(monkeypatch):
-    """Three methods, each of which takes a second or two."""
+def here(monkeypatch):
+    """Jobs of compiled kernels run in processes of their own, and others in this process."""
+    apart = measurement._run_in_process
+
+    def work(job, *folders):
+        return (apart if "engine=compiled" in str(job) else work_here)(job, *folders)
+
+    monkeypatch.setattr(measurement, "_run_in_process", work)
+
+
+@pytest.fixture
+def few(here, monkeypatch):
+    """Three methods, one of which takes some seconds."""
     monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: FOUR)
 
 
@@ -60,7 +77,7 @@ def test_table_figures_and_plot_are_written(call, few):
                    for line in result.out.splitlines())  # fmt: skip
 
 
-def test_without_sizes_the_body_keeps_its_size(call, monkeypatch):
+def test_without_sizes_the_body_keeps_its_size(call, here, monkeypatch):
     monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: FOUR[:1])
     result = call("bench", "e.json", "--set", "leaders.0.select={numbers: [7, 8]}", "--json", "b")
     assert result.code == 0, result.err
@@ -89,7 +106,7 @@ def test_without_sizes_the_body_keeps_its_size(call, monkeypatch):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_invalid_input_is_refused_in_one_line(call, arguments, code, words):
+def test_invalid_input_is_refused_in_one_line(call, here, arguments, code, words):
     result = call("bench", "e.json", *arguments)
     assert result.code == code
     assert words in result.err
@@ -97,7 +114,7 @@ def test_invalid_input_is_refused_in_one_line(call, arguments, code, words):
     assert "Traceback" not in result.err
 
 
-def test_unavailable_method_is_a_row_with_a_reason(tmp_path, tensile, monkeypatch):
+def test_unavailable_method_is_a_row_with_a_reason(tmp_path, tensile, here, monkeypatch):
     file = tmp_path / "e.json"
     file.write_text(json.dumps(tensile))
     never = ("abacus", "float64", 1)
@@ -111,7 +128,7 @@ def test_unavailable_method_is_a_row_with_a_reason(tmp_path, tensile, monkeypatc
         list(measure(str(file), (), None, lambda _: None))
 
 
-def test_missing_engine_names_its_extra(monkeypatch, tmp_path, tensile):
+def test_missing_engine_names_its_extra(here, monkeypatch, tmp_path, tensile):
     """The measuring process itself finds no numba."""
     (tmp_path / "sitecustomize.py").write_text(
         "import importlib.util as util\nfind = util.find_spec\n"

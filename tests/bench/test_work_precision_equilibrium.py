@@ -15,12 +15,12 @@ from pbdkit.bench.work_precision import (
     followers_of,
     lines,
     measure,
-    result_of,
     table,
     work_precision_figure,
 )
 from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.scene.scene import build_scene
+from tests.bench.test_work_precision import work_here
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 TOLERANCES = (1e-2, 1e-6)
@@ -48,11 +48,6 @@ BENT = [HOLD, pulled(nearest=[[8.0, 5.0]])]
 
 def scene_of(leaders, **parts):
     return build_scene(pbdkit.Experiment(**sheet(leaders, **parts)))
-
-
-def work_here(job, folder, cache):
-    """A job in this process: one of its own, which takes a second, is in test_work_precision.py."""
-    return measurement._without_fault(json.loads(json.dumps(result_of(job))))
 
 
 @pytest.fixture
@@ -148,7 +143,7 @@ def test_slow_method_is_skipped_at_tighter_tolerances():
     ) in lines(found)
 
 
-def test_breakable_bonds_are_refused(call):
+def test_breakable_bonds_are_refused(call, quick):
     fracture = {"type": "threshold", "thresholds": [9.0]}
     Path("s.json").write_text(json.dumps(sheet(AFFINE, fracture=fracture)))
     result = call("bench", "s.json")

@@ -14,6 +14,7 @@ from plugin_sources import BROKEN, NEWER, listed, rule
 from scene_strategies import in_turn
 
 import pbdkit
+from pbdkit.bench import work_precision
 from pbdkit.cli.commands import builtin_commands
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.plugin.registry import Registry
@@ -36,7 +37,7 @@ EVERY_COMMAND = {
     "experiments": ["experiments"],
     "init": ["init", "new.yaml"],
     "plot": ["plot", "made.nc"],
-    "animate": ["animate", "made.nc", "-o", "made.gif", "--every", "10"],
+    "animate": ["animate", "made.nc", "-o", "made.gif", "--every", "10", "--dpi", "40"],
     "curve": ["curve", "torn.nc", "broken-bonds"],
     "export": ["export", "torn.nc"],
     "report": ["report", "torn.nc"],
@@ -69,13 +70,19 @@ def test_all_commands_are_tested() -> None:
     assert {arguments[0] for arguments in EVERY_COMMAND.values()} == set(builtin_commands())
 
 
+def job_here(job: Any) -> Any:
+    """Run a job of `pbdkit bench` in this process."""
+    return work_precision._without_fault(json.loads(json.dumps(work_precision.result_of(job))))
+
+
 @pytest.mark.usefixtures("healthy")
 def test_all_broken_plugins_together_stop_no_command(
     install: Install, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = ("numpy", "float64", 1)
     Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
-    monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: [one])  # is enough
+    monkeypatch.setattr(work_precision, "engines", lambda: [one])  # is enough
+    monkeypatch.setattr(work_precision, "_run_in_process", lambda job, *_: job_here(job))
     assert call("run", "e.json", "-o", "made.nc").code == 0
     for n, (source, _) in enumerate(BROKEN.values()):
         install(f"pbdkit-broken-{n}", source, f"0.{n}")
@@ -94,11 +101,11 @@ def test_all_broken_plugins_together_stop_no_command(
 @pytest.mark.usefixtures("healthy")
 @pytest.mark.parametrize("kind", BROKEN)
 def test_no_broken_plugin_stops_a_command(install: Install, call: Call, kind: str) -> None:
-    """Choose a run, of which others read the result, and a quarter of the other commands, each in
-    its turn."""
+    """Choose a run, of which others read the result, and some of the other commands, each in its
+    turn."""
     source, reason = BROKEN[kind]
     run, *others = CHEAP
-    tried = [run, *in_turn(others, 4, first=[*BROKEN].index(kind) % 4)]
+    tried = [run, *in_turn(others, 8, first=[*BROKEN].index(kind) % 8)]
     install("pbdkit-broken", source, "0.3")
     Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
     assert {name: r for name in tried if (r := call(*EVERY_COMMAND[name])).code} == {}
@@ -131,13 +138,24 @@ def test_corrupt_metadata_stops_no_command(
     install: Install, call: Call, tmp_path: Path, file: str, content: Any, name: str
 ) -> None:
     install("pbdkit-torn", rule("torn"))
-    torn = tmp_path / "site" / "pbdkit_torn-1.0.dist-info" / file
-    torn.write_bytes(content if isinstance(content, bytes) else content.encode())
+    tear(tmp_path / "site" / "pbdkit_torn-1.0.dist-info" / file, content)
     assert call("check", "e.json", HEALTHY).code == 0
     row = listed(call)[name]
     assert row["state"] == "broken"
     assert row["reason"] != ""
-    # Where it builds its first model, pydantic would go through all distributions.
+
+
+def tear(file: Path, content: Any) -> None:
+    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def test_corrupt_metadata_stops_no_first_command(
+    install: Install, call: Call, tmp_path: Path
+) -> None:
+    """Where a process builds its first model, pydantic would go through all distributions."""
+    for n, (file, content, _) in enumerate(METADATA.values()):
+        install(f"pbdkit-torn-{n}", rule(f"torn-{n}"))
+        tear(tmp_path / "site" / f"pbdkit_torn_{n}-1.0.dist-info" / file, content)
     command = [sys.executable, "-m", "pbdkit", "run", "e.json", "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

@@ -90,7 +90,7 @@ def test_page_contains_the_outline_if_it_cuts_cells(hole, sheet):
 
 
 def test_a_page_is_in_the_units_of_the_user():
-    settings = ["units.length=0.5 mm", "fracture={type: strain, failure: 0.5}"]
+    settings = ["units.length=2 mm", "fracture={type: strain, failure: 0.5}"]
     dataset = pbdkit.run(
         pbdkit.load("modelling/composite-plate", settings=settings), progress=False
     )
@@ -98,14 +98,14 @@ def test_a_page_is_in_the_units_of_the_user():
     lattice, bonds = run["lattice"], run["bonds"]
     reference = dataset.reference_mm.values
     assert lattice["length"] == "mm"
-    assert lattice["spacing"] == pytest.approx(0.5)
+    assert lattice["spacing"] == pytest.approx(2.0)
     assert lattice["box"][0] == pytest.approx(reference[:, 0].min(), abs=0.1)
     assert lattice["box"][2] == pytest.approx(60.0, abs=0.1)
     np.testing.assert_allclose(
         unpacked(lattice["u"])[1::2], dataset.u_mm[-1].values.ravel(), rtol=1e-6
     )
     rest = unpacked(bonds["rest"], "<f8").reshape(-1, 2)
-    assert np.hypot(*rest.T).min() == pytest.approx(0.5)
+    assert np.hypot(*rest.T).min() == pytest.approx(2.0)
     (curve,) = [c for c in run["curves"] if c["title"].startswith("mean displacement of")]
     assert curve["y_label"] == "mm"
 
