@@ -1,5 +1,5 @@
 """Work–precision measurements: the cost of each solver against its error (`pbdkit bench`). The
-measurements are in `work_precision`, each in a separate process."""
+module `work_precision` makes the measurements, each of them in a separate process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def pbdkit_commands() -> list[Command]:
 
 
 def _sizes(context: click.Context, option: click.Parameter, text: str | None) -> tuple[int, ...]:
-    """Return numbers of sites, which are separated by commas."""
+    """Return the numbers of sites in a text, in which they are separated by commas."""
     words = [word.strip() for word in text.split(",")] if text is not None else []
     for word in words:
         if not (word.isascii() and word.isdecimal()) or not 2 <= int(word) < 2**31:

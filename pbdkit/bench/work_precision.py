@@ -1,7 +1,9 @@
-"""Work–precision measurements: solvers at several sizes, each in a separate process.
+"""Work–precision measurements of solvers at several sizes. Each measurement is made in a separate
+process.
 
-The rows are shown as a table, a JSON object and a picture. A measurement is a process
-``python -m pbdkit.bench.work_precision ANSWER``, with the job as JSON on its input.
+The rows are shown as a table, a JSON object and a picture. A measurement is made by a process
+``python -m pbdkit.bench.work_precision ANSWER``, which reads the job as JSON from its standard
+input and writes its result to the file ANSWER.
 """
 
 from __future__ import annotations
@@ -56,8 +58,8 @@ def resized(experiment: Experiment, size: int) -> tuple[str, ...]:
     """Return the settings with which about `size` sites lie along the longer side of the body.
 
     A grid gets `size` columns and rows in proportion; positions are scaled with the body. For any
-    other body the lattice constant is changed, and so are lengths that are given in lattice
-    constants: thresholds and the radius of neighbours.
+    other body the lattice constant is changed. Lengths that are given in lattice constants, such as
+    thresholds and the radius of neighbours, are changed accordingly.
 
     Raises
     ------
@@ -136,48 +138,53 @@ TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 METHODS = ("lu", "multigrid", "conjugate-gradients")
 """Methods of the solver `equilibrium`."""
 MAX_PARTICLES_LU = 2_000_000
-"""Number of particles above which LU is omitted: its factors take 1.4 GiB for a million particles,
-and their size grows faster than the number."""
+"""Number of particles above which LU is omitted. For a million particles the factors take 1.4 GiB,
+and their size grows faster than the number of particles."""
 MAX_STEPPING_S = 60.0
-"""Duration in seconds above which steps are extrapolated from the rate instead of measured."""
+"""If all steps would take longer than this, in seconds, their duration is extrapolated from the
+rate of some steps instead of measured."""
 COMPARISONS = 4
-"""Number of steps, evenly spread up to the last, at which displacements are compared."""
+"""Number of steps at which displacements are compared. They are evenly distributed, and the last
+one is the last step of the run."""
 NOISY_START = ("initial={type: noise, amplitude: 1e-3}", "steps=10000000")
-"""Settings for timed steps: every particle moves, and the engine is that for long runs."""
+"""Settings for timed steps. With them every particle moves, and the engine is the one for long
+runs."""
 TIMED_STEPS = (2, 42)
-"""Steps between which the rate is measured."""
+"""Steps between which the rate is measured, in steps per second."""
 Job = Callable[..., dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method measured at a size.
+    """Measurement of a method at a size.
 
     Parameters
     ----------
     size
-        Sites along the longer side; None for the size in the experiment.
+        Number of sites along the longer side; None for the size in the experiment.
     method, precision, threads
         Method of the solver or engine, its precision and its number of threads.
     particles
         Number of particles.
     tolerance, certified, error
-        Tolerance, certified bound and upper bound of the error: the largest distance from the
-        reference, relative to the largest displacement; for equilibria to the largest prescribed
-        displacement. Infinite if a run diverged.
+        Tolerance, certified bound of the error, and measured upper bound of the error. The error is
+        the largest distance from the reference, divided by the largest displacement or, for
+        equilibria, by the largest prescribed displacement. It is infinite if a run diverged.
     steps
         Number of steps, or of iterations of the linear solver.
     setup_first_s, setup_s
-        Seconds until an engine is ready, without and with compiled kernels in the cache.
+        Seconds until an engine is ready: without compiled kernels in the cache (`setup_first_s`),
+        and with them (`setup_s`).
     ns_per_particle_step
         Nanoseconds for each particle and step.
     seconds, cpu_s
-        Duration from the experiment to the equilibrium without imports and compilation, and
-        processor time of all threads.
+        Duration from the experiment to the equilibrium, without imports and compilation; and the
+        processor time of all threads in this duration.
     peak_memory_mib
-        Peak memory above that of the imports in MiB.
+        Peak memory minus the memory after the imports, in MiB.
     is_predicted
-        True if times are the time of one step times the number of steps.
+        True if the duration was not measured, but is the time of one step multiplied by the number
+        of steps.
     reason
         Reason why there is no measurement.
     """
@@ -202,12 +209,14 @@ class Row:
 
     @property
     def line(self) -> str:
-        """Method and threads; rows with the same ones have the same colour in a picture."""
+        """Method and threads. Rows with the same method and number of threads have the same colour
+        in a picture."""
         return self.method + (f", {self.threads} threads" if (self.threads or 1) > 1 else "")
 
 
 def engines() -> list[tuple[str, str, int]]:
-    """Return engine, precision and threads of each variant of steps, the reference first."""
+    """Return the combinations of engine, precision and number of threads with which steps are
+    measured. The first one is the reference."""
     combinations = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
     combinations += [] if what_is_missing() else [("gpu", 1)]
     return [
@@ -227,16 +236,18 @@ def measure(
 ) -> Iterator[Row]:
     """Yield the row of the reference, then a row for each method.
 
-    For steps the methods are engines, precisions and threads, and the reference is numpy in
-    float64. If the solver is `equilibrium`, they are its methods and steps, at several tolerances.
-    Every measurement is made in a separate process, without records and diagnostics.
+    If the experiment is solved by steps, the methods are combinations of engine, precision and
+    number of threads, and the reference is numpy in float64. If the solver is `equilibrium`, the
+    methods are the methods of this solver and, for comparison, steps; each of them is measured at
+    several tolerances. Every measurement is made in a separate process, without records and
+    diagnostics.
 
     Parameters
     ----------
     experiment
         File or shipped name.
     settings
-        Settings with which it is loaded.
+        Settings with which the experiment is loaded.
     size
         Sites along the longer side; None for the size in the experiment.
     report
@@ -268,7 +279,8 @@ def measure(
 
 
 def _run_in_process(job: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
-    """Return the result of a job in a new process, with a cache folder of its own."""
+    """Run a job in a new process and return its result. `cache` is the cache folder that the
+    process uses."""
     (answer := folder / "answer.json").unlink(missing_ok=True)
     command = [sys.executable, "-m", "pbdkit.bench.work_precision", str(answer)]
     env = os.environ | {"PBDKIT_CACHE_DIR": str(cache)}
@@ -283,7 +295,7 @@ def _run_in_process(job: dict[str, Any], folder: Path, cache: Path) -> dict[str,
 
 
 def _without_fault(result: dict[str, Any]) -> dict[str, Any]:
-    """Return the result of a job; raise the error that it contains, if any."""
+    """Return the result of a job. If it contains an error, raise the error."""
     if "fault" in result:
         kind = PluginError if result["fault"] == "PluginError" else ExperimentError
         raise kind(result["message"])
@@ -314,7 +326,8 @@ def _rows_of_engines(run_job: Job, base: Row, steps: int) -> Iterator[Row]:
 
 
 def _error(distance: float, size: float, uncertainty: float = 0.0) -> float:
-    """Return an upper bound of the relative error for a reference with a relative uncertainty."""
+    """Return an upper bound of the relative error. The relative uncertainty of the reference is
+    included."""
     if not np.isfinite(distance) or not np.isfinite(size):
         return np.inf
     return (float(distance / size) if distance else 0.0) + uncertainty
@@ -357,7 +370,8 @@ def _rows_of_method(
 def _rows_of_steps(
     run_job: Job, base: Row, exact: dict[str, Any], tolerances: list[float]
 ) -> Iterator[Row]:
-    """Yield rows of steps that are measured, then of those that are extrapolated."""
+    """Yield the rows for steps: first the rows with measured durations, then those with
+    extrapolated durations."""
 
     def time_of_step(threads: int) -> tuple[float, float, int]:
         measured = run_job(
@@ -411,11 +425,11 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 """Markers of the methods in the picture."""
 FLOOR = 1e-18
-"""Position on the axis of errors at which errors of exactly zero are drawn."""
+"""Value on the logarithmic axis of errors at which errors of exactly zero are drawn."""
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """Return a table of the columns that have values, with a line between sizes."""
+    """Return a table of the columns that contain values. Sizes are separated by lines."""
     table, columns = Table(box=SIMPLE_HEAD, pad_edge=False), _columns_with_values(rows)
     for name in columns:
         is_word = name in ("method", "precision")
@@ -464,9 +478,9 @@ def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row])
 def work_precision_figure(rows: Sequence[Row], title: str) -> Figure:
     """Return a figure of error against cost, on logarithmic axes.
 
-    It has a panel for each size, a colour for each method and number of threads, and a marker for
-    each row. Predicted rows are hollow, errors of exactly zero lie at the bottom, and runs that
-    diverged are omitted.
+    The figure has a panel for each size. Each row is a marker, with a colour for each method and
+    number of threads. Markers of extrapolated durations are hollow, errors of exactly zero are
+    drawn at the bottom, and runs that diverged are omitted.
     """
     from matplotlib.figure import Figure
 
@@ -525,9 +539,9 @@ def show_work_precision(
     experiment
         Experiment.
     name, settings
-        Name and settings by which it is described in the JSON file.
+        Name and settings that describe the experiment in the JSON file.
     changes
-        All settings with which it is loaded by `name`.
+        All settings with which the experiment is loaded by its `name`.
     sizes
         Numbers of sites along the longer side; empty for the size in the experiment.
     json_file, picture
@@ -561,7 +575,7 @@ REPEATS = 7
 MAX_REPEATING_S = 2.0
 """Maximum duration of all repetitions in seconds."""
 MAX_SOLVING_S = 60.0
-"""Duration in seconds of a measurement after which smaller tolerances are omitted."""
+"""If a measurement takes longer than this, in seconds, smaller tolerances are omitted."""
 COMPILED = "pbdkit.stepping.numba_engine.engine"
 """Module of the compiled engine."""
 SOLVERS = ("scipy.sparse.linalg", "scipy.sparse.csgraph", "numba")
@@ -578,7 +592,7 @@ def main(answer: Path) -> None:
 
 
 def result_of(job: Task) -> Task:
-    """Run a job; an error becomes part of the result."""
+    """Run a job and return its result. If an error occurs, the result contains the error."""
     try:
         return {"step": _step, "settle": _settle, "exact": _compute_exact}[job["what"]](job)
     except PbdkitError as error:
@@ -586,7 +600,8 @@ def result_of(job: Task) -> Task:
 
 
 def _import(*modules: str) -> int:
-    """Import modules, which are not part of the measurement, and return the peak memory."""
+    """Import the modules that a measurement needs, so that their import is not measured. Return the
+    peak memory after that."""
     for module in modules:
         if find_spec(module.split(".")[0]):
             import_module(module)
@@ -598,7 +613,8 @@ def _times() -> Floats:
 
 
 def _repetitions(spent: list[Floats]) -> Iterator[int]:
-    """Yield numbers of repetitions until these suffice; the caller appends times to `spent`."""
+    """Yield the numbers of repetitions until there are enough of them. The caller appends the
+    duration of each repetition to `spent`."""
     for turn in range(REPEATS):
         yield turn
         took = [float(times[..., 0].max(initial=0.0)) for times in spent]
@@ -609,7 +625,7 @@ def _repetitions(spent: list[Floats]) -> Iterator[int]:
 def _step(job: Task) -> Task:
     """Measure set-up and steps.
 
-    For each number of steps `at`, the result contains the seconds to that step, the best of several
+    For each step in `at`, the result contains the seconds up to that step in the fastest of several
     runs, the largest distance from the reference, and the largest displacement.
     """
     experiment, at = load(job["experiment"], settings=job["settings"]), job["at"]
@@ -640,10 +656,11 @@ def _step(job: Task) -> Task:
 
 
 def _compared(scene: Scene, state: State, folder: Path) -> tuple[float, float]:
-    """Return the largest distance from the reference, and its largest displacement.
+    """Return the largest distance of a state from the reference, and the largest displacement of
+    the reference.
 
-    The reference is the equilibrium of the followers if it is in the folder; otherwise the state
-    that the first process saved at this step.
+    If the folder contains the equilibrium of the followers, it is the reference. Otherwise the
+    reference is the state that the first process saved at this step.
     """
     exact, u = folder / "exact.npy", state.u.reshape(len(state.u), -1).astype(float)
     file = exact if exact.exists() else folder / f"{state.step}.npy"
@@ -660,8 +677,8 @@ def _largest_norm(u: Floats) -> float:
 
 
 def _settle(job: Task) -> Task:
-    """Measure the solver for each tolerance, the largest first, until a measurement takes too
-    long."""
+    """Measure the solver for each tolerance, beginning with the largest, until a measurement takes
+    too long."""
     imports, rows = _import(*SOLVERS), []
     for tolerance in job["tolerances"]:
         settings = [*job["settings"], f"solver.tolerance={tolerance:g}"]
@@ -690,7 +707,8 @@ def _equilibrium(experiment: Experiment) -> tuple[Scene, State, Certificate]:
 
 
 def _compute_exact(job: Task) -> Task:
-    """Compute an accurate equilibrium, and the number of steps to each tolerance."""
+    """Compute an accurate equilibrium, and the number of steps that are needed for each
+    tolerance."""
     _import(*SOLVERS)
     experiment = load(job["experiment"], settings=job["settings"])
     if experiment.fracture.type != "none":
@@ -708,16 +726,17 @@ def _compute_exact(job: Task) -> Task:
 
 @dataclass(frozen=True)
 class Decay:
-    """Decay of the distance to equilibrium in steps.
+    """Decay of the distance to equilibrium when steps are made.
 
-    After n steps the distance is `share` · `rate`ⁿ of the largest prescribed displacement.
+    After n steps the distance is `share` · `rate`ⁿ times the largest prescribed displacement.
     """
 
     share: float
     rate: float
 
     def steps_to(self, tolerance: float) -> int | None:
-        """Return the number of steps to a tolerance, or None if it is never reached."""
+        """Return the number of steps after which the distance is within a tolerance, or None if
+        this never happens."""
         if not 0.0 < self.rate < 1.0:
             return None
         return max(1, math.ceil(math.log(max(1.0, self.share / tolerance)) / -math.log(self.rate)))
@@ -737,9 +756,9 @@ def _of_followers(scene: Scene, state: State) -> Floats:
 def decay_of(scene: Scene, exact: Floats) -> Decay:
     """Return the decay of the slowest mode that the start excites.
 
-    The mode is computed by inverse iteration, v ← A⁻¹ v with A = 1 - (step operator), from the
-    distance of the start from `exact`, (axis, follower). The share of the mode is the projection of
-    this distance onto it.
+    The mode is computed by inverse iteration, v ← A⁻¹ v with A = 1 - (step operator). The iteration
+    begins with the difference between the start and `exact`, (axis, follower). The share of the
+    mode is the projection of this difference onto the mode.
     """
     start = initial_state(scene)
     steps, resting = scene.experiment.steps, initial_state(scene)

@@ -1,4 +1,5 @@
-"""Cells of a lattice on the raster, and the cells around particles for the damage of bonds."""
+"""Cells of a lattice on the raster. The cells around each particle are also determined, because
+damage of bonds is stored by cell."""
 
 from __future__ import annotations
 
@@ -27,13 +28,13 @@ Share = NDArray[np.floating[Any]] | float
 CELLS_AT_ONCE = 65536
 """Number of cells processed together, which bounds the size of temporaries."""
 LEVEL = 1e-9
-"""Relative difference of height up to which two corners count as equally high."""
+"""Two corners count as equally high if their heights differ by at most this relative amount."""
 
 
 @lru_cache(maxsize=32)
 def tiling_of(cell: Cell, slots: Slots) -> Tiling:
-    """Compute the polygons of a plane lattice, each once for a repeat cell, and find those beside
-    each slot.
+    """Compute the polygons of a plane lattice, each of them once in a repeat cell, and find the
+    polygons on both sides of each slot.
 
     Returns
     -------
@@ -66,14 +67,15 @@ class Patch:
     whole: Mask
 
     def differences(self, u: NDArray[Any]) -> tuple[Vector, ...]:
-        """Return the differences u_k - u_0 of the corners, from planes u, (axis, sublattice, cell,
-        cell).
+        """Return the differences u_k - u_0 between the displacements of corner k and corner 0. `u`
+        is (axis, sublattice, cell, cell).
         """
         corners = [u[(slice(None), *block.slices())] for block in self.corners]
         return tuple(Vector(*(plane - corners[0])) for plane in corners)
 
     def bonds(self, slots: Slots) -> list[tuple[Block, Slot]]:
-        """Return the bonds between corners, each as the block of its starts and its slot."""
+        """Return the bonds between corners. Those along a slot are returned as the slot and the
+        block of places at which they start."""
         corners, bonds = self.polygon.corners, []
         for k, a in enumerate(corners):
             steps = {_step(a, b) for b in corners[k + 1 :]}
@@ -104,8 +106,8 @@ def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
 def _bands(raster: Raster, block: Block) -> Iterator[Block]:
     """Divide a block into bands of rows.
 
-    The cuts do not depend on the part of the lattice that a raster holds, because the order of sums
-    at a particle depends on them.
+    The cuts are the same whether a raster holds the whole lattice or a part of it. This is
+    necessary because the order in which contributions to a particle are added depends on the cuts.
     """
     (first, *start), (last, *stop) = block.start, block.stop
     step = max(1, CELLS_AT_ONCE // math.prod(raster.shape[2:]))
@@ -126,18 +128,18 @@ class WeighedCells:
         Area fraction of each cell inside the outline, 0 to 1, (kind, sublattice, cell, cell), at
         the place of its first corner. None if all cells are whole.
     weight
-        The area fraction times the ratio of the stiffness of the cell to that of the rule, 0 for
-        the cells in `mixed`.
+        Area fraction of each cell, times the ratio of the stiffness of the cell to the stiffness of
+        the rule; 0 for the cells in `mixed`.
     mixed
         Area fractions of the cells with a stiffness that is not proportional to that of the rule,
         one array for each stiffness.
     weights
         Weights of the rule by slot, for each stiffness of `mixed`.
     phase
-        Number of the material of each cell, -1 for a cell of several materials. None if there is
-        one material.
+        Number of the material of each cell, and -1 for a cell that contains several materials. None
+        if there is only one material.
     names
-        Names of the components of the stiffnesses, one each.
+        Name of the component of stiffness that each of the stiffnesses stands for.
     """
 
     tiling: Tiling
@@ -149,7 +151,7 @@ class WeighedCells:
     names: tuple[str, ...] = ()
 
     def restrict(self, to: Restriction) -> WeighedCells:
-        """Return the cells of some rows."""
+        """Return the cells restricted to some rows."""
         share = None if self.share is None else to.cut(self.share)
         is_shared = share is not None and self.weight is self.share
         return replace(
@@ -180,20 +182,21 @@ class WeighedCells:
         precision
             Floating-point type of the result.
         shares
-            Area fractions, which replace the weights.
+            Area fractions that are used in place of the weights.
 
         Returns
         -------
         tuple
-            Weights on the left and on the right; the number 1 if all are 1.
+            Weights on the left and on the right. If all weights on a side are 1, the number 1 is
+            returned for it.
         """
         return self.beside_each([slot], where, precision, shares)[0]
 
     def beside_each(
         self, slots: Iterable[Slot], where: Where, precision: str, shares: Floats | None = None
     ) -> list[tuple[Share, Share]]:
-        """Return the weights to the left and right of several slots. A cell beside two of the slots
-        is returned as one shared array."""
+        """Return the weights to the left and right of several slots. If the cells beside two of the
+        slots are the same, they are returned as the same array."""
         values = self.weight if shares is None else shares
         sides = [side for slot in slots for side in self.tiling.beside[slot]]
         cells = {(side.kind, side.first): side for side in sides}
@@ -222,7 +225,8 @@ def whole_cells(raster: Raster, tiling: Tiling) -> WeighedCells:
 
 
 def _within(raster: Raster, polygon: CellPolygon) -> Block | None:
-    """Return the block of first corners in the body with all other corners on the raster."""
+    """Return the block of places in the body at which the first corner of a cell can lie, so that
+    all other corners lie on the raster."""
     block = raster.body_block(polygon.source)
     if not block:
         return None
@@ -236,7 +240,7 @@ def _within(raster: Raster, polygon: CellPolygon) -> Block | None:
 def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[CellPolygon]:
     """Return the polygons with the first corner of sublattice `source`, counterclockwise.
 
-    Corners that are neighbours have exactly the rest offsets of the slots.
+    If two corners are neighbours, their distance vector is exactly the rest offset of the slot.
     """
     exact = {(slot.target, slot.cell): slot.rest for slot in slots}
     around = [replace(offset, rest=exact.get((offset.target, offset.cell), offset.rest))
@@ -257,7 +261,8 @@ def _is_ahead(r: Vector[float]) -> bool:
 
 
 def _beside(polygons: tuple[CellPolygon, ...], slots: Slots) -> dict[Slot, tuple[Side, Side]]:
-    """Return the cells beside every slot; empty unless neighbours are corners of simple cells."""
+    """Return the cells beside every slot. The result is empty unless all neighbours of a particle
+    are corners of its cells, and all cells are triangles or parallelograms."""
     all_slots = (slot for ends in slots for slot in ends)
     slot_of = {(slot.source, slot.target, slot.cell): slot for slot in all_slots}
     left: dict[Step, Side] = {}
@@ -305,13 +310,13 @@ def _reach(cell: Cell) -> float:
 
 
 def _around_the_origin(x: Floats) -> Iterator[list[int]]:
-    """Generate the polygons that meet at the origin, counterclockwise. Each is given by its other
-    corners, which are among x.
+    """Generate the polygons that meet at the origin, counterclockwise. A polygon is given by its
+    corners other than the origin, which are among x.
 
     x are the surrounding sites, sorted by distance; the nearest site is always a corner. The
-    polygons are those of the Delaunay tessellation: among the sites q to the left of a side (0, p),
-    the corners of its polygon are those at which the side subtends the largest angle, with the
-    cotangent q·(q - p) / p×q.
+    polygons are those of the Delaunay tessellation. Consider a side from 0 to p, and the sites q to
+    the left of it. The side is seen from q under an angle with the cotangent q·(q - p) / p×q. The
+    corners of the polygon to the left of the side are the sites q with the largest angle.
     """
     side = 0
     for _ in range(len(x)):
@@ -347,9 +352,11 @@ class CellBond:
     slot
         Slot of the plane.
     home
-        Slot of the neighbour at which the bond is stored; None for the particle itself.
+        Slot from the particle to the neighbour at which the bond is stored; None if the bond is
+        stored at the particle itself.
     on_left, on_right
-        Whether the cell lies to the left and to the right of the bond; both for a diagonal.
+        Whether the cell lies to the left, or to the right, of the bond; both are true if the bond
+        is a diagonal of the cell.
     """
 
     plane: int
@@ -360,7 +367,7 @@ class CellBond:
 
     @property
     def side(self) -> int:
-        """Side of the bond on which the cell lies: 0 for left or both, 1 for right."""
+        """Side of the bond on which the cell lies: 0 for left or for both sides, 1 for right."""
         return 0 if self.on_left else 1
 
 
@@ -368,8 +375,8 @@ class CellBond:
 class CellsAround:
     """Bonds of the cells around the particles of a sublattice.
 
-    `cells` contains the bonds of each cell, and `beside` the indices of the cells to the left and
-    right of each slot.
+    `cells` contains the bonds of each cell, and `beside` contains for each slot the indices of the
+    cells to its left and right.
     """
 
     cells: tuple[tuple[CellBond, ...], ...]
@@ -393,7 +400,8 @@ def cells_around(
     Returns
     -------
     tuple
-        One entry for each sublattice; empty unless neighbours are the corners of the cells.
+        One entry for each sublattice. The result is empty unless all neighbours of a particle are
+        corners of its cells.
     """
     return tuple(_around(tiling, ends, planes) for ends in slots) if tiling.beside else ()
 

@@ -1,8 +1,9 @@
 """Fill the outline of a body with sites, frame points, whole cells and cut cells.
 
 A cut cell is weighted by the fraction of its area inside the outline. Cells that would connect the
-two sides of a narrow void are omitted: these are cells with a disconnected inside and, at a
-particle in the void, the cells of all sides but one.
+two sides of a narrow void are omitted. These are, first, cells in which the region inside the
+outline is disconnected. Second, if a particle lies in the void, the cells around it are connected
+only on the same side of the void; the cells of one side are kept, and the others are omitted.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ from pbdkit.plugin import Cell, Lattice, Vector
 from pbdkit.plugin.lattice import CellPolygon, Index, Offset, Tiling
 
 Lines = tuple[int, int]
-"""Type of a range of lines of sites: indices i from the first to below the second."""
+"""Type of a range of lines of sites. It contains the indices i from the first number to the second,
+which is excluded."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Filling:
         Area fractions of the cells inside the outline, at the site of their first corner, (kind, i,
         j). None if cells are not weighted.
     left_out
-        Sites of the first corners of the cells omitted at narrow voids, (cell, axis).
+        Cells omitted at narrow voids, given by the sites of their first corners, (cell, axis).
     """
 
     body: Mask
@@ -66,14 +68,15 @@ class Filling:
 
     @property
     def box(self) -> tuple[Index, Index] | None:
-        """Smallest window of site indices with all particles of the body, (low, high), or None."""
+        """Smallest window of site indices that contains all particles of the body, (low, high).
+        None if there is no particle."""
         if not (ends := bounds(self.body)):
             return None
         low, high = (tuple(map(add, self.first, end)) for end in ends)
         return low, high
 
     def left_out_on(self, lines: Lines | None = None) -> LeftOut:
-        """Return the cells omitted at narrow voids, with the first corner on the lines."""
+        """Return those cells omitted at narrow voids that have their first corner on the lines."""
         if self.left_out is None:
             return LeftOut()
         line = self.left_out[:, 0]
@@ -81,7 +84,7 @@ class Filling:
         return LeftOut.of(self.left_out[(line >= low) & (line < high)])
 
     def within(self, low: Index, high: Index) -> Filling:
-        """Return the part of the filling from site `low` to below `high`."""
+        """Return the part of the filling from site `low` to `high`, which is excluded."""
         ends = (
             [n - first for n, first in zip(end, self.first, strict=True)] for end in (low, high)
         )
@@ -106,8 +109,8 @@ class Filling:
 def framed(lattice: Lattice, filling: Filling, layers: int) -> tuple[Index, NDArray[np.int8]]:
     """Compute the kind of each site of the body and of its frame.
 
-    The frame consists of every site within `layers` of index distance of the body that is not in
-    it.
+    The frame consists of the sites outside the body with an index distance of at most `layers` from
+    a site of the body.
 
     Returns
     -------
@@ -136,7 +139,8 @@ def build_raster(lattice: Lattice, low: Index, sites: NDArray[np.int8], reach: I
     sites
         Kind of each site, (i, j).
     reach
-        Number of repeat cells of padding along each axis, the reach of the slots.
+        Number of repeat cells along each axis by which the raster is padded: the reach of the
+        slots.
     """
     cell = lattice.cell()
     first = np.floor_divide(low, cell.period) - reach
@@ -150,12 +154,13 @@ def build_raster(lattice: Lattice, low: Index, sites: NDArray[np.int8], reach: I
 
 
 def sublattices_from(cell: Cell, low: Index, shape: Index) -> Indices:
-    """Return the sublattice of each site of a window from `low`; -1 at a hole."""
+    """Return the sublattice of each site of a window that begins at the site `low`; -1 for an index
+    without a site."""
     return _repeated(cell.sublattices, low, shape)
 
 
 def has_sites(cell: Cell, low: Index, shape: Index) -> Mask:
-    """Return a mask of the indices of a window from `low` that are sites."""
+    """Return a mask of the indices of a window, which begins at `low`, that are sites."""
     return _repeated(cell.sublattices >= 0, low, shape)
 
 
@@ -166,7 +171,7 @@ def _repeated(values: NDArray[Any], low: Index, shape: Index) -> NDArray[Any]:
 
 
 def dilated(mask: Mask, layers: int) -> Mask:
-    """Dilate a mask by `layers` places along each axis, diagonals included."""
+    """Dilate a mask by `layers` places along each axis, including the diagonal directions."""
     for axis in range(mask.ndim):
         result = mask.copy()
         target, source = np.moveaxis(result, axis, 0), np.moveaxis(mask, axis, 0)
@@ -178,8 +183,8 @@ def dilated(mask: Mask, layers: int) -> Mask:
 
 
 def window(body: Body, lattice: Lattice, lines: Lines | None = None) -> tuple[Index, Index]:
-    """Return the smallest and the largest site index that may belong to the body; with `lines`,
-    those within this range of the first index."""
+    """Return the smallest and the largest site index that may belong to the body. With `lines`, the
+    first index is restricted to this range."""
     low, high = hull(_indices(box, lattice) for box in body.boxes())
     if lines:
         first = max(low[0], lines[0])
@@ -189,7 +194,8 @@ def window(body: Body, lattice: Lattice, lines: Lines | None = None) -> tuple[In
 
 
 def sites_from(lattice: Lattice, low: Index, shape: Index) -> Sites:
-    """Return the indices of a window from the site `low`, and their positions."""
+    """Return the site indices of a window that begins at the site `low`, and the positions of the
+    sites."""
     index = [n + first for n, first in zip(np.indices(shape), low, strict=True)]
     cell = lattice.cell()
     at = positions(cell, *cells_of_sites(cell, *index))
@@ -231,7 +237,8 @@ def fill(body: Body, lattice: Lattice, lines: Lines | None = None) -> Filling:
 
 
 def tolerance_of(body: Body, lattice: Lattice) -> float:
-    """Return the distance up to which a site in the window of a body counts as on the outline."""
+    """Return the distance from the outline up to which a site in the window of a body counts as
+    lying on the outline."""
     corners = np.array([*product(*zip(*window(body, lattice), strict=True))]).T
     cell = lattice.cell()
     at = positions(cell, *cells_of_sites(cell, *corners))
@@ -239,7 +246,8 @@ def tolerance_of(body: Body, lattice: Lattice) -> float:
 
 
 def rounding_of(cell: Cell, *at: Floats) -> Floats:
-    """Return the distance up to which each point counts as on the outline."""
+    """Return, for each point, the distance from the outline up to which it counts as lying on the
+    outline."""
     farthest = np.maximum.reduce([np.abs(x) for x in at])
     minimum, rounding = 1e-9 * math.hypot(*cell.vectors[0]), 4 * np.finfo(float).eps
     return np.asarray(np.maximum(minimum, rounding * farthest))
@@ -248,16 +256,17 @@ def rounding_of(cell: Cell, *at: Floats) -> Floats:
 def has_narrow_slot(body: Mask, layers: int) -> bool:
     """Return whether two faces of the body are closer than the frame requires.
 
-    True if fewer than 2·layers + 1 empty sites lie between two faces in two adjacent lines, so that
-    frame points there belong to both faces.
+    The result is true if, in two adjacent lines, fewer than 2·layers + 1 empty sites lie between
+    two faces. Frame points between these faces then belong to both of them.
     """
     axes = range(body.ndim)
     return any(_narrow(np.moveaxis(body, axis, -1), 2 * layers + 1) for axis in axes)
 
 
 def _narrow(body: Mask, width: int) -> bool:
-    """Apply the criterion of `has_narrow_slot` along the last axis, to several lines at a time
-    together with the line after them."""
+    """Apply the criterion of `has_narrow_slot` along the last axis. Several lines are processed at
+    once. Each part also includes the first line of the next part, so that every pair of adjacent
+    lines is compared."""
     lines = max(1, CHUNK_ROWS // body[0].size)
     parts = (body[begin : begin + lines + 1] for begin in range(0, len(body), lines))
     return any(_narrow_lines(part, width) for part in parts)
@@ -280,7 +289,7 @@ def _indices(box: Box, lattice: Lattice) -> tuple[Index, Index]:
     corners = product(*zip(box.low, box.high, strict=True))
     points = np.array(list(corners)) - lattice.origin
     cells = np.linalg.solve(np.array(cell.vectors).T, points.T)
-    # A basis site lies up to one cell from the corner of its repeat cell.
+    # A basis site can lie up to one cell away from the corner of its repeat cell.
     low = [(math.floor(n.min()) - 1) * p for n, p in zip(cells, cell.period, strict=True)]
     high = [(math.ceil(n.max()) + 2) * p - 1 for n, p in zip(cells, cell.period, strict=True)]
     return tuple(low), tuple(high)
@@ -289,40 +298,45 @@ def _indices(box: Box, lattice: Lattice) -> tuple[Index, Index]:
 Window = tuple[slice, ...]
 """Type of a window of an array."""
 FINE = 8
-"""Number of parts along each edge of a triangle in a cut cell; the outline is straight in each."""
+"""Number of parts into which each edge of a triangle in a cut cell is divided. The outline is
+assumed to be straight in each of the small triangles."""
 SITES_AT_ONCE = 2**18
-"""Number of sites processed together, in whole lines, which bounds the size of temporaries."""
+"""Number of sites that are processed together, rounded to whole lines. It limits the size of
+temporary arrays."""
 CELLS_AT_ONCE = 512
 """Number of cut cells processed together, so that memory does not grow with the body."""
 NEAREST = 0.6
-"""Largest distance between an outline that crosses a cell and the nearest corner of the cell,
-relative to the width of the cell.
+"""Upper bound on the distance between an outline that crosses a cell and the nearest corner of the
+cell, relative to the width of the cell.
 
 No point of a triangle is farther from its nearest corner than 1/√3 of the longest side."""
 MIN_SHARE = 0.02
-"""Area fraction below which a cell is omitted: corners on a sliver of the body have almost no
-stiffness, and their displacements are not representative of it."""
+"""Area fraction below which a cell is omitted. If only a sliver of a cell belongs to the body, its
+corners have almost no stiffness, and their displacements do not represent the displacement of the
+body."""
 CURVATURE_TOLERANCE = 1e-3
-"""Deviation from linearity above which a triangle is divided, relative to its width.
+"""Deviation of the signed distance from linearity, relative to the width of a triangle, above which
+the triangle is divided.
 
-The distance is not linear at a corner of the outline, or between two sides of it."""
+The distance is not linear near a corner of the outline, or between two sides of the outline."""
 MAX_HALVINGS = 8
 """Maximum number of subdivisions of triangles in which the distance is not linear."""
 FAR = 1e100
 """Finite substitute for infinite distances, such as those from bodies of given sites, so that
 differences of distances are defined."""
 KINK = 1 / 32
-"""Change of slope of the signed distance along a side of a cell above which more than one line of
-the outline may cross the cell."""
+"""If the slope of the signed distance changes by more than this along a side of a cell, more than
+one line of the outline may cross the cell."""
 FINER = 2 * FINE
-"""Number of parts along each edge of a triangle in a cell that may have several parts."""
+"""Number of parts into which each edge of a triangle is divided, for cells in which the region
+inside the outline may be disconnected."""
 NOTICEABLE_SHARE = 0.1
-"""Area fraction above which cells omitted at a void are counted. Smaller ones also occur in the
-corners of wide voids and are as negligible as those below `MIN_SHARE`."""
+"""Area fraction above which cells that are omitted at a void are counted. Smaller cells are also
+omitted in the corners of wide voids, and are as negligible as cells below `MIN_SHARE`."""
 INWARD = 1e-3
 """Fraction by which points on the border of a cell are moved towards its centre."""
 NEAR_END = 1 / 64
-"""Fraction of a segment at either end that is not searched for a void."""
+"""Fraction of the length of a segment that is not searched for a void at each of its ends."""
 TIE_RTOL = 1e-9
 """Relative difference up to which the areas of two groups of cells count as equal."""
 
@@ -330,13 +344,13 @@ TIE_RTOL = 1e-9
 def fill_with_cells(
     body: Body, lattice: Lattice, tiling: Tiling, lines: Lines | None = None
 ) -> Filling:
-    """Find the cells that lie partly or wholly inside the outline. The body consists of all their
-    corners.
+    """Find the cells that lie partly or wholly inside the outline. The body consists of all corners
+    of these cells.
 
     Parameters
     ----------
     body
-        The outline. A body of given sites has the whole cells between these.
+        The outline. If the body is given by its sites, it has the whole cells between these sites.
     lattice
         The lattice.
     tiling
@@ -359,8 +373,9 @@ def fill_with_cells(
     share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *shape))
     corner, line_count = np.zeros(shape, bool), max(1, SITES_AT_ONCE // math.prod(shape[1:]))
     tolerance, left_out = tolerance_of(body, lattice), []
-    # A particle depends on its cells, these on cells that share a corner with them, and these on
-    # the distance at their corners.
+    # Whether a particle belongs to the body depends on its cells. Whether these are omitted depends
+    # on the cells that share a corner with them, and the area fractions of those depend on the
+    # distance from the outline at their corners.
     padding = max(2 * margin, 4 * _reach_of(tiling))
     for begin in range(low[0], high[0], line_count):
         end = min(begin + line_count, high[0])
@@ -376,7 +391,8 @@ def fill_with_cells(
 
 
 def margin_of(tiling: Tiling) -> int:
-    """Return the maximum number of sites around an outline that belong to cells that it cuts."""
+    """Return the maximum number of layers of sites outside an outline that belong to cells cut by
+    it."""
     corners = (corner for polygon in tiling.polygons for corner in polygon.corners)
     return max(2, *(abs(n) for corner in corners for n in corner.site))
 
@@ -387,7 +403,8 @@ def _reach_of(tiling: Tiling) -> int:
 
 
 class _Cutter:
-    """Compute the signed distance at the sites of a window, and the shares of cells."""
+    """Compute the signed distance from the outline at the sites of a window, and the shares of
+    cells. The share of a cell is the fraction of its area inside the outline."""
 
     def __init__(
         self, body: Body, lattice: Lattice, low: Index, high: Index, tolerance: float
@@ -400,14 +417,14 @@ class _Cutter:
         self._distance = self._signed(sites)
 
     def connected(self, tiling: Tiling) -> tuple[list[Floats], Mask, Indices]:
-        """Compute the shares of cells without those that would connect two sides of a void.
+        """Compute the shares of cells. Cells that would connect two sides of a void are omitted.
 
         Returns
         -------
         tuple
-            Shares of the cells of each shape, at the place of their first corner; mask of the
-            places that are corners of cells; sites of the first corners of the large cells omitted,
-            (cell, axis).
+            Three results. The shares of the cells of each shape, at the place of their first
+            corner. A mask of the places that are corners of cells. The sites of the first corners
+            of omitted cells with a noticeable share, (cell, axis).
         """
         parts = [self._shares(polygon) for polygon in tiling.polygons]
         shares, left_out = [share for share, _ in parts], [places for _, places in parts]
@@ -432,7 +449,8 @@ class _Cutter:
         return marked
 
     def first_corners(self, polygon: CellPolygon) -> Window:
-        """Return the part of the window where all corners of a cell lie in the window."""
+        """Return the part of the window in which the first corner of a cell can lie, so that all
+        corners lie in the window."""
         steps = [corner.site for corner in polygon.corners]
         low, high = np.min(steps, axis=0), np.max(steps, axis=0)
         return tuple(map(slice, -low, np.array(self.shape) - high))
@@ -444,7 +462,8 @@ class _Cutter:
         -------
         tuple
             Shares at the place of the first corner, 0 where there is no cell; and the places,
-            (cell, axis), of the large cells that are omitted because their inside is disconnected.
+            (cell, axis), of cells with a noticeable share that are omitted because the region
+            inside the outline is disconnected in them.
         """
         steps, first_corners = (
             [corner.site for corner in polygon.corners],
@@ -479,11 +498,12 @@ class _Cutter:
         return whole, large + low
 
     def _bridges(self, tiling: Tiling, shares: list[Floats], corners: Mask) -> list[Indices]:
-        """Find the cells that are connected to others only by a particle outside the outline.
+        """Find the cells that are connected to other cells only by a particle outside the outline.
 
         Around such a particle two neighbouring cells are connected if part of the edge between them
-        is inside. Only the connected group with the largest area is retained. If several groups are
-        largest, none is retained, so that mirror images of a body remain mirror images.
+        is inside. Of the connected groups of cells around the particle, only the group with the
+        largest area is retained. If several groups have the largest area, none is retained;
+        otherwise mirror images of a body would not have mirror images of its cells.
 
         Returns
         -------
@@ -499,7 +519,7 @@ class _Cutter:
             share = np.array(
                 [_values(shares[n], at - tiling.polygons[n].corners[k].site) for n, k in around]
             )
-            # The edge between a cell and its predecessor, counterclockwise.
+            # The edge between a cell and the previous cell, counterclockwise.
             ends = [
                 np.subtract(_next(tiling.polygons[n], k).site, tiling.polygons[n].corners[k].site)
                 for n, k in around
@@ -518,11 +538,11 @@ class _Cutter:
         return [_distinct_rows(np.concatenate(places)) for places in bridges]
 
     def _joined(self, start: Indices, end: Indices) -> Mask:
-        """Return whether edges that start at places outside the outline end inside or on it,
-        (place,).
+        """Return whether edges that start at places outside the outline end inside the outline or
+        on it, (place,).
 
-        An end on the outline does not count if it is the tip of a void with less than a right
-        angle.
+        An end on the outline does not count if it is the tip of a void with an angle of less than
+        90°.
         """
         near, far = _values(self._distance, start), _values(self._distance, end)
         is_in_window = ((end >= 0) & (end < self.shape)).all(axis=1)
@@ -561,12 +581,13 @@ def shares_inside(
     Returns
     -------
     tuple
-        Shares, (cell,); and mask of the cells in which the outline may be more than one straight
-        line or a wide arc.
+        Shares, (cell,); and a mask of the cells in which the outline may be something other than
+        one straight line or a wide arc.
 
     Notes
     -----
-    A cell is divided into triangles, and these into small ones on which the distance is linear.
+    A cell is divided into triangles, and the triangles into small triangles on which the distance
+    is assumed to be linear.
     """
     points, small = _points_within(x, y)
     distance = np.clip(signed(*points), -FAR, FAR)
@@ -586,7 +607,7 @@ def shares_inside(
 
 
 def has_pieces(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats) -> Mask:
-    """Return whether the inside of cells is disconnected.
+    """Return whether the region inside the outline is disconnected in each cell.
 
     Parameters
     ----------
@@ -605,8 +626,8 @@ def has_pieces(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats)
     next_border, next_distance = np.roll(border, -1, axis=1), np.roll(distance, -1, axis=0)
     inside = distance <= 0.0
     is_separated = _is_separated(signed, border, next_border, distance, next_distance)
-    # If the inside is connected and has no holes, its part of the border of the cell is a single
-    # run, which includes the points next to each corner that lies inside.
+    # If the region inside the outline is connected and has no holes, its points on the border of
+    # the cell are consecutive. They include the points next to each corner that lies inside.
     runs = (inside & (next_distance > 0.0)).sum(axis=0)
     is_isolated = (signed(x, y) <= 0.0) & ~inside[::FINER]
     (candidates,) = np.nonzero((runs > 1) | is_separated.any(axis=0) | is_isolated.any(axis=0))
@@ -617,7 +638,8 @@ def has_pieces(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats)
 
 
 def _is_disconnected(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats) -> Mask:
-    """Return whether the inside of cells is disconnected, by components of a mesh of each cell."""
+    """Return whether the region inside the outline is disconnected in cells. The connected
+    components of a mesh of each cell are determined."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -629,7 +651,8 @@ def _is_disconnected(signed: Callable[[Floats, Floats], Floats], x: Floats, y: F
     joined = inside[a] & inside[b]
     joined &= ~_is_separated(signed, points[:, a], points[:, b], distance[a], distance[b])
     place = np.arange(inside.size).reshape(inside.shape)
-    # Slivers along a side, and outlines on it, connect its corners.
+    # If a sliver of the body, or the outline, lies along a side of the cell, the corners of this
+    # side are connected.
     corner = place[: len(x)]
     slivers = _along_sides(signed, x, y)
     links = tuple(
@@ -640,7 +663,8 @@ def _is_disconnected(signed: Callable[[Floats, Floats], Floats], x: Floats, y: F
     _, label = connected_components(graph, directed=False)
     label = label.reshape(inside.shape)
     count = np.bincount(label[distance < 0.0], minlength=label.max() + 1)
-    # Components of points on the outline do not count, unless these are corners.
+    # Components that consist of points on the outline do not count, unless the points are corners
+    # of the cell.
     piece = inside & (count[label] > 0)
     piece[: len(x)] |= inside[: len(x)]
     high, low = (np.where(piece, label, at) for at in (-1, len(count)))
@@ -651,8 +675,8 @@ def _along_sides(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Float
     """Return whether sides of cells, from each corner to the next, are connected inside the
     outline.
 
-    Such a side lies inside, or on the outline near one of its ends, and no tip of a void touches
-    it.
+    A connected side lies inside the outline, except that it may lie on the outline near one of its
+    ends. No tip of a void touches it.
     """
     a = np.stack([x, y])
     part = np.arange(FINER + 1)[:, None, None] / FINER
@@ -677,10 +701,10 @@ def _is_separated(
 ) -> Mask:
     """Return whether a void lies between points a and b inside the outline, (axis, ...).
 
-    `near` and `far` are the signed distances at a and b. A few points between them are tested. One
-    of them divides the segment in proportion to the distances: if the void has parallel sides and
-    no other outline is nearer, this point lies in the void, however narrow it is. With `touching`
-    the outline counts as void.
+    `near` and `far` are the signed distances at a and b. A few points between a and b are tested.
+    One of these points divides the segment in the ratio of the two distances. If the void has
+    parallel sides and no other outline is nearer, this point lies in the void even if the void is
+    very narrow. With `touching`, points on the outline count as points in the void.
     """
     total = np.abs(near) + np.abs(far)
     candidates = (near <= 0.0) & (far <= 0.0) & (total < np.hypot(*(b - a)))
@@ -701,7 +725,8 @@ def _between(a: Floats, b: Floats, part: Floats) -> Floats:
 
 
 def _cells_around(tiling: Tiling, source: int) -> list[tuple[int, int]]:
-    """Return (polygon, corner) of the cells around a site of a sublattice, counterclockwise."""
+    """Return the cells around a site of a sublattice, counterclockwise. Each is given by its
+    polygon and by the corner at which the site lies."""
     cells = [
         (n, k)
         for n, polygon in enumerate(tiling.polygons)
@@ -739,7 +764,7 @@ def _values(plane: NDArray[Any], at: Indices) -> NDArray[Any]:
 def _group_count(exists: Mask, joined: Mask) -> Indices:
     """Count the connected groups of cells around particles, (cell, particle).
 
-    `joined` marks cells that are connected to their predecessor.
+    `joined` marks cells that are connected to the previous cell.
     """
     links = exists & np.roll(exists, 1, axis=0) & joined
     count = exists.sum(axis=0) - links.sum(axis=0)
@@ -747,7 +772,8 @@ def _group_count(exists: Mask, joined: Mask) -> Indices:
 
 
 def _smaller_groups(share: Floats, joined: Mask) -> Mask:
-    """Return a mask of the cells around particles, (cell, particle), outside the largest group."""
+    """Return a mask, (cell, particle), of the cells around particles that do not belong to the
+    largest connected group."""
     exists = share > 0.0
     links = exists & np.roll(exists, 1, axis=0) & joined
     number = np.broadcast_to(np.arange(len(share))[:, None], share.shape).copy()
@@ -772,23 +798,25 @@ def cut_by_border(
     Parameters
     ----------
     signed
-        Signed distance from the outline as a function of coordinates, at most the distance from the
-        outline unless it `exaggerates`.
+        Signed distance from the outline as a function of coordinates. Its magnitude must not be
+        larger than the distance from the outline, unless `exaggerates` is true.
     x, y
         Corners of the cells, (corner, cell).
     exaggerates
-        Whether the signed distance can exceed the distance from the outline.
+        Whether the magnitude of the signed distance can be larger than the distance from the
+        outline.
 
     Returns
     -------
     tuple
-        Shares, (cell,); and the integral of n nᵀ over the outline in each cell with its normals n,
-        (cell, 2, 2). Both sides of a thin layer contribute alike.
+        Shares, (cell,); and the integral of n nᵀ over the outline in each cell, (cell, 2, 2), where
+        n is the normal of the outline. Both sides of a thin layer make the same contribution to the
+        integral.
 
     Notes
     -----
-    As in `shares_inside`, but triangles in which the distance is not linear are divided further, so
-    that layers far thinner than a cell are resolved.
+    The method is that of `shares_inside`, but triangles in which the distance is not linear are
+    divided further. For this reason layers that are far thinner than a cell are resolved.
     """
     points, small = _points_within(x, y)
     distance, count = signed(*points)[small], len(small) * points[0].shape[1]
@@ -826,10 +854,11 @@ def cut_by_border(
 
 
 def _across(at: Floats, distance: Floats) -> Floats:
-    """Return the straight pieces of an outline in triangles, rotated by a right angle, (axis,
-    triangle).
+    """Return the segments of an outline in triangles, rotated by a right angle, (axis, triangle).
+    In a triangle the outline is a straight segment.
 
-    `at` is (axis, corner, triangle). The result is 0 where no outline crosses a triangle.
+    `at` is (axis, corner, triangle). The result is 0 for a triangle that the outline does not
+    cross.
     """
     inside = distance < 0.0
     odd = np.where(inside.sum(axis=0) == 1, inside, ~inside)
@@ -845,7 +874,7 @@ def _across(at: Floats, distance: Floats) -> Floats:
 
 
 def _in_four(at: Floats) -> Floats:
-    """Divide each triangle, (axis, corner, triangle), into four of half its size."""
+    """Divide each triangle, (axis, corner, triangle), into four triangles of half its width."""
     a, b, c = at.swapaxes(0, 1)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     corners = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
@@ -853,7 +882,8 @@ def _in_four(at: Floats) -> Floats:
 
 
 def _points_within(x: Floats, y: Floats) -> tuple[tuple[Floats, Floats], Indices]:
-    """Return the points of the triangles in cells, and the points of each small triangle.
+    """Return the points into which cells are divided, and for each small triangle the indices of
+    its points.
 
     Points are (x, y), each (point, triangle, cell), for cells with corners (corner, cell).
     """
@@ -882,7 +912,7 @@ def _width(polygon: CellPolygon) -> float:
 def _sides(n: int) -> tuple[Indices, Indices]:
     """Return indices of the points along the sides of a cell with n corners.
 
-    They are (point, triangle), each (side, point).
+    The indices are a pair (point, triangle); both arrays are (side, point).
     """
     weights, _ = _small_triangles()
     _, k, m = (weights.T * FINE).round().astype(int).tolist()
@@ -904,7 +934,8 @@ def _mesh(n: int) -> tuple[Floats, Indices]:
     -------
     tuple
         Weights of the corners at each point, (point, corner); points at the ends of each edge,
-        (edge, end). The first points are the corners; all others are moved inward slightly.
+        (edge, end). The first points are the corners of the cell. All other points on the border
+        are moved slightly inward.
     """
     fine, small = _small_triangles(FINER)
     corners = np.concatenate([np.eye(n), np.full((1, n), 1 / n)])
@@ -925,14 +956,15 @@ def _mesh(n: int) -> tuple[Floats, Indices]:
 def _inward(weights: Floats) -> Floats:
     """Move points slightly towards the centre of a cell, given the weights of the corners.
 
-    Parts that are connected only along the border of a cell are not connected in its interior.
+    As a result, parts of the body that are connected only along the border of a cell do not count
+    as connected in its interior.
     """
     return np.asarray((1.0 - INWARD) * weights + INWARD / weights.shape[-1])
 
 
 @cache
 def _small_triangles(fine: int = FINE) -> tuple[Floats, Indices]:
-    """Divide a triangle into small ones.
+    """Divide a triangle into small triangles.
 
     Returns
     -------
@@ -954,8 +986,8 @@ def _small_triangles(fine: int = FINE) -> tuple[Floats, Indices]:
 
 
 def _negative_share(a: Floats, b: Floats, c: Floats) -> Floats:
-    """Return the share of triangles in which a linear function is negative, given its corner
-    values.
+    """Return the fraction of the area of triangles in which a linear function is negative, given
+    the values of the function at the corners.
     """
     small, large = np.minimum(a, b), np.maximum(a, b)
     low, middle = np.minimum(small, c), np.maximum(small, np.minimum(large, c))

@@ -1,5 +1,5 @@
-"""Neighbours of every sublattice, as constant slots in exactly opposite pairs, and the bonds
-between particles.
+"""Neighbours of every sublattice, and the bonds between particles. Neighbours are given by constant
+slots, which occur in exactly opposite pairs.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.lattice import Index, Tiling
 
 MIN_FLATNESS = 1e-3
-"""Smallest accepted flatness of a cell. With one site in a cell, about π/flatness sites are closer
-to a site than the length of the longest cell vector."""
+"""Smallest accepted flatness of a cell, as defined by `flatness`. If a cell has one site, about
+π/flatness sites lie within the length of the longest cell vector of a site."""
 COINCIDENCE_RTOL = 1e-9
-"""Distance up to which two sites coincide, relative to the first cell vector."""
+"""Distance, relative to the length of the first cell vector, up to which two sites are regarded as
+coincident."""
 BARYCENTRE_RTOL = 1e-9
-"""Distance of a site from the barycentre of its neighbours, relative to their distance, up to which
-both coincide."""
+"""A site is regarded as the barycentre of its neighbours if its distance from the barycentre,
+relative to the distance of the neighbours, is at most this number."""
 
 
 @dataclass(frozen=True)
 class BondPlane:
-    """Bonds along one slot and its opposite, stored on the source sublattice of the slot."""
+    """Bonds along one slot and the opposite slot. They are stored at the source sublattice of the
+    slot."""
 
     slot: Slot
     opposite: Slot
@@ -49,9 +51,9 @@ class Neighbourhood:
     cell
         Repeat cell of the lattice.
     slots
-        Neighbours of each sublattice, by shell, with opposite slots side by side.
+        Slots of the neighbours of each sublattice, sorted by shell. Opposite slots are adjacent.
     planes
-        Pairs of opposite slots, each once.
+        Pairs of opposite slots; no pair occurs twice.
     """
 
     cell: Cell
@@ -60,13 +62,13 @@ class Neighbourhood:
 
     @cached_property
     def tiling(self) -> Tiling:
-        """Cells of the lattice, and which of them lie beside the slots."""
+        """Cells of the lattice, with the cells on both sides of each slot."""
         return tiling_of(self.cell, self.slots)
 
     @cached_property
     def cells_around(self) -> tuple[CellsAround, ...]:
-        """Cells around the particles of each sublattice; empty unless neighbours are corners of
-        cells.
+        """Cells around the particles of each sublattice. Empty unless all neighbours of a particle
+        are corners of its cells.
         """
         return cells_around(self.tiling, self.slots, [plane.slot for plane in self.planes])
 
@@ -77,18 +79,18 @@ class Neighbourhood:
 
     @property
     def reach(self) -> int:
-        """Largest difference of site index, max(|Δi|, |Δj|)."""
+        """Largest difference, max(|Δi|, |Δj|), between the site indices of two neighbours."""
         return max(abs(n) for slot in self.every for n in slot.site)
 
     @property
     def reach_in_cells(self) -> Index:
-        """Largest difference of repeat cell along each axis."""
+        """Largest difference, along each axis, between the repeat cells of two neighbours."""
         return tuple(np.abs([slot.cell for slot in self.every]).max(axis=0).tolist())
 
     @cached_property
     def home(self) -> dict[Slot, tuple[int, bool]]:
-        """Plane that stores the bonds of each slot, and whether they are stored at the start of the
-        slot."""
+        """Plane in which the bonds along each slot are stored, and whether a bond is stored at the
+        particle at which the slot starts."""
         ends = enumerate(self.planes)
         return {slot: (n, slot is p.slot) for n, p in ends for slot in (p.slot, p.opposite)}
 
@@ -101,7 +103,7 @@ class Neighbourhood:
         return tuple((-cells.min(axis=0)).tolist()), tuple(cells.max(axis=0).tolist())
 
     def shells(self) -> list[list[float]]:
-        """Return the rest lengths of each shell, from the first shell."""
+        """Return the rest lengths of the slots of each shell, beginning with the first shell."""
         lengths: list[list[float]] = [[] for _ in range(max(slot.shell for slot in self.every))]
         for slot in self.every:
             lengths[slot.shell - 1].append(math.hypot(*slot.rest))
@@ -117,7 +119,8 @@ class Neighbourhood:
         return float(2.0 ** round(math.log2(min(map(min, self.shells())))))
 
     def spans_space(self) -> bool:
-        """Return whether bonds point in all directions of space; otherwise rows are not coupled."""
+        """Return whether the directions of the bonds span the space. Otherwise the lattice has rows
+        that are not coupled to each other."""
         rests = np.array([slot.rest for slot in self.every])
         directions = rests / np.linalg.norm(rests, axis=1)[:, None]
         return bool(np.linalg.matrix_rank(directions, tol=1e-9) == self.cell.axes)
@@ -167,10 +170,11 @@ def checked_cell(lattice: Lattice) -> Cell:
 
 
 def flatness(cell: Cell) -> float:
-    """Return the area of a cell relative to the largest possible area.
+    """Return the area of a cell, multiplied by the number of its sites and divided by the area of a
+    square with the length of the longest cell vector as its side.
 
-    It is sites · area / (longest vector)², which for one site and vectors of equal length is the
-    sine of their angle; in space it is the volume relative to that of a cube.
+    For one site and vectors of equal length the result is the sine of their angle. In space the
+    volume of the cell is divided by the volume of a cube.
     """
     scaled = np.array(cell.vectors) / max(math.hypot(*v) for v in cell.vectors)
     return len(cell.sites) * abs(float(np.linalg.det(scaled)))
@@ -207,7 +211,8 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
 def _refuse_unbalanced(slots: tuple[Slot, ...], metric: NeighbourMetric) -> None:
     """Raise ExperimentError if a site is not the barycentre of its neighbours.
 
-    Neighbourhood can be mutual and not balanced if sites are not centres of inversion.
+    If sites are not centres of inversion, neighbourhood can be mutual although a site is not the
+    barycentre of its neighbours.
     """
     sums = [math.fsum(along) for along in zip(*(slot.rest for slot in slots), strict=True)]
     if math.hypot(*sums) > BARYCENTRE_RTOL * math.fsum(math.hypot(*slot.rest) for slot in slots):
@@ -244,7 +249,8 @@ class _ExactVectors:
     """Replace vectors that are equal or opposite within rounding by one value and its exact
     negative.
 
-    Sums over a body at rest then cancel exactly, independent of the magnitude.
+    Sums over the neighbours in a body at rest then cancel exactly, independent of the magnitude of
+    the vectors.
     """
 
     def __init__(self) -> None:
@@ -252,7 +258,8 @@ class _ExactVectors:
         self._near: dict[Index, int] = {}
 
     def of(self, v: Vector[float]) -> tuple[int, bool, Vector[float]]:
-        """Return the index of a stored vector, whether it is negated, and the exact value."""
+        """Return the index of the stored vector that v is equal or opposite to, whether v is
+        opposite to it, and the exact value of v."""
         if (number := self._near.get(self._key(v))) is not None:
             return number, False, self._known[number]
         if (number := self._near.get(self._key(-v))) is not None:
@@ -264,7 +271,8 @@ class _ExactVectors:
         return number, False, self._known[number]
 
     def _key(self, v: Vector[float]) -> Index:
-        """Return the place on a grid much coarser than rounding errors."""
+        """Return the point of a grid, the spacing of which is much larger than rounding errors, in
+        which v lies."""
         unit = 1e-6 * math.hypot(*(self._known[0] if self._known else v))
         return tuple(math.floor(component / unit) for component in v)
 
@@ -272,8 +280,9 @@ class _ExactVectors:
 def crosses(start: Vector, end: Vector, a: Vector, b: Vector) -> Mask:
     """Return whether each bond from `start` to `end` crosses the crack from a to b.
 
-    A particle exactly on the line of the crack counts to its left side, so that a crack along a row
-    of particles separates the row from those on its right. A bond that touches a tip is crossed.
+    A particle exactly on the line of the crack is treated as lying to the left of it. A crack along
+    a row of particles therefore separates this row from the particles on the right of the crack. A
+    bond that touches a tip of the crack counts as crossed.
     """
     is_separated = (_side(a, b, start) >= 0) ^ (_side(a, b, end) >= 0)
     return is_separated & (_side(start, end, a) * _side(start, end, b) <= 0)
@@ -296,8 +305,8 @@ def crossed_bonds(
     Yields
     ------
     tuple
-        Index of the plane, block of its bonds, and mask of those that cross, bonds to frame points
-        included.
+        Index of the plane, block of the bonds of the plane, and mask of the bonds that cross a
+        segment. Bonds to frame points are included.
     """
     # Positions on rasters are relative to site (0, 0) of the lattice.
     origin = Vector(*raster.lattice.origin[:2])
@@ -337,9 +346,10 @@ class BondTable:
 
 
 def plane_block(raster: Raster, plane: BondPlane, *, inside: bool = False) -> Block | None:
-    """Return the block of the starts of all bonds of a plane with an end in the body.
+    """Return the block of the places at which the bonds of a plane start that have at least one end
+    in the body.
 
-    With `inside`, only bonds with both ends in the body.
+    With `inside`, only bonds with both ends in the body are included.
     """
     forward = raster.body_block(plane.slot.source)
     target = raster.body_block(plane.slot.target)
@@ -353,7 +363,8 @@ def plane_block(raster: Raster, plane: BondPlane, *, inside: bool = False) -> Bl
 def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) -> Mask:
     """Return a mask of the places of a block where a bond starts.
 
-    Both ends are particles, at least one of them in the body; without `frame_too` both.
+    Both ends of a bond are particles, and at least one of them belongs to the body. Without
+    `frame_too` both ends have to belong to the body.
     """
     start = raster.kind[block.slices()]
     end = raster.kind[block.seen_through(plane.slot).slices()]
@@ -398,7 +409,8 @@ def _bonds_of_plane(
 def missing_segments(
     raster: Raster, neighbourhood: Neighbourhood, segments: Mapping[str, Segment]
 ) -> list[str]:
-    """Return a warning, with its field, for each segment that crosses no bond."""
+    """Return a warning for each segment that crosses no bond. The warning begins with the field of
+    the segment in the experiment."""
     return [
         f"{field}: it crosses no bond of the body; check its end points"
         for field, segment in segments.items()
@@ -411,8 +423,8 @@ def missing_segments(
 def setting_of(
     raster: Raster, neighbourhood: Neighbourhood, box: tuple[Vector[float], Vector[float]]
 ) -> Setting:
-    """Return the lattice context from which a rule may derive constants; `box` is that of the
-    body."""
+    """Return the lattice context from which a rule may derive constants. `box` is the bounding box
+    of the body."""
     lower, upper = (end.each(add, raster.lattice.origin) for end in box)
     cell, slots = raster.cell, neighbourhood.slots
     return Setting(cell, slots, lower, upper, neighbourhood.tiling)

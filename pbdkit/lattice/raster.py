@@ -1,6 +1,7 @@
-"""Particles on padded rasters, one for each sublattice, and blocks and lists of places on them.
+"""Particles on padded rasters, one raster for each sublattice. A block is a rectangle of places on
+a raster; lists of places are supported too.
 
-Rows of the particle table are in the order of the particle numbers.
+The rows of the particle table have the order of the particle numbers.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from pbdkit.plugin.vector import Vector, vector
 
 
 def distinct(numbers: NDArray[np.integer[Any]]) -> Indices:
-    """Return the distinct numbers, which are not negative, sorted.
+    """Return the distinct values of an array of nonnegative integers, sorted.
 
-    numpy.unique imports numpy.ma, which takes a tenth of the time of `check` for a small
-    experiment.
+    numpy.unique is not used, because it imports numpy.ma. This would take a tenth of the time of
+    `pbdkit check` for a small experiment.
     """
     ordered = np.sort(numbers).astype(np.intp, copy=False)
     return ordered[np.diff(ordered, prepend=-1) > 0]
@@ -53,14 +54,14 @@ class LeftOut:
         return cls(len(sites), min(map(tuple, sites.tolist()), default=None))
 
     def __add__(self, other: LeftOut) -> LeftOut:
-        """Add the numbers of cells, and keep the smaller of the first sites."""
+        """Add the numbers of cells, and take the smaller one of the two first sites."""
         sites = [cells.first for cells in (self, other) if cells.first]
         return LeftOut(self.count + other.count, min(sites, default=None))
 
 
 @dataclass(frozen=True)
 class Block:
-    """Rectangle of repeat cells of one sublattice, from `start` to below `stop`."""
+    """Rectangle of repeat cells of one sublattice, from `start` to `stop`, which is excluded."""
 
     sublattice: int
     start: Index
@@ -71,7 +72,8 @@ class Block:
         return (self.sublattice, *map(slice, self.start, self.stop))
 
     def seen_through(self, slot: Slot | Offset) -> Block:
-        """Return the block of the neighbours at a slot, or of the sites at an offset."""
+        """Return the block that contains, for each particle of this block, its neighbour along a
+        slot or the site at an offset from it."""
         start, stop = (tuple(map(add, end, slot.cell)) for end in (self.start, self.stop))
         return Block(slot.target, start, stop)
 
@@ -95,7 +97,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Places:
-    """Particles of one sublattice by their flat places on rasters of a shape.
+    """Particles of one sublattice, given by their flat places on rasters of the given shape.
 
     Has the methods of Block.
     """
@@ -116,7 +118,8 @@ class Places:
         return result
 
     def seen_through(self, slot: Slot | Offset) -> Places:
-        """Return the places of the neighbours at a slot, or of the sites at an offset."""
+        """Return, for each of the places, the place of its neighbour along a slot or of the site at
+        an offset from it."""
         return Places(self.shape, self.place + slot_step(self.shape, slot))
 
 
@@ -132,8 +135,8 @@ def bounds(mask: Mask) -> tuple[Index, Index] | None:
 
 
 def hull(boxes: Iterable[tuple[Sequence[Any], Sequence[Any]]]) -> tuple[Any, Any]:
-    """Return the smallest and the largest number along each axis over several (low, high), as
-    tuples.
+    """Return, as tuples, the smallest `low` and the largest `high` along each axis over several
+    boxes (low, high).
     """
     low, high = zip(*boxes, strict=True)
     return tuple(map(min, zip(*low, strict=True))), tuple(map(max, zip(*high, strict=True)))
@@ -151,9 +154,8 @@ Where = Block | Places
 
 
 def slot_step(shape: tuple[int, ...], slot: Slot | Offset) -> int:
-    """Return the difference of flat places on rasters between a particle and its neighbour at a
-    slot.
-    """
+    """Return the index offset from a particle to its neighbour along a slot, on flattened
+    rasters."""
     source = slot.source if isinstance(slot, Slot) else slot.target
     step = slot.target - source
     for size, cells in zip(shape[1:], slot.cell, strict=True):
@@ -172,9 +174,10 @@ class Stretch:
     Parameters
     ----------
     lines
-        First line, and end of the range.
+        First line of the range, and the line after the last one.
     low, high
-        Sites from `low` to below `high` contain the nearby particles of the body.
+        Range of site indices, `high` excluded, that contains the particles of the body on these
+        lines and near them.
     particle_offset
         Number of particles before the range.
     rows
@@ -205,8 +208,8 @@ class RowRange:
     own
         Range of the lines that belong to this process.
     framed
-        Range of the lines with the frame points for which this process determines the particles
-        that they follow.
+        Range of the lines with those frame points that this process assigns to the body particles
+        they follow.
     """
 
     stretch: Stretch
@@ -225,19 +228,19 @@ FRAME = 2
 NOWHERE = np.iinfo(np.int64).max
 """Site index larger than any that occurs."""
 CHUNK_ROWS = 65536
-"""Number of table rows processed together, which bounds the size of temporaries."""
+"""Number of table rows that are processed together. It limits the size of temporary arrays."""
 
 
 @dataclass(frozen=True)
 class RowLayout:
-    """Size of the whole lattice of which a raster holds a part.
+    """Size of the whole lattice, for a raster that holds a part of it.
 
     Parameters
     ----------
     rows
         Number of particles of each row of repeat cells, padding included.
     row_offset
-        Number of rows before those of the raster.
+        Number of rows of the lattice before the first row of the raster.
     """
 
     rows: NDArray[np.int64]
@@ -325,18 +328,19 @@ class Raster:
         return (lines >= low) & (lines < high)
 
     def sees_frame(self, lines: Indices) -> Mask:
-        """Return a mask of the lines with the frame points for which this process determines the
-        particles that they follow."""
+        """Return a mask of the lines with those frame points that this process assigns to the body
+        particles they follow."""
         low, high = self.row_range.framed if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
     def hull_of_all(self, boxes: Iterable[Box]) -> Box:
-        """Return the smallest and the largest number along each axis, over the boxes of all
+        """Return the smallest and the largest coordinate along each axis over the boxes of all
         processes."""
         return hull(box for part in self.communicator.allgather(list(boxes)) for box in part)
 
     def body_box(self) -> tuple[Vector[float], Vector[float]]:
-        """Return the corners (lower, upper) of the body, from site (0, 0) of the lattice."""
+        """Return the lower and the upper corner of the bounding box of the body, relative to site
+        (0, 0) of the lattice."""
         ends = (self.ends_of_rows(s) for s in range(self.shape[0]))
         at = [positions(self.cell, s, *cells) for s, cells in enumerate(ends)]
         lower, upper = self.hull_of_all(
@@ -348,12 +352,14 @@ class Raster:
 
     @cached_property
     def _full(self) -> bool:
-        """True if every site of the window is a particle, so that rows follow from indices."""
+        """True if every site of the window is a particle, so that the row of a particle can be
+        computed from its site index."""
         return self.count == self.sites.size
 
     @cached_property
     def _flat_sites(self) -> Indices:
-        """Place of each row in the window, (particle,); used if the window has gaps."""
+        """Place in the window of the particle in each row, (particle,). It is used if the window
+        contains sites that are not particles."""
         return np.flatnonzero(self.sites != EMPTY)
 
     @cached_property
@@ -389,7 +395,8 @@ class Raster:
         return list(map(add, np.unravel_index(place, self.sites.shape), self.low))
 
     def _of_all(self, values: Callable[[Indices], Any], columns: int, dtype: Any) -> NDArray[Any]:
-        """Evaluate a function of rows chunk by chunk, into an array (particle, column)."""
+        """Evaluate a function of rows chunk by chunk, and write the results into an array
+        (particle, column)."""
         out = np.empty((self.count, columns), dtype)
         for rows in self.chunks():
             out[rows[0] : rows[-1] + 1] = values(rows)
@@ -438,7 +445,7 @@ class Raster:
         return np.stack(offsets, axis=1) + self.lattice.origin
 
     def reference_planes(self, where: Where) -> Any:
-        """Return X relative to site (0, 0) of the lattice, as one plane for each component."""
+        """Return X relative to site (0, 0) of the lattice, as one array for each component."""
         s: Any
         if isinstance(where, Places):
             s, *cells = np.unravel_index(where.place, self.shape)
@@ -448,9 +455,8 @@ class Raster:
         return positions(self.cell, s, *cells)
 
     def table(self, u: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of planes u, (axis, sublattice, cell, cell), by particle, (particle,
-        axis).
-        """
+        """Convert values on rasters, (axis, sublattice, cell, cell), to a table (particle,
+        axis)."""
         if not self._full:
             flat = u.reshape(len(u), -1)
             return self._of_all(lambda rows: flat.take(self.place_of(rows), 1).T, len(u), u.dtype)
@@ -472,7 +478,7 @@ class Raster:
         body = np.moveaxis(self.sites == FOLLOWER, axis, 0)
         end = (body[::-1] if last else body).argmax(axis=0)
         end = self.low[axis] + (len(body) - 1 - end if last else end)
-        if axis == 0:  # Lines along this axis continue on other processes.
+        if axis == 0:  # Lines along this axis extend over several processes.
             far = np.where(body.any(axis=0), -end if last else end, NOWHERE)
             far = self.communicator.smallest(far)
             occupied, end = far < NOWHERE, -far if last else far
@@ -485,10 +491,11 @@ class Raster:
         return rows[rows >= 0]
 
     def ends_of_rows(self, sublattice: int) -> list[Indices]:
-        """Return the repeat cells of the first and last particle of the body in every row of cells.
+        """Return, for every row of cells, the repeat cells of the first and of the last particle of
+        the body in it.
 
-        One array for each index, for particles of one sublattice. Rows run along the last axis,
-        along which positions are monotonic.
+        Only particles of one sublattice are considered. There is one array for each index. Rows are
+        parallel to the last axis, along which positions are monotonic.
         """
         body = self.kind[sublattice] == FOLLOWER
         rows = np.nonzero(body.any(axis=-1))
@@ -505,9 +512,10 @@ class Raster:
 
 @dataclass(frozen=True)
 class Restriction:
-    """Rows of repeat cells of a raster, as a separate raster.
+    """Rows of repeat cells of a raster, stored as a separate raster. This is the part of a lattice
+    that a process computes.
 
-    Features of a scene have a method `restrict`, which returns the feature restricted to these
+    Features of a scene have a method `restrict`, which returns the part of the feature in these
     rows.
 
     Parameters
@@ -519,8 +527,8 @@ class Restriction:
     low
         First row, in the whole raster.
     present, moving
-        Rows with particles, and rows in which all particles have all their neighbours, as (first,
-        last + 1) in the whole raster.
+        Rows that contain particles, and rows in which every particle has all its neighbours in the
+        part. Both are ranges (first, last + 1) in the whole raster.
     """
 
     whole: Raster
@@ -530,47 +538,53 @@ class Restriction:
     moving: tuple[int, int]
 
     def is_between(self, place: Indices, rows: tuple[int, int]) -> Mask:
-        """Return a mask of flat places of the whole raster, True for those in these rows."""
+        """Return a mask that is true for those flat places of the whole raster that lie in these
+        rows."""
         row = np.unravel_index(place, self.whole.shape)[1]
         return np.asarray((row >= rows[0]) & (row < rows[1]))
 
     def is_present(self, place: Indices) -> Mask:
-        """Return a mask of flat places of the whole raster, True for those in the part."""
+        """Return a mask that is true for those flat places of the whole raster that lie in the
+        part."""
         return self.is_between(place, self.present)
 
     def is_moving(self, place: Indices) -> Mask:
-        """Return a mask of flat places of the whole raster, True for those with all neighbours in
-        the part."""
+        """Return a mask that is true for those flat places of the whole raster that have all
+        neighbours in the part."""
         return self.is_between(place, self.moving)
 
     def places(self, place: Indices) -> Indices:
-        """Convert flat places of the whole raster to those of the part."""
+        """Convert flat places of the whole raster to flat places of the raster of the part."""
         s, row, *rest = np.unravel_index(place, self.whole.shape)
         return np.ravel_multi_index((s, row - self.low, *rest), self.part.shape)
 
     def rows(self, rows: Indices) -> Indices:
-        """Convert rows of the table of the whole raster to those of the part."""
+        """Convert rows in the particle table of the whole raster to rows in the table of the
+        part."""
         return rows - self.part.particle_offset + self.whole.particle_offset
 
     def cut(self, planes: Array) -> Array:
-        """Return a copy of the rows of an array; its last axes are those of cells."""
+        """Return a copy of the part of an array that belongs to these rows. The last axes of the
+        array are the axes of the raster's cells."""
         axes = len(self.whole.shape) - 1
         return row_view(planes, axes, slice(self.low, self.low + self.part.shape[1])).copy()
 
 
 def row_view(array: Array, axes: int, rows: slice) -> Array:
-    """Return a view of rows of an array; its last `axes` axes are those of cells."""
+    """Return a view of some rows of an array. The last `axes` axes of the array are the axes of the
+    raster's cells."""
     return array[(*(slice(None),) * (array.ndim - axes), rows)]
 
 
 def positions(cell: Cell, s: int | Indices, *cells: Indices) -> Any:
-    """Return the positions of sublattice s in repeat cells (m, n), at + m·a + n·b, from site (0,
-    0).
+    """Return the positions of the particles of sublattice s in repeat cells (m, n), relative to
+    site (0, 0). With the basis position p and the cell vectors a and b they are p + m·a + n·b.
     """
     return vector(cell.basis[s, axis] + part for axis, part in enumerate(cell.shift(cells)))
 
 
 def cells_of_sites(cell: Cell, *site: Indices) -> tuple[Indices, ...]:
-    """Return sublattice and repeat cell of the sites (i, j); sublattice -1 at a hole."""
+    """Return the sublattice and the repeat cell of the sites (i, j). The sublattice is -1 for an
+    index without a site."""
     remainder = tuple(i % p for i, p in zip(site, cell.period, strict=True))
     return cell.sublattices[remainder], *(i // p for i, p in zip(site, cell.period, strict=True))

@@ -1,6 +1,6 @@
-"""Matrices of blocks (axis, axis) between particles, and their scalar entries.
+"""Matrices that consist of blocks (axis, axis) between particles, and their scalar entries.
 
-Small ones are dense arrays, others scipy.sparse.csr_array.
+Small matrices are dense arrays, other matrices are scipy.sparse.csr_array.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class CoordinateMatrix:
     shape: tuple[int, int]
 
     def plus(self, other: CoordinateMatrix, factor: float = 1.0) -> CoordinateMatrix:
-        """Return the sum with `factor` times another matrix, in the shape of the other."""
+        """Return the sum of this matrix and `factor` times another matrix. The result has the shape
+        of the other matrix."""
         rows = np.concatenate([self.rows, other.rows])
         columns = np.concatenate([self.columns, other.columns])
         values = np.concatenate([self.values, factor * other.values])
@@ -59,7 +60,8 @@ class CoordinateMatrix:
 
 
 def identity_like(matrix: Any) -> Any:
-    """Return the identity, dense or sparse as the square matrix is."""
+    """Return the identity matrix of the same size. It is dense if the given square matrix is dense,
+    and otherwise sparse."""
     if isinstance(matrix, np.ndarray):
         return np.eye(len(matrix))
     from scipy.sparse import eye_array
@@ -68,18 +70,21 @@ def identity_like(matrix: Any) -> Any:
 
 
 def one_minus(matrix: Any) -> Any:
-    """Return the identity minus a matrix, dense or sparse as the matrix is."""
+    """Return the identity minus a matrix. The result is dense if the matrix is dense, and otherwise
+    sparse."""
     difference = identity_like(matrix) - matrix
     return difference if isinstance(matrix, np.ndarray) else difference.tocsr()
 
 
 def connected(matrix: Any, *, strongly: bool) -> tuple[int, Integers]:
-    """Find the connected components of a matrix, seen as a directed graph.
+    """Find the connected components of the directed graph that is defined by the entries of a
+    matrix.
 
     Parameters
     ----------
     strongly
-        Whether edges count in their direction only (strongly connected components).
+        If true, edges connect in their direction only, so that the components are strongly
+        connected.
 
     Returns
     -------
@@ -104,7 +109,7 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Integers]:
         if (longer == reach).all():
             break
         reach = longer
-    first = np.argmax(reach & reach.T, axis=1)  # Components are labelled by their lowest unknown.
+    first = np.argmax(reach & reach.T, axis=1)  # In the order of lowest unknowns.
     names, label = np.unique(first, return_inverse=True)
     return len(names), label
 
@@ -123,7 +128,7 @@ def _undirected_components(reach: NDArray[np.bool_]) -> tuple[int, Integers]:
 
 @dataclass
 class BlockMatrix:
-    """Block matrix of (axis, axis) blocks at (row, column), counted in particles.
+    """Matrix of blocks (axis, axis). The rows and columns of blocks are particles.
 
     Parameters
     ----------
@@ -132,8 +137,8 @@ class BlockMatrix:
     axes
         Number of axes of space.
     parts
-        Rows, columns and blocks, (entry, axis, axis). Blocks at the same place are added. Blocks
-        that are all equal may be broadcast views of one.
+        Rows, columns and blocks, (entry, axis, axis). Blocks at the same place are added. If all
+        blocks are equal, they may be a broadcast view of one block.
     """
 
     shape: tuple[int, int]
@@ -156,8 +161,9 @@ class BlockMatrix:
         Parameters
         ----------
         to, of
-            Axes of the rows and of the columns; default: all, and the same as `to`. With all axes,
-            particle n has the unknowns 2n (x) and 2n + 1 (y) in the plane.
+            Axes of the rows (`to`), by default all, and axes of the columns (`of`), by default the
+            same as `to`. With all axes, particle n has the unknowns 2n (x) and 2n + 1 (y) in the
+            plane.
         """
         to = to or range(self.axes)
         of = of or to
@@ -171,7 +177,7 @@ class BlockMatrix:
         return CoordinateMatrix(row, column, values, shape)
 
     def _joined(self) -> tuple[Integers, Integers, Floats]:
-        """Return all parts as one."""
+        """Return all parts, concatenated to a single part."""
         if not self.parts:
             nothing = np.empty(0, np.intp)
             return nothing, nothing, np.empty((0, self.axes, self.axes))
@@ -179,11 +185,11 @@ class BlockMatrix:
         return rows, columns, blocks
 
     def couples(self, a: int, b: int) -> bool:
-        """Return whether displacements along axis b change those along axis a."""
+        """Return whether displacements along axis b change displacements along axis a."""
         return any(blocks[:, a, b].any() for _, _, blocks in self.parts)
 
     def is_isotropic(self) -> bool:
-        """Return whether the couplings along all axes are equal."""
+        """Return whether all axes have the same couplings and are not coupled to each other."""
         return all(
             np.array_equal(blocks[:, 0, 0], blocks[:, a, a])
             for _, _, blocks in self.parts
@@ -198,5 +204,5 @@ class BlockMatrix:
 
 
 def frame_matrices(weights: Floats, axes: int) -> Floats:
-    """Return a frame's weights as matrices, (entry, axis, axis)."""
+    """Return the weights of a frame as matrices, (entry, axis, axis)."""
     return weights[:, None, None] * np.eye(axes) if weights.ndim == 1 else weights

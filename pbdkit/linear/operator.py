@@ -1,6 +1,6 @@
 """The step operator: the paper's "transformation operator between matrices" as a sparse matrix.
 
-A step maps the displacements of the followers, one unknown a particle and axis, as
+A step maps the displacements of the followers, with one unknown for each particle and axis, as
 
     u(t+1) = A u(t) + B u(t-1) + C u_L + f
 
@@ -33,15 +33,16 @@ if TYPE_CHECKING:
 
 
 class Guiding:
-    """Guided particles of a step: prescribed along some axes, free along the others.
+    """Guided particles of a step. Their motion is prescribed along some axes and free along the
+    others.
 
     Attributes
     ----------
     free : (particle, axis, axis)
         Identity along the free axes, zero elsewhere.
     turns : (particle, axis, axis)
-        T, which maps the unconstrained move of each particle to its constrained move: the identity
-        along free axes, plus fractions of the move along prescribed axes
+        Matrix T of each particle, which maps its unconstrained move to its constrained move. Along
+        free axes the result is the move, plus fractions of the move along prescribed axes
         (`pbdkit.stepping.leaders`).
     """
 
@@ -63,8 +64,8 @@ class Guiding:
         return np.where(self.guided.place[order[at]] == place, order[at], -1)
 
     def turned(self, place: Indices, values: Floats) -> Floats:
-        """Return the constrained moves or blocks, (particle, axis, ...), of particles at flat
-        places."""
+        """Return the constrained moves, or blocks, of particles at flat places, (particle, axis,
+        ...), given the unconstrained ones."""
         numbers = self.numbers(place)
         if not (rows := np.flatnonzero(numbers >= 0)).size:
             return values
@@ -76,17 +77,19 @@ class Guiding:
         self, free: BlockMatrix, leader: BlockMatrix, rows: Indices, places: Indices,
         numbers: tuple[Indices, Indices], blocks: Floats,
     ) -> None:  # fmt: skip
-        """Add the blocks of followers to `free`, and split those of guided particles between
+        """Add the blocks of followers to `free`. The blocks of guided particles are split between
         `free` and `leader`.
 
         Parameters
         ----------
         free, leader
-            BlockMatrix with free unknowns and with prescribed displacements. Both are extended.
+            Matrices for free unknowns (`free`) and for prescribed displacements (`leader`). Blocks
+            are added to both.
         rows, places
             Row and flat place of each block.
         numbers
-            Number of the unknown, and of the prescribed displacement, of each block.
+            Two numbers for each block: that of its unknown, and that of its prescribed
+            displacement.
         blocks : (entry, axis, axis)
             ∂move/∂u.
         """
@@ -101,22 +104,24 @@ class Guiding:
 
 @dataclass(frozen=True)
 class StepOperator:
-    """One step, linearised at a state, for fixed roles and leaders at rest.
+    """One step, linearised at a state. Roles are constant and leaders are at rest.
 
-    In the plane, unknown 2n is the x displacement of the n-th follower and 2n + 1 its y
-    displacement; leaders are numbered in the same way. The couplings are the same matrices, as
-    blocks between particles.
+    In the plane, unknown 2n is the x displacement of the n-th follower, and unknown 2n + 1 its y
+    displacement; leaders are numbered in the same way. The attributes `couplings_...` contain the
+    same matrices as the methods, as blocks between particles.
 
     Parameters
     ----------
     followers, leaders
-        Rows of the particle table. Guided particles are among both.
+        Rows of followers and of leaders in the particle table. Guided particles are contained in
+        both.
     couplings_current, couplings_previous, couplings_leader
         ∂u(t+1)/∂u(t), ∂u(t+1)/∂u(t-1) and ∂u(t+1)/∂u_L.
     couplings_frame
         The part of `couplings_leader` that acts through frame points.
     source : (unknown,)
-        Displacement that a step adds at u = 0: loads and the nonlinear remainder.
+        Displacement that a step adds at u = 0. It consists of the effect of loads and of the
+        remainder of the linearisation.
     prescribed_unknowns
         Unknowns of guided particles along prescribed axes. Their rows and columns are empty.
     """
@@ -132,7 +137,7 @@ class StepOperator:
 
     @property
     def couplings_steady(self) -> BlockMatrix:
-        """Return `couplings_current` + `couplings_previous`, the matrix of a step if u(t-1) is
+        """Return `couplings_current` + `couplings_previous`, the matrix of a step if u(t-1) =
         u(t)."""
         current = self.couplings_current
         return BlockMatrix(
@@ -151,13 +156,15 @@ class StepOperator:
 
     @cached_property
     def leader(self) -> scipy.sparse.csr_array:
-        """Assemble ∂u(t+1)/∂u_L, the derivative with respect to prescribed displacements."""
+        """Assemble the matrix ∂u(t+1)/∂u_L of derivatives with respect to prescribed
+        displacements."""
         return self.couplings_leader.entries().sparse()
 
     def augmented(self) -> CoordinateMatrix:
-        """Return the operator on (u(t), u(t-1)), or on u(t) alone if the step does not read u(t-1).
+        """Return the operator on the pair (u(t), u(t-1)), or on u(t) only if the step does not
+        depend on u(t-1).
 
-        Prescribed unknowns are left out.
+        Prescribed unknowns are omitted.
         """
         parts = self.couplings_current, self.couplings_previous
         current, previous = (
@@ -183,9 +190,9 @@ def step_operator(
     scene
         Scene with the rule that is linearised.
     state
-        State at which the rule is linearised; default: the initial state.
+        State at which the rule is linearised; by default the initial state.
     step
-        Step of the roles and loads; default: the last.
+        Step that determines roles and loads; by default the last step.
 
     Raises
     ------
@@ -237,8 +244,8 @@ def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Flo
 
 
 def _followed(scene: Scene) -> BlockMatrix:
-    """Return the map from body displacements to those of body and frame: rows by flat place,
-    columns in the order of the body's particles."""
+    """Return the matrix that maps the displacements of the body to the displacements of body and
+    frame. Rows are flat places, and columns are the particles of the body in their order."""
     raster = scene.raster
     body, place = raster.body_rows, raster.place_of(np.arange(raster.count))
     followed = BlockMatrix((raster.kind.size, len(body)), scene.axes)
@@ -252,8 +259,8 @@ def _followed(scene: Scene) -> BlockMatrix:
 
 
 def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, BlockMatrix]:
-    """Compute moves and couplings with the scene's own rule; particles without neighbours do not
-    move."""
+    """Compute moves and couplings with the scene's own rule, without an inner rule. Particles
+    without neighbours do not move."""
     kind, moves = scene.raster.kind.ravel(), np.zeros((len(place), scene.axes))
     couplings = BlockMatrix((len(place), kind.size), scene.axes)
     moving = np.flatnonzero(has_neighbours(scene, place)).astype(np.int32)
@@ -341,8 +348,8 @@ class _Assembly:
         return moves[1] - moves[0]
 
     def _add(self, rows: Integers, places: Indices, blocks: Floats) -> None:
-        """Add the blocks of followers and leaders directly, those of frame points through the body
-        particles that these follow."""
+        """Add blocks. Blocks of followers and leaders are added directly. Blocks of frame points
+        are distributed over the body particles that the points follow."""
         by_frame, frame = self._kind[places] == FRAME, self._scene.frame
         if frame is not None and by_frame.any():
             first, last = (

@@ -1,8 +1,8 @@
 """Linear response of a rule to small displacements, computed from the rule's own functions.
 
-The response of a linear rule is exact in any configuration; other rules are linearised at a state.
-At rest, particles with the same neighbourhood have the same response, so that one particle of each
-kind is evaluated.
+For linear rules the response is exact in any configuration; other rules are linearised at a state.
+At rest, particles with the same neighbourhood have the same response. It is therefore sufficient to
+evaluate one particle for each kind of neighbourhood.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from pbdkit.stepping.state import State
 Present = NDArray[np.bool_]
 Answer = Callable[[Contributions, Here], Any]
 CHUNK_SIZE = 8192
-"""Number of places that are evaluated together, which bounds the size of temporary arrays."""
+"""Number of places that are evaluated together. It limits the size of temporary arrays."""
 FEW = 200
-"""Number of places up to which every place is evaluated, because grouping equal places takes
+"""Number of places up to which every place is evaluated, because grouping equal places would take
 longer."""
 
 
@@ -46,7 +46,7 @@ class LinearResponse:
     centre : (kind, axis of the response, axis of u)
         Derivative with respect to the follower's own displacement.
     neighbours : (kind, axis of the response, axis of u) by slot
-        Derivative with respect to the displacement of the neighbour at each slot.
+        Derivative with respect to the displacement of the neighbour along each slot.
     answer : (kind, axis)
         The response itself.
     """
@@ -57,7 +57,8 @@ class LinearResponse:
     answer: Floats
 
     def of_each(self, values: Floats) -> Floats:
-        """Return the values of all followers; a broadcast view if all are of one kind."""
+        """Expand values of each kind to values of all followers. The result is a broadcast view if
+        all followers are of one kind."""
         if len(values) == 1:
             return np.broadcast_to(values[0], (len(self.kind), *values.shape[1:]))
         return values[self.kind]
@@ -80,7 +81,7 @@ def respond(
     Returns
     -------
     list of LinearResponse
-        One for each of `answers`.
+        One response for each of `answers`.
 
     Raises
     ------
@@ -148,8 +149,8 @@ def _group_alike(
 ) -> tuple[Indices, Indices]:
     """Group places by the response of their particles.
 
-    They have the same neighbours, the same fractions of cells around them, and the same broken
-    bonds.
+    Particles with the same response have the same neighbours, the same area fractions of the cells
+    around them, and the same broken bonds.
 
     Returns
     -------
@@ -177,8 +178,8 @@ def _group_alike(
     differing = [mask for to in neighbours for mask in (to.present, to.broken) if mask is not None]
     for mask in differing:
         code = 2 * code + mask
-    # With more masks the key would exceed an integer of 64 bits; 20 bits are reserved for the cut
-    # and torn cells around a particle.
+    # With more masks the key would not fit in an integer of 64 bits. 20 bits of it are reserved for
+    # the cut and torn cells around a particle.
     if len(differing) > 42:
         return np.arange(len(place)), place
     _, representatives, kind[irregular] = np.unique(code, return_index=True, return_inverse=True)
@@ -216,10 +217,12 @@ def _is_regular(scene: Scene, state: State, sublattice: int) -> Present:
 
 
 class _Followers:
-    """Evaluate the rule at some places for all small displacements at once, (axis, step, place).
+    """Evaluate the rule at some places for a series of small displacements at once. Arrays are
+    (axis, step, place).
 
-    The first step is zero. It is followed by displacements of the particle along each axis, with
-    all neighbours fixed, and by those of the neighbour at each slot.
+    The first entry of the series is a displacement of zero. The next entries are displacements of
+    the particle along each axis, with all neighbours fixed. They are followed by displacements of
+    the neighbour along each slot.
     """
 
     def __init__(self, scene: Scene, state: State, sublattice: int, place: Indices) -> None:
@@ -247,7 +250,7 @@ class _Followers:
             raise ValueError(f"it returned values of the type {value.dtype}, not real numbers")
         if finite and not (np.isfinite(value).all() and np.isfinite(derivatives).all()):
             raise ValueError(f"its {name} at rest, or a derivative of it, is not finite")
-        # Axes: mover, place, axis of the response, axis of u.
+        # Axes: displaced particle, place, axis of the response, axis of u.
         centre, *neighbours = np.moveaxis(
             derivatives[:, 1:].reshape(len(derivatives), -1, len(derivatives), self._shape[1]),
             0,
@@ -268,11 +271,11 @@ class _Followers:
     def _totals(self, step: complex) -> Contributions:
         """Return the sums over the neighbours after each displacement.
 
-        The displacement of one neighbour changes a single contribution.
+        Only one contribution changes if one neighbour is displaced.
         """
         axes = len(self._local.u)
-        # Steps that change the contribution of a slot: none, those of the particle, those of the
-        # neighbour.
+        # The contribution of a slot is evaluated for no displacement, and for displacements of the
+        # particle and of the neighbour.
         count = 1 + 2 * axes
         own_step, neighbour_step = self._steps(step, 1, count), self._steps(step, 1 + axes, count)
         displacement = self._local.u + own_step
@@ -293,11 +296,11 @@ class _Followers:
             return tuple(self._total(values, 1 + axes) for values in zip(*parts, strict=True))
 
     def _total(self, by_slot: Sequence[Any], common: int) -> Any:
-        """Return the totals of one number or vector, with contributions given by slot."""
+        """Return the totals of one number or vector, given its contributions for each slot."""
         if isinstance(by_slot[0], Vector):
             return vector(self._total(along, common) for along in zip(*by_slot, strict=True))
         if all(np.ndim(values) < 2 for values in by_slot):
-            return sum(by_slot)  # Weights, which no step changes.
+            return sum(by_slot)  # These are weights, which no displacement changes.
         shape = (2 * common - 1, self._shape[1])
         by_slot = [
             values if np.shape(values) == shape else np.broadcast_to(values, shape)

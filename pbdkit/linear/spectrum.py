@@ -1,4 +1,5 @@
-"""Eigenvalues of the step operator, computed by blocks of coupled unknowns."""
+"""Eigenvalues of the step operator. They are computed separately for each block of coupled
+unknowns."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ MAX_BOND_ENDS = 800_000
 """Largest number of bond ends, two for each bond."""
 
 MAX_EVALUATIONS = 2e8
-"""Largest number of evaluations of the rule. They grow with the square of the number of neighbours
-for neighbourhoods larger than `LARGE_NEIGHBOURHOOD`."""
+"""Largest number of evaluations of the rule. If particles have more than `LARGE_NEIGHBOURHOOD`
+neighbours, the number of evaluations is proportional to the square of the number of neighbours."""
 
 LARGE_NEIGHBOURHOOD = 42
 """Number of neighbours above which every particle is evaluated separately."""
@@ -45,7 +46,8 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 NEUTRAL = 1e-9
 """Tolerance within which the modulus of an eigenvalue counts as 1."""
 STRAIGHT = 1e-6
-"""Imaginary parts below this are rounding errors: such a mode does not oscillate."""
+"""Imaginary parts below this are rounding errors. A mode with such an eigenvalue does not
+oscillate."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,8 @@ def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
 
     Notes
     -----
-    Both roots of μ² - (1 + b - w (1 - λ)) μ + b = 0. Without momentum they are 1 - w (1 - λ), and
-    zeros.
+    The result contains both roots of μ² - (1 + b - w (1 - λ)) μ + b = 0. Without momentum one of
+    them is 1 - w (1 - λ), and the other is zero.
     """
     half = (1.0 + memory - relaxation * (1.0 - eigenvalues)) / 2.0
     root = np.sqrt(half * half - memory + 0j)
@@ -85,11 +87,11 @@ def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
 
 
 def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | None:
-    """Return the relaxation below which all modes decay with this momentum, apart from those with λ
-    = 1.
+    """Return the relaxation below which all modes decay with this momentum. Modes with λ = 1 are
+    ignored.
 
-    Return None if no positive relaxation is stable (if an eigenvalue exceeds 1, or |memory| ≥ 1),
-    and also if all are stable.
+    Return None if no positive relaxation is stable, because an eigenvalue exceeds 1 or |memory| ≥
+    1. Also return None if every relaxation is stable.
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z) or z.real.min() < NEUTRAL or abs(memory) >= 1.0:
@@ -99,8 +101,8 @@ def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | No
 
 
 def slowest_swing(mu: Complex) -> Swing | None:
-    """Return the mode with the longest period among the eigenvalues μ of a step, or None if all are
-    real."""
+    """Return the oscillating mode with the longest period, given the eigenvalues μ of a step.
+    Return None if all eigenvalues are real."""
     swinging = mu[np.abs(mu.imag) > STRAIGHT]
     if not len(swinging):
         return None
@@ -109,22 +111,22 @@ def slowest_swing(mu: Complex) -> Swing | None:
 
 
 def swings_below(relaxation: float, memory: float) -> float:
-    """Return the real λ below which modes oscillate, 1 - (1 - √b)² / w, for momentum 0 < b < 1.
+    """Return 1 - (1 - √b)² / w, for a momentum 0 < b < 1. Modes with a real λ below it oscillate.
 
-    Modes with λ below 1 - (1 + √b)² / w do not oscillate.
+    Modes with λ below 1 - (1 + √b)² / w, however, do not oscillate.
     """
     return 1.0 - float((1.0 - np.sqrt(memory)) ** 2) / relaxation
 
 
 SHIFT_MARGIN = 1e-7
-"""Distance of the shift of the inverse iteration from the bounds of the spectrum."""
+"""Distance between the shift of the inverse iteration and the bound of the spectrum."""
 
 MAX_MULTIPLICATIONS = 1e9
-"""Largest number of multiplications that are spent on one spectrum."""
+"""Largest number of multiplications for one spectrum."""
 
 KRYLOV_VECTORS = 20
-"""Number of Krylov vectors. In addition to each matrix product, this number of multiplications is
-made for each component."""
+"""Number of Krylov vectors. In addition to each matrix product, an iteration needs this number of
+multiplications for each component of a vector."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,8 @@ class Spectrum:
     symmetric
         Whether all diagonal blocks are symmetric.
     eigenvalues
-        The eigenvalues that were computed: all of small blocks, the extreme ones of large blocks.
+        The eigenvalues that were computed. These are all eigenvalues of small blocks, and the
+        extreme eigenvalues of large blocks.
     """
 
     radius: float
@@ -149,12 +152,12 @@ class Spectrum:
 
 
 class TooDearError(RuntimeError):
-    """The eigenvalues are so close together that the maximum number of matrix products is
-    exceeded."""
+    """The eigenvalues are so close together that their computation would exceed the maximum number
+    of multiplications."""
 
 
 def spectrum(matrix: Any) -> Spectrum:
-    """Compute the extreme eigenvalues of a matrix, dense or sparse, and all eigenvalues of small
+    """Compute the extreme eigenvalues of a dense or sparse matrix, and all eigenvalues of its small
     blocks.
 
     Raises
@@ -181,10 +184,10 @@ def spectrum_of(eigenvalues: Complex, symmetric: bool) -> Spectrum:
 
 
 def just_below(matrix: Any, edge: float) -> Complex:
-    """Compute the eigenvalue of each large block that is nearest to `edge` from below.
+    """Compute, for each large block, the eigenvalue below `edge` that is nearest to it.
 
-    Eigenvalues are compared by their real part, and computed by a shifted inverse iteration. Those
-    of small blocks are in `Spectrum.eigenvalues`.
+    Eigenvalues are compared by their real parts, and computed by a shifted inverse iteration. The
+    eigenvalues of small blocks are in `Spectrum.eigenvalues`.
 
     Raises
     ------
@@ -199,7 +202,8 @@ def just_below(matrix: Any, edge: float) -> Complex:
 
 
 def has_symmetric_rows(matrix: Any) -> bool:
-    """Return whether a sparse matrix becomes symmetric by multiplying its rows by positive factors.
+    """Return whether a sparse matrix becomes symmetric if its rows are multiplied by some positive
+    factors.
 
     Its eigenvalues are then real.
     """
@@ -221,7 +225,7 @@ def has_symmetric_rows(matrix: Any) -> bool:
 
 
 def _diagonal_blocks(matrix: Any) -> Iterator[Any]:
-    """Yield the strongly connected diagonal blocks; equal ones once."""
+    """Yield the strongly connected diagonal blocks. Of several equal blocks only one is yielded."""
     count, label = connected(matrix, strongly=True)
     order = np.argsort(label, kind="stable")
     bounds = np.searchsorted(label[order], np.arange(count + 1))
@@ -246,14 +250,15 @@ def _hashable(block: Any) -> tuple[Any, ...]:
 
 
 class _Budget:
-    """Count of multiplications in an iteration, which ends the iteration with TooDearError if there
-    are too many."""
+    """Counter of the multiplications in an iteration. If there are too many, it ends the iteration
+    with TooDearError."""
 
     def __init__(self) -> None:
         self._remaining = MAX_MULTIPLICATIONS
 
     def counted(self, size: int, cost: int, product: Callable[[Any], Any]) -> Any:
-        """Return the product as a scipy.sparse.linalg.LinearOperator."""
+        """Return a scipy.sparse.linalg.LinearOperator that computes the product and counts its
+        multiplications."""
         from scipy.sparse.linalg import LinearOperator
 
         def counted(x: Any) -> Any:
@@ -287,7 +292,7 @@ def _extremes(block: Any, symmetric: bool, budget: _Budget) -> Complex:
         product = budget.counted(block.shape[0], block.nnz, block.dot)
         parts = [eigs(product, k=6, which=w, return_eigenvectors=False) for w in ("LM", "LR", "SR")]
         return np.concatenate(parts)
-    # Shift just outside the spectrum, which Gershgorin's discs bound.
+    # The shift lies just outside the spectrum, which is bounded by Gershgorin's discs.
     diagonal = block.diagonal()
     spread = np.asarray(abs(block).sum(axis=1)).ravel() - abs(diagonal)
     ends = ((diagonal + spread).max() + SHIFT_MARGIN, (diagonal - spread).min() - SHIFT_MARGIN)

@@ -1,16 +1,16 @@
-"""Stencil of a rule at rest on the infinite lattice: derivatives of its functions, and their symbol
-for plane waves.
+"""Stencil of a rule at rest on the infinite lattice. It consists of the derivatives of the rule's
+functions; its symbol describes the effect on plane waves.
 
-Derivatives of elementwise functions are taken by a complex step if that is valid, else by
-differences. Functions built from arithmetic and roots are analytic, and ∂f = Im f(x + ih) / h is
-exact to rounding. Other functions (an absolute value, a hypotenuse) discard the imaginary part or
-raise an error. Comparison with a central difference detects this; the difference, with about nine
-digits, is then used instead.
+Derivatives of elementwise functions are computed by a complex step if that is valid, otherwise by
+differences. Functions that consist of arithmetic and roots are analytic, so that ∂f = Im f(x + ih)
+/ h is exact except for rounding. Other functions, such as an absolute value, discard the imaginary
+part or raise an error. This is detected by comparison with a central difference, which has about
+nine correct digits and is then used instead.
 
-A step multiplies a displacement exp(iθ·c) over repeat cells c by the symbol, a matrix of blocks
-(axis, axis) over sublattices. The eigenvalues of a finite body lie within the range of those of
-plane waves if its frame copies or mirrors displacements. This bound is computed within
-milliseconds.
+A plane wave is a displacement exp(iθ·c) that depends on the repeat cell c. A step multiplies it by
+the symbol, a matrix with a block (axis, axis) for each pair of sublattices. If the frame of a
+finite body copies or mirrors displacements, the eigenvalues of the body lie within the range of the
+eigenvalues of plane waves. This bound is computed within milliseconds.
 """
 
 from __future__ import annotations
@@ -42,11 +42,12 @@ SMALL = 1e-6
 """Real step of derivatives, as a fraction of the spacing."""
 
 Moved = Callable[[complex], tuple[Any, Any]]
-"""Type of a function that returns the components of a value after a step along one direction."""
+"""Type of a function that maps the size of a step along one direction to the components of a value
+after the step."""
 
 
 def derivative(moved: Moved, shape: tuple[int, ...], unit: float) -> NDArray[np.float64]:
-    """Differentiate at a step of zero, (component, *shape).
+    """Differentiate a function of a step at a step of zero. The result is (component, *shape).
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def derivative(moved: Moved, shape: tuple[int, ...], unit: float) -> NDArray[np.
     shape
         Shape of its components.
     unit
-        Length that scales the steps.
+        Length with which the sizes of steps are multiplied.
     """
     small, tiny = SMALL * unit, TINY * unit
     with np.errstate(all="ignore"):
@@ -72,12 +73,12 @@ def derivative(moved: Moved, shape: tuple[int, ...], unit: float) -> NDArray[np.
 
 
 def array_of(components: tuple[Any, ...], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Stack components, broadcast to a shape: (component, *shape)."""
+    """Broadcast components to a shape, and stack them to an array (component, *shape)."""
     return np.array([np.broadcast_to(component, shape) for component in components])
 
 
 NOWHERE = Here(cast(Any, None))
-"""Place of a particle for rules that do not depend on it."""
+"""Place of a particle that is passed to rules that do not depend on the place."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any],
 def _derivatives(scene: Scene, slots: Sequence[Slot], at: Here) -> Floats:
     """Compute the derivatives of the move at rest, (1 + slot, axis of the move, axis of u).
 
-    The first is the derivative with respect to the displacement of the particle itself.
+    The first entry is the derivative with respect to the displacement of the particle itself.
     """
     count, axes = 1 + len(slots), scene.axes
     steps = np.eye(count * axes).reshape(count, axes, -1)
@@ -137,7 +138,7 @@ def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
     Parameters
     ----------
     at
-        Place, for rules that depend on it.
+        Place of the particle, for rules that depend on the place.
     """
     slot_lists = scene.neighbourhood.slots
     derivatives = [_derivatives(scene, slots, at) for slots in slot_lists]
@@ -152,7 +153,8 @@ def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
 
 
 def _composed(outer: Stencil, inner: Stencil) -> Stencil:
-    """Return the stencil of a rule applied to the moves of another."""
+    """Return the stencil of a rule (`outer`) that is applied to the moves of another rule
+    (`inner`)."""
     centre = np.zeros_like(outer.centre)
     neighbours: dict[Slot, Floats] = {}
     slots: dict[tuple[int, int, Index], Slot] = {}
@@ -176,19 +178,21 @@ def _with_itself(stencil: Stencil) -> Iterator[tuple[Slot, Floats]]:
 
 
 def _after(first: Slot, second: Slot) -> Slot:
-    """Return the slot from the start of the first to the end of the second."""
+    """Return the slot from the start of the first slot to the end of the second slot, where the
+    second begins at the end of the first."""
     cell, site = map(add, first.cell, second.cell), map(add, first.site, second.site)
     rest, shell = first.rest + second.rest, first.shell + second.shell
     return Slot(first.source, second.target, tuple(cell), tuple(site), rest, shell)
 
 
 WAVES = 48
-"""Number of wave numbers along each axis; even, so that the shortest waves are among them."""
+"""Number of wave numbers along each axis. It is even, so that the shortest waves are included."""
 
 MAX_EVALUATIONS = 100_000
-"""Largest number of evaluations of a rule by pairs of neighbours: about half a second."""
+"""Largest number of evaluations of a rule, counted by pairs of neighbours. They take about half a
+second."""
 LITTLE_MEMORY = 0.9
-"""Largest momentum for which plane waves bounded the spectra of random bodies
+"""Largest momentum for which, in tests with random bodies, plane waves bounded the spectrum
 (tests/stability/test_forecast.py)."""
 
 
@@ -214,7 +218,8 @@ class Bound:
     def largest_stable_relaxation(self, memory: float) -> float | None:
         """Return 2 (1 + memory) / (1 - λ_min).
 
-        None if eigenvalues are complex or exceed 1, or |memory| ≥ 1: no such bound exists then.
+        Return None if eigenvalues are complex or exceed 1, or if |memory| ≥ 1, because no such
+        bound exists in these cases.
         """
         if self.imaginary > 1e-9 or self.largest > 1.0 + 1e-9 or abs(memory) >= 1.0:
             return None
@@ -224,9 +229,9 @@ class Bound:
 def wave_bound(scene: Scene) -> Bound | None:
     """Compute the bound of plane waves for the scene's rule at rest.
 
-    Return None for rules that depend on the place or do not accept scalars, if neighbours are
-    searched at every step or number more than some 300, and for frames with a delay, which can
-    cause growth of modes that are not plane waves.
+    Return None for rules that depend on the place or do not accept scalars. Also return None if
+    neighbours are searched at every step, if there are more than about 300 neighbours, or if the
+    frame has a delay, because a delay can cause growth of modes that are not plane waves.
     """
     if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MAX_EVALUATIONS:
         return None
@@ -251,8 +256,8 @@ def wave_bound(scene: Scene) -> Bound | None:
 def bounds_the_body(scene: Scene) -> bool:
     """Return whether plane waves bound the modes of the finite body.
 
-    They may not if particles lack neighbours, for bodies of several materials and, with large
-    momentum, for frames on oblique lattices.
+    They may not bound them if particles lack neighbours, if the body consists of several materials
+    or, with large momentum, if the body has a frame on an oblique lattice.
     """
     reach = scene.neighbourhood.reach
     whole = scene.experiment.frame.depth(reach) >= reach and not scene.experiment.rule.varying
@@ -260,7 +265,8 @@ def bounds_the_body(scene: Scene) -> bool:
 
 
 def _eigenvalues(matrices: Complex) -> Complex:
-    """Compute the eigenvalues of (wave, n, n) matrices; in closed form for n = 2."""
+    """Compute the eigenvalues of matrices, (wave, n, n). For n = 2 they are computed in closed
+    form."""
     if matrices.shape[-1] > 2:
         eigenvalues: Complex = np.linalg.eigvals(matrices)
         return eigenvalues

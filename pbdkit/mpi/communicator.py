@@ -1,4 +1,4 @@
-"""Communicator of ranks by MPI."""
+"""Communicator of ranks that uses MPI."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pbdkit.errors import PbdkitError
 NUMBERS_AT_ONCE = 2**20
 """Number of values, summed over all processes, that are compared at once."""
 PAUSE_S = 0.05
-"""Interval in seconds at which processes test for a message of the root."""
+"""Interval in seconds at which processes test for a message from the root."""
 FAILED = 1
 """Exit status of a run that ends because one process failed."""
 
@@ -27,7 +27,8 @@ FAILED = 1
 class MPICommunicator(Communicator):
     """Communicator of mpi4py.
 
-    All operations except `raise_together` and `scatter` raise nothing.
+    An exception in another process is raised in this process only by `raise_together`,
+    `raise_first` and `scatter`.
     """
 
     def __init__(self, comm: Any) -> None:
@@ -60,7 +61,7 @@ class MPICommunicator(Communicator):
         return bool(values.any())
 
     def send(self, block: Bytes, rank: int) -> None:
-        """Send bytes to one process, which expects the same number."""
+        """Send bytes to one process, which has to expect the same number of bytes."""
         self._comm.Send(block, rank)
 
     def receive(self, into: Bytes, rank: int) -> None:
@@ -68,8 +69,9 @@ class MPICommunicator(Communicator):
         self._comm.Recv(into, rank)
 
     def scatter(self, each: Iterable[Any] | None) -> Any:
-        """Return the object that the root generates for this process; objects are generated one
-        after the other. An exception in their generation is raised in all processes."""
+        """Return the object that the root generates for this process. The root generates the
+        objects of all processes one after the other; if this raises an exception, it is raised in
+        all processes."""
         result: Any = None
         with self.raise_together():
             if each is None:
@@ -89,7 +91,8 @@ class MPICommunicator(Communicator):
         return result
 
     def exchange(self, sent: dict[int, list[Bytes]], received: dict[int, list[Bytes]]) -> None:
-        """Send blocks to ranks, and fill those that are received from them."""
+        """Send the blocks `sent` to other ranks, and fill the blocks `received` with data from
+        them."""
         waiting = [self._comm.Irecv(b, rank) for rank, each in received.items() for b in each]
         waiting += [self._comm.Isend(b, rank) for rank, each in sent.items() for b in each]
         for request in waiting:
@@ -97,8 +100,9 @@ class MPICommunicator(Communicator):
 
     @contextmanager
     def raise_together(self) -> Iterator[None]:
-        """Run the block; an exception in any process is raised in all of them at its end, that of
-        the lowest rank."""
+        """Run the block. If an exception occurs in any process, it is raised in all processes at
+        the end of the block. If exceptions occur in several processes, the exception of the lowest
+        rank is raised."""
         error: Exception | None = None
         try:
             yield
@@ -107,7 +111,7 @@ class MPICommunicator(Communicator):
         self.raise_first(error)
 
     def raise_first(self, error: Exception | None) -> None:
-        """Raise the error of the lowest rank that has one, in all processes."""
+        """Raise, in all processes, the error of the lowest rank that has an error."""
         if not self.any(error is not None):
             return
         errors = self.allgather(error and _carried(error))
@@ -116,8 +120,8 @@ class MPICommunicator(Communicator):
         raise raised
 
     def by_root(self, work: Callable[[], int]) -> int:
-        """Return the result of work that the root does alone; the other processes sleep
-        meanwhile."""
+        """Return the result of work that only the root does. The other processes sleep until it is
+        done."""
         if not self.is_root:
             while not self._comm.iprobe(source=0):
                 time.sleep(PAUSE_S)
@@ -136,8 +140,8 @@ class MPICommunicator(Communicator):
     @contextmanager
     def root_speaks(self) -> Iterator[None]:
         """Let only the root report an exception that ends the block. After an exception that is not
-        a PbdkitError, the end of this process also ends all others, which would otherwise wait for
-        it."""
+        a PbdkitError, the end of this process also ends all other processes, because they would
+        otherwise wait for it."""
         try:
             yield
         except PbdkitError as error:
@@ -149,7 +153,8 @@ class MPICommunicator(Communicator):
 
 
 def _carried(error: Exception) -> Exception:
-    """Return an error that can be sent: the same one, or one with the same message."""
+    """Return an error that can be sent to other processes: the same error if possible, otherwise an
+    error with the same message."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:

@@ -1,6 +1,4 @@
-"""Runs on several ranks: building the scene of each part, recording, and detection of a launch by
-mpiexec.
-"""
+"""Runs on several ranks: construction of the scene of each part, recording, and execution."""
 
 from __future__ import annotations
 
@@ -41,9 +39,9 @@ from pbdkit.stepping.state import State
 class PartitionScheme(NamedTuple):
     """Partition of a scene for a solver.
 
-    `subdomains` divides the scene, and `widest` returns an upper bound of the halo. Its arguments
-    are the number of rows that a step reads, the number of rows that neighbours reach, the minimum
-    number of rows of a part, and the number of parts.
+    `subdomains` divides the scene. `widest` returns an upper bound of the number of rows of the
+    halo. Its arguments are the number of rows that a step reads, the number of rows that neighbours
+    reach, the minimum number of rows of a part, and the number of parts.
     """
 
     subdomains: Callable[[Scene, int], list[partition.Subdomain]]
@@ -58,7 +56,7 @@ CUTS: dict[type[Solver], PartitionScheme] = {
 
 
 class ElsewhereError(PbdkitError):
-    """Error of another process."""
+    """An error has occurred in another process."""
 
 
 class BuildCommunicator(Communicator):
@@ -83,7 +81,8 @@ class BuildCommunicator(Communicator):
 
     @contextmanager
     def raise_together(self) -> Iterator[None]:
-        """Run the block; if a process raises in it, all others raise ElsewhereError at its end."""
+        """Run the block. If an exception occurs in a process, all other processes raise
+        ElsewhereError at the end of the block."""
         try:
             yield
         except ElsewhereError:
@@ -95,9 +94,9 @@ class BuildCommunicator(Communicator):
 
 
 def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
-    """Return the scene of the rows of a process and their halo. The whole scene is returned if
-    frame points follow distant particles. It is also built after an error, so that the same error
-    is raised as by a single process.
+    """Return the scene of the rows of a process and their halo. If frame points follow distant
+    particles, the whole scene is returned. After an error the whole scene is built, too, so that
+    the same error is raised as in a run with a single process.
 
     Raises the errors of `build_scene`, in all processes.
     """
@@ -155,8 +154,8 @@ def _built(experiment: Experiment, ranks: Communicator) -> Scene:
 
 
 def _levels(rule: FollowerRule) -> int:
-    """Return an upper bound of the number of times that a step evaluates neighbours, including once
-    for the forces on masses."""
+    """Return an upper bound of the number of times that a step evaluates neighbours, one after the
+    other. The evaluation of the forces on masses is included."""
     levels = 2
     while isinstance(rule, AppliesTwice):
         with blaming(rule, "to return its inner rule", "rule"):
@@ -166,8 +165,8 @@ def _levels(rule: FollowerRule) -> int:
 
 def _search(ground: Ground) -> int:
     """Return an upper bound of the number of rows between a frame point and the particles that it
-    can follow: its nearest particles, or particles at a difference of site index of twice the depth
-    of the frame."""
+    can follow. These are its nearest particles, or particles with site indices that differ by twice
+    the depth of the frame."""
     cell: Cell = ground.cell
     steps = [math.hypot(*v) / p for v, p in zip(cell.vectors, cell.period, strict=True)]
     farthest = ground.layers * sum(steps) + sum(math.hypot(*v) for v in cell.vectors)
@@ -193,14 +192,15 @@ class DistributedRecorder(Recorder):
         self._local = {when_measured(d) for d in diagnostics if d.local}
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
-        """Begin. A history, which contains the whole lattice, is used in the first process only."""
+        """Begin the record. The history contains the whole lattice and is therefore used only in
+        the first process."""
         super().begin(None if history is None else ())
         if history is not None:
             self._joining.take(history)
 
     def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
-        """Record in the same way as a single process, without equilibria within steps. An error of
-        one rank is raised on all."""
+        """Record a state in the same way as a single process. Equilibria within steps are not
+        recorded. An error on one rank is raised on all ranks."""
         if state.step <= self.last_steps.step and not last:
             return
         recorded = last or self._scene.experiment.records(state.step)
@@ -229,8 +229,8 @@ class DistributedRecorder(Recorder):
         return values
 
     def _inside_out(self, state: State) -> str | None:
-        """Return the description of inverted cells. The state is gathered only if a part has
-        some."""
+        """Return the description of inverted cells. The state is gathered only if some part has
+        inverted cells."""
         if not self._ranks.any(super()._inside_out(state) is not None):
             return None
         whole = self._division.gathered(state)
@@ -268,7 +268,7 @@ class PartSink(KeepingSink):
         self._first(lambda inner: inner.begin(columns, sizes | self._sizes, planned))
 
     def take(self, history: Iterable[Values]) -> None:
-        """Write entries of the whole lattice, in the first process."""
+        """Write entries of the whole lattice. Only the first process does this."""
 
         def put(inner: Sink) -> None:
             for values in history:
@@ -277,8 +277,8 @@ class PartSink(KeepingSink):
         self._first(put)
 
     def _parted(self, column: Column) -> tuple[str, int] | None:
-        """Return the dimension that is divided among processes, and its axis in an entry; None if
-        each process has all values."""
+        """Return the dimension of a column that is divided among processes, and the axis of this
+        dimension in an entry. Return None if each process has all values."""
         dims = column.dims[1:] if column.grows else column.dims
         along = [n for n, dim in enumerate(dims) if dim in self._own]
         if not along or column.name in self._not_local:
@@ -286,13 +286,13 @@ class PartSink(KeepingSink):
         return dims[along[0]], along[0]
 
     def put(self, values: Values) -> None:
-        """Write an entry, joined from the parts if it is divided, otherwise from the first
-        process."""
+        """Write an entry. If it is divided among processes, it is joined from the parts; otherwise
+        the entry of the first process is written."""
         whole = dict(values)
         for name in [name for name in values if name in self._parts]:
             dim, axis = self._parts[name]
             part = np.asarray(values[name])[(*(slice(None),) * axis, self._own[dim])]
-            if name == "bond":  # Each part counts its own bonds.
+            if name == "bond":  # Each part counts only its own bonds.
                 part += sum(self._lengths[name][: self._ranks.rank]) + 1 - part[:1]
             whole[name] = partition.joined(self._ranks, part, axis, self._lengths[dim])
         self._first(lambda inner: inner.put(whole), whole)
@@ -314,7 +314,7 @@ class PartSink(KeepingSink):
         self._first(lambda inner: inner.keep_final(checkpoint), checkpoint.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
-        """Finish with the number of processes."""
+        """Finish the result. The number of processes is added to its attributes."""
         self._first(lambda inner: inner.finish(attributes | {"ranks": str(self._ranks.size)}))
 
     def abandon(self) -> None:
@@ -325,8 +325,8 @@ class PartSink(KeepingSink):
     def _first(
         self, call: Callable[[KeepingSink], None], joining: Mapping[str, Any] | None = None
     ) -> None:
-        """Call the sink in the first process, and raise its errors in all. Meanwhile the others
-        send their parts of arrays."""
+        """Call the sink in the first process, and raise its errors in all processes. During the
+        call the other processes send their parts of arrays."""
         with self._ranks.raise_together():
             if self._inner:
                 try:
@@ -349,8 +349,8 @@ DRIVERS: dict[type[Solver], Callable[[driver.Division, Scene, Watch], Driver]] =
 
 
 class DistributedSimulation(Simulation):
-    """Run that several processes share, each with a part of the scene. Its states are those of the
-    part. All errors are raised in all processes."""
+    """Run that several processes share. Each process has a part of the scene, and the states of its
+    run are states of this part. Every error is raised in all processes."""
 
     def __init__(self, ranks: MPICommunicator, scene: Scene, watch: Watch) -> None:
         automatic = scene.experiment.stepping.open_parameters
@@ -365,8 +365,8 @@ class DistributedSimulation(Simulation):
         self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
 
     def _warnings(self, scene: Scene, bound: Bound | None) -> tuple[str, ...]:
-        """Return the warnings of the part; warnings about masses refer to the whole scene and are
-        issued by the first process."""
+        """Return the warnings about the part. Warnings about masses refer to the whole scene and
+        are issued by the first process."""
         if not any(leading.share is not None for leading in scene.leading):
             return quick_warnings(scene, bound)
         with self.division.ranks.raise_together():
@@ -383,7 +383,8 @@ class DistributedSimulation(Simulation):
         return self.division.count
 
     def recorder(self, sink: Sink) -> Recorder:
-        """Return the recorder of the part, which writes into the result of `sink`."""
+        """Return the recorder of the part. It writes to a sink that was returned by the method
+        `sink`."""
         assert isinstance(sink, PartSink)
         return DistributedRecorder(self.division, sink)
 
@@ -393,7 +394,7 @@ class DistributedSimulation(Simulation):
 
 
 def _tuned(ranks: MPICommunicator, scene: Scene) -> Scene:
-    """Return the scene with values in place of `auto`, which the first process computes for the
+    """Return the scene with numbers in place of `auto`. The first process computes them for the
     whole scene."""
     if not scene.experiment.stepping.is_open:
         return scene
@@ -417,7 +418,8 @@ class DistributedExecution(Execution):
         return built(self.communicator, experiment)
 
     def tuned(self, scene: Scene) -> Scene:
-        """Return the part with the values in place of `auto`, computed for the whole scene."""
+        """Return the part of the scene with numbers in place of `auto`, which are computed for the
+        whole scene."""
         return _tuned(self.communicator, scene)
 
     def by_root(self, work: Callable[[], int]) -> int:

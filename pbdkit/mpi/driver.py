@@ -1,5 +1,5 @@
-"""Drivers of the part of a lattice that one rank owns: stepping with halo exchange, equilibrium,
-and the decisions that all ranks take together.
+"""Drivers for the part of a lattice that one rank owns. They make steps with halo exchange, or
+compute an equilibrium, and take decisions together with the drivers of all other ranks.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class DividedStepper(Engine):
         self._halo, self._steps = halo, steps
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """Return the state after `steps` steps. An error of one process is raised in all."""
+        """Return the state after `steps` steps. An error in one process is raised in all
+        processes."""
         end = state.step + steps
         while state.step < end:
             limit = min(self._steps, end - state.step)
@@ -64,15 +65,15 @@ class DividedStepper(Engine):
 
 
 def whole_of(ranks: MPICommunicator, scene: Scene) -> Scene | None:
-    """Return the whole scene in the first process, None in the others."""
+    """Return the whole scene in the first process, and None in the other processes."""
     if not ranks.is_root:
         return None
     return build_scene(scene.experiment) if scene.raster.extent else scene
 
 
 class Division:
-    """Scene divided among processes: the part of this process, and methods that gather and
-    distribute states.
+    """Scene that is divided among processes. It contains the part of this process, and methods that
+    gather and distribute states.
 
     The first process stores the `whole` scene if diagnostics or the steady state need it.
     """
@@ -95,8 +96,8 @@ class Division:
         return self.whole or whole_of(self.ranks, scene)
 
     def begun(self, scene: Scene) -> tuple[State, bool]:
-        """Return the part of the state at time 0, and whether it can be computed again from the
-        part alone. Random numbers are drawn by the first process for the whole
+        """Return this process's part of the state at time 0, and whether it can be computed again
+        without data of other processes. Random numbers are drawn by the first process for the whole
         lattice."""
         experiment, whole = scene.experiment, None
         draws = any(isinstance(part, Draws) for part in (experiment.rule, experiment.fracture))
@@ -111,7 +112,7 @@ class Division:
         return self.dealt(whole), False
 
     def dealt(self, whole: State | None) -> State:
-        """Return this process's part of a state that only the first process has."""
+        """Return this process's part of a whole state, which only the first process has."""
         members = self.ranks.allgather(self.halo.members)
         if whole is None or not self.ranks.is_root:
             return self._state(None)
@@ -130,19 +131,20 @@ class Division:
         return self.halo.gathered(state)
 
     def state_dict(self, own: dict[str, Any]) -> dict[str, Any]:
-        """Return the state of a driver of the part, in which the state is that of the whole
-        lattice, joined on access."""
+        """Return the dictionary with the state of a driver. The entry for the state of the scene is
+        replaced by the state of the whole lattice, the arrays of which are joined when they are
+        accessed."""
         return own | {"state": self.halo.joined(own["state"])}
 
     def scattered(self, parts: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the state of a driver of the part from that of the whole lattice, which the first
-        process has."""
+        """Return the dictionary with the state of the driver of this part, given that of the whole
+        lattice, which only the first process has."""
         rest = self.ranks.bcast({key: part for key, part in parts.items() if key != "state"})
         state = self.dealt(parts.get("state") if self.ranks.is_root else None)
         return {**rest, "state": state}
 
     def stepper(self, choice: Choice) -> tuple[Engine, Choice]:
-        """Return the engine of the part: one thread in each process by default."""
+        """Return the engine of the part. By default it uses one thread in each process."""
         if self.scene.experiment.stepping.threads == "auto":
             choice = replace(choice, threads=1)
         with self.ranks.raise_together():
@@ -152,7 +154,8 @@ class Division:
 
 
 class DistributedWatch(Watch):
-    """Watch by which all processes stop if one is to stop; the first shows the progress."""
+    """Watch that interrupts all processes if the user interrupts one of them. The first process
+    shows the progress."""
 
     def __init__(self, ranks: MPICommunicator, watch: Watch) -> None:
         super().__init__(lambda: ranks.any(watch.stopping()), watch.show)
@@ -160,7 +163,7 @@ class DistributedWatch(Watch):
 
 @dataclass
 class DividedGuard(Guard):
-    """Guard over all parts."""
+    """Check for divergence over all parts of the lattice."""
 
     ranks: MPICommunicator
 
@@ -169,8 +172,8 @@ class DividedGuard(Guard):
         return self.ranks.largest(super().most(state))
 
     def worst(self, scene: Scene, state: State) -> int:
-        """Return the number of the particle with the largest displacement; among equal ones that of
-        the lowest rank."""
+        """Return the number of the particle with the largest displacement. If the displacements of
+        several particles are equal, the particle of the lowest rank is chosen."""
         values = self.ranks.allgather((super().most(state), super().worst(scene, state)))
         # NaN counts as largest.
         return int(values[int(np.argmax([largest for largest, _ in values]))][1])
@@ -186,7 +189,7 @@ class DividedSettling(SteadyStateMonitor):
         self._agree(None)
 
     def _agree(self, found: Certificate | None) -> Certificate | None:
-        """Share the result of the first process."""
+        """Send the result of the first process to all processes, and return it."""
         monitor = self._settling
         values = self._division.ranks.bcast(monitor and (found, monitor.pace, monitor.obstacle))
         certificate: Certificate | None = values[0]
@@ -194,8 +197,8 @@ class DividedSettling(SteadyStateMonitor):
         return certificate
 
     def look(self, state: State) -> Certificate | None:
-        """Return the error bound of a steady state, as a single process does. Raises StoppedError
-        in all processes."""
+        """Return the error bound of a steady state, as in a run with a single process. Raises
+        StoppedError in all processes."""
         whole, certificate, ranks = self._division.gathered(state), None, self._division.ranks
         error: Exception | None = None
         if self._settling and whole is not None:
@@ -225,27 +228,30 @@ class DistributedSteppingDriver(SteppingDriver):
             self.monitor = DividedSettling(division, settle)
 
     def _steps_in(self, seconds_a_step: float) -> int:
-        """Return the number of steps, as estimated by the first process."""
+        """Return the number of steps that the first process estimates."""
         return int(self._division.ranks.bcast(super()._steps_in(seconds_a_step)))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the driver, in which the state is that of the whole
-        lattice, joined on access."""
+        """Return the dictionary with the state of the driver. Its entry for the state of the scene
+        is the state of the whole lattice, the arrays of which are joined when they are accessed."""
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """Restore the driver from the state of the whole lattice, which the first process has."""
+        """Restore the driver from the dictionary with the state of the whole lattice, which only
+        the first process has."""
         super().load_state_dict(self._division.scattered(parts))
 
 
 def refuse_operations(ranks: MPICommunicator, scene: Scene, mode: Mode) -> None:
-    """Raise NotSharedError in all processes for an operation that any of them cannot share."""
+    """Raise NotSharedError in all processes if some process has an operation that does not support
+    ranks."""
     reasons = [reason for reason in ranks.allgather(hindrance(scene, mode)) if reason]
     refuse(scene, [(True, (reason.field,), reason.reason) for reason in reasons])
 
 
 def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> None:
-    """Raise NotSharedError for the first feature that ranks do not support, with its field."""
+    """Raise NotSharedError for the first feature in `unfit` that is present. The features are not
+    supported on several ranks; the error names the field of the feature."""
     for clash, field, text in unfit:
         if clash:
             refusal = f"{text}, which is not supported on several processes; run it in one process"
@@ -253,10 +259,12 @@ def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> 
 
 
 SHARE = 4
-"""Ratio of the number of rows of a part to that of the finest whole grid."""
+"""Ratio of the number of rows of a part to the number of rows of the finest grid that is not
+divided."""
 A_CYCLE = 6
-"""Number of rows of that grid that a process uses for a cycle in addition to its own: the number of
-valid rows decreases by 4 on the way down, and by 2 on the way up."""
+"""Number of rows of the finest undivided grid by which a process extends its own rows for a cycle.
+In a cycle the number of valid rows decreases by 4 on the way to coarser grids, and by 2 on the way
+back."""
 
 
 class DistributedRows(Rows):
@@ -267,7 +275,7 @@ class DistributedRows(Rows):
         self._halo, self.strip = halo, strip
 
     def exchange_halo(self, field: NDArray[Any]) -> None:
-        """Update the halo of a field, in place, from the other parts."""
+        """Update the halo of a field, in place, with data from the other parts."""
         self._halo.meet(field)
 
     def whole(self, numbers: NDArray[Any]) -> NDArray[Any]:
@@ -275,8 +283,8 @@ class DistributedRows(Rows):
         return np.concatenate(self.communicator.allgather(numbers[..., self.own]), axis=-1)
 
     def random(self, shape: tuple[int, ...]) -> Floats:
-        """Return the random numbers that a single process would draw for these rows; each number
-        advances the generator by one."""
+        """Return the random numbers that a single process would draw for these rows. The generator
+        is advanced by one for each number of the other rows."""
         assert self.strip
         planes, (rows, places) = shape[:-2], shape[-2:]
         numbers: Floats = np.empty((math.prod(planes), rows, places))
@@ -287,8 +295,8 @@ class DistributedRows(Rows):
 
 
 def deep_subdomains(scene: Scene, parts: int) -> list[partition.Subdomain]:
-    """Return parts with halos for a multigrid cycle. Their arrays begin at rows that exist on all
-    divided grids.
+    """Return parts with halos that are wide enough for a multigrid cycle. The arrays of a part
+    begin at a row that exists on all divided grids.
 
     Raises ExperimentError if rows are too few.
     """
@@ -305,12 +313,13 @@ def deep_subdomains(scene: Scene, parts: int) -> list[partition.Subdomain]:
 
 
 def deep_halo(each: int, edge: int, least: int, parts: int) -> int:
-    """Return an upper bound of the halos of `deep_subdomains`, as `widest_halo` does."""
+    """Return an upper bound of the halos of `deep_subdomains`. The arguments are the same as those
+    of `widest_halo`."""
     return 3 * edge + each + (A_CYCLE + 1) * int(2 ** _depth(parts))
 
 
 def strip_of(scene: Scene, own: partition.Subdomain, parts: int) -> Strip:
-    """Return the strip of a part on the grid of a scene."""
+    """Return the rows of a part, as a `Strip` of the grid of a scene."""
     count, margin = scene.raster.whole_shape[1], _margin(scene)
     first = own.low + margin if own.low else 0
     last = own.high - margin if own.high < count else count
@@ -323,8 +332,9 @@ def _depth(parts: int) -> int:
 
 
 def _margin(scene: Scene) -> int:
-    """Return the number of outermost rows of a part that are empty, that do not move, or that
-    have these or their frame points as neighbours."""
+    """Return the number of outermost rows of a part that cannot be used in the system. These are
+    the empty rows, the rows that do not move, and the rows that have such rows, or frame points
+    that follow them, as neighbours."""
     return 3 * reach_of(scene, 0).reach + partition.farthest_apart(scene)
 
 
@@ -333,8 +343,8 @@ STUCK = "the distributed iteration does not converge; run it in one process"
 
 
 class DistributedEquilibriumDriver(EquilibriumDriver):
-    """Driver of an equilibrium that several processes share. It supports linear rules, without
-    obstacles and bonds that break, on the stencils of a lattice with one site in a cell."""
+    """Driver of an equilibrium that several processes compute together. It supports linear rules on
+    a lattice with one site in a repeat cell. Obstacles and bonds that break are not supported."""
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
@@ -348,11 +358,13 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         self._rows = DistributedRows(ranks, division.halo, strip)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the driver with the state of the whole lattice, joined on access."""
+        """Return the dictionary with the state of the driver. Its entry for the state of the scene
+        is the state of the whole lattice, the arrays of which are joined when they are accessed."""
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """Restore the driver from the state of the whole lattice, which the first process has."""
+        """Restore the driver from the dictionary with the state of the whole lattice, which only
+        the first process has."""
         super().load_state_dict(self._division.scattered(parts))
 
     def _way(self, state: State) -> Way:

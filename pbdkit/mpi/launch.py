@@ -1,4 +1,4 @@
-"""Detection of a start by mpiexec. Little is imported for programs that are started otherwise."""
+"""Detection of a start by mpiexec. If a program is started in another way, little is imported."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ if TYPE_CHECKING:
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
 """Environment variables in which launchers of MPI programs store the number of processes."""
 RANK = "PMIX_RANK"
-"""Environment variable of other launchers."""
+"""Environment variable that other launchers set, and that contains the rank."""
 
 
 @contextmanager
 def launched() -> Iterator[Communicator]:
     """Yield the communicator of the processes that were started together, as by `mpiexec -n 4`.
 
-    Only the root prints in the block. A process that was started alone has the serial communicator.
+    In the block, only the root prints. If the process was started alone, the serial communicator is
+    yielded.
 
-    Raises ExperimentError if mpi4py is missing, finds no MPI library, or belongs to another
-    launcher.
+    Raises ExperimentError if mpi4py is missing, finds no MPI library, or uses another MPI library
+    than the launcher.
     """
     size = max(int(os.environ.get(name, 1)) for name in SIZES)
     if RANK not in os.environ and size == 1:

@@ -1,10 +1,11 @@
-"""Partition of a lattice among ranks: rows of repeat cells with a halo, exchange of halos, and
-joining of parts.
+"""Partition of a lattice among ranks. A part consists of rows of repeat cells with a halo. This
+module also exchanges halos and joins parts.
 
-A part has its own rows and a halo of rows of the adjacent parts. The outermost rows, as many as
-neighbours reach, are empty; in the same number of rows next to them, all particles except leaders
-are treated as frame points that follow no particle. In each step the number of valid rows decreases
-by the reach of a step, so that several steps can be made before the halo is exchanged.
+A part has its own rows and a halo of rows of the adjacent parts. The outermost rows of the halo are
+empty; their number is the number of rows that neighbours reach. In the same number of rows next to
+them, all particles except leaders are treated as frame points that follow no particle. In each step
+the number of valid rows decreases by the reach of a step. If the halo is wide enough, several steps
+can therefore be made before it is exchanged.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ BLOCK = 2**23
 
 
 class Share:
-    """Share of an array in a process other than the first, along an axis: its type, and a method to
-    send it."""
+    """Part of an array along an axis, in a process other than the first. It has the data type of
+    the array, and a method that sends the part to the first process."""
 
     def __init__(self, part: Array, axis: int) -> None:
         self.shape, self.dtype, self.ndim = part.shape, part.dtype, part.ndim
@@ -62,9 +63,9 @@ class Share:
 
 
 def joined(ranks: MPICommunicator, part: Array, axis: int, lengths: Sequence[int]) -> Any:
-    """Return an array of which each process has a part, with these lengths along an axis in the
-    order of ranks. The result is a PiecedArray in the first process and a Share in each of the
-    others."""
+    """Join an array of which each process has a part. `lengths` are the lengths of the parts along
+    an axis, in the order of ranks. The result is a PiecedArray in the first process, and a Share in
+    each of the other processes."""
     if not ranks.is_root:
         return Share(part, axis)
     shape = (*part.shape[:axis], sum(lengths), *part.shape[axis + 1 :])
@@ -97,21 +98,21 @@ def _blocks(part: Array, axis: int) -> Iterator[Bytes]:
 
 
 MOST_STEPS = 16
-"""Maximum number of steps between two exchanges, after which the halo of a part of 1500 rows is a
-hundredth of the part."""
+"""Maximum number of steps between two exchanges. With this number, the halo of a part with 1500
+rows is a hundredth of the part."""
 MAX_OVERLAP = 0.05
-"""Maximum number of rows that two adjacent parts both compute, relative to the number of rows of a
-part."""
+"""Maximum number of rows that are computed by both of two adjacent parts, relative to the number of
+rows of a part."""
 MIN_MEASURED_ROWS = 3
-"""Minimum number of moving rows beyond the own rows of a part if diagnostics are evaluated on
-it."""
+"""Minimum number of moving rows on each side of the own rows of a part if diagnostics are evaluated
+on the part."""
 
 
 @dataclass(frozen=True)
 class Subdomain:
-    """Rows `begin` to `end` of repeat cells, with a halo from `low` to `high`. The outermost `edge`
-    rows are empty, and the same number of rows next to them do not move; `steps` can be made
-    between two exchanges."""
+    """Part of a lattice: its own rows of repeat cells are `begin` to `end`, and with its halo it
+    extends from row `low` to row `high`. The outermost `edge` rows are empty, and the same number
+    of rows next to them do not move. `steps` steps can be made between two exchanges."""
 
     begin: int
     end: int
@@ -122,24 +123,26 @@ class Subdomain:
 
     @property
     def own(self) -> slice:
-        """Own rows in arrays of the part."""
+        """Range of the own rows in arrays of the part."""
         return slice(self.begin - self.low, self.end - self.low)
 
     def after(self, rows: int) -> Subdomain:
-        """Return the subdomain with rows counted from another row."""
+        """Return the subdomain with rows that are counted from the row `rows` instead of row 0."""
         begin, end, low, high = (n - rows for n in (self.begin, self.end, self.low, self.high))
         return replace(self, begin=begin, end=end, low=low, high=high)
 
     def cut(self, array: Array, axes: int) -> Array:
-        """Return a copy of the part of an array with cells along the last `axes`."""
+        """Return a copy of the rows of this subdomain from an array of the whole lattice. The last
+        `axes` axes of the array are cells."""
         return row_view(array, axes, slice(self.low, self.high)).copy()
 
     def seen(self, rows: int) -> tuple[int, int]:
-        """Return the rows with particles, of a lattice of `rows` rows."""
+        """Return the range of rows that are not empty in this subdomain. `rows` is the number of
+        rows of the whole lattice."""
         return self._within(rows, self.edge)
 
     def inner(self, rows: int) -> tuple[int, int]:
-        """Return the rows that move."""
+        """Return the range of rows that move in this subdomain."""
         return self._within(rows, 2 * self.edge)
 
     def _within(self, rows: int, edge: int) -> tuple[int, int]:
@@ -155,12 +158,13 @@ def reaches(scene: Scene) -> tuple[int, int]:
 
 
 def farthest_apart(scene: Scene) -> int:
-    """Return the largest number of rows from a frame point to the particles that it follows."""
+    """Return the largest number of rows between a frame point and a particle that it follows."""
     return int(max(scene.raster.communicator.allgather(reach_of(scene, 0).apart)))
 
 
 def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
-    """Return parts of whole rows with about equal numbers of particles.
+    """Divide a scene into parts that consist of whole rows and have about the same number of
+    particles.
 
     Raises ExperimentError if rows are too few.
     """
@@ -168,14 +172,14 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     counts = scene.raster.row_counts
     bounds = bounds_of(counts, parts)
     steps = _steps(each, int(np.diff(bounds).min()))
-    # After the last of these steps all own rows are valid, and all particles that their frame
-    # points follow.
+    # After the last step between two exchanges, the own rows and all particles that their frame
+    # points follow must be valid.
     looked_at = edge + MIN_MEASURED_ROWS * any(d.local for d in experiment.diagnostics)
-    # Bonds from own frame points lead to moving particles.
+    # The other ends of the bonds of own frame points must be moving particles.
     halo = max(steps * each, looked_at, 2 * edge * experiment.shows_bonds) + edge
     if scene.has_fracture and not experiment.fracture.breaks_frame_bonds():
-        # Bonds to particles that do not move cannot break here, so that such particles must lie
-        # beyond the bonds of own rows.
+        # Particles that do not move are treated as frame points, and bonds to frame points do not
+        # break. Therefore no own particle may have a bond to such a particle.
         halo += edge
     return [
         Subdomain(b, e, max(0, b - halo), min(len(counts), e + halo), edge, steps)
@@ -184,14 +188,14 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
 
 
 def widest_halo(each: int, edge: int, least: int, parts: int) -> int:
-    """Return an upper bound of the halos of `subdomains`, if a step reaches at most `each` rows and
-    neighbours `edge` rows, for parts of at least `least` rows."""
+    """Return an upper bound of the number of rows of the halos of `subdomains`. A step reaches at
+    most `each` rows, neighbours reach at most `edge` rows, and a part has at least `least` rows."""
     return _steps(each, least) * each + 3 * edge + MIN_MEASURED_ROWS + int(MAX_OVERLAP * least)
 
 
 def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
-    """Return the rows at which parts begin, and the end of the last; `counts` are the particles of
-    each row.
+    """Return the rows at which parts begin, and the end of the last part. `counts` are the numbers
+    of particles of each row.
 
     Raises ExperimentError if rows are too few.
     """
@@ -208,8 +212,8 @@ def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
 
 
 def _steps(each: int, least: int) -> int:
-    """Return the number of steps between two exchanges, for the rows that a step reaches and the
-    minimum number of rows of a part."""
+    """Return the number of steps between two exchanges. `each` is the number of rows that a step
+    reaches, and `least` the minimum number of rows of a part."""
     return min(MOST_STEPS, 1 + int(MAX_OVERLAP * least / each)) if each else MOST_STEPS
 
 
@@ -217,8 +221,9 @@ def _steps(each: int, least: int) -> int:
 class SubdomainScene:
     """Scene of a subdomain and its place in the whole lattice.
 
-    `ours` are the particles of each leader group in its own rows, `early` the numbers of those in
-    rows before, and `rows` the rows of the table that are its own particles.
+    `ours` are the particles of each leader group in the own rows of the subdomain. `early` are the
+    numbers of particles of each group in earlier rows. `rows` are the rows of the table with the
+    subdomain's own particles.
     """
 
     subdomain: Subdomain
@@ -229,8 +234,8 @@ class SubdomainScene:
 
 
 def part_of(scene: Scene, subdomain: Subdomain) -> SubdomainScene:
-    """Return the part of a scene with the rows of a subdomain; the raster of the scene contains at
-    least these rows."""
+    """Return the part of a scene with the rows of a subdomain. The raster of the scene must contain
+    at least these rows."""
     to, rows = restriction(scene.raster, subdomain)
     places = [each.place[each.is_in(to)] for each in scene.leading]
     begin = to.low + subdomain.own.start
@@ -240,15 +245,16 @@ def part_of(scene: Scene, subdomain: Subdomain) -> SubdomainScene:
 
 
 def restriction(raster: Raster, subdomain: Subdomain) -> tuple[Restriction, slice]:
-    """Return the restriction of a raster to the rows of a subdomain, and the rows of the table of
-    the part that are the subdomain's own particles."""
+    """Return the restriction of a raster to the rows of a subdomain. Also return which rows in the
+    table of the part are the subdomain's own particles."""
     offset = raster.extent.row_offset if raster.extent else 0
     subdomain = subdomain.after(offset)
     period = raster.cell.period[0]
     lines = raster.sites.shape[0]
 
     def line(row: int) -> int:
-        """Return the first line of sites of a row of cells, in the table."""
+        """Return the index, in the sites of the raster, of the first line of sites of a row of
+        cells."""
         return int(np.clip((raster.first[0] + row) * period - raster.low[0], 0, lines))
 
     low, high = line(subdomain.low), line(subdomain.high)
@@ -299,12 +305,12 @@ class Halo:
             np.arange(len(ours)) + first - early
             for ours, early, first in zip(part.ours, part.early, offsets, strict=True)
         )
-        """Particles of each leader group that the part has, by their index in the group."""
+        """Indices, within each leader group, of the particles that the part has."""
         own, rank, rows = part.subdomain, ranks.rank, parts[-1].end
         ranks_around = [n for n in range(len(parts)) if n != rank]
         sides = [n for n in ranks_around if _touch(own, parts[n]) or _touch(parts[n], own)]
         self.received = {n: self._rows(_shared(own, parts[n])) for n in sides}
-        """Rows that come from each rank."""
+        """Rows that are received from each rank."""
         self._sent = {n: self._rows(_shared(parts[n], own)) for n in sides}
         places = [each.place for each in part.scene.leading]
         self._at = [np.unravel_index(place, part.scene.raster.shape)[1] for place in places]
@@ -322,13 +328,13 @@ class Halo:
         return slice(first, max(first, last))
 
     def _members(self, *within: slice) -> list[Array]:
-        """Return the members of each leader group in rows."""
+        """Return the members of each leader group that lie in some rows."""
         ins = [[(at >= rows.start) & (at < rows.stop) for rows in within] for at in self._at]
         return [np.flatnonzero(np.logical_and.reduce(masks)) for masks in ins]
 
     def renew(self, state: State) -> None:
-        """Update the halo of a state in place, with the velocities of masses in it. Displacements
-        of the step before are omitted if no step reads them."""
+        """Update the halo of a state in place, including the velocities of masses in the halo.
+        Displacements of the previous step are omitted if no step reads them."""
         arrays = [
             array for array in state.arrays() if self._looks_back or array is not state.previous
         ]
@@ -355,7 +361,7 @@ class Halo:
     def _exchange(
         self, arrays: list[Array], theirs: dict[int, list[Array]], mine: dict[int, list[Array]]
     ) -> None:
-        """Exchange rows of arrays, and further arrays, with each rank."""
+        """Exchange rows of `arrays`, and the further arrays `theirs` and `mine`, with each rank."""
         sent, received = (
             {r: [*self._blocks(arrays, rows), *map(as_bytes, extra.get(r, []))] for r, rows in each}
             for each, extra in ((self._sent.items(), theirs), (self.received.items(), mine))
@@ -363,14 +369,14 @@ class Halo:
         self._ranks.exchange(sent, received)
 
     def _blocks(self, arrays: list[Array], rows: slice) -> Iterator[Bytes]:
-        """Generate the contiguous memory of some rows, plane by plane."""
+        """Generate the blocks of contiguous memory that contain some rows, plane by plane."""
         for array in arrays:
             for plane in np.ndindex(array.shape[: array.ndim - self._axes]):
                 yield as_bytes(array[plane][rows])
 
     def joined(self, state: State) -> State:
-        """Return the state of the whole lattice with arrays that are joined on access; in each
-        process other than the first, the arrays are its shares."""
+        """Return the state of the whole lattice. In the first process the arrays are joined when
+        they are accessed. In every other process the arrays are its parts of them, as `Share`."""
         rows_of_part, rows = (
             self._part.subdomain.own,
             [part.end - part.begin for part in self._parts],
@@ -387,11 +393,12 @@ class Halo:
         return state.map(whole, starts)
 
     def gathered(self, state: State) -> State | None:
-        """Return the state of the whole lattice in the first process; None in the others."""
+        """Return the state of the whole lattice in the first process, and None in the other
+        processes."""
         shares = self.joined(state)
         if self._ranks.is_root:
             starts = (None if start is None else np.asarray(start) for start in shares.starts)
-            # The order is that in which the other processes send.
+            # Arrays are received in the order in which the other processes send them.
             whole = shares.map(np.asarray, ())
             return replace(whole, starts=tuple(starts))
         every: list[Any] = [*shares.arrays(), *(s for s in shares.starts if s is not None)]
@@ -401,7 +408,7 @@ class Halo:
 
 
 def _shared(part: Subdomain, other: Subdomain) -> tuple[int, int]:
-    """Return the rows of a part's halo that another part owns."""
+    """Return those rows in the halo of a part that another part owns."""
     return max(part.low, other.begin), min(part.high, other.end)
 
 
@@ -413,7 +420,8 @@ def _touch(part: Subdomain, other: Subdomain) -> bool:
 def part_of_state(
     whole: State, axes: int, subdomain: Subdomain, members: Sequence[Indices]
 ) -> State:
-    """Return a copy of a part of a whole state, with some members of the leader groups."""
+    """Return a copy of the part of a whole state in a subdomain. `members` are the members of the
+    leader groups that it contains."""
     starts = zip(whole.starts, members, strict=True)
     starts_of_part = tuple(
         None if start is None else np.asarray(start)[:, rows] for start, rows in starts
@@ -422,17 +430,19 @@ def part_of_state(
 
 
 SITES_AT_ONCE = 2**22
-"""Number of sites that are counted at a time, so that the memory does not grow with the body."""
+"""Number of sites that are counted together. It is limited so that the memory does not grow with
+the body."""
 
 
 @dataclass(frozen=True)
 class RowCount:
     """Number of particles in the rows of a lattice.
 
-    `low` and `high` are the ends of the body's box of sites; `lines` are the numbers of particles
-    on each line of sites, including the frame, from the first nonempty line; `period` and `reach`
-    are the number of indices of a repeat cell and of cells that neighbours reach along the first
-    axis; `left_out` are the cells omitted at narrow voids.
+    `low` and `high` are the smallest and the largest site index of the body. `lines` are the
+    numbers of particles on each line of sites, including the frame, beginning with the first line
+    that is not empty. `period` is the number of site indices in a repeat cell along the first axis,
+    and `reach` the number of repeat cells that neighbours reach along it. `left_out` are the cells
+    omitted at narrow voids.
     """
 
     low: Index
@@ -445,18 +455,20 @@ class RowCount:
 
     @property
     def first(self) -> int:
-        """Repeat cells of the first row of the lattice, which is padding."""
+        """Index, along the first axis, of the repeat cells in the first row of the lattice. This
+        row is padding and has no particles."""
         return self._start // self.period - self.reach
 
     @cached_property
     def rows(self) -> NDArray[np.int64]:
-        """Number of particles of each row of repeat cells, padding included, (row,)."""
+        """Number of particles of each row of repeat cells, including the rows of padding,
+        (row,)."""
         row = (self._start + np.arange(len(self.lines))) // self.period - self.first
         rows = np.bincount(row, self.lines, row[-1] + 1 + self.reach)
         return rows.astype(np.int64)
 
     def stretch(self, begin: int, end: int) -> Stretch:
-        """Return the stretch of the rows from `begin` to below `end`."""
+        """Return the stretch of the rows from `begin` to `end`, which is excluded."""
         first, last = self._line(begin), self._line(end)
         near, far = first - self.layers, last + self.layers
         return Stretch(
@@ -475,14 +487,15 @@ class RowCount:
         return self.low[0] - self.layers
 
     def _line(self, row: int) -> int:
-        """Return the first line of sites of a row, among those with particles."""
+        """Return the index i of the first line of sites of a row, limited to the lines that are
+        counted."""
         line = (self.first + row) * self.period
         return min(max(line, self._start), self._start + len(self.lines))
 
 
 def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
     """Count the particles of a body and its frame in each row; return None if there is no body.
-    Each process counts the particles of an equal number of lines."""
+    Each process counts the particles of the same number of lines."""
     rank = communicator.rank
     lattice, layers = ground.experiment.lattice, ground.layers
     (first, *_), (last, *_) = low, high = window(ground.experiment.body, lattice)

@@ -29,23 +29,25 @@ if TYPE_CHECKING:
 
 
 MAX_EQUILIBRIA = 1000
-"""Number of recorded equilibria above which a warning suggests fewer."""
+"""Number of recorded equilibria above which a warning suggests recording fewer."""
 MIN_FLATNESS = 0.05
 """Flatness of a cell below which a warning is issued."""
 MAX_DISTANCE = 2.0
-"""Distance of a selected point from the body above which a warning is issued, in spacings."""
+"""Distance, in lattice spacings, of a selected point from the body above which a warning is
+issued."""
 MAX_LISTED = 5
 """Maximum number of distant points listed in warnings."""
 ROUND_ANGLE = math.pi / 12
-"""Angle in radians. Numbers that are multiples of it are assumed to be in radians, not degrees."""
+"""Angle in radians. If an angle in an experiment is a multiple of this number, it is assumed to be
+given in radians by mistake."""
 ROUND_ATOL = 1e-3
-"""Tolerance of the recognition of multiples of `ROUND_ANGLE`."""
+"""Tolerance with which multiples of `ROUND_ANGLE` are recognised."""
 DECIMALS = 2
-"""Number of decimals up to which an angle is assumed to be in degrees."""
+"""An angle with at most this number of decimals is assumed to be in degrees."""
 LOCKING_FACTOR = 0.07
-"""Factor k of the relative excess stiffness in bending, which is about k c_shear / (λ n) for a body
-that is n cells thick. λ is the smallest stiffness of a cell, that of a mode that extends one axis
-and contracts the other."""
+"""Factor k in the relative excess stiffness in bending, which is about k c_shear / (λ n) for a body
+that is n cells thick. λ is the smallest stiffness of a cell, which belongs to a mode that extends
+one axis and contracts the other."""
 MAX_LOCKING = 0.05
 """Relative excess stiffness above which a warning is issued."""
 
@@ -105,14 +107,14 @@ def locking(
 
     A material that is almost inextensible along the diagonals of the lattice is stiff in shear and
     under equal biaxial strain, and compliant under extension along one axis with contraction along
-    the other. Bending requires hourglass modes of the cells, which their shear stiffness resists
-    (locking).
+    the other. Bending requires hourglass modes of the cells. The shear stiffness of the cells
+    resists these modes (locking).
     """
     rule = experiment.rule
     if not isinstance(rule, MixesCells) or (c := rule.elasticity()) is None:
         return
     values, vectors = np.linalg.eigh([[c.xx, c.xy], [c.xy, c.yy]])
-    if vectors[0, 0] * vectors[1, 0] > -0.25:  # The compliant mode is of another kind.
+    if vectors[0, 0] * vectors[1, 0] > -0.25:  # The mode is another one.
         return
     sides = [math.hypot(*vector) for vector in raster.cell.vectors]
     ends = zip(*box, sides, strict=True)
@@ -158,8 +160,8 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
 def carried_by_leaders(
     raster: Raster, leading: Sequence[Leading], loads: Loads | None, steps: int
 ) -> Iterator[str]:
-    """Generate a warning for each load without effect, because all its particles are led along its
-    direction while it acts."""
+    """Generate a warning for each load that has no effect because all its particles have prescribed
+    motion along its direction while it acts."""
     for n, loading in enumerate(loads.each if loads else ()):
         load = loading.load
         along = np.flatnonzero(load.force_at(max(load.from_, 1))).tolist()
@@ -196,7 +198,7 @@ def never_near(
 
 
 def _offsets(driven: Leading | Barrier, steps: int) -> list[NDArray[Any]]:
-    """Return the displacements of a motion at its knots, each (particle or 1, axis)."""
+    """Return the displacements of a motion at its knots, as arrays (particle or 1, axis)."""
     motion, last = driven.group.motion, driven.group.last(steps) - driven.group.from_ + 1
     if isinstance(motion, Oscillation):
         return [np.array([motion.amplitude]), -np.array([motion.amplitude])]
@@ -206,8 +208,8 @@ def _offsets(driven: Leading | Barrier, steps: int) -> list[NDArray[Any]]:
 
 
 def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
-    """Generate a warning for each of the first points of `nearest` that are far from all
-    particles."""
+    """Generate a warning for each point of a selection `nearest` that is far from all particles,
+    for at most `MAX_LISTED` points."""
     selections = {f"leaders.{n}": group.select for n, group in enumerate(experiment.leaders)}
     selections |= {f"loads.{n}": load.select for n, load in enumerate(experiment.loads)}
     points = [(name, at) for name, select in selections.items() for at in select.nearest or ()]
@@ -230,7 +232,8 @@ def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
 
 
 def angles_in_radians(experiment: Experiment) -> Iterator[str]:
-    """Generate a warning for each angle, or total rotation, that is a round number of radians."""
+    """Generate a warning for each angle, or total rotation, that is a multiple of `ROUND_ANGLE` and
+    therefore seems to be given in radians."""
     angles = {}
     if (angle := getattr(experiment.lattice, "angle", None)) is not None:
         angles["lattice.angle"] = angle, angle
@@ -248,8 +251,8 @@ def angles_in_radians(experiment: Experiment) -> Iterator[str]:
 
 
 def round_in_radians(angle: float) -> bool:
-    """Return whether an angle is a multiple of 15°, up to a full turn, expressed in radians with
-    more than `DECIMALS` decimals.
+    """Return whether a number, read as radians, is a multiple of 15° up to a full turn. Numbers
+    with at most `DECIMALS` decimals are excluded.
 
     0.7854 is such an angle, 2.88 is not.
     """

@@ -1,9 +1,8 @@
-"""Constants and state variables that elementwise functions receive, and the object to which each
-belongs.
+"""Constants and state variables that elementwise functions receive. This module calls them numbers.
 
-A number belongs to the scene, a slot, a cell, a bond or a particle. New kinds of numbers are
-declared here, with their name and the function that receives them; the numpy engine and the kernels
-use this description.
+Each number belongs to the scene, a slot, a cell, a bond or a particle. New kinds of numbers are
+declared here, with their name and the functions that receive them. The numpy engine and the kernels
+use these declarations.
 """
 
 from __future__ import annotations
@@ -203,7 +202,7 @@ def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: 
     """
     part: TakesFields = getattr(experiment, field)
     cell, regions = experiment.lattice.cell(), dict[str, Mask]()
-    # Largest distance of the corners of cut cells from the body.
+    # Corners of cut cells lie at most this distance outside the body.
     reach = max(math.hypot(*vector) for vector in cell.vectors)
     if any(isinstance(varying, ByRegion) for varying in part.varying.values()):
         for name, region in experiment.regions.items():
@@ -229,11 +228,11 @@ def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: 
 def _refuse_incompatible(
     part: TakesFields, field: str, values: Values, x: Floats, y: Floats
 ) -> None:
-    """Validate the values together at the places with the largest differences between two
-    parameters.
+    """Validate the values of all parameters together, at the places where the difference between
+    two parameters is largest.
 
-    Values that are valid one by one can be incompatible, for instance where one must exceed
-    another.
+    Values that are valid for each parameter alone can be incompatible, for instance if one
+    parameter must exceed another.
     """
     for first, second in combinations(values.values(), 2):
         for place in (int(np.argmin(first - second)), int(np.argmax(first - second))):
@@ -269,9 +268,9 @@ def kinds_of(part: TakesFields, values: Values) -> tuple[list[Any], NDArray[np.i
 
 
 WHOLE_CELLS = {"left": 1.0, "right": 1.0}
-"""Area fractions of the cells on both sides of a bond under frames that do not weight cells."""
+"""Area fractions of the cells on both sides of a bond if the frame policy does not weight cells."""
 Planes = Mapping[str, Floats]
-"""Type of numbers on rasters or planes, by name."""
+"""Type of values for each particle or each bond, by name."""
 
 
 @dataclass(frozen=True)
@@ -287,7 +286,8 @@ class SceneConstants:
     fracture
         Parameters ``p`` of the fracture model.
     limits
-        Constants ``c`` of the fracture model without state variables, by slot.
+        Constants of the fracture model by slot. State variables, which are also in ``c``, are not
+        included.
     of_bond
         Named tuple of limits and state variables of a bond, ``c``.
     of_particle
@@ -308,7 +308,7 @@ class SceneConstants:
     by_bond: Planes = field(default_factory=dict)
 
     def restrict(self, to: Restriction) -> SceneConstants:
-        """Return the constants of some rows."""
+        """Return the constants restricted to some rows."""
         by_particle = {name: to.cut(planes) for name, planes in self.by_particle.items()}
         by_bond = {name: to.cut(planes) for name, planes in self.by_bond.items()}
         return replace(self, by_particle=by_particle, by_bond=by_bond)
@@ -319,7 +319,7 @@ class SceneConstants:
         return [v for name, v in self.rule._asdict().items() if name not in self.by_particle]
 
     def limits_of(self, slot: Slot) -> list[float]:
-        """Return the limits of a slot that do not vary in space."""
+        """Return those limits of a slot that do not vary in space."""
         limits = self.limits[slot]._asdict()
         return [value for name, value in limits.items() if name not in self.by_bond]
 
@@ -328,7 +328,8 @@ class SceneConstants:
         return self.rule._replace(**{name: where.of(v) for name, v in self.by_particle.items()})
 
     def limits_at(self, slot: Slot, plane: int, home: Where) -> Any:
-        """Return the limits of bonds along a slot that are stored on a plane."""
+        """Return the limits of the bonds along a slot. `plane` is the index of the plane in which
+        the bonds are stored, and `home` are the places at which they are stored."""
         values = {name: home.within(planes[plane]) for name, planes in self.by_bond.items()}
         return self.limits[slot]._replace(**values)
 
@@ -380,7 +381,8 @@ def _refuse_pulling(
 ) -> None:
     """Raise ExperimentError if broken bonds exert forces under a calibrated rule.
 
-    Such a force acts on one end only, so that forces do not balance.
+    The fictitious point of a broken bond exerts a force on one end only, so that forces would not
+    balance.
     """
     u = 0.1 * slots[0].rest
     lost = [fracture.fictitious(u, slot.rest, parameters) for slot in slots]
@@ -393,7 +395,8 @@ def _refuse_pulling(
 
 
 def named_weights(values: Any, rule: FollowerRule) -> Any:
-    """Return the weights of a rule for a slot as the named tuple ``w``."""
+    """Return the weights of a rule for a slot as the named tuple that functions receive as
+    ``w``."""
     return _named("Weights", values, **(WHOLE_CELLS if rule.uses_cells else {}))
 
 
@@ -405,7 +408,8 @@ def of_material(
     Raises
     ------
     ExperimentError
-        If the rule is not calibrated to a material, or not defined by cells.
+        If the rule is not calibrated to a material, or is not defined on cells although the
+        fracture model requires cells.
     """
     if not isinstance(fracture, KnowsStiffness):
         return {}
@@ -419,8 +423,8 @@ def of_material(
 
 
 def _named(kind: str, values: Any, **constants: float) -> Any:
-    """Return a named tuple of Python floats; with numpy's scalars single precision would be
-    promoted to double."""
+    """Return a named tuple of Python floats. numpy's scalars are not used because they would
+    promote single precision to double precision."""
     if not isinstance(values, dict):
         raise TypeError(
             f"it returned {type(values).__name__}; return numbers by name: {{'k': 1.0}}"
@@ -431,7 +435,7 @@ def _named(kind: str, values: Any, **constants: float) -> Any:
 
 @cache
 def _kind(name: str, fields: tuple[str, ...]) -> Any:
-    """Create a type of named tuples; cached because this is slow."""
+    """Create a type of named tuples. The result is cached, because creating a type is slow."""
     return namedtuple(name, fields)
 
 
@@ -450,9 +454,9 @@ class Home(Enum):
     CELL = "cell"
     """One value for each cell beside a slot."""
     BOND = "bond"
-    """One value for each bond, as a state variable."""
+    """One value for each bond, stored as a state variable."""
     PARTICLE = "particle"
-    """One value for each particle, as a state variable."""
+    """One value for each particle, stored as a state variable."""
     FIXED_BOND = "bond, by a field"
     """One value for each bond, constant in time."""
     FIXED_PARTICLE = "particle, by a field"
@@ -461,12 +465,12 @@ class Home(Enum):
 
 @dataclass(frozen=True)
 class Number:
-    """Number passed to elementwise functions.
+    """Constant or state variable that is passed to elementwise functions.
 
     Parameters
     ----------
     name
-        Name of the number.
+        Name of the constant or state variable.
     home
         Kind of object to which it belongs.
     changes
@@ -484,7 +488,7 @@ Numbers = tuple[Number, ...]
 
 @dataclass(frozen=True)
 class VisibleNumbers:
-    """Numbers by the argument that holds them, in order.
+    """Numbers that elementwise functions receive, sorted by the argument that contains them.
 
     Parameters
     ----------
@@ -535,7 +539,8 @@ def _remembered(numbers: Iterable[Remembered], home: Home) -> Numbers:
 
 
 SAMPLE_COUNT = 3
-"""Number of places at which the evaluation of a component on whole arrays is verified."""
+"""Number of places at which the result of a component for whole arrays is compared with its results
+for single places."""
 PROBE = 0.7
 """Largest relative displacement at which fracture models are evaluated, in bond lengths."""
 
@@ -590,13 +595,14 @@ def _refuse(experiment: Experiment) -> None:
 
 
 def _knows_varying(fracture: FractureModel, rule: FollowerRule) -> bool:
-    """Return whether the breaking of bonds depends on a stiffness that varies in space."""
+    """Return whether the fracture model depends on the stiffness of the rule while this stiffness
+    varies in space."""
     return isinstance(fracture, KnowsStiffness) and bool(rule.varying)
 
 
 def _draws(part: TakesFields) -> bool:
-    """Return whether constant state variables are drawn at random from the parameters of a
-    component."""
+    """Return whether a component has constant state variables that are drawn at random, in
+    dependence on its parameters."""
     return isinstance(part, Draws) and any(not number.changes for number in part.remembered())
 
 
@@ -622,8 +628,8 @@ def _by_particle(
 
 
 def _refuse_weights(rule: FollowerRule, values: Values, setting: Setting) -> None:
-    """Raise ExperimentError if weights depend on the values: the weights of a slot cannot vary in
-    space."""
+    """Raise ExperimentError if the weights depend on varying parameters, because the weights of a
+    slot cannot vary in space."""
     slots = [slot for ends in setting.slots for slot in ends]
     parts, _ = kinds_of(rule, {name: _ends(value) for name, value in values.items()})
     weights = [[part.weights(slot, setting) for slot in slots] for part in parts]
@@ -645,7 +651,8 @@ def _by_bond(
 ) -> dict[str, Floats]:
     """Compute the spatially varying limits of the fracture model by name, (plane, cell, cell).
 
-    Bonds have the values at their midpoint. All other results of the model must be uniform.
+    The parameters are evaluated at the midpoint of each bond. Results of the model other than
+    limits must not vary.
     """
     fracture, slots = experiment.fracture, [plane.slot for plane in neighbourhood.planes]
     base = [constants.limits[slot]._asdict() for slot in slots]
@@ -677,8 +684,8 @@ def _by_bond(
 def _rules_at(
     experiment: Experiment, x: Floats, y: Floats, needed: Mask
 ) -> Iterator[tuple[FollowerRule, Mask]]:
-    """Generate the rule with each combination of parameters, and the mask of the places that have
-    it.
+    """Generate the rule for each combination of parameters that occurs, and a mask of the places
+    with this combination.
     """
     rule = experiment.rule
     parts, kind = [rule], np.zeros(x.shape, np.intp)
@@ -688,7 +695,7 @@ def _rules_at(
 
 
 def _limits(slot: Slot, rule: FollowerRule, setting: Setting, fracture: FractureModel) -> Any:
-    """Return the constants of a fracture model for a slot, including those derived from the
+    """Return the constants of a fracture model for a slot, including the constants derived from the
     material.
     """
     return {**fracture.constants(slot), **of_material(fracture, rule, setting, slot)}
@@ -697,10 +704,10 @@ def _limits(slot: Slot, rule: FollowerRule, setting: Setting, fracture: Fracture
 def _refuse_parameters(
     experiment: Experiment, constants: SceneConstants, slot: Slot, values: Values
 ) -> None:
-    """Raise ExperimentError if functions of the fracture model depend on varying parameters
-    directly, and not through limits.
+    """Raise ExperimentError if functions of the fracture model depend directly on varying
+    parameters. They may depend on them only by means of limits.
 
-    Limits are stored for each bond, parameters once for all bonds.
+    The reason is that limits are stored for each bond, but parameters only once for all bonds.
     """
     fracture = experiment.fracture
     parts, _ = kinds_of(fracture, {name: _ends(value) for name, value in values.items()})
@@ -716,7 +723,7 @@ def _refuse_parameters(
 def _probed(
     experiment: Experiment, constants: SceneConstants, slot: Slot, parameters: Mapping[str, float]
 ) -> Floats:
-    """Evaluate the functions of the fracture model at several differences."""
+    """Evaluate the functions of the fracture model for several relative displacements."""
     fracture, p = experiment.fracture, type(constants.fracture)(**parameters)
     initial = (number.initial for number in bond_numbers(experiment))
     c = constants.of_bond(*constants.limits[slot], *initial)
@@ -738,9 +745,9 @@ def _evaluate(
 ) -> dict[str, NDArray[Any]]:
     """Evaluate a function of a component with spatially varying parameters.
 
-    The function is evaluated on whole arrays first. If it does not support these, or gives other
-    results for several places than for each place alone, it is evaluated once for each distinct
-    combination of values.
+    The function is first evaluated on whole arrays. If it does not support arrays, or if its
+    results for several places differ from those for each place alone, it is evaluated once for each
+    distinct combination of values.
     """
     shape, names = next(iter(values.values())).shape, list(function(part))
     result = _evaluate_arrays(part, values, function, names)
@@ -757,7 +764,7 @@ def _evaluate_arrays(
     try:
         answer = function(part.model_copy(update=dict(values)))
         result = {name: np.asarray(answer[name], float) for name in names}
-    except Exception:  # The function is evaluated at each place instead.
+    except Exception:  # The function is then evaluated for each combination of values.
         return None
     size = next(iter(values.values())).size
     for n in sorted({0, size // 2, size - 1})[:SAMPLE_COUNT]:

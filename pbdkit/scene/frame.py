@@ -38,7 +38,8 @@ class Frame:
     depends_on_rule: bool = False
 
     def follow(self, body: Floats, out: Floats) -> None:
-        """Write the displacements of the frame to `out`; both arrays are (axis, flat place)."""
+        """Compute the displacements of the frame points from `body`, and write them to `out`. Both
+        arrays are (axis, flat place)."""
         u = body[:, self.body_place]
         weight = self.map.weight
         weighted = weight * u if weight.ndim == 1 else np.einsum("eab,be->ae", weight, u)
@@ -46,8 +47,8 @@ class Frame:
             plane[self.place] = np.bincount(self.map.point, values, len(self.place))
 
     def restrict(self, to: Restriction) -> Frame | None:
-        """Return the points of some rows that follow particles of these rows alone; None if there
-        are none."""
+        """Return the frame restricted to those points of some rows that follow only particles of
+        these rows. Return None if there are no such points."""
         missing = self.map.point[~to.is_present(self.body_place)]
         has_missing = np.bincount(missing, minlength=len(self.place)) > 0
         is_resolved = to.is_moving(self.place) & ~has_missing
@@ -150,7 +151,8 @@ class RasterFrame(FrameSites):
         return np.where(self.raster.table_kind[rows] == FOLLOWER, rows, -1)
 
     def nearest(self) -> tuple[Indices, Indices]:
-        """Return the pairs (point, body) of each frame point with all nearest body particles.
+        """Return all pairs (point, body) of a frame point and a body particle that is nearest to
+        it. If several body particles are equally near, there is a pair with each of them.
 
         Searches outward from every frame point, shell by shell.
         """
@@ -162,8 +164,8 @@ class RasterFrame(FrameSites):
         return point[order], body[order]
 
     def _nearest_of(self, sublattice: int, points: Indices) -> Iterator[tuple[Indices, Indices]]:
-        """Generate the pairs of points of a sublattice and nearest body particles, offset by
-        offset.
+        """Generate the pairs of frame points of a sublattice and nearest body particles. Offsets
+        are tried one after the other.
         """
         nearest = np.full(len(points), np.inf)
         searched, radius = 0.0, max(math.hypot(*v) for v in self.cell.vectors)

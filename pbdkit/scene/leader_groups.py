@@ -1,7 +1,8 @@
 """Leader groups on a raster.
 
-Groups lead along all axes or along some; particles that lead along some axes and follow along the
-others (rollers) are called guided. Leaders can also have prescribed directions.
+A group prescribes the motion of its particles along all axes or along some of them. Particles with
+prescribed motion along some axes and free motion along the others (rollers) are called guided.
+Leaders can also have prescribed directions.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from pbdkit.scene.selection import Selecting, shares_of, spacing
 
 
 def rotations_of(experiment: Experiment) -> tuple[tuple[int, int], ...]:
-    """Return the indices of cosine and sine of each rotation among the state variables of the rule.
+    """Return, for each rotation, the indices of its cosine and its sine among the state variables
+    of the rule.
 
     Raises
     ------
@@ -55,8 +57,8 @@ def check_directions(experiment: Experiment, *, has_frame: bool) -> None:
     ------
     ExperimentError
         If a rule that reads the state variables of neighbours is combined with frame points or
-        broken bonds, for which there are none, or if leaders are clamped under a rule without
-        directions.
+        broken bonds, because frame points and fictitious points have no state variables. Also if
+        leaders are clamped under a rule without directions.
     """
     rule = experiment.rule
     if shares_particles(rule):
@@ -92,9 +94,10 @@ class Leading:
     reference
         Reference positions, (particle, axis).
     axes
-        Indices of the axes along which the group leads.
+        Indices of the axes along which the group prescribes the motion.
     share
-        Fraction of the force on the group that acts on each particle, for motion by Newton's law.
+        Fraction of the force on the group that acts on each particle. It is used if the group moves
+        by Newton's law.
     """
 
     group: LeaderGroup
@@ -111,7 +114,7 @@ class Leading:
         return (to.is_present if self.share is None else to.is_moving)(self.place)
 
     def restrict(self, to: Restriction) -> Leading:
-        """Return the group with the particles of some rows."""
+        """Return the group restricted to the particles of some rows."""
         is_in = self.is_in(to)
         return replace(
             self,
@@ -122,7 +125,8 @@ class Leading:
         )
 
     def offset(self, n: float) -> Floats:
-        """Return the displacement of the motion, (particle or 1, lead axis)."""
+        """Return the displacement of the motion along the prescribed axes, (particle or 1,
+        axis)."""
         offset = np.atleast_2d(self.group.motion.offset(n, self.reference))
         return np.asarray(offset[:, list(self.axes)])
 
@@ -133,8 +137,8 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
     Raises
     ------
     ExperimentError
-        If a group selects no particle or a frame point, or two groups move one particle differently
-        in the same step.
+        If a group selects no particle or a frame point, or if two groups prescribe different
+        motions of one particle in the same step.
     """
     groups: list[Leading] = []
     body, steps = Selecting(raster, experiment.regions), experiment.steps
@@ -175,7 +179,8 @@ def _meeting(leading: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
 
 
 def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[np.int8]:
-    """Return the kind of every particle during a step, (particle,); at time 0 those of step 1."""
+    """Return the kind of every particle during a step, (particle,). At time 0 it is the kind during
+    step 1."""
     kinds = raster.table_kind.copy()
     for leaders in leading:
         if leaders.group.leads(max(step, 1)):
@@ -186,7 +191,8 @@ def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[n
 def _refuse_contradiction(
     raster: Raster, groups: list[Leading], k: int, n: int, steps: int
 ) -> None:
-    """Compare the motions of groups k and n in every step in which both lead a particle."""
+    """Compare the motions of groups k and n in every step in which both prescribe the motion of a
+    common particle."""
     a, b = sorted((groups[k], groups[n]), key=lambda leading: leading.group.from_)
     shared = np.intersect1d(a.rows, b.rows)
     begin, end = b.group.from_, min(a.group.last(steps), b.group.last(steps))
@@ -248,8 +254,8 @@ def _refuse_infinite(
 def _is_comparable(a: LeaderGroup, b: LeaderGroup, at_rest: bool) -> bool:
     """Return whether two motions can be compared before the run.
 
-    Rotations depend on the positions at their start, which must be available before the run.
-    Motions by Newton's law are never available before the run.
+    Rotations depend on the positions at their start, which must be known before the run. Motions by
+    Newton's law are never known before the run.
     """
     if any(isinstance(group.motion, Newton) for group in (a, b)):
         return False
@@ -265,14 +271,15 @@ def _offset(group: LeaderGroup, step: int, start: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Guided:
-    """Guided particles of a step, which lead along some axes and follow along the others.
+    """Guided particles of a step. They have prescribed motion along some axes and free motion along
+    the others.
 
     Parameters
     ----------
     rows, place
         Rows, sorted, and flat places of the particles.
     lead_axes
-        Mask of the axes along which each particle leads, (axis, particle).
+        Mask of the axes along which the motion of each particle is prescribed, (axis, particle).
     """
 
     rows: Indices
@@ -280,20 +287,21 @@ class Guided:
     lead_axes: Mask
 
     def is_led(self, raster: Raster) -> Mask:
-        """Return a mask of the components along which guided particles lead, (axis, flat place)."""
+        """Return a mask of the prescribed components of guided particles, (axis, flat place)."""
         mask = np.zeros((len(self.lead_axes), raster.kind.size), bool)
         mask[:, self.place] = self.lead_axes
         return mask
 
 
 def has_guides(leading: Iterable[Leading]) -> bool:
-    """Return whether a group leads along some axes only, so that particles can be guided."""
+    """Return whether some group prescribes the motion along some axes only, so that particles can
+    be guided."""
     return any(len(group.axes) < group.reference.shape[1] for group in leading)
 
 
 def guided_at(raster: Raster, leading: Iterable[Leading], step: int) -> Guided:
-    """Return the guided particles of a step; groups that lead a particle along different axes are
-    combined."""
+    """Return the guided particles of a step. If several groups prescribe the motion of a particle
+    along different axes, all these axes are included."""
     active = [group for group in leading if group.group.leads(step)]
     axes = len(raster.cell.vectors)
     parts = [group.rows for group in active if len(group.axes) < axes]

@@ -34,8 +34,8 @@ class Loading:
     rows, place
         Rows and flat places of its particles.
     share
-        Fraction of the force that acts on each particle, or the area of each particle for a body
-        force.
+        Fraction of the force that acts on each particle. For a body force it is the area of each
+        particle.
     """
 
     load: Load
@@ -44,7 +44,7 @@ class Loading:
     share: Floats
 
     def restrict(self, to: Restriction) -> Loading:
-        """Return the load on the particles of some rows."""
+        """Return the load restricted to the particles of some rows."""
         is_moving = to.is_moving(self.place)
         rows, place = to.rows(self.rows[is_moving]), to.places(self.place[is_moving])
         return replace(self, rows=rows, place=place, share=self.share[is_moving])
@@ -61,7 +61,7 @@ class Loads:
     shape
         Shape of the raster.
     held_at
-        Moment at which the loads are evaluated; None to evaluate them at each step.
+        Moment at which the loads are evaluated. If it is None, they are evaluated at each step.
     """
 
     each: tuple[Loading, ...]
@@ -70,12 +70,13 @@ class Loads:
     _last: tuple[Any, Planes] | None = field(default=None, repr=False)
 
     def restrict(self, to: Restriction) -> Loads:
-        """Return the loads on the particles of some rows."""
+        """Return the loads restricted to the particles of some rows."""
         each = tuple(loading.restrict(to) for loading in self.each)
         return Loads(each, to.part.shape, self.held_at)
 
     def at(self, moment: float, dtype: Any) -> Planes:
-        """Return the forces at the end of a step, or at a moment within it, as a shared array."""
+        """Return the forces at the end of a step, or at a moment within it. The array is shared and
+        must not be changed."""
         moment = moment if self.held_at is None else self.held_at
         forces = [loading.load.force_at(moment).tolist() for loading in self.each]
         key = forces, np.dtype(dtype)
@@ -116,7 +117,7 @@ class Loads:
 def build_loads(
     raster: Raster, tiling: Tiling, cells: WeighedCells | None, experiment: Experiment
 ) -> Loads | None:
-    """Find the particles of every load, and the fraction of the load on each.
+    """Find the particles of every load, and the fraction of the load that acts on each particle.
 
     Returns
     -------

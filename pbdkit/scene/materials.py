@@ -1,4 +1,4 @@
-"""Stiffness of cells under rules with spatially varying material.
+"""Stiffness of cells for rules with a spatially varying material.
 
 A cell that is cut by the border of two materials is replaced by a laminate with layers along the
 border.
@@ -28,19 +28,20 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import Values, kinds_of, named_weights, signed_distance, values_at
 
 ACROSS = [0, 2]
-"""Indices of the components (normal, tangential, shear) of equal stress in all layers."""
+"""Indices, among the components (normal, tangential, shear), of those with the same stress in all
+layers."""
 ALONG = [1]
-"""Indices of the components of equal strain in all layers."""
+"""Indices of the components with the same strain in all layers."""
 ISOTROPY_RTOL = 1e-6
-"""Relative anisotropy of the integral of n nᵀ below which a border has no main direction, as for a
-square inside a cell."""
+"""Relative anisotropy of the integral of n nᵀ below which a border is treated as having no main
+direction. This is so, for instance, for a square inside a cell."""
 DIRECTIONS = 12
 """Number of directions over which the stiffness of cells without a main direction is averaged. The
 set of directions has the rotational symmetries of every lattice."""
 
 
 def layered(outer: Floats, inner: Floats, share: Floats, facing: Floats) -> Floats:
-    """Compute the stiffness of cells that a border of two materials cuts.
+    """Compute the stiffness of cells that are cut by a border between two materials.
 
     Parameters
     ----------
@@ -49,13 +50,14 @@ def layered(outer: Floats, inner: Floats, share: Floats, facing: Floats) -> Floa
     share
         Area fraction of the inner material, (cell,).
     facing
-        Integral of n nᵀ over the border in each cell with its normals n, (cell, 2, 2).
+        Integral of n nᵀ over the border in each cell, (cell, 2, 2), where n is the normal of the
+        border.
 
     Returns
     -------
     NDArray
-        Stiffness, (cell, 3, 3), of a laminate along the main direction of the border, or the mean
-        over laminates of all directions if the border has none.
+        Stiffness, (cell, 3, 3), of a laminate with layers along the main direction of the border.
+        If the border has no main direction, it is the mean over laminates of all directions.
     """
     whole = facing[:, 0, 0] + facing[:, 1, 1]
     spread = np.array([facing[:, 0, 0] - facing[:, 1, 1], 2 * facing[:, 0, 1]])
@@ -96,8 +98,9 @@ def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Flo
 
     Notes
     -----
-    Tractions on the layers and strain along them are the same in both materials (Backus 1962),
-    which gives harmonic means across the layers and arithmetic means along them.
+    The tractions on the layers and the strain along the layers are the same in both materials
+    (Backus 1962). Therefore the stiffness across the layers is a harmonic mean, and the stiffness
+    along them an arithmetic mean.
     """
     turn = _to_layers(normal)
     back = _to_layers(normal * [1.0, -1.0])
@@ -122,8 +125,8 @@ def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Flo
 def _pieces(c: Floats) -> tuple[Any, Any, Any]:
     """Return the terms of a material that are averaged over the layers, in the axes of the layers.
 
-    They are C_nn⁻¹, C_nn⁻¹ C_nt and C_tt - C_tn C_nn⁻¹ C_nt, with n for the components across the
-    layers and t for the component along them.
+    The terms are C_nn⁻¹, C_nn⁻¹ C_nt and C_tt - C_tn C_nn⁻¹ C_nt. The index n stands for the
+    components across the layers, and t for the component along them.
     """
     across, coupling = c[:, ACROSS][:, :, ACROSS], c[:, ACROSS][:, :, ALONG]
     compliance = np.linalg.inv(across)
@@ -132,7 +135,8 @@ def _pieces(c: Floats) -> tuple[Any, Any, Any]:
 
 
 def _to_layers(normal: Floats) -> Floats:
-    """Return the rotation of strains (xx, yy, engineering xy) to layers, (cell, 3, 3)."""
+    """Return the matrices, (cell, 3, 3), that rotate strains (xx, yy, engineering xy) to the axes
+    of the layers."""
     c, s = normal.T
     return np.moveaxis(
         np.array(
@@ -144,9 +148,10 @@ def _to_layers(normal: Floats) -> Floats:
 
 
 STIFFNESS = "stiffness"
-"""Name of the parameter that scales the stiffness of cells under every rule."""
+"""Name of the parameter that scales the stiffness of cells for every rule."""
 SPRINGS = "springs"
-"""Name, beside those of the components of stiffness, of the springs in torn cells."""
+"""Name under which the springs of torn cells are listed, in addition to the names of the components
+of stiffness."""
 PLACES = {
     "xx": (0, 0),
     "yy": (1, 1),
@@ -182,7 +187,7 @@ def weighed(
     Raises
     ------
     ExperimentError
-        If the rule does not support cells of other materials.
+        If the rule does not support cells with a material other than its own.
     """
     rule = experiment.rule
     if not (rule.varying and rule.uses_cells):
@@ -219,15 +224,15 @@ def weighed(
 
 
 def _springs(rule: Any, setting: Setting, mixed: Mask, stiffness: Floats) -> Floats:
-    """Return the factor that multiplies the springs of the rule in each cell, 0 if `mixed` is
-    false."""
+    """Return the factor by which the springs of the rule are multiplied in each cell. It is 0 for
+    cells that are not `mixed`."""
     result = np.zeros(len(mixed))
     result[mixed] = rule.spring_share(stiffness[mixed], setting)
     return result
 
 
 def regions_of(experiment: Experiment) -> dict[str, Body]:
-    """Return the regions that parameters of the rule refer to, in the order of the experiment."""
+    """Return the regions to which parameters of the rule refer, in the order of the experiment."""
     fields = experiment.rule.varying.values()
     names = {n for field in fields if isinstance(field, ByRegion) for n, _ in field.values}
     return {name: body for name, body in experiment.regions.items() if name in names}
@@ -257,7 +262,7 @@ def _weights(
 
 
 def stiffness_at(experiment: Experiment, values: Values) -> Floats:
-    """Compute the stiffness over Young's modulus for parameters at places.
+    """Compute the stiffness, divided by Young's modulus, for the parameters at places.
 
     Returns
     -------
@@ -328,8 +333,9 @@ class _Cells:
         Returns
         -------
         tuple
-            Ratio of the stiffness to that of the rule, (cell,), 0 where the stiffness is not a
-            multiple of it; and the stiffness of the cells with ratio 0, (cell, 3, 3).
+            Ratio of the stiffness of each cell to the stiffness of the rule, (cell,). It is 0 if
+            the stiffness of the cell is not a multiple of the stiffness of the rule. The second
+            result is the stiffness of the cells with ratio 0, (cell, 3, 3).
         """
         rule, x, y = self.experiment.rule, self.x.mean(axis=0), self.y.mean(axis=0)
         values = dict(values_at(self.experiment, "rule", x, y, self.inside))
@@ -348,8 +354,8 @@ class _Cells:
         return np.where(is_other, 0.0, factor), stiffness
 
     def phases(self) -> NDArray[np.int64]:
-        """Return the regions that contain each cell as a bit mask, (cell,); -1 if a border cuts the
-        cell.
+        """Return for each cell the regions that contain it, as a bit mask, (cell,). The result is
+        -1 if a border cuts the cell.
         """
         result = np.zeros(self.x.shape[1], np.int64)
         for bit, (_, share, _) in enumerate(self._borders):
@@ -359,8 +365,8 @@ class _Cells:
         return result
 
     def _mixed(self, values: Values, cells: Any) -> Floats:
-        """Compute the stiffness of selected cells as layers along the border of one region after
-        another.
+        """Compute the stiffness of selected cells. One region after the other is added, as a
+        laminate with layers along the border of the region.
         """
         outer = {name: value[cells] for name, value in values.items()}
         fields = self.experiment.rule.varying
@@ -388,7 +394,8 @@ class _Cells:
         return result
 
     def _factors(self, otherwise: Floats) -> Floats:
-        """Return the mean stiffness over the parts of each cell, relative to the rule."""
+        """Return the mean stiffness over the parts of each cell, divided by the stiffness of the
+        rule."""
         rule = self.experiment.rule
         field, base = rule.varying[STIFFNESS], getattr(rule, STIFFNESS)
         if not isinstance(field, ByRegion):
@@ -400,8 +407,8 @@ class _Cells:
 
     @cached_property
     def _borders(self) -> list[tuple[str, Floats, Floats]]:
-        """Regions that parameters refer to, with the area fraction in each cell and the orientation
-        of the border."""
+        """Regions to which parameters refer, with the fraction of each cell's area inside the
+        region and the orientation of its border."""
         return [
             (name, *self._shares(region)) for name, region in regions_of(self.experiment).items()
         ]

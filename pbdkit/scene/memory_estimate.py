@@ -1,9 +1,9 @@
-"""Estimates of the memory of a scene and of the linear systems of an equilibrium, made before
-anything large is allocated.
+"""Estimates of the memory that a scene and the linear systems of an equilibrium need. They are made
+before large arrays are allocated.
 
-All coefficients are measured for sheets of 2500 to a million particles: the memory of a process
-after its imports is subtracted from its peak memory. For compact bodies held by leaders, the
-estimates are within 15 % of the measured values.
+All coefficients are measured for sheets of 2500 to a million particles, as the peak memory of a
+process minus its memory after its imports. For compact bodies that are held by leaders, the
+estimates differ from the measured values by at most 15 %.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ LARGEST_ANEW = 20_000
 because the rule is nonlinear or bonds break. Beyond it the moves are compiled."""
 
 KERNELS = 48 * 2**20
-"""Number of bytes of the compiled functions of grids."""
+"""Number of bytes of the compiled functions of multigrid."""
 SHARED_STENCILS = 160
-"""Number of bytes per particle of grids on which most particles share a stencil."""
+"""Number of bytes per particle of multigrid systems in which most particles share a stencil."""
 SINGLE_STENCILS = 2300
-"""Number of bytes per particle of grids on which each particle has a separate stencil, as for a
-nonlinear rule."""
+"""Number of bytes per particle of multigrid systems in which each particle has a separate stencil,
+for instance because the rule is nonlinear."""
 SCALAR_MATRIX = 900
 """Number of bytes per particle of a matrix and its factors if x and y are solved separately."""
 SCALAR_MATRIX_EACH = 112
@@ -51,8 +51,8 @@ NONLINEAR_MATRICES = 2
 def equilibrium_size(
     experiment: Experiment, neighbourhood: Neighbourhood, particles: int, grids: bool
 ) -> int:
-    """Return the number of bytes of the linear systems of an equilibrium; with `grids` they are
-    multigrid systems if the method permits."""
+    """Return the number of bytes of the linear systems of an equilibrium. With `grids` multigrid is
+    assumed if the method of the solver permits it."""
     linear = experiment.rule.linear and not experiment.obstacles
     if grids and _on_grids(experiment, neighbourhood, particles):
         return KERNELS + particles * (SHARED_STENCILS if linear else SINGLE_STENCILS)
@@ -65,7 +65,8 @@ def equilibrium_size(
 
 
 def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
-    """Return whether multigrid on stencils is the requested or the fastest method."""
+    """Return whether multigrid on stencils is requested or, if the method is selected
+    automatically, is the fastest method."""
     once = experiment.rule.linear and not experiment.fracture.can_break
     largest = LARGEST_DIRECT if once else LARGEST_ANEW
     return method == "multigrid" or (method == "auto" and particles > largest)
@@ -89,18 +90,19 @@ def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: i
 MIB = 2**20
 """Number of bytes in a mebibyte."""
 SMALLEST = 6 * MIB
-"""Number of bytes of the smallest scene: tables are built in chunks."""
+"""Number of bytes of the smallest scene. It is not zero because tables are built in chunks of
+constant size."""
 
 # Numbers of bytes per particle, measured as the peak of the process for sheets of 90 000 to 500 000
 # particles.
 WORKSPACE = 20
-"""Temporary arrays while the tables are built."""
+"""Temporary arrays that exist while the tables are built."""
 BONDS = 80
-"""Table of bonds, and temporary arrays while it is built, for each plane of bonds."""
+"""Table of bonds, and temporary arrays that exist while it is built, for each plane of bonds."""
 CELLS = 110
 """Area fractions of cells."""
 FREE_EDGES = 60
-"""Weights of a calibrated rule under a frame with points."""
+"""Weights of a calibrated rule if the frame has points."""
 INNER = 130
 """Moves of an inner rule."""
 LOADS = 60
@@ -116,13 +118,13 @@ TABLES = 40
 NEW_NEIGHBOURS = 150
 """Search of neighbours at every step."""
 NEW_NEIGHBOURS_EACH = 118
-"""Search of neighbours at every step, for each neighbour."""
+"""Additional bytes for each neighbour if neighbours are searched at every step."""
 
 CHUNK_BYTES = 2**20
-"""Approximate size of a chunk of a file in bytes. If entries are small, a chunk consists of several
-entries of a variable; if they are large, it is a part of an entry. To read the time series of a
-particle, one chunk is read for each batch of steps; to read a snapshot, little more than the
-snapshot is read."""
+"""Approximate size of a chunk of a file in bytes. If the entries of a variable are small, a chunk
+consists of several entries; if they are large, a chunk is a part of an entry. The time series of a
+particle can therefore be read with one chunk for each batch of steps, and a snapshot without
+reading much more than the snapshot."""
 
 OPEN_CHUNK = 1024
 """Number of entries of a chunk along a dimension of unknown length."""
@@ -140,10 +142,9 @@ class TooLargeError(ExperimentError):
 
 @dataclass(frozen=True)
 class Sizes:
-    """Estimates of the size of a scene: number of particles (including the frame), bytes of
-    memory
-    during a run, and bytes of its output. If a run returns a dataset instead of writing a file, the
-    output is in memory, too."""
+    """Estimates of the size of a scene: the number of particles, including the frame, the bytes of
+    memory that a run needs, and the bytes of its output. If a run returns a dataset instead of
+    writing a file, its output is in memory, too."""
 
     particles: int
     memory: int
@@ -173,7 +174,8 @@ def sizes_of(
 
 
 def _workspace(experiment: Experiment, each: int, planes: float) -> float:
-    """Return the number of bytes per particle besides state and table, with `each` neighbours."""
+    """Return the number of bytes per particle in addition to the state and the particle table, for
+    particles with `each` neighbours."""
     rule, frame, diagnostics = experiment.rule, experiment.frame, experiment.diagnostics
     workspace = WORKSPACE + experiment.shows_bonds * planes * BONDS
     workspace += INNER * isinstance(rule, AppliesTwice) + LOADS * bool(experiment.loads)
@@ -193,8 +195,8 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
 
 
 def _output(experiment: Experiment, particles: int, planes: float) -> int:
-    """Return the number of bytes of the dataset without its final state, for `planes` bonds per
-    particle, all of which may break."""
+    """Return the number of bytes of the dataset without its final state. There are `planes` bonds
+    per particle, and all of them are assumed to break."""
     fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
     records = experiment.record_count
@@ -236,9 +238,10 @@ def refuse_too_large(
     layers: int,
     communicator: Communicator = SERIAL,
 ) -> None:
-    """Raise ExperimentError if the scene exceeds the memory of the machine, assuming that the body
-    fills its window of site indices. With several processes, the part of each is compared with its
-    share of that memory. Python's integers are used, as windows can be very large."""
+    """Raise ExperimentError if the scene needs more memory than the machine has. The body is
+    assumed to fill its window of site indices. With several processes, the part of each process is
+    compared with its share of the memory. Python's integers are used, because the number of sites
+    can exceed 64 bits."""
     cell = neighbourhood.cell
     share = len(cell.sites) / math.prod(cell.period)
     particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
@@ -259,15 +262,16 @@ def refuse_too_large(
 
 
 def _bytes_of(dtype: str, value: int) -> int:
-    """Return the number of bytes of a number. Floating-point numbers have `value` bytes."""
+    """Return the number of bytes of a value with this data type. Floating-point values are stored
+    with `value` bytes."""
     return value if dtype == "f8" else np.dtype(dtype).itemsize
 
 
 def _bytes_an_entry(
     diagnostic: Diagnostic, particles: int, recorded: int, *, in_mm: bool
 ) -> list[float]:
-    """Return the number of bytes of one entry of each variable in the file; with `in_mm` lengths
-    are stored twice."""
+    """Return the number of bytes of one entry of each variable of a diagnostic in the file. With
+    `in_mm` lengths are stored twice, in lattice units and in mm."""
     sizes = {"particle": particles, "axis": 2, "principal": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     sizes |= {diagnostic.own_dimension: OPEN_CHUNK}

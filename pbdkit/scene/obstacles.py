@@ -1,7 +1,9 @@
-"""Obstacles on a lattice: their outlines at a moment, and the shortest way out for a particle.
+"""Obstacles on a lattice: their outlines at a moment, and the shortest displacement that moves a
+particle out of them.
 
-`facing`, `way_out` and `clearance` are elementwise; the same source is evaluated on arrays and
-inside kernels. `leave` and `way_between` are evaluated for one particle at a time in both.
+`facing`, `way_out` and `clearance` are elementwise: the same source is evaluated on arrays and
+inside kernels. `leave` and `way_between` are evaluated for one particle at a time, by numpy and in
+kernels.
 """
 
 from __future__ import annotations
@@ -39,25 +41,26 @@ SEGMENT = 2
 CIRCLE = 3
 """Shape of a face that is a circle."""
 ROUNDING = 64 * float(np.finfo(float).eps)
-"""Rounding error of a gap, relative to coordinates and sizes of outlines."""
+"""Rounding error of the distance between a particle and an outline, relative to the coordinates and
+to the size of the outline."""
 FLAT = 1e-12
-"""Squared sine of the angle below which two lines count as parallel."""
+"""Two lines count as parallel if the squared sine of their angle is smaller than this number."""
 TURNS = 8
 """Number of iterations of Newton's method for the nearest point of a circle."""
 STRAIGHTEST = 0.1
-"""Smallest second derivative in the iterations of Newton's method, relative to that of a straight
-face."""
+"""Lower bound on the second derivative in the iterations of Newton's method, relative to its value
+for a straight face."""
 WIDEST = 0.5
-"""Largest rotation of the normal, in radians, in an iteration of Newton's method."""
+"""Upper bound on the rotation of the normal, in radians, in an iteration of Newton's method."""
 
 
 class Face(NamedTuple):
-    """Smooth part of an outline as seen from places.
+    """Smooth part of an outline, described by its distance and direction from given places.
 
     Parameters
     ----------
     distance
-        Distance of each place, (place,).
+        Distance of each place from the face, (place,).
     normal
         Outward normal at the nearest point, (axis, place).
     curvature
@@ -121,8 +124,9 @@ class Outline:
     kind
         HALF_PLANE, CIRCLES or POLYGON.
     points
-        Points, (point, axis): a point of the half-plane and that point plus the unit normal, the
-        centre of circles, or the vertices of a polygon, counterclockwise.
+        Points, (point, axis). For a half-plane these are a point on its border and that point plus
+        the unit normal. For circles it is the centre. For a polygon these are the vertices,
+        counterclockwise.
     inner, outer
         Radii of circles; the obstacle lies between them.
     """
@@ -133,8 +137,8 @@ class Outline:
     outer: float = 0.0
 
     def shifted(self, by: Floats) -> Outline:
-        """Return the outline with its points shifted, by one vector for all points or by one for
-        each point."""
+        """Return the outline with shifted points. All points are shifted by the same vector, or
+        each point by a vector of its own."""
         return Outline(self.kind, self.points + by, self.inner, self.outer)
 
     @property
@@ -169,9 +173,9 @@ class Outline:
         return np.stack([np.broadcast_to(way, at[0].shape) for way in result])
 
     def faces(self, x: Floats, y: Floats) -> Iterator[Face]:
-        """Generate the faces of the outline as seen from places.
+        """Generate the faces of the outline, with the distances and normals at given places.
 
-        A half-plane has one face, circles have one each, a polygon has one for each edge.
+        A half-plane has one face, each circle is one face, and a polygon has a face for each edge.
         """
         if self.kind == HALF_PLANE:
             gap, nx, ny = self.facing(x, y)
@@ -222,7 +226,8 @@ def _counter_clockwise(vertices: Sequence[tuple[float, float]]) -> Floats:
 def facing(
     x: Any, y: Any, kind: Any, points: Any, first: Any, last: Any, inner: Any, outer: Any
 ) -> Any:
-    """Return the signed distance of places from an outline and the normal at the nearest point.
+    """Return the signed distance of places from an outline, and the normal of the outline at the
+    nearest point.
 
     Parameters
     ----------
@@ -256,8 +261,9 @@ def way_out(
     """Return the displacement from places inside an outline to its nearest point.
 
     Distances are measured in the metric S = C⁻¹ of particles with the compliance C = (xx, xy, yy).
-    The displacement is the one that a force along the normal n causes, w ∥ C n, which is along n if
-    C is a multiple of the identity. The parameters are those of `facing`.
+    The displacement w has the direction of C n, as a displacement that is caused by a force along
+    the normal n. If C is a multiple of the identity, w is parallel to n. The parameters are those
+    of `facing`.
     """
     if kind == HALF_PLANE:
         gap, nx, ny = _before_half_plane(x, y, points, first)
@@ -286,8 +292,8 @@ def clearance(x: Any, y: Any, kinds: Any, points: Any, first: Any, radii: Any) -
     """Return 0 at places outside all outlines, and the negative depth at places inside. If outlines
     overlap, the largest depth is used.
 
-    `kinds`, `first` and `radii` (inner, outer, size) have a row for each outline; `points` are
-    those of all outlines.
+    `kinds`, `first` and `radii` (inner, outer, size) have a row for each outline. `points` are the
+    points of all outlines.
     """
     depth = 0.0
     for w in range(len(kinds)):
@@ -304,9 +310,10 @@ def leave(
 ) -> Any:  # fmt: skip
     """Return the displacement of one particle to the nearest place outside all outlines.
 
-    The displacement is (w_x, w_y), in the metric of the particle, and zero if the particle is
-    outside. `code` is 0 for a particle that is free along both axes, 1 if it is led along x, 2
-    along y, and 3 along both.
+    The displacement is (w_x, w_y); it is zero if the particle is outside. The nearest place is
+    determined in the metric of the particle. `code` is 0 for a particle that is free along both
+    axes, 1 for a particle that is led along x, 2 for one that is led along y, and 3 for one that is
+    led along both axes.
     """
     count, n = 0, 0
     for w in range(len(kinds)):
@@ -333,10 +340,11 @@ def way_between(
     """Return the displacement of one particle inside several outlines to a place outside all of
     them.
 
-    Candidates are the nearest points of faces, and the points where two faces meet; for a particle
-    that is led along one axis, the points of faces on the line along its free axis. The nearest
-    candidate outside all outlines is chosen or, if there is none, the candidate of smallest depth.
-    Without candidates the displacement is zero.
+    Candidates for the place are the nearest points of faces and the points where two faces meet.
+    For a particle that is led along one axis, they are the points at which its line along the free
+    axis crosses faces. The nearest candidate outside all outlines is chosen. If all candidates are
+    inside some outline, the one with the smallest depth is chosen. If there is no candidate, the
+    displacement is zero.
     """
     best, far, bx, by = -math.inf, math.inf, 0.0, 0.0
     for w in range(len(kinds)):
@@ -381,7 +389,8 @@ def _face(
 ) -> Any:
     """Return the e-th face of an outline relative to (x, y), as (a, b, c, d, shape).
 
-    (a, b) is a point and (c, d) a direction; for a circle (a, b) is the centre and c the radius.
+    For a line or a segment, (a, b) is a point and (c, d) a direction. For a circle (a, b) is the
+    centre and c the radius.
     """
     if kind == HALF_PLANE:
         px, py = points[first, 0], points[first, 1]
@@ -396,8 +405,8 @@ def _face(
 
 
 def _nearest_on(face: Any, xx: Any, xy: Any, yy: Any) -> Any:
-    """Return the displacements to the at most two nearest points of a face; NaN for a missing
-    point."""
+    """Return the displacements to the nearest points of a face. There are at most two such points;
+    the displacement to a missing one is NaN."""
     a, b, c, d, shape = face
     wx, wy = math.nan, math.nan
     if shape == CIRCLE:
@@ -410,8 +419,8 @@ def _nearest_on(face: Any, xx: Any, xy: Any, yy: Any) -> Any:
 
 
 def _meeting(face: Any, other: Any) -> Any:
-    """Return the displacements to the at most two points where two faces meet; NaN for a missing
-    point."""
+    """Return the displacements to the points where two faces meet. There are at most two such
+    points; the displacement to a missing one is NaN."""
     a, b, c, d, shape = face
     p, q, r, s, like = other
     if shape == NOTHING or like == NOTHING:
@@ -424,7 +433,7 @@ def _meeting(face: Any, other: Any) -> Any:
         if _is_off(t, shape) or _is_off(k, like):
             return math.nan, math.nan, math.nan, math.nan
         return a + t * c, b + t * d, a + t * c, b + t * d
-    if shape == CIRCLE and like == CIRCLE:  # Both points of intersection lie on this line.
+    if shape == CIRCLE and like == CIRCLE:  # Both intersections of circles lie on this line.
         ux, uy = p - a, q - b
         squared = ux * ux + uy * uy
         if squared == 0.0:
@@ -445,14 +454,14 @@ def _meeting(face: Any, other: Any) -> Any:
 
 
 def _is_off(t: Any, shape: Any) -> Any:
-    """Return whether a point, given by its fraction of a segment, lies beyond the ends of the
-    segment.
+    """Return whether a point of a line lies beyond the ends of a segment. The point is given by its
+    distance from the first end, as a fraction t of the segment.
     """
     return shape == SEGMENT and (t < -ROUNDING or t > 1.0 + ROUNDING)
 
 
 def _square(wx: Any, wy: Any, xx: Any, xy: Any, yy: Any) -> Any:
-    """Return w·S w times det C."""
+    """Return w·S w multiplied by det C."""
     return yy * wx * wx - 2.0 * xy * wx * wy + xx * wy * wy
 
 
@@ -538,7 +547,8 @@ def _before_polygon(x: Any, y: Any, points: Any, first: Any, last: Any) -> Any:
 
 
 SLACK = 1e-9
-"""Depth up to which a particle counts as outside at the start, relative to the lattice constant."""
+"""Depth inside an outline, relative to the lattice constant, up to which a particle counts as
+outside at the start."""
 
 
 @dataclass(frozen=True)
@@ -550,7 +560,7 @@ class Barrier:
     group
         The obstacle in the experiment.
     start
-        Outline at the start, in coordinates.
+        Outline at the start, in the coordinates of the experiment.
     origin
         Position of site (0, 0) of the lattice.
     """
@@ -643,9 +653,10 @@ def collisions(
 ) -> list[str]:
     """Return a warning for each leader group that moves into an obstacle.
 
-    Obstacles do not act on leaders. Positions are compared at the knots of motions, for a body at
-    rest. Groups that move by Newton's law are not considered, since obstacles stop them; guided
-    particles are not considered if they can evade along their free axis.
+    The warning is issued because obstacles do not act on leaders. Positions are compared at the
+    knots of motions, for a body at rest. Groups that move by Newton's law are not considered,
+    because obstacles stop them. Guided particles are not considered if they can evade along their
+    free axis.
     """
     slack = SLACK * math.hypot(*raster.cell.vectors[0])
     warnings = []
@@ -688,8 +699,8 @@ def _can_evade(outline: Outline, places: Floats, axis: int) -> Mask:
 
 
 def _moments(leaders: Leading, barrier: Barrier, steps: int) -> Iterator[int]:
-    """Generate steps at which both the leader group and the obstacle are active: the first, the
-    last, and the knots of both motions."""
+    """Generate steps at which both the leader group and the obstacle are active: the first and the
+    last of these steps, and the knots of both motions."""
     groups = leaders.group, barrier.group
     begin = max(group.from_ for group in groups)
     end = min(group.last(steps) for group in groups)
@@ -698,5 +709,6 @@ def _moments(leaders: Leading, barrier: Barrier, steps: int) -> Iterator[int]:
 
 
 def _number(raster: Raster, rows: Indices, mask: Mask) -> int | None:
-    """Return the number of the first particle of the mask, or None."""
+    """Return the number of the first particle for which the mask is true, or None if there is no
+    such particle."""
     return raster.particle_offset + int(rows[np.argmax(mask)]) + 1 if mask.any() else None

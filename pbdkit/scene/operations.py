@@ -1,4 +1,4 @@
-"""Particle operations on a raster, and the particles of each."""
+"""Particle operations on a raster, and the particles on which each of them acts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Operated:
     parameters: Any
 
     def restrict(self, to: Restriction) -> Operated:
-        """Return the operation on the particles of some rows."""
+        """Return the operation, restricted to the particles of some rows."""
         is_moving = to.is_moving(self.place)
         rows, place = to.rows(self.rows[is_moving]), to.places(self.place[is_moving])
         return replace(self, rows=rows, place=place)

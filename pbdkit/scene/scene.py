@@ -61,7 +61,8 @@ from pbdkit.scene.operations import Operated, build_operations
 
 
 class Ground:
-    """Neighbours, frame layers and body of an experiment, as the first stage of its scene.
+    """Neighbours, frame layers and body of an experiment. They are the first stage in the
+    construction of its scene.
 
     Arrays of the size of the body are created only on request.
 
@@ -81,7 +82,7 @@ class Ground:
     warnings
         Warnings of the fracture model.
     left_out
-        Cells omitted at narrow voids, after a call of `raster`.
+        Cells omitted at narrow voids. Available after a call of `raster`.
 
     Raises
     ------
@@ -113,11 +114,11 @@ class Ground:
 
     @property
     def spill(self) -> int:
-        """Maximum number of lines outside its window on which the body can have particles."""
+        """Maximum number of lines outside the window of the body on which it can have particles."""
         return margin_of(self.neighbourhood.tiling) if self.experiment.frame.weighs_cells else 0
 
     def filled(self, lines: Lines | None = None) -> Filling:
-        """Return the sites of the body on the lines; all lines by default."""
+        """Return the sites of the body on the lines, by default on all lines."""
         experiment, tiling = self.experiment, self.neighbourhood.tiling
         if not experiment.frame.weighs_cells:
             return fill(experiment.body, experiment.lattice, lines)
@@ -148,7 +149,7 @@ class Ground:
                 row_range=self._row_range,
             )
         cells, tiling = filling.on(raster, self.neighbourhood.tiling), self.neighbourhood.tiling
-        # Without frame points, a cell with a missing corner is left out, because the forces between
+        # Without frame points, a cell with a missing corner is omitted, because the forces between
         # its other corners would not balance.
         if not (cells or self.layers) and isinstance(self.experiment.rule, MixesCells):
             cells = whole_cells(raster, tiling) if tiling.beside else None
@@ -201,7 +202,7 @@ class Scene:
     cells
         Weighted cells; None if cells are not weighted.
     inner
-        Scene of the inner rule; None if the rule has none.
+        Scene of the inner rule; None if the rule has no inner rule.
     leading
         Leader groups.
     loads
@@ -235,14 +236,14 @@ class Scene:
 
     @property
     def driven(self) -> tuple[Leading | Barrier, ...]:
-        """Leader groups and obstacles, which move by motions."""
+        """Leader groups and obstacles. The movement of both is described by motions."""
         return (*self.leading, *self.barriers)
 
     def at(self, moment: float) -> Scene:
         """Return the scene with its time-dependent parameters at the end of a step, or at a moment
         within it.
 
-        The scene itself has the final values of its time-dependent parameters.
+        `self` has the final values of its time-dependent parameters.
         """
         courses = self._courses
         if all(course.at(moment) == course.last for course in courses):
@@ -260,7 +261,8 @@ class Scene:
 
     @cached_property
     def _cache(self) -> dict[tuple[float, ...], Scene]:
-        """Scene of the last moment, by the values of the time-dependent parameters."""
+        """Last scene that `at` returned, with the values of the time-dependent parameters as its
+        key."""
         return {}
 
     @cached_property
@@ -271,14 +273,14 @@ class Scene:
         return replace(self, barriers=(), operations=())
 
     def restrict(self, to: Restriction) -> Scene:
-        """Return the scene of some rows of the lattice. Each feature with a method `restrict` is
-        restricted to these rows."""
+        """Return the scene restricted to some rows of the lattice, by the method `restrict` of each
+        feature."""
         values = {each.name: _restricted(getattr(self, each.name), to) for each in fields(self)}
         return replace(self, **values | {"raster": to.part})
 
     @property
     def has_fracture(self) -> bool:
-        """True if bonds can be torn or cut, so that their state is stored."""
+        """True if bonds can break or be cut, so that their state is stored."""
         return self.experiment.parts_bonds
 
     @property
@@ -411,7 +413,8 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
 
 
 def _segments(experiment: Experiment) -> dict[str, Segment]:
-    """Return the cuts and the initial cracks, by their fields in the experiment."""
+    """Return the segments of the cuts and of the initial cracks, by their fields in the
+    experiment."""
     segments = {f"cuts.{n}": cut.segment for n, cut in enumerate(experiment.cuts)}
     if isinstance(model := experiment.fracture, StartsCracked):
         with blaming(model, "to return its cracks", "fracture"):
@@ -437,13 +440,13 @@ def _frame_of(raster: Raster, experiment: Experiment) -> Frame | None:
 
 
 def with_inner(scene: Scene) -> Scene:
-    """Add the scene of the inner rule if the rule is applied to the moves of another.
+    """Add the scene of the inner rule if the rule is applied to the moves of an inner rule.
 
     Raises
     ------
     ExperimentError
         If the frame has a delay, bonds can break, neighbours are re-evaluated or a rule has state
-        variables: the moves of the inner rule are not defined then.
+        variables, because the moves of the inner rule are not defined in these cases.
     """
     experiment, rule = scene.experiment, scene.experiment.rule
     if not isinstance(rule, AppliesTwice):

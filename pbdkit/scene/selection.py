@@ -1,4 +1,5 @@
-"""Selections of body particles in the reference configuration, and the distribution of a force."""
+"""Selections of body particles in the reference configuration, and the distribution of a force over
+selected particles."""
 
 from __future__ import annotations
 
@@ -18,11 +19,12 @@ from pbdkit.plugin.operation import Selection
 from pbdkit.scene.constants import signed_distance
 
 COLLINEAR_RTOL = 1e-9
-"""Distance from a line, relative to its length, up to which a particle lies on it."""
+"""Distance from a line, relative to the length of the line, up to which a particle counts as lying
+on it."""
 
 
 def shares_of(raster: Raster, rows: Indices) -> Floats:
-    """Return the fraction of a force on the selected particles of a raster that acts on each,
+    """Return the fraction of a force that acts on each of the selected particles of a raster,
     (particle,)."""
     local = rows[raster.is_own(raster.site_of(rows)[:, 0])]
     parts = raster.communicator.allgather((raster.particle_offset + local, raster.reference(local)))
@@ -41,9 +43,9 @@ def shares(at: Floats) -> Floats:
     Returns
     -------
     NDArray
-        Fraction of the force that acts on each particle, (particle,). If all lie on a line it is
-        proportional to half the sum of the distances to the two adjacent particles, otherwise it is
-        the same for all.
+        Fraction of the force that acts on each particle, (particle,). If all particles lie on a
+        line, the fraction is proportional to half the sum of the distances to the two adjacent
+        particles. Otherwise it is the same for all particles.
     """
     order = np.lexsort(at.T)
     offset = at - at[order[0]]
@@ -81,7 +83,8 @@ class Selecting:
         return self.raster.reference(self._body)
 
     def distance(self, point: Pair) -> Floats:
-        """Return the distance of each body particle from a point at rest, (particle,)."""
+        """Return the distance of each body particle, in its reference position, from a point,
+        (particle,)."""
         return np.asarray(np.hypot(*(self._x - point).T))
 
     def select(self, selection: Selection, where: tuple[str | int, ...]) -> Indices:
@@ -110,8 +113,8 @@ class Selecting:
         return distinct(rows)
 
     def _edge(self, edge: str) -> Indices:
-        """Return the body particle of smallest or largest i in every row j, or of smallest or
-        largest j in every column i."""
+        """Return the body particle with the smallest or the largest i in every row j, or with the
+        smallest or the largest j in every column i."""
         axis = 0 if edge in ("left", "right") else 1
         return self.raster.ends_of_lines(axis, last=edge in ("right", "top"))
 
@@ -129,8 +132,8 @@ class Selecting:
         return self._body[distance <= 0.0]
 
     def nearest(self, points: Iterable[Pair]) -> Indices:
-        """Return the row of the particle nearest to each point; among equally near particles that
-        of the lowest number."""
+        """Return the row of the particle nearest to each point. Of equally near particles the one
+        with the lowest number is chosen."""
         targets, raster = list(points), self.raster
         smallest = self.least_distances(targets)
         numbers = np.full(len(targets), NOWHERE)

@@ -1,8 +1,8 @@
 """Predictions about a run before its first step.
 
 `analysis` computes the spectrum of a step and the rate of convergence, `relaxation` the optimal
-relaxation and momentum, `lag` the distance from equilibrium while leaders move, and `forecast`
-combines them with warnings and estimates of memory and time for `pbdkit check`.
+relaxation and momentum, and `lag` the distance from equilibrium while leaders move. `forecast`
+combines these results with warnings and with estimates of memory and time, for `pbdkit check`.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Stability analysis of an experiment: spectrum of its step operator, rate of convergence, and the
-reasons why steps do not converge.
+"""Stability analysis of an experiment. It computes the spectrum of the step operator, the rate of
+convergence, and the reasons why steps do not converge.
 
 If the step operator is too large to be stored as a matrix, the slowest mode is computed by inverse
-iteration on finer and finer grids, with multigrid on the lattice's stencils; 1 - λ is accurate to 1
-%. The smallest eigenvalue is then taken from plane waves; edges without a frame may have smaller
-ones.
+iteration on finer and finer grids, with multigrid on the lattice's stencils. The result 1 - λ has
+an accuracy of 1 %. The smallest eigenvalue is then taken from plane waves, although edges without a
+frame may cause smaller eigenvalues.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Spectra:
-    """Eigenvalues of one scene, with the roles of the last step, linearised at the start.
+    """Eigenvalues of one scene, linearised at the start, with the roles of the last step.
 
     Parameters
     ----------
@@ -69,7 +69,8 @@ class Spectra:
 
     @cached_property
     def estimate(self) -> StabilityEstimate:
-        """Return the estimator for scenes without a matrix, or with one that is too large."""
+        """Return the estimator, which is used for scenes that have no step operator, or one that is
+        too large for a matrix."""
 
         return StabilityEstimate(self.scene)
 
@@ -77,14 +78,14 @@ class Spectra:
     def spectrum(self) -> Spectrum | None:
         """Return the spectrum of the solver's step, with relaxation, momentum and frame delay.
 
-        None if it is unknown; `left_out` gives the reason.
+        None if the spectrum is unknown; `left_out` gives the reason.
         """
         rule_spectrum, solver = self.of_rule, self.scene.experiment.stepping
         if rule_spectrum is None:
             return self._spectrum_of(lambda: self.operator.augmented().matrix(), self.scene.lag > 0)
         if solver.relaxation == 1.0 and solver.memory == 0.0:
             return rule_spectrum
-        # The extremes of a real spectrum are mapped to the extremes of its image.
+        # The map from λ to μ maps the ends of a real spectrum to the extreme values of μ.
         eigenvalues = modes(rule_spectrum.eigenvalues, solver.relaxation, solver.memory)
         return spectrum_of(eigenvalues, rule_spectrum.symmetric and solver.memory == 0.0)
 
@@ -149,10 +150,11 @@ class Spectra:
             return None
 
     def rule_matrix(self) -> Any:
-        """Return the matrix of the rule's own step.
+        """Return the matrix of the rule's own step, without relaxation and momentum.
 
-        Without frame delay, the coupling to the previous step is -b for all followers, so that the
-        sum of the couplings to the current and to the previous step does not depend on momentum.
+        The momentum b adds b to the coupling of each follower to the current state, and -b to its
+        coupling to the previous state. Without frame delay, the sum of both couplings therefore
+        does not depend on the momentum.
         """
         steady = self.operator.couplings_steady.entries()
         scale, unknowns = (
@@ -168,16 +170,17 @@ class Spectra:
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
 """Fractions to which the slowest mode decays in `Analysis.steps_to`."""
 NEAR = 0.9
-"""Fraction of the bound of plane waves. A larger relaxation causes a warning if edges have no
-frame."""
+"""If edges have no frame, a warning is issued for a relaxation of more than this fraction of the
+bound of plane waves."""
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """Stability of a scene before its first step, with the roles of the last step and linearised at
-    the start.
+    """Stability of a scene before its first step, linearised at the start, with the roles of the
+    last step.
 
-    It is exact for linear rules. Numbers are None if they do not exist or take too long to compute.
+    The analysis is exact for linear rules. A result is None if it does not exist or would take too
+    long to compute.
 
     Parameters
     ----------
@@ -194,7 +197,8 @@ class Analysis:
     scene: Scene
 
     def __repr__(self) -> str:
-        """Return the name of the experiment alone, because all other data take time or space."""
+        """Return only the name of the experiment, because all other results take time to compute or
+        much space."""
         return f"<pbdkit.Analysis of {self.scene.experiment.name}>"
 
     def __str__(self) -> str:
@@ -225,7 +229,7 @@ class Analysis:
 
     @property
     def exact(self) -> bool:
-        """Return whether the numbers hold for the whole run.
+        """Return whether the results hold for the whole run.
 
         They do if the rule is declared linear, and bonds, neighbours, contacts and parameters do
         not change.
@@ -237,7 +241,7 @@ class Analysis:
 
     @cached_property
     def spectra(self) -> Spectra:
-        """Return the eigenvalues behind the numbers."""
+        """Return the eigenvalues from which the results are computed."""
         return Spectra(self.scene.bare)
 
     @property
@@ -252,7 +256,8 @@ class Analysis:
 
     @property
     def estimated(self) -> bool:
-        """Return whether the spectrum is an estimate, as for large bodies: 1 - ρ within 1 %."""
+        """Return whether the spectrum is an estimate, as for large bodies. The accuracy of 1 - ρ is
+        then 1 %."""
         return self.spectra.estimated
 
     @property
@@ -293,7 +298,7 @@ class Analysis:
     def largest_stable_relaxation(self) -> float | None:
         """Return the relaxation below which all modes decay, with the momentum of the experiment.
 
-        It is 2 (1 + b) / (1 - λ_min) for real eigenvalues.
+        With the momentum b it is 2 (1 + b) / (1 - λ_min) if the eigenvalues are real.
         """
         rule_spectrum, memory = self.spectra.of_rule, self.scene.experiment.stepping.memory
         return (
@@ -302,7 +307,8 @@ class Analysis:
 
     @property
     def best_memory(self) -> float | None:
-        """Momentum of fastest convergence without relaxation, (1 - √(1 - ρ))² for 0 ≤ ρ < 1."""
+        """Momentum with which steps without relaxation converge fastest. It is (1 - √(1 - ρ))² for
+        0 ≤ ρ < 1."""
         rule_spectrum = self.spectra.of_rule
         if (
             rule_spectrum is None
@@ -330,8 +336,8 @@ class Analysis:
         Returns
         -------
         bool or None
-            None if the eigenvalues of the rule are unknown: the frame has a delay, neighbours are
-            searched at every step, or the body is too large.
+            None if the eigenvalues of the rule are unknown, because the frame has a delay,
+            neighbours are searched at every step, or the body is too large.
         """
         rule_spectrum = self.spectra.of_rule
         if rule_spectrum is None:
@@ -352,8 +358,9 @@ class Analysis:
         Returns
         -------
         `Swing` or None
-            Period 2π / arg μ in steps and decay |μ| a step, which is √memory for real eigenvalues;
-            None if no mode oscillates, or if the eigenvalues of the rule are unknown.
+            Period 2π / arg μ in steps, and decay per step |μ|, which is √memory if the eigenvalues
+            of the rule are real. None if no mode oscillates, or if the eigenvalues of the rule are
+            unknown.
         """
         rule_spectrum = self.spectra.of_rule
         if rule_spectrum is None:
@@ -364,7 +371,8 @@ class Analysis:
         if 0.0 < memory < 1.0 and rule_spectrum.largest > (
             edge := swings_below(relaxation, memory)
         ):
-            # The slowest modes do not oscillate; those at the limit may not have been computed yet.
+            # The slowest modes do not oscillate, and the modes near the limit of oscillation may
+            # not have been computed yet.
             try:
                 eigenvalues = np.append(eigenvalues, just_below(self.spectra.rule_matrix(), edge))
             except RuntimeError:  # Too expensive, or ARPACK did not converge.
@@ -385,7 +393,8 @@ class Analysis:
 
     @cached_property
     def trailing(self) -> Lag | None:
-        """Return the lag of the body behind its equilibrium in the fastest steps of its leaders.
+        """Return the distance of the body from its equilibrium in the steps in which its leaders
+        move fastest.
 
         None if no leader moves steadily, if steps diverge or are not made, or if it would take too
         long.
@@ -417,13 +426,14 @@ class Analysis:
     def lag(self) -> float | None:
         """Return the largest distance of a follower from its equilibrium, in lattice units.
 
-        It is the steady value in the fastest steps of the leaders.
+        It is the constant distance that is reached after long motion at the largest speed of the
+        leaders.
         """
         return self.trailing.steady if self.trailing else None
 
     @cached_property
     def parts_without_leader(self) -> list[Any]:
-        """Return the numbers of the particles of each part that no leader reaches."""
+        """Return the numbers of the particles of each part that is not connected to a leader."""
         if not self.spectra.has_matrix:
             return []
         operator = self.operator
@@ -440,8 +450,8 @@ class Analysis:
         return sorted(parts)
 
     def warnings(self) -> list[str]:
-        """Return the reasons why steps do not converge, with remedies, and the results that are
-        left out.
+        """Return the reasons why steps do not converge, with remedies. Also return messages about
+        results that were not computed.
 
         Returns
         -------
@@ -467,7 +477,7 @@ class Analysis:
     def _growth(self) -> list[str]:
         """Warn of modes that grow, or never decay."""
         if not self.scene.experiment.solver.makes_steps and self.largest_stable_relaxation:
-            return []  # Steps with that relaxation would lead to equilibrium, too.
+            return []  # Steps with that relaxation would also converge to equilibrium.
         if self.stable is False:
             bound = self.largest_stable_relaxation
             remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
@@ -483,7 +493,8 @@ class Analysis:
         return []
 
     def _edges_near_the_bound(self) -> list[str]:
-        """Warn if the bound is that of plane waves and free edges may have a lower one."""
+        """Warn if the largest stable relaxation is taken from plane waves, and free edges may
+        require a smaller one."""
         frame, bound = self.scene.experiment.frame, self.largest_stable_relaxation
         has_free_edges = not bounds_the_body(self.scene) and not frame.weighs_cells
         relaxation = self.scene.experiment.stepping.relaxation
@@ -496,7 +507,8 @@ class Analysis:
 ACCURACY = 1e-2
 """Relative accuracy of solutions."""
 CLOSE = 1e-3
-"""Relative change of the slowness at which inverse iteration ends."""
+"""Inverse iteration ends if the relative change of the slowness 1 / (1 - λ) is smaller than this
+number."""
 
 MAX_ITERATIONS = 8
 """Largest number of inverse iterations."""
@@ -539,8 +551,8 @@ class StabilityEstimate:
 
     @cached_property
     def at_rest(self) -> State:
-        """Return the initial state with all displacements zero, in which equal neighbourhoods
-        respond alike."""
+        """Return the initial state with all displacements set to zero. In this state particles with
+        equal neighbourhoods have the same response."""
         state = initial_state(self._scene)
         return replace(state, u=np.zeros_like(state.u))
 
@@ -586,7 +598,7 @@ class StabilityEstimate:
             return None
         relative_slowness = self._scene.experiment.stepping.relaxation * mode.slowness
         largest = 1.0 - 1.0 / relative_slowness
-        # A constrained body has no modes that change sign in every step.
+        # A constrained body has no modes that change their sign in every step.
         smallest = (
             max(waves.smallest, -largest) if waves.smallest >= -1.0 - NEUTRAL else waves.smallest
         )
@@ -594,7 +606,8 @@ class StabilityEstimate:
 
 
 def verdict_of(found: Any) -> list[tuple[str, str]]:
-    """Return the statements of an Analysis or a Forecast on stability, as names and texts."""
+    """Return the results of an Analysis or a Forecast about stability, as pairs of name and
+    text."""
     if found.spectral_radius is None:
         return [("stability", "not known for this scene")]
     near = "" if found.exact else ", linearised at the start"

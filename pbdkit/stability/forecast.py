@@ -3,10 +3,10 @@
 `pbdkit check` reports the forecast, and `pbdkit run` issues those of its warnings that are computed
 quickly.
 
-Two of the checks need an explanation. The steps of leaders with a mass are stable if ω ≤ 2, the
-limit of the symplectic Euler method with a step of 1. A part of the body resists rigid-body motions
-by its supports alone; if leaders do not constrain such a motion and the loads do work along it,
-there is no equilibrium, and steps do not converge.
+Two of the checks need an explanation. The steps of leaders with a mass are stable if their angular
+frequency ω is at most 2, which is the limit of the symplectic Euler method with a step of 1. A part
+of the body resists rigid-body motions only by means of its supports. If leaders do not constrain
+such a motion and the loads do work along it, there is no equilibrium, and steps do not converge.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ NUDGE = 1e-3
 
 
 def too_light(scene: Scene) -> list[str]:
-    """Warn of groups with a mass too small for stable steps, with all other particles fixed."""
+    """Warn of leader groups with a mass that is too small for stable steps, even if all other
+    particles were fixed."""
     forces, warnings = NewtonForces(scene), []
     state = initial_state(scene) if forces.numbers else None
     for n in forces.numbers:
@@ -70,7 +71,8 @@ def too_light(scene: Scene) -> list[str]:
 class Forecast:
     """Forecast of a run.
 
-    Numbers of the stability analysis are None if they do not exist or take too long to compute.
+    Results of the stability analysis are None if they do not exist or would take too long to
+    compute.
 
     Parameters
     ----------
@@ -79,7 +81,7 @@ class Forecast:
     followers
         Number of followers in step 1.
     memory_mib, output_mib
-        Memory of the run and size of its output in MiB.
+        Memory of the run and size of its output, in MiB.
     seconds
         Estimated duration of the steps; None for an equilibrium.
     relaxation, memory
@@ -90,13 +92,14 @@ class Forecast:
         Period in steps, and decay per step, of the slowest oscillating mode; None if there is no
         momentum or no mode oscillates.
     exact
-        Whether the analysis holds for the whole run, or is linearised at the start.
+        True if the analysis holds for the whole run. False if it is a linearisation at the start.
     estimated
         Whether the spectrum is an estimate, in which 1 - ρ is accurate to 1 %.
     lag, lag_reached
-        Largest distance of a follower from its equilibrium in the fastest steps of the leaders, in
-        lattice units: the steady value, and the value at the end of these steps. None if no leader
-        moves steadily.
+        Largest distance of a follower from its equilibrium in the steps in which the leaders move
+        fastest, in lattice units. `lag` is the constant distance that is reached after long motion
+        at this speed, and `lag_reached` the distance at the end of these steps. None if no leader
+        moves at constant speed.
     size_mm
         Extent of the body's particles along each axis in mm; None without `units`.
     warnings
@@ -131,9 +134,10 @@ class Forecast:
 
 
 QUICK_PARTICLES = 2000
-"""Number of particles up to which a run analyses the body as `check` does (at most 0.9 s)."""
+"""Number of particles up to which `pbdkit run` makes the same analysis as `pbdkit check`, which
+takes at most 0.9 s."""
 MAX_CHANGES = 16
-"""Maximum number of separate analyses, each at a step at which parameters change."""
+"""Maximum number of analyses with different values of time-dependent parameters."""
 ANALYSIS_FIELDS = (
     *("spectral_radius", "smallest_eigenvalue", "largest_stable_relaxation", "stable", "steps_to"),
     *("exact", "estimated", "lag"),
@@ -196,7 +200,8 @@ def _seconds(scene: Scene) -> float | None:
 
 
 def _sizes(analysis: Analysis) -> Sizes:
-    """Estimate the sizes of a run; for a large equilibrium they depend on the linear solver."""
+    """Estimate the sizes of a run. For the equilibrium of a large body they depend on the linear
+    solver."""
     scene = analysis.scene
     count, grids = scene.raster.count, not scene.barriers
     if grids and count > LARGEST_ANEW and not scene.experiment.solver.makes_steps:
@@ -205,15 +210,16 @@ def _sizes(analysis: Analysis) -> Sizes:
 
 
 def quick_warnings(scene: Scene, bound: Bound | None) -> tuple[str, ...]:
-    """Return the warnings that are known in milliseconds, with the bound of plane waves."""
+    """Return the warnings that are computed within milliseconds, given the bound of plane waves."""
     return (*_scene_warnings(scene), *_growing_waves(scene, bound))
 
 
 def prediction(scene: Scene, bound: Bound | None) -> dict[str, Any]:
-    """Return the attributes of the dataset that predict stability, from the bound of plane waves.
+    """Return the attributes of the dataset that predict stability. They are computed from the bound
+    of plane waves.
 
-    They are empty without a bound. `stable` is None if no wave grows and waves do not bound the
-    body.
+    Without a bound there are no attributes. `stable` is None if no plane wave grows, but plane
+    waves do not bound the modes of the body.
     """
     memory = scene.experiment.stepping.memory
     if bound is None:
@@ -239,8 +245,8 @@ def _too_short(analysis: Analysis) -> list[str]:
 
 
 def _divergence_in_time(scene: Scene) -> list[str]:
-    """Warn of steps that diverge during the run with earlier values of time-dependent
-    parameters."""
+    """Warn of steps that diverge for values that time-dependent parameters have before the end of
+    the run."""
     from pbdkit.stability.analysis import Analysis
 
     courses, steps = scene.experiment.courses, scene.experiment.steps
@@ -303,9 +309,11 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
 
 
 def refuse_unheld_loads(scene: Scene) -> None:
-    """Raise the ExperimentError of the run if loads act on a part of the body without supports.
+    """Raise the ExperimentError that the run would raise if loads act on a part of the body without
+    supports.
 
-    The check applies only to the solver `equilibrium`: a part without supports has no equilibrium.
+    The check applies only to the solver `equilibrium`, because a part without supports has no
+    equilibrium under loads.
     """
     if scene.experiment.solver.makes_steps or not scene.loads:
         return
@@ -318,7 +326,8 @@ def refuse_unheld_loads(scene: Scene) -> None:
 
 
 def _missing_supports(scene: Scene) -> list[str]:
-    """Warn of each part of the body that loads move without bound."""
+    """Warn of each part of the body that is not supported against the loads, so that they would
+    displace it without bound."""
     if not (scene.loads and scene.experiment.solver.makes_steps):
         return []
 
@@ -333,7 +342,8 @@ def _missing_supports(scene: Scene) -> list[str]:
 def outlook(scene: Scene) -> list[str]:
     """Return warnings that are computed within a second, in addition to `quick_warnings`.
 
-    They concern supports and, for small bodies, what prevents convergence.
+    The warnings concern missing supports and, for small bodies, the reasons why steps do not
+    converge.
     """
     warnings = _missing_supports(scene)
     if scene.raster.count > QUICK_PARTICLES or not scene.experiment.solver.makes_steps:
@@ -341,13 +351,13 @@ def outlook(scene: Scene) -> list[str]:
     from pbdkit.stability.analysis import Analysis
 
     analysis = Analysis(scene)
-    with suppress(PbdkitError):  # `check` reports the reason.
+    with suppress(PbdkitError):  # `pbdkit check` reports the reason.
         warnings += [*analysis.obstructions(), *_too_short(analysis)]
     return warnings
 
 
 def refuse_too_much_output(scene: Scene) -> None:
-    """Raise ExperimentError if the records of a run exceed the memory."""
+    """Raise ExperimentError if the records of a run would exceed the memory."""
     sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total)
     if sizes.output > machine_memory():
         raise scene.experiment.located(
@@ -363,22 +373,23 @@ def refuse_too_much_output(scene: Scene) -> None:
 MAX_PARTICLES = 20_000
 """Number of particles above which the body is assumed to be connected."""
 IS_ZERO = 1e-13
-"""Relative tolerance for zero eigenvalues of the supports."""
+"""Relative tolerance up to which an eigenvalue of the matrix of the supports counts as zero."""
 
 DOES_WORK = 1e-9
-"""Relative tolerance for zero work of the forces."""
+"""Relative tolerance up to which the work of the forces counts as zero."""
 
 
 @dataclass(frozen=True)
 class PushedPart:
-    """Part of the body that loads move without bound.
+    """Part of the body that is not supported against the loads, so that they would displace it
+    without bound.
 
     Parameters
     ----------
     particles
-        Number of its followers.
+        Number of followers in the part.
     first
-        Number of the first of them.
+        Particle number of the first of these followers.
     """
 
     particles: int
@@ -386,10 +397,10 @@ class PushedPart:
 
 
 def pushed_parts(scene: Scene) -> list[PushedPart]:
-    """Return the parts of the body that loads move without bound at the last step.
+    """Return the parts of the body that are not supported against the loads of the last step.
 
-    Supports by leaders alone are considered: scenes with obstacles, and frames and rules that
-    resist rigid motions, have no such parts.
+    Only leaders are considered as supports. The result is empty for scenes with obstacles, and if
+    the frame or the rule resists rigid motions.
     """
     rule, frame = scene.experiment.rule, scene.experiment.frame
     if not scene.loads or scene.axes != 2 or scene.barriers:
@@ -405,8 +416,8 @@ def pushed_parts(scene: Scene) -> list[PushedPart]:
     for leading in scene.leading:
         for axis in leading.axes if leading.group.leads(step) else ():
             is_prescribed[axis, leading.place] = True
-    # Only under linear rules is there no resistance to rotations by any angle; frames that copy the
-    # displacements of the body resist rotations.
+    # Rotations are included only for rules under which large rotations meet no resistance, and
+    # without frame points, because frames that copy the displacements of the body resist rotations.
     modes = 3 if rule.linear and (scene.frame is None or frame.weighs_cells) else 2
     return [
         PushedPart(len(followers), raster.particle_offset + int(raster.body_rows[followers[0]]) + 1)
@@ -417,7 +428,8 @@ def pushed_parts(scene: Scene) -> list[PushedPart]:
 
 
 def _parts(scene: Scene) -> Iterator[Indices]:
-    """Yield the particles of each connected part, as rows of the body."""
+    """Yield, for each connected part, the indices of its particles among the particles of the
+    body."""
     rows = scene.raster.body_rows
     if len(rows) > MAX_PARTICLES:
         yield np.arange(len(rows))
@@ -426,8 +438,8 @@ def _parts(scene: Scene) -> Iterator[Indices]:
     body_row[rows] = np.arange(len(rows))
     ends = body_row[scene.bonds.ends]
     ends = ends[(ends >= 0).all(axis=1)]
-    # Imported here because only bodies in several parts need it, and the import of scipy takes
-    # long.
+    # Imported here, because scipy takes long to import and is needed only if the body has several
+    # parts.
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -447,7 +459,7 @@ def _is_pushed(x: Floats, is_prescribed: Mask, forces: Floats, modes: int) -> bo
     is_prescribed : (particle, axis)
         Whether the displacement is prescribed.
     modes
-        3 with rotations, 2 without.
+        Number of rigid motions: 3 including the rotation, 2 without it.
     """
     middle, size = x.mean(axis=0), float(np.ptp(x, axis=0).max()) or 1.0
     lever = (x - middle) / size

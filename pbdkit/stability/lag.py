@@ -2,18 +2,19 @@
 
 In a step the leaders move first, then the followers. During a step, frame points have the
 displacements from the end of the step before. Frame points that follow leaders therefore have the
-displacements of the leaders at that time or, with frame delay, one step earlier. With the influence
-L of leaders on followers, and its part S that acts through frame points,
+displacements that the leaders had at that time or, with frame delay, one step earlier. Let L be the
+influence of leaders on followers, and S the part of L that acts by means of frame points. Then
 
     u(t+1) = P u(t) + Q u(t-1) + (L - S) u_L(t+1) + S u_L(t - lag) + s,
 
-If leaders move by v in a step, the equilibrium u* moves by δ, with A δ = L v and A = 1 - P - Q. The
-difference e = u* - u obeys
+If leaders move by v in a step, the equilibrium u* moves by δ, where A δ = L v and A = 1 - P - Q.
+The distance e = u* - u from equilibrium satisfies
 
     e(t+1) = P e(t) + Q e(t-1) + δ + Q δ - (L - S) v + lag · S v,
 
-and converges to a steady value: A e = P δ if S = 0 and Q = 0. For the barycentre rule on a sheet of
-a square lattice of length l with spacing h, it is at most 4 v l² / (9 √3 h²).
+and converges to a constant value. If S = 0 and Q = 0, the constant value satisfies A e = P δ. For
+the barycentre rule on a sheet of length l, on a square lattice with spacing h, it is at most 4 v l²
+/ (9 √3 h²).
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from pbdkit.stepping.state import State
 
 @dataclass(frozen=True)
 class BoundaryCoupling:
-    """Influence of leaders and frame points on followers.
+    """Influence of leaders and frame points on the followers near them.
 
     Parameters
     ----------
@@ -50,7 +51,7 @@ class BoundaryCoupling:
     place
         Flat places of the followers that are influenced.
     couplings
-        ∂move/∂u of their moves, columns by flat place.
+        Derivatives ∂move/∂u of the moves of these followers. Columns are flat places.
     """
 
     scene: Scene
@@ -58,7 +59,8 @@ class BoundaryCoupling:
     couplings: BlockMatrix
 
     def moves(self, u: Floats) -> Floats:
-        """Return the relaxed moves of these followers for displacements u, both as planes."""
+        """Return the moves of these followers, including relaxation, for displacements u. Both are
+        arrays (axis, sublattice, cell, cell)."""
         result = np.zeros(u.shape)
         table = self.couplings.times(u.reshape(len(u), -1).T)
         relaxation = self.scene.experiment.stepping.relaxation
@@ -66,8 +68,8 @@ class BoundaryCoupling:
         return result
 
     def frame_displacements(self, u: Floats) -> Floats:
-        """Return the displacements of frame points for displacements u, as planes that are zero
-        elsewhere."""
+        """Return the displacements that frame points have if the body has the displacements u. The
+        result has the shape of u and is zero except at frame points."""
         result = np.zeros(u.shape)
         if frame := self.scene.frame:
             frame.follow(u.reshape(len(u), -1), result.reshape(len(u), -1))
@@ -77,7 +79,7 @@ class BoundaryCoupling:
 def boundary_coupling(scene: Scene, state: State, step: int) -> BoundaryCoupling:
     """Linearise the moves of followers beside leaders and frame points, with the roles of a step.
 
-    All followers are included if a rule is applied to the moves of another.
+    If the rule is applied to the moves of an inner rule, all followers are included.
     """
     raster, guiding = scene.raster, Guiding(scene, step)
     kind = kinds_of_places(raster, scene.leading, step)
@@ -99,10 +101,10 @@ def boundary_coupling(scene: Scene, state: State, step: int) -> BoundaryCoupling
 
 
 MAX_PRODUCTS = 2e8
-"""Largest number of products that are computed for the lag at the end of an interval."""
+"""Largest number of matrix products that are computed for the distance from equilibrium at the end
+of an interval."""
 EARLY_FRACTION = 0.01
-"""Number of steps, as a fraction of 1 / (1 - λ), up to which the decay of the difference is
-negligible."""
+"""Number of steps, divided by 1 / (1 - λ), up to which the decay of the distance is negligible."""
 MIN_ACCURACY = 1e-12
 """Smallest tolerance of the linear solver."""
 
@@ -111,20 +113,20 @@ MIN_ACCURACY = 1e-12
 class Lag:
     """Distance of the body from its equilibrium in the steps in which a leader moves fastest.
 
-    Lengths are in lattice units. They hold for linear rules as long as no bond breaks.
+    Lengths are in lattice units. The results are valid for linear rules as long as no bond breaks.
 
     Parameters
     ----------
     first, last
-        First and last of the steps in which a leader moves fastest.
+        The first and the last of the steps in which a leader moves fastest.
     speed
         Displacement of the fastest leader in a step.
     steady
-        Largest distance of a follower from its equilibrium once it has become steady.
+        Largest distance of a follower from its equilibrium after the distance has become constant.
     reached
-        The distance at the end of these steps if the body starts in equilibrium. If a computation
-        by steps would take too long, it is accurate to 10 %, or None if the step has momentum or
-        the frame a delay.
+        The distance at the end of these steps if the body starts in equilibrium. If computing all
+        steps would take too long, the value is an estimate with an accuracy of 10 %. In this case
+        it is None if the solver has momentum or the frame has a delay.
     """
 
     first: int
@@ -135,11 +137,12 @@ class Lag:
 
     @property
     def size(self) -> float:
-        """Return the distance that is reached; the steady distance if `reached` is None."""
+        """Return `reached` or, if it is None, `steady`."""
         return self.steady if self.reached is None else self.reached
 
     def late(self, bond: float, units: Units | None = None) -> list[str]:
-        """Warn of a distance larger than a bond, in mm if the scene has units."""
+        """Warn of a distance that is larger than the length `bond`. The message is in mm if the
+        scene has units."""
         if self.size <= bond:
             return []
         mm, unit = in_lengths(units) if units else (1.0, "")
@@ -160,14 +163,14 @@ class Lag:
 
 @dataclass(frozen=True)
 class Trail:
-    """Increments of the distance e = u* - u, as planes.
+    """Increments of the distance e = u* - u, as arrays (axis, sublattice, cell, cell).
 
     Parameters
     ----------
     first
-        Increment of the first step.
+        Increment in the first step.
     push
-        Increment of each further step.
+        Increment in each further step.
     steady
         A⁻¹ push.
     """
@@ -180,8 +183,8 @@ class Trail:
     def of(
         cls, scene: Scene, system: System, state: State, step: int, slowness: float
     ) -> Trail | None:
-        """Compute the increments at the velocities of a step; None if the leaders influence no
-        follower.
+        """Compute the increments for the velocities that the leaders have in a step. Return None if
+        the leaders influence no follower.
 
         Raises
         ------
@@ -205,7 +208,7 @@ class Trail:
             return None
         size, accuracy = float(np.abs(v).max()), 0.1
         while True:
-            # In A⁻¹ δ, the error of δ may be amplified by the slowness.
+            # In A⁻¹ δ, the error of δ may be multiplied by the slowness.
             accuracy *= ACCURACY
             delta = system.solve(direct + through_frame, accuracy * size)
             first = delta - direct
@@ -221,9 +224,10 @@ class Trail:
 def lag_of(
     scene: Scene, state: State, system_at: Callable[[int], System | None], slowness: float
 ) -> Lag | None:
-    """Compute the distance from equilibrium in the fastest interval of at least two steps.
+    """Compute the distance from equilibrium in the interval of at least two steps in which a leader
+    moves fastest.
 
-    A displacement in a single step, or an oscillation, has no steady speed.
+    A displacement in a single step, or an oscillation, has no constant speed.
 
     Parameters
     ----------
@@ -235,7 +239,7 @@ def lag_of(
     Returns
     -------
     Lag or None
-        None if no leader moves steadily, or if the body has no equilibrium.
+        None if no leader moves at constant speed, or if the body has no equilibrium.
     """
     first, last, speed = fastest(scene)
     system = system_at(first) if speed else None
@@ -255,7 +259,8 @@ def lag_of(
 
 
 def _reached_exactly(scene: Scene, trail: Trail, first: int, steps: int) -> float | None:
-    """Compute max |e| after some steps, step by step; None if it would take too long."""
+    """Compute max |e| after some steps, by computing each step. Return None if this would take too
+    long."""
     if excess(scene) or steps * scene.raster.count > MAX_PRODUCTS:
         return None
     operator = step_operator(scene, step=first)
@@ -274,10 +279,11 @@ def _reached_exactly(scene: Scene, trail: Trail, first: int, steps: int) -> floa
 def _reached_about(
     scene: Scene, trail: Trail, system: System, slowness: float, steps: int
 ) -> float | None:
-    """Compute max |e| after some steps to 10 %, by e = (1 - Pⁿ) A⁻¹ push, for steps without
-    momentum.
+    """Compute max |e| after some steps without momentum, with an accuracy of 10 %. The formula is e
+    = (1 - Pⁿ) A⁻¹ push.
 
-    At first all increments are added; later P is projected on the span of A⁻¹ push and A⁻² push.
+    For few steps the increments are added without decay. For more steps, P is projected onto the
+    span of A⁻¹ push and A⁻² push.
     """
     if scene.lag or scene.experiment.stepping.memory:
         return None
@@ -300,7 +306,7 @@ def _largest(planes: Floats) -> float:
 
 
 class Interval(NamedTuple):
-    """Steps from `first` to `last` in which the fastest leader moves by `speed` a step."""
+    """Steps from `first` to `last`, in which the fastest leader moves by `speed` in each step."""
 
     first: int
     last: int
@@ -308,8 +314,8 @@ class Interval(NamedTuple):
 
 
 def fastest(scene: Scene) -> Interval:
-    """Return the interval of at least two steps of constant velocities in which a leader moves
-    fastest."""
+    """Return the interval in which a leader moves fastest. It has at least two steps, and all
+    velocities are constant in it."""
     steps, changes = scene.experiment.steps, [_changes(leading, scene) for leading in scene.leading]
     bounds = np.array(sorted({1, steps + 1, *chain(*changes)}))
     speeds = np.zeros(len(bounds) - 1)
@@ -332,7 +338,7 @@ def _changes(leading: Leading, scene: Scene) -> list[int]:
 
 
 def _velocity(leading: Leading, step: int) -> Floats:
-    """Return the velocities of a group's particles in a step, (particle, axis); rotations
+    """Return the velocities of a group's particles in a step, (particle, axis). Rotations are
     included."""
     n, motion, at = step - leading.group.from_ + 1, leading.group.motion, leading.reference
     v = np.zeros_like(at)

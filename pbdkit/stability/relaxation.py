@@ -1,14 +1,16 @@
-"""Optimal relaxation w and momentum b, for which the slowest mode of a rule decays fastest, and the
-choice of `auto` for a scene.
+"""Optimal relaxation w and momentum b, for which the slowest mode of a rule decays fastest. The
+values replace `auto` in a scene.
 
-A mode with the eigenvalue λ of the rule's own step becomes two modes with the eigenvalues μ of μ² -
-(1 + b - wz) μ + b = 0, z = 1 - λ (heavy-ball method, Polyak 1964). For real z from m to M, at the
-optimum the moduli of μ at both ends are equal, and the two roots at an end coincide.
+With relaxation and momentum, a mode with the eigenvalue λ of the rule's own step becomes two modes.
+Their eigenvalues μ are the roots of μ² - (1 + b - wz) μ + b = 0 with z = 1 - λ (heavy-ball method,
+Polyak 1964). If the values of z are real and lie between m and M, two conditions determine the
+optimum: |μ| has the same value at z = m and at z = M, and at each of these ends the two roots
+coincide.
 
-The modes are those of the rule's own step at rest, with the roles of the last step. All are
-computed if the groups of coupled unknowns are small. Otherwise the ends of the spectrum are
-computed by iteration: the slowest mode by repeated equilibrium solutions, the fastest by moves
-alone.
+The modes are the modes of the rule's own step at rest, with the roles of the last step. If the
+groups of coupled unknowns are small, all modes are computed. Otherwise only the ends of the
+spectrum are computed, by iteration. The slowest mode requires repeated equilibrium solutions, and
+the fastest mode only evaluations of moves.
 """
 
 from __future__ import annotations
@@ -45,10 +47,11 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, initial_state
 
 SEARCH_START = 1e-6
-"""Lower end of the search for the relaxation, as a fraction of its bound."""
+"""Lower end of the interval in which the relaxation is searched, as a fraction of its upper
+bound."""
 
 MIN_GAP = 1e-4
-"""Lower end of the search for 1 - √b."""
+"""Lower end of the interval in which 1 - √b is searched."""
 
 
 class StepWeights(NamedTuple):
@@ -58,19 +61,21 @@ class StepWeights(NamedTuple):
     memory: float
 
     def rate(self, eigenvalues: Complex) -> float:
-        """Return max |μ| over modes λ, except those with λ = 1; 0 if there is none."""
+        """Return max |μ| over the modes λ. Modes with λ = 1 are ignored; if there are no other
+        modes, the result is 0."""
         moving = eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
         return float(np.abs(modes(moving, *self)).max(initial=0.0))
 
 
 class HopelessError(ValueError):
-    """No relaxation and momentum let all modes decay; the message gives the reason."""
+    """No relaxation and momentum exist with which all modes decay. The message contains the
+    reason."""
 
 
 def best_weights(
     eigenvalues: Complex, relaxation: float | None = None, memory: float | None = None
 ) -> StepWeights:
-    """Return the w and b of fastest decay for modes λ, except those with λ = 1.
+    """Return the w and b with which the modes λ decay fastest. Modes with λ = 1 are ignored.
 
     Parameters
     ----------
@@ -82,7 +87,7 @@ def best_weights(
     Raises
     ------
     HopelessError
-        If there are no values for which all modes decay.
+        If there are no values with which all modes decay.
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z):
@@ -102,9 +107,10 @@ def best_weights(
 
 
 def _best_for_real(m: float, M: float, w: float | None, b: float | None) -> StepWeights:
-    """Return the optimum for real modes z from m to M.
+    """Return the optimum for modes with real z between m and M.
 
-    Both roots are real up to z = (1 - √b)² / w, complex to (1 + √b)² / w and real beyond.
+    Both roots μ are real for z up to (1 - √b)² / w, complex for z from there to (1 + √b)² / w, and
+    real for larger z.
     """
     if b is None and w is None:
         b = ((math.sqrt(M) - math.sqrt(m)) / (math.sqrt(M) + math.sqrt(m))) ** 2
@@ -117,8 +123,8 @@ def _best_for_real(m: float, M: float, w: float | None, b: float | None) -> Step
 
 
 def _best_for_complex(eigenvalues: Complex, w: float | None, b: float | None) -> StepWeights:
-    """Search for the optimum: over 1 - √b on a logarithmic scale, and for each b over w below its
-    bound."""
+    """Search for the optimum. 1 - √b is varied on a logarithmic scale and, for each b, w is varied
+    below its bound."""
 
     def weights_for(memory: float) -> StepWeights:
         if w is not None:
@@ -143,7 +149,7 @@ def _best_for_complex(eigenvalues: Complex, w: float | None, b: float | None) ->
 
 
 def _minimise(function: Any, low: float, high: float) -> float:
-    """Return the argument that minimises a function with one minimum."""
+    """Return the argument that minimises a function with a single minimum."""
     from scipy.optimize import minimize_scalar
 
     result = minimize_scalar(function, bounds=(low, high), method="bounded")
@@ -151,7 +157,8 @@ def _minimise(function: Any, low: float, high: float) -> float:
 
 
 MARGIN = 0.02
-"""Relative margin of the ends of a spectrum from iteration, which may underestimate its width."""
+"""Relative margin that is added at the ends of a spectrum that is computed by iteration, because
+iteration may underestimate its width."""
 ROUGH = 1e-3
 """Relative accuracy of solutions."""
 MOVES = 24
@@ -166,12 +173,13 @@ REMEDY = "give numbers, or omit them (relaxation 1, memory 0)"
 
 
 def tuned(scene: Scene) -> Scene:
-    """Return the scene with numbers in place of `auto`; the scene itself if there is none.
+    """Return the scene with numbers in place of `auto`. If the experiment does not contain `auto`,
+    return the scene itself.
 
     Raises
     ------
     ExperimentError
-        If there is no spectrum, or if no such numbers let all modes decay.
+        If there is no spectrum, or if no numbers exist with which all modes decay.
     """
     solver = scene.experiment.stepping
     if not solver.is_open:
@@ -183,7 +191,7 @@ def tuned(scene: Scene) -> Scene:
 
 
 def chosen_weights(scene: Scene) -> StepWeights:
-    """Choose numbers for `auto`; prescribed numbers remain."""
+    """Choose numbers in place of `auto`. Prescribed numbers are not changed."""
     _refuse(scene)
     solver = scene.experiment.stepping
     both = ("relaxation", solver.relaxation_setting), ("memory", solver.memory_setting)
@@ -221,15 +229,15 @@ def _refusal(text: str) -> ExperimentError:
 
 
 def with_solver(scene: Scene, solver: Stepping) -> Scene:
-    """Return the scene with another solver."""
+    """Return the scene with the given solver settings."""
     experiment = scene.experiment.model_copy(update={"solver": solver})
     inner = scene.inner and with_solver(scene.inner, solver)
     return replace(scene, experiment=experiment, inner=inner)
 
 
 def _eigenvalues(scene: Scene, rest: State) -> tuple[Complex, bool]:
-    """Return the relevant eigenvalues of the rule's own step, and whether all others are known to
-    lie between them."""
+    """Return eigenvalues of the rule's own step, and whether all other eigenvalues are known to lie
+    between them."""
     kinds = kinds_at(scene.raster, scene.leading, scene.experiment.steps)
     followers = np.flatnonzero(kinds == FOLLOWER)
     if len(followers) <= scene.axes * DENSE:
@@ -246,8 +254,8 @@ def _largest_block_size(entries: CoordinateMatrix) -> int:
 
 
 def _ends(scene: Scene, rest: State, place: NDArray[np.intp]) -> tuple[Complex, bool]:
-    """Return the largest and the smallest 1 - λ, moved apart by a margin, and whether all λ are
-    known to be real."""
+    """Return the largest and the smallest value of 1 - λ, moved apart by a margin. Also return
+    whether all λ are known to be real."""
     from pbdkit.equilibrium.linearise import linearised
     from pbdkit.equilibrium.system import PUSH, Moves, one_thread
 
@@ -266,7 +274,8 @@ def _ends(scene: Scene, rest: State, place: NDArray[np.intp]) -> tuple[Complex, 
         return values
 
     def rule_operator(v: Floats) -> Floats:
-        """Apply 1 - P, by a central difference if the rule is nonlinear."""
+        """Apply 1 - P, where P is the rule's own step. If the rule is nonlinear, a central
+        difference is used."""
         size, signs = nudge / np.abs(v).max(), (1.0,) if linear else (1.0, -1.0)
         states = (replace(rest, u=planes(sign * size * v)) for sign in signs)
         responses = [at_followers(moves.at(state, scene.experiment.steps)) for state in states]
@@ -291,18 +300,18 @@ def _ends(scene: Scene, rest: State, place: NDArray[np.intp]) -> tuple[Complex, 
 
 
 def _is_reciprocal(scene: Scene, rest: State) -> bool:
-    """Return whether the interactions are known to come from a symmetric stiffness."""
+    """Return whether the interactions are known to have a symmetric stiffness matrix."""
     if isinstance(scene.experiment.rule, Calibrated) and scene.frame is None:
         return True
     return not excess(scene) and has_symmetric_rows(step_operator(scene, rest).current)
 
 
 def _largest(product: Callable[[Floats], Floats], start: Floats, iterations: int) -> complex:
-    """Return the eigenvalue of largest modulus after some iterations of Arnoldi's method."""
+    """Estimate the eigenvalue with the largest modulus by some iterations of Arnoldi's method."""
     basis, hessenberg = [start / np.linalg.norm(start)], np.zeros((iterations + 1, iterations))
     for n in range(iterations):
         v = product(basis[-1])
-        for _ in range(2):  # Repeated, to remove rounding errors of the orthogonalisation.
+        for _ in range(2):  # The second pass removes rounding errors.
             coefficients = np.array([vector @ v for vector in basis])
             hessenberg[: n + 1, n] += coefficients
             v = v - coefficients @ np.array(basis)
