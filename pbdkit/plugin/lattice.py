@@ -1,5 +1,7 @@
-"""The interfaces Lattice (a repeat cell with a basis) and NeighbourMetric (neighbours in shells),
-and the cells of a lattice: polygons of neighbouring sites that tile the plane.
+"""The interfaces Lattice (a repeat cell with a basis) and NeighbourMetric (neighbours in shells).
+
+The module also computes the cells of a lattice, which are polygons of neighbouring sites that tile
+the plane.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ Index = tuple[int, ...]
 
 PLANE_ORIGIN = Vector(0.0, 0.0)
 NEARLY = 1e-9
-"""Relative tolerance of lengths, for differences of rounding."""
+"""Relative tolerance within which lengths are equal except for rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class BasisSite:
 
 @dataclass(frozen=True)
 class Offset:
-    """Step from one site to another.
+    """Vector and indices of the step from one site to another.
 
     Parameters
     ----------
@@ -59,7 +61,7 @@ class Offset:
     cell : tuple of int
         Number of repeat cells along each axis.
     site, primitive : tuple of int
-        Differences of site index and of primitive index.
+        Difference between the site indices of the two sites, and between their primitive indices.
     rest : Vector of float
         Vector in lattice units.
     """
@@ -123,7 +125,7 @@ class Cell:
 
     @cached_property
     def basis(self) -> NDArray[np.float64]:
-        """Positions of the sites in the cell, (sublattice, axis)."""
+        """Positions of the sites of the basis in the repeat cell, (sublattice, axis)."""
         return np.array([site.at for site in self.sites])
 
     @cached_property
@@ -135,12 +137,12 @@ class Cell:
         return result
 
     def shift(self, cell: Iterable[Any]) -> Any:
-        """Return m·a + n·b, the vector from a repeat cell to another.
+        """Return m·a + n·b, the vector from a repeat cell to the cell that is (m, n) cells away.
 
         Parameters
         ----------
         cell : iterable of int or array
-            Numbers (m, n) of cells along the vectors; numbers or arrays.
+            m and n, the numbers of cells along the vectors, as numbers or arrays.
 
         Returns
         -------
@@ -223,10 +225,11 @@ class Cell:
         return sorted(offsets, key=lambda o: (o.length, o.site))
 
     def _cells_within(self, radius: float) -> Iterator[Index]:
-        """Yield the repeat cells within a radius, and a few others.
+        """Yield all repeat cells within a radius, and a few cells beyond it.
 
-        The indices along the previous axes limit the range along each axis (Fincke and Pohst). For
-        nearly collinear vectors there would be too many combinations to test all of them.
+        The indices along the previous axes limit the range of indices along the next axis (Fincke
+        and Pohst). The reason is that the number of all combinations of indices is too large for
+        nearly collinear vectors.
         """
         # Columns in reverse, so that the first axis is the outermost.
         R = np.linalg.qr(np.array(self.vectors[::-1]).T, mode="r")
@@ -247,7 +250,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class _CellAsWritten:
-    """A cell that equals only cells with the same digits, signs of zero and types."""
+    """Key of a cache: a cell that equals only cells with the same digits and types.
+
+    In contrast to numbers, zeros of different sign are different here.
+    """
 
     text: str
     cell: Cell = field(compare=False)
@@ -255,18 +261,19 @@ class _CellAsWritten:
 
 @lru_cache(maxsize=64)
 def _offsets_within(written: _CellAsWritten, source: int, radius: float) -> tuple[Offset, ...]:
-    """Return the offsets of a cell; scenes on the same lattice share them."""
+    """Return the offsets of a cell from a cache, which scenes on the same lattice share."""
     return tuple(written.cell._offsets(source, radius))
 
 
 class Lattice(Component):
-    """Positions of sites: a repeat cell with one or more sites, from `origin`, in lattice units.
+    """Positions of sites, given by a repeat cell with one or more sites and by `origin`.
 
-    To add a lattice, write `cell`. A site has an integer index (i, j); (0, 0) lies at `origin`.
+    To add a lattice, write `cell`. A site has an integer index (i, j). The site (0, 0) lies at
+    `origin`; lengths are in lattice units.
 
     Examples
     --------
-    A lattice with one site a cell:
+    A lattice with one site in each cell:
 
     >>> class Sheared(Lattice):
     ...     type: Literal["sheared"] = "sheared"
@@ -299,7 +306,7 @@ class Slot:
     source, target : int
         Sublattices.
     cell, site : tuple of int
-        Steps between repeat cells and between site indices.
+        Difference between the repeat cells of the two particles, and between their site indices.
     rest : Vector of float
         Rest offset X_k - X_j, in lattice units.
     shell : int
@@ -333,9 +340,9 @@ class Nearness:
 class NeighbourMetric(Component):
     """Selects the neighbours of a site on the infinite lattice, by shells.
 
-    To add a metric, write `shells_around`. Neighbourhood is mutual: if the offset from j to k is
-    selected, the offset from k to j must be selected, too, in the same shell. Otherwise the metric
-    is rejected.
+    To add a metric, write `shells_around`. Being neighbours must be mutual: if the offset from j to
+    k is selected, the offset from k to j must be selected too, in the same shell. Otherwise the
+    metric is rejected.
 
     Examples
     --------
@@ -370,9 +377,9 @@ class NeighbourMetric(Component):
         """
 
     def nearness(self) -> Nearness | None:
-        """Return the neighbourhood that is searched at every step, or None.
+        """Return the neighbourhood in which neighbours are searched in every step, or None.
 
-        By default it is None: neighbours remain those of step 0, as in a solid.
+        By default it is None: particles have the same neighbours in all steps, as in a solid.
 
         Returns
         -------
@@ -384,9 +391,9 @@ class NeighbourMetric(Component):
 
 @dataclass(frozen=True)
 class CellPolygon:
-    """A cell: sites on a circle without sites inside (Delaunay).
+    """A cell: a polygon of sites on a circle that contains no other site (Delaunay).
 
-    These are squares on the square lattice and triangles on the hexagonal one.
+    Cells are squares on the square lattice and triangles on the hexagonal one.
 
     Parameters
     ----------
@@ -395,8 +402,8 @@ class CellPolygon:
     kind : int
         Number of the cell among those of this sublattice.
     corners : tuple of Offset
-        Offsets from the first corner to all corners, itself included, counterclockwise. The first
-        corner is the lowest one, and the leftmost of several lowest ones.
+        Offsets from the first corner to all corners including itself, counterclockwise. The first
+        corner is the lowest one or, if several are equally low, the leftmost of them.
     """
 
     source: int
@@ -405,7 +412,7 @@ class CellPolygon:
 
     @cached_property
     def rest(self) -> tuple[Vector[float], ...]:
-        """X_k - X_0 of the corners, in lattice units."""
+        """Vectors X_k - X_0 from the first corner to all corners, in lattice units."""
         return tuple(corner.rest for corner in self.corners)
 
     @cached_property
@@ -435,7 +442,8 @@ class Side:
     kind : int
         Number of the polygon among those with the sublattice of its first corner.
     first : Slot or None
-        Slot from the start of the bond to the first corner; None if the two are the same site.
+        Slot from the start of the bond to the first corner of the cell; None if both are the same
+        site.
     start, end : int
         Corners between which the bond lies.
     """
@@ -455,10 +463,10 @@ class Tiling:
     polygons : tuple of CellPolygon
         Cells.
     beside : dict of Slot to (Side, Side)
-        Cells to the left and right of a slot; a diagonal has the same cell twice. The map is empty
-        unless all cells are triangles or parallelograms, and the neighbours of every site are the
-        corners of the cells around it: 8 neighbours on the square and rectangular lattices, 6 on
-        the hexagonal one.
+        Cells to the left and right of a slot. For a diagonal both are the same cell. The map is
+        empty unless two conditions hold: all cells are triangles or parallelograms, and the
+        neighbours of every site are the corners of the cells around it. These are 8 neighbours on
+        the square and rectangular lattices and 6 on the hexagonal one.
     """
 
     polygons: tuple[CellPolygon, ...] = ()
@@ -466,7 +474,7 @@ class Tiling:
 
     @cached_property
     def rectangle(self) -> tuple[float, float] | None:
-        """Sides of the cells if all are the same rectangle along the axes, else None."""
+        """Sides (a, b) of the cells if all are the same rectangle along the axes, else None."""
         sides = {polygon.rectangle for polygon in self.polygons}
         return sides.pop() if self.beside and len(sides) == 1 else None
 
@@ -478,7 +486,7 @@ class Tiling:
         return kinds.pop() if self.beside and len(kinds) == 1 else None
 
     def is_diagonal(self, slot: Slot) -> bool:
-        """Return whether a slot crosses a cell, which is then on both of its sides.
+        """Return whether a slot is a diagonal of a cell, which is then on both sides of the bond.
 
         Parameters
         ----------
@@ -495,22 +503,23 @@ class Tiling:
 
 
 def signed_area(corners: Sequence[Any]) -> Any:
-    """Return the area of a polygon, negative if its corners are clockwise, elementwise."""
+    """Return the area of a polygon, which is negative if its corners are clockwise, elementwise."""
     pairs = [(corners[k - 1], corners[k]) for k in range(len(corners))]
     return sum(a.x * b.y - b.x * a.y for a, b in pairs) / 2
 
 
 def area_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
-    """Return the signed area of a polygon with corners r + d relative to that with corners r."""
+    """Return the signed area of a polygon with corners r + d divided by that with corners r."""
     current = [a + b for a, b in zip(r, d, strict=True)]
     return signed_area(current) / signed_area(r)
 
 
 def corner_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
-    """Return the smallest relative signed area of the triangles at the corners of a polygon.
+    """Return the smallest signed area of the triangles at the corners of a polygon, as a ratio.
 
-    Each triangle is spanned by two adjacent sides. All areas are positive if and only if the
-    polygon is convex and not inverted.
+    The triangle at a corner is spanned by the two sides that meet there. Its area in the polygon
+    with corners r + d is divided by its area in the polygon with corners r. All ratios are positive
+    if and only if the polygon with corners r + d is convex and not inverted.
     """
     triples = [(k - 1, k, (k + 1) % len(r)) for k in range(len(r))]
     shares = (area_share([d[k] for k in three], [r[k] for k in three]) for three in triples)

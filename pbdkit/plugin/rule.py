@@ -105,24 +105,25 @@ SCALES_FORCES = (
     "displacements do not depend on it, and rules do not have this parameter; it scales forces and "
     "stresses: write it under `units`, or in each diagnostic of forces or stresses"
 )
-"""Hint for Young's modulus as a key of a rule."""
+"""Message for a rule in which Young's modulus is given as a key."""
 
 
 class FollowerRule(TakesFields):
     """Moves a follower according to its neighbours in the intermediate configuration m.
 
-    To add a rule, write `gather` and `apply`, both static and elementwise: they are called with
-    whole arrays, single numbers and probes, and compiled into kernels. With u = x - X:
+    To add a rule, write `gather` and `apply`. Both are static and elementwise, because they are
+    called with whole arrays and with single numbers, and are compiled into kernels. With the
+    displacement u = x - X, a step evaluates them as follows:
 
-    1. for each present neighbour k, ``gather(d, r, w, p)`` returns contributions, vectors and
-       numbers; d = u_k - u_j is the difference, r = X_k - X_j the rest offset (x_k - x_j = r +
-       d), w the weights of the slot and p the parameters;
-    2. the contributions are summed over the neighbours in the order of the slots;
+    1. For each neighbour k that exists, ``gather(d, r, w, p)`` returns contributions, which are
+       vectors or numbers. d = u_k - u_j is the difference of the displacements, r = X_k - X_j is
+       the rest offset (x_k - x_j = r + d), w are the weights of the slot, and p are the parameters.
+    2. The contributions are summed over the neighbours in the order of the slots.
     3. ``apply(total, here, p)`` returns the move, a vector, from the position in m to the target. A
        particle with a move of exactly zero is at rest.
 
-    Relaxation and memory are applied afterwards by the framework. A particle without neighbours
-    does not move. A fictitious neighbour counts as present.
+    pbdkit then applies relaxation and momentum to the move. A particle without neighbours does not
+    move. A fictitious neighbour is a neighbour that exists.
 
     Optional capabilities are further base classes: `Calibrated`, `Loadable`, `TearsCells`,
     `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`,
@@ -134,23 +135,27 @@ class FollowerRule(TakesFields):
         "thickness": SCALES_FORCES,
     }
     linear: ClassVar[bool] = False
-    """True if moves superpose: for given neighbours the move is a constant plus a linear function
-    of the displacements. Predictions of `check` then hold for the whole run."""
+    """True if moves superpose: as long as the neighbours do not change, the move is a constant plus
+    a linear function of the displacements. Predictions of `check` then hold for the whole run."""
     uses_reference: ClassVar[bool] = False
-    """True if the move depends on the position: `here.X` and `here.centred` are then set. Under all
-    other rules, moves do not change if the body is translated."""
+    """True if the move depends on the position of the particle: `here.X` and `here.centred` are
+    then set. With all other rules, moves do not change if the body is translated."""
     has_axes: ClassVar[bool] = False
     """True if directions matter: a body that is reflected, or rotated by a right angle, may then
     move differently."""
     uses_cells: ClassVar[bool] = False
-    """True if the rule works cell by cell of the lattice. ``w.left`` and ``w.right`` are then the
-    shares, 0 to 1, of the cells to the left and right of the bond, seen from j, that belong to the
-    body. They are 1 inside the body, and everywhere if the frame does not weigh cells. A bond
-    across a cell has that cell on both sides."""
+    """True if the move is a sum over the cells of the lattice.
+
+    A bond has a cell to its left and one to its right, as seen from j. ``w.left`` and ``w.right``
+    are then the area fractions of these two cells inside the body. Both are 1 inside the body, and
+    for all bonds if the frame does not weigh cells. If the bond is the diagonal of a cell, both
+    belong to this cell.
+    """
 
     def parameters(self, setting: Setting) -> dict[str, float]:
-        """Return the numbers that `gather` and `apply` receive as ``p.name``; by default the
-        numeric fields.
+        """Return the numbers that `gather` and `apply` receive as ``p.name``.
+
+        By default these are the numeric fields.
 
         Parameters
         ----------
@@ -170,12 +175,14 @@ class FollowerRule(TakesFields):
         return self.numeric_parameters()
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """Return the constants of a slot that `gather` receives as ``w.name``; by default none.
+        """Return the constants of a slot, which `gather` receives as ``w.name``.
+
+        By default there are none.
 
         Parameters
         ----------
         slot : Slot
-            Slot; all slots must have the same names.
+            Slot; the constants of all slots must have the same names.
         setting : Setting
             Lattice and body.
 
@@ -205,13 +212,13 @@ class FollowerRule(TakesFields):
         Returns
         -------
         tuple of Vector or Number
-            Contributions; they are summed over the neighbours.
+            Contributions, which pbdkit sums over the neighbours.
         """
 
     @staticmethod
     @abstractmethod
     def apply(total: tuple[Any, ...], here: Here, p: Parameters) -> Vector:
-        """Return the move of the follower, from its position in m to its target, elementwise.
+        """Return the move of the follower from its position in m to its target, elementwise.
 
         Parameters
         ----------
@@ -239,11 +246,11 @@ class Calibrated(ABC):
         Returns
         -------
         Stiffness or None
-            Elasticity over Young's modulus and thickness.
+            Elasticity divided by Young's modulus and thickness.
         """
 
     def through_thickness(self) -> float:
-        """Return σ_zz over σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain.
+        """Return σ_zz / (σ_xx + σ_yy): 0 in plane stress, Poisson's ratio in plane strain.
 
         Returns
         -------
@@ -271,7 +278,7 @@ class Calibrated(ABC):
         Returns
         -------
         Vector
-            Force over Young's modulus and thickness, in lattice units.
+            Force divided by Young's modulus and thickness, in lattice units.
         """
 
 
@@ -281,16 +288,16 @@ class Loadable(Calibrated):
     @staticmethod
     @abstractmethod
     def loaded(total: tuple[Any, ...], load: Vector, p: Parameters) -> tuple[Vector | Number, ...]:
-        """Return the sums as if a neighbour exerted the force `load` in addition, elementwise.
+        """Return the sums as if a further neighbour exerted the force `load`, elementwise.
 
-        The contribution to the move must not depend on the positions of the neighbours.
+        The contribution of the load to the move must not depend on the positions of the neighbours.
 
         Parameters
         ----------
         total : tuple of Vector or Number
             Sums of the contributions.
         load : Vector
-            Force over Young's modulus and thickness, in lattice units.
+            Force divided by Young's modulus and thickness, in lattice units.
         p : Parameters
             Parameters of the rule.
 
@@ -307,12 +314,15 @@ class Loadable(Calibrated):
 
 
 class StoresEnergy(Calibrated):
-    """A nonlinear calibrated rule; the energy of linear rules is -½ Σ u·force."""
+    """A nonlinear calibrated rule with a strain energy.
+
+    Linear rules do not need this capability, because their energy is -½ Σ u·force.
+    """
 
     @staticmethod
     @abstractmethod
     def energy(d: Vector, r: Vector, w: Weights, p: Parameters) -> Number:
-        """Return the half of the strain energy of a bond that belongs to this end, elementwise.
+        """Return the share of this end, one half, in the strain energy of a bond, elementwise.
 
         Parameters
         ----------
@@ -328,7 +338,7 @@ class StoresEnergy(Calibrated):
         Returns
         -------
         Number
-            Energy over Young's modulus and thickness.
+            Energy divided by Young's modulus and thickness.
         """
 
 
@@ -338,9 +348,10 @@ class Torn(NamedTuple):
     Parameters
     ----------
     left, right : Number
-        Largest damage of any bond of the cell to the left and to the right.
+        Largest damage of the bonds of the cell to the left of the bond, and of those of the cell to
+        the right.
     bond_left, bond_right : Number
-        Damage of the bond itself in each of the two cells.
+        Damage of the bond itself in the left cell and in the right cell.
     """
 
     left: Number
@@ -350,11 +361,11 @@ class Torn(NamedTuple):
 
 
 class TearsCells(Calibrated):
-    """A calibrated rule that works cell by cell and computes the forces of damaged cells.
+    """A calibrated rule that sums over cells and computes the forces of damaged cells.
 
-    The forces balance, and rigid motions cause no forces. If bonds can break, a broken bond keeps
-    its difference d, and fictitious points are not used. The fictitious points of the fracture
-    model must therefore exert no forces.
+    The forces must balance, and rigid motions must cause no forces. For a broken bond the rule
+    receives the difference d between its real ends, and fictitious points are not used. A fracture
+    model with fictitious points that exert forces can therefore not be combined with the rule.
     """
 
     @staticmethod
@@ -362,7 +373,7 @@ class TearsCells(Calibrated):
     def torn(
         d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters
     ) -> tuple[Vector | Number, ...]:
-        """Return the contributions of one neighbour beside damage, elementwise.
+        """Return the contributions of one neighbour in damaged cells, elementwise.
 
         Parameters
         ----------
@@ -373,8 +384,8 @@ class TearsCells(Calibrated):
         w : Weights
             Constants of the slot.
         t : Torn
-            Damage beside the bond. Where it is zero, the result is that of `gather` to the last
-            bit.
+            Damage beside the bond. Where it is zero, the result must equal that of `gather` to the
+            last bit.
         p : Parameters
             Parameters of the rule.
 
@@ -386,7 +397,7 @@ class TearsCells(Calibrated):
 
 
 class MixesCells(Calibrated):
-    """A calibrated rule that works cell by cell, with a material for each cell."""
+    """A calibrated rule that sums over cells, of which each can have a material of its own."""
 
     @abstractmethod
     def cell_weights(self, slot: Slot, setting: Setting, c: Stiffness) -> dict[str, float]:
@@ -399,7 +410,8 @@ class MixesCells(Calibrated):
         setting : Setting
             Lattice and body.
         c : Stiffness
-            Stiffness of the cells over the modulus of the rule; the weights are linear in it.
+            Stiffness of the cells divided by the modulus of the rule. The weights must be linear in
+            it.
 
         Returns
         -------
@@ -408,10 +420,11 @@ class MixesCells(Calibrated):
         """
 
     def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """Return the weights of springs, which act in torn cells alone; by default there are none.
+        """Return the weights of springs, which act in torn cells only; by default there are none.
 
-        All other weights of the slot are 0. The weights of springs are not linear in the stiffness
-        of a cell; in cells of another stiffness they are multiplied by `spring_share`.
+        In the returned weights, all weights except those of the springs are 0. The weights of
+        springs are not linear in the stiffness of a cell, in contrast to those of `cell_weights`.
+        In cells of another stiffness they are multiplied by `spring_share`.
 
         Parameters
         ----------
@@ -433,7 +446,8 @@ class MixesCells(Calibrated):
         Parameters
         ----------
         c : array of float, shape (cell, 3, 3)
-            Stiffness over Young's modulus, in the components xx, yy, xy.
+            Stiffness of each cell divided by Young's modulus, as a matrix for the components xx, yy
+            and xy of strain and stress.
         setting : Setting
             Lattice and body.
 
@@ -451,10 +465,10 @@ class RenewsParticles(Remembers):
     @staticmethod
     @abstractmethod
     def remember(total: tuple[Any, ...], here: Here, p: Parameters) -> tuple[Number, ...]:
-        """Return the new values of the numbers that change, in their order, elementwise.
+        """Return the new values of the state variables that change, elementwise.
 
-        State variables of leaders are updated like those of followers. A particle without
-        neighbours keeps its numbers.
+        The order is that of `remembered`. State variables of leaders are updated like those of
+        followers. Those of a particle without neighbours do not change.
 
         Parameters
         ----------
@@ -504,21 +518,22 @@ class SharesParticles(Remembers):
         Returns
         -------
         tuple of Vector or Number
-            Contributions; they are summed over the neighbours.
+            Contributions, which pbdkit sums over the neighbours.
         """
 
 
 class TurnsParticles(RenewsParticles):
-    """A rule with directions of particles: some state variables are rotations.
+    """A rule in which particles have directions, stored as state variables.
 
-    Each is stored by its cosine and sine. Clamped leaders prescribe them, and turn with their
-    motion.
+    The rotation of a direction is stored as two state variables, its cosine and its sine. Clamped
+    leaders prescribe the directions, which rotate with the motion of the group.
     """
 
     @abstractmethod
     def rotations(self) -> tuple[tuple[str, str], ...]:
-        """Return the names of cosine and sine of each rotation, counterclockwise from the
-        reference.
+        """Return the names of the state variables with cosine and sine of each rotation.
+
+        Rotations are counterclockwise, from the direction in the reference configuration.
 
         Returns
         -------
@@ -528,10 +543,10 @@ class TurnsParticles(RenewsParticles):
 
 
 class AppliesTwice(ABC):
-    """A rule that works on the moves of an inner rule, for operators that are applied twice.
+    """A rule that is applied to the moves of an inner rule, for operators that are applied twice.
 
-    `gather` and `apply` receive the inner moves z, of followers and leaders alike, in place of
-    displacements: d = z_k - z_j and here.u = z_j.
+    The moves z that the inner rule computes for followers and leaders replace the displacements in
+    `gather` and `apply`: d = z_k - z_j and here.u = z_j.
     """
 
     @abstractmethod
