@@ -1,6 +1,7 @@
-"""Everything that the author of a component needs: the interfaces, the optional capabilities, the
-data that components exchange with pbdkit, and the marker of the hook by which a distribution
-registers its components.
+"""Everything that the author of a component needs.
+
+These are the interfaces, the optional capabilities, the classes of the data that components receive
+and return, and the marker of the hook by which a distribution registers its components.
 
 Examples
 --------
@@ -107,9 +108,10 @@ INTERFACES: dict[str, type[Component]] = {
     "operations": ParticleOperation,
     "diagnostics": Diagnostic,
 }
-"""The open interfaces, by the field of the experiment that specifies their components."""
+"""Interfaces that plugins can implement, by the field of the experiment that selects a
+component."""
 LISTS = frozenset({"operations", "diagnostics"})
-"""The fields that list any number of components."""
+"""The fields that contain a list of components instead of one component."""
 
 BUILTIN = GROUP
 """The distribution of the built-in components."""

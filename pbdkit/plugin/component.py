@@ -1,4 +1,4 @@
-"""Base class of components, its parameters, and state variables of bonds and particles."""
+"""Base classes of components: validated parameters, and state variables of bonds and particles."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class Strict(BaseModel):
-    """Frozen model that accepts finite numbers and known keys only.
+    """Frozen pydantic model that accepts only finite numbers and known keys.
 
-    "10", True and 10.0 are not accepted as the integer 10. The message for an unknown key contains
-    the nearest known key.
+    Types are not converted: "10", True and 10.0 are not accepted as the integer 10. The message for
+    an unknown key contains the most similar known key.
     """
 
     model_config = ConfigDict(
@@ -33,7 +33,7 @@ class Strict(BaseModel):
     )  # fmt: skip
 
     _elsewhere: ClassVar[Mapping[str, str]] = {}
-    """Hints for keys that belong in another place of the experiment, by key."""
+    """Hints for keys that belong in another place of the experiment: a map from key to hint."""
 
     @classmethod
     def key_hint(cls, key: str) -> str:
@@ -85,7 +85,7 @@ class Component(Strict, ABC):
         class Stiff(pbdkit.FollowerRule):
             type: Literal["stiff"] = "stiff"
 
-    A component has no run state: state variables are part of the state of the run.
+    A component does not change during a run; its state variables are part of the state of the run.
     """
 
     model_config = ConfigDict(json_schema_extra=_require_type)
@@ -114,7 +114,7 @@ class Component(Strict, ABC):
         return default
 
     def numeric_parameters(self) -> dict[str, float]:
-        """Return the numeric and boolean parameters by name, for elementwise functions.
+        """Return the numeric and boolean parameters by name, as elementwise functions receive them.
 
         Returns
         -------
@@ -164,7 +164,7 @@ def as_values(answer: Any, what: str) -> tuple[Any, ...]:
     Raises
     ------
     AnswerError
-        If it is a single value, as when the comma of ``(value,)`` is missing.
+        If the result is a single value, for example because the comma of ``(value,)`` is missing.
     """
     if isinstance(answer, Vector) or not isinstance(answer, (tuple, list)):
         raise AnswerError(f"`{what}` returned {_kind(answer)}, not a tuple; write `(value,)`")
@@ -181,22 +181,23 @@ DTYPES = ("f8", "i1", "i2", "i4", "i8")
 
 @dataclass(frozen=True)
 class Remembered:
-    """State variable of a fracture model, for each bond, or of a rule, for each particle.
+    """State variable: of a fracture model with a value for each bond, or of a rule for each
+    particle.
 
     Parameters
     ----------
     name : str
-        Name of the number, and of the variable in the dataset.
+        Name of the state variable, and of its variable in the dataset.
     long_name, units : str
         Attributes of the variable.
     initial : float
-        Initial value, unless the component draws it.
+        Initial value, unless the component has random initial values.
     dtype : str
-        ``"f8"``, in the precision of the run, or an integer type.
+        ``"f8"`` for numbers in the precision of the run, or an integer type.
     changes : bool
-        Whether it can change; otherwise it is recorded once.
+        Whether the value can change during the run; a constant value is recorded once.
     recorded : bool
-        Whether it is recorded.
+        Whether the state variable is recorded in the dataset.
 
     Raises
     ------
@@ -273,14 +274,18 @@ class Particles:
 
 
 Drawn = dict[str, NDArray[Any]]
-"""Type of initial values by the name of the number; others start at their `initial`."""
+"""Type of random initial values by the name of the state variable.
+
+State variables that are missing start at their `initial`.
+"""
 
 
 class Remembers(ABC):
     """Component with state variables.
 
-    A fracture model has state variables for each bond, which it receives by name in ``c``; a rule
-    has state variables for each particle of the body, in ``here.own``.
+    The state variables of a fracture model have a value for each bond, and its functions receive
+    them by name in ``c``. Those of a rule have a value for each particle of the body, and its
+    functions receive them in ``here.own``.
     """
 
     @abstractmethod
@@ -307,11 +312,12 @@ class Draws(Remembers):
         owners : Bonds or Particles
             `Bonds` for a fracture model, `Particles` for a rule.
         generator : numpy.random.Generator
-            Random number generator. It depends on the seed of the experiment only, not on other
-            random components, engine or threads.
+            Random number generator. Its numbers depend only on the seed of the experiment, and not
+            on other random components, the engine or the number of threads.
 
         Returns
         -------
         dict of str to array, shape (owner,)
-            Values by the name of the number. Numbers that are missing start at their `initial`.
+            Values by the name of the state variable. State variables that are missing start at
+            their `initial`.
         """

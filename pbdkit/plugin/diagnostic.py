@@ -15,7 +15,7 @@ from pbdkit.plugin.component import Bonds, Component, Pair
 from pbdkit.plugin.rule import Stiffness
 
 Need = Literal["bonds", "cells", "material", "forces", "loads"]
-"""Type of a requirement of a diagnostic."""
+"""Type of the names of data that a diagnostic can require."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Variable:
     name : str
         Name of the variable.
     dims : tuple of str
-        Dimensions, without the leading `time` or `step`, which is added unless the diagnostic is
-        evaluated at the end.
+        Dimensions without the first one. `time` or `step` is added as the first dimension, unless
+        the diagnostic is evaluated at the end only.
     long_name, units : str
         Attributes of the variable.
     dtype : str
@@ -45,9 +45,10 @@ class Variable:
     attributes: dict[str, Any] = field(default_factory=dict)
 
     def is_recordable(self, values: Any, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which values are allowed in the dataset.
+        """Return a mask of the values that are allowed in the dataset.
 
-        Values are finite, or NaN at particles outside the outline, such as frame points.
+        All finite values are allowed, and NaN at particles outside the outline, such as frame
+        points.
 
         Parameters
         ----------
@@ -69,16 +70,16 @@ class Variable:
 
 
 class LeaderRows(NamedTuple):
-    """Leader group at a step.
+    """State of a leader group at a step.
 
     Parameters
     ----------
     rows : array of int
-        Rows of its particles.
+        Rows of its particles in the tables of `Moment`.
     leads : bool
         Whether the group is active at this step.
     axes : tuple of int
-        Axes along which it prescribes displacements.
+        Axes along which the group prescribes displacements.
     """
 
     rows: NDArray[np.intp]
@@ -87,16 +88,16 @@ class LeaderRows(NamedTuple):
 
 
 class LoadRows(NamedTuple):
-    """Load at a step.
+    """State of a load at a step.
 
     Parameters
     ----------
     rows : array of int
-        Rows of its particles.
+        Rows of the particles on which it acts.
     share : array of float
-        Share of each particle in the force, or its area for a body force.
+        Share of each particle in the force; for a body force, the area of the particle.
     force : array of float, shape (axis,)
-        Total force, or force per area, over Young's modulus and thickness.
+        Total force divided by Young's modulus and thickness; for a body force, the force per area.
     """
 
     rows: NDArray[np.intp]
@@ -121,7 +122,7 @@ class TouchingRows(NamedTuple):
 
 @dataclass(frozen=True)
 class BondHistory(Bonds):
-    """Bonds with the time and strain of their breaking.
+    """Bonds, with step and strain at which each bond broke.
 
     Parameters
     ----------
@@ -136,8 +137,8 @@ class BondHistory(Bonds):
     broken_step : array of int, shape (bond,)
         Step at which each bond broke, -1 if it is intact, 0 for an initial crack.
     broken_strain : array of float, shape (bond,)
-        Strain at breaking, in the intermediate configuration. NaN if the bond is intact, was cut,
-        or was broken from the start.
+        Strain in the intermediate configuration in which the bond broke. NaN if the bond is intact,
+        was cut, or was broken from the start.
     """
 
     broken_step: NDArray[np.int32]
@@ -159,14 +160,14 @@ class CellValues(ABC):
         *,
         intact_only: bool = False,
     ) -> Floats:
-        """Evaluate a function on every cell with all corners in the body.
+        """Evaluate a function on every cell of which all corners belong to the body.
 
         Parameters
         ----------
         function : callable
-            Elementwise function of (d, r), which hold one vector for each corner, counterclockwise:
-            d[k] = u_k - u_0 and the constant r[k] = X_k - X_0. It is called once for each shape and
-            part of the body.
+            Elementwise function of (d, r). Both are sequences with one vector for each corner,
+            counterclockwise: d[k] = u_k - u_0 and r[k] = X_k - X_0. The function is called once for
+            each shape of cells in each part of the body.
         intact_only : bool
             Whether to exclude cells with a broken bond between corners.
 
@@ -183,14 +184,14 @@ class CellValues(ABC):
         Returns
         -------
         array of float, shape (particle, component, axis)
-            Gradient; NaN at frame points, 0 at particles without cells, extrapolated outside the
-            outline.
+            Gradient. It is NaN at frame points and 0 at particles without cells, and is
+            extrapolated to particles outside the outline.
 
         Notes
         -----
-        It is the mean over the cells at the particle, weighted by their shares inside the outline,
-        and extrapolated from the centre of these cells to the particle. Cells with a broken bond
-        between corners are excluded.
+        The gradient is the mean over the cells at the particle, weighted by their area fractions
+        inside the outline. It is extrapolated from the common centre of these cells to the
+        particle. Cells with a broken bond between two of their corners are excluded.
         """
 
     def lost_stress(self) -> Floats | None:
@@ -199,14 +200,17 @@ class CellValues(ABC):
         Returns
         -------
         array of float, shape (particle, component, axis), or None
-            First Piola–Kirchhoff stress over Young's modulus, as the mean over the cells of
-            `gradient`; None if no bond softens.
+            First Piola–Kirchhoff stress divided by Young's modulus, as a mean over the same cells
+            as in `gradient`; None if no bond softens.
         """
         return None
 
 
 class ForceValues(ABC):
-    """Forces and energy of the material, over Young's modulus and thickness, in lattice units."""
+    """Forces and energy of the material, divided by Young's modulus and thickness.
+
+    They are in lattice units.
+    """
 
     @property
     @abstractmethod
@@ -216,21 +220,21 @@ class ForceValues(ABC):
     @property
     @abstractmethod
     def through_thickness(self) -> Any:
-        """Ratio of σ_zz to σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain.
+        """Ratio σ_zz / (σ_xx + σ_yy): 0 in plane stress, Poisson's ratio in plane strain.
 
-        One number, or one for each particle.
+        It is a single number, or an array with a number for each particle.
         """
 
     @abstractmethod
     def on_particles(self) -> Floats:
-        """Return the forces of the neighbours on every particle, including leaders.
+        """Return the force that its neighbours exert on every particle, including leaders.
 
-        The forces of broken bonds are those of the rule.
+        At broken bonds the force that the rule computes is included.
 
         Returns
         -------
         array of float, shape (particle, axis)
-            Forces over Young's modulus and thickness, in lattice units; NaN at frame points.
+            Forces divided by Young's modulus and thickness, in lattice units; NaN at frame points.
         """
 
     @abstractmethod
@@ -240,15 +244,15 @@ class ForceValues(ABC):
         Returns
         -------
         float
-            Energy over Young's modulus and thickness: ½ uᵀK u = -½ Σ u·f for a linear rule, the sum
-            over bonds for a nonlinear one.
+            Energy divided by Young's modulus and thickness. For a linear rule it is ½ uᵀK u = -½ Σ
+            u·f, for a nonlinear one the sum of the energies of the bonds.
         """
 
 
 class Moment(ABC):
     """State of the run at the end of a step, as input of diagnostics.
 
-    Tables have one row for each particle and are read-only.
+    Its arrays have one row for each particle and are read-only.
     """
 
     step: int
@@ -256,14 +260,14 @@ class Moment(ABC):
     @property
     @abstractmethod
     def body(self) -> NDArray[np.bool_]:
-        """Mask of leaders and followers, (particle,); the other rows are frame points."""
+        """Mask of the particles of the body, (particle,); all other particles are frame points."""
 
     @property
     @abstractmethod
     def inside(self) -> NDArray[np.bool_]:
         """Mask of the particles inside or on the outline, (particle,).
 
-        Corners of cut cells can lie outside.
+        Particles of the body can lie outside the outline, as corners of cells that it cuts.
         """
 
     @property
@@ -274,7 +278,8 @@ class Moment(ABC):
     @property
     @abstractmethod
     def forces(self) -> ForceValues:
-        """Forces and energy of the material, for diagnostics that require these."""
+        """Forces and energy of the material, for diagnostics with "material" or "forces" in
+        `needs`."""
 
     @abstractmethod
     def rows(self, numbers: tuple[int, ...]) -> NDArray[np.intp]:
@@ -293,7 +298,8 @@ class Moment(ABC):
 
     @abstractmethod
     def nearest(self, points: tuple[Pair, ...]) -> NDArray[np.intp]:
-        """Return the row of the body particle nearest to each point at rest.
+        """Return the row of the body particle nearest to each point, in the reference
+        configuration.
 
         Parameters
         ----------
@@ -329,7 +335,7 @@ class Moment(ABC):
         Returns
         -------
         array of float, shape (particle, axis)
-            Displacements in lattice units; at time 0 those of time 0.
+            Displacements in lattice units; at time 0 the initial displacements.
         """
 
     @abstractmethod
@@ -351,7 +357,9 @@ class Moment(ABC):
     def sum_over_neighbours(
         self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
-        """Return Σ_k function(d, r) over the reference neighbours k of each body particle.
+        """Return Σ_k function(d, r) for each body particle.
+
+        The sum includes all neighbours k in the reference configuration.
 
         Parameters
         ----------
@@ -359,8 +367,8 @@ class Moment(ABC):
             Function of d = u_k - u_j and r = X_k - X_j, evaluated elementwise like the method
             `gather` of a rule.
         intact_only : bool
-            Whether to exclude broken bonds; otherwise they are included with the displacement of
-            the real neighbour, not of the fictitious point.
+            Whether to exclude broken bonds. If they are included, d is computed from the
+            displacement of the real neighbour and not from that of the fictitious point.
 
         Returns
         -------
@@ -380,7 +388,9 @@ class Moment(ABC):
 
     @abstractmethod
     def loads(self) -> tuple[LoadRows, ...]:
-        """Return the loads in the order of the experiment; no load acts at time 0.
+        """Return the loads in the order of the experiment.
+
+        At time 0 no load acts.
 
         Returns
         -------
@@ -395,12 +405,12 @@ class Moment(ABC):
         Returns
         -------
         tuple of TouchingRows
-            One entry for each obstacle; empty for an obstacle that does not exist at this step.
+            One entry for each obstacle; without rows if the obstacle does not exist at this step.
         """
 
     @abstractmethod
     def broken_bonds(self) -> int:
-        """Return the number of bonds that have broken.
+        """Return the number of bonds that have broken so far.
 
         Returns
         -------
@@ -417,7 +427,7 @@ class Moment(ABC):
         Returns
         -------
         BondHistory
-            Bonds with the time and strain of their breaking.
+            Bonds, with step and strain at which each bond broke.
         """
 
     @abstractmethod
@@ -427,35 +437,45 @@ class Moment(ABC):
         Parameters
         ----------
         name : str
-            Name of the number.
+            Name of the state variable.
 
         Returns
         -------
         array, shape (bond,) or (particle,)
-            Values: for each bond in the order of the dataset, or for each particle. Frame points
-            have the initial value.
+            Values for each bond, in the order of the dataset, if the fracture model has the
+            variable; values for each particle if the rule has it. Frame points have the initial
+            value.
         """
 
 
 class Diagnostic(Component):
     """Quantity of the run that is stored in the dataset.
 
-    To implement a diagnostic, define `variables` and `measure`. It is evaluated at recorded steps,
-    at every step if it declares `every_step`, or once after the last step if it declares `at_end`.
+    To implement a diagnostic, define `variables` and `measure`. By default it is evaluated at
+    recorded steps. It is evaluated at every step if it declares `every_step`, and only once after
+    the last step if it declares `at_end`.
     """
 
     needs: ClassVar[frozenset[Need]] = frozenset()
-    """Requirements of the diagnostic.
+    """Data that the diagnostic requires.
 
-    "bonds": the table of bonds in the dataset. "cells": `Moment.cells`; a body without cells, such
-    as a single row, is an error. "material": `Moment.forces.stiffness`, and "forces": all of
-    `Moment.forces`; rules that are not calibrated are an error. "loads": `Moment.loads`;
-    experiments without loads are an error. Variables can then have the dimension `load`.
+    - "bonds": the table of bonds in the dataset.
+    - "cells": `Moment.cells`. A body without cells, such as a single row, is an error.
+    - "material": `Moment.forces.stiffness`. A rule that is not calibrated is an error.
+    - "forces": all of `Moment.forces`. A rule that is not calibrated is an error.
+    - "loads": `Moment.loads`. An experiment without loads is an error. Variables can then have the
+      dimension `load`.
     """
     every_step: ClassVar[bool] = False
-    """True to evaluate at every step (dimension `step`) instead of at recorded steps."""
+    """True if the diagnostic is evaluated at every step instead of at recorded steps.
+
+    The first dimension of its variables is then `step`.
+    """
     at_end: ClassVar[bool] = False
-    """True to evaluate once, after the last step; variables then have no leading dimension."""
+    """True if the diagnostic is evaluated only once, after the last step.
+
+    Its variables then have neither the dimension `time` nor `step`.
+    """
     local: ClassVar[bool] = False
     """True if the value at a particle depends only on the particle and its neighbours.
 
@@ -463,7 +483,10 @@ class Diagnostic(Component):
     evaluates the whole lattice.
     """
     own_dimension: ClassVar[str] = ""
-    """Name of a dimension of variables with `at_end`, of the length that the values have."""
+    """Name of a dimension that only this diagnostic has, for variables with `at_end`.
+
+    Its length is that of the values.
+    """
 
     @abstractmethod
     def variables(self) -> tuple[Variable, ...]:
@@ -476,7 +499,7 @@ class Diagnostic(Component):
         """
 
     def coordinates(self) -> dict[str, NDArray[Any]]:
-        """Return additional dimensions with their coordinates; by default there are none.
+        """Return the coordinates of additional dimensions; by default there are none.
 
         Returns
         -------
@@ -488,8 +511,8 @@ class Diagnostic(Component):
     def check(self, particles: int, leader_groups: int) -> None:
         """Check that the diagnostic is compatible with the scene.
 
-        Variables can have the dimensions `leader_group`, `obstacle`, and `principal`, the larger
-        and the smaller principal value in the plane.
+        Variables can have the dimensions `leader_group`, `obstacle` and `principal`. The last one
+        has two entries, for the larger and the smaller principal value in the plane.
 
         Parameters
         ----------
@@ -501,16 +524,16 @@ class Diagnostic(Component):
         Raises
         ------
         ExperimentError
-            If it is not compatible.
+            If the diagnostic is not compatible.
         """
         return
 
     @abstractmethod
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return the values of the variables, one array for each, in the shapes of their `dims`.
+        """Return one array of values for each variable, in the shape of its `dims`.
 
-        Values must be finite, except NaN at frame points in variables of the body, and at particles
-        that are not `inside` in variables that are not defined outside the outline.
+        Values must be finite. NaN is allowed only where a variable is not defined: at frame points,
+        and at particles for which `Moment.inside` is false.
 
         Parameters
         ----------

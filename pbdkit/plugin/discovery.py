@@ -27,15 +27,15 @@ from pbdkit.plugin import INTERFACES, Component, SharesParticles
 
 
 def interface_of(component: type[Component]) -> type[Component]:
-    """Return the open interface that a component class implements."""
+    """Return the interface that a component class implements."""
     return next(i for i in INTERFACES.values() if issubclass(component, i))
 
 
 def full_description(component: type[Component]) -> str:
-    """Return interface, type and distribution of a component: ``FollowerRule 'odd' of pbdkit-odd
-    0.3``.
+    """Return the interface, type and distribution of a component as a text.
 
-    The distribution is that with an entry point into the package of the component.
+    An example is ``FollowerRule 'odd' of pbdkit-odd 0.3``. The distribution is the one with an
+    entry point that refers to the package of the component.
     """
     package, origin = component.__module__.split(".")[0], ""
     with suppress(Exception):  # metadata of other distributions can be damaged
@@ -55,9 +55,10 @@ def blame(component: type[Component], when: str, error: BaseException) -> Plugin
 def blaming(component: Component, when: str, *field: str | int) -> Iterator[None]:
     """Convert errors in the code of a component.
 
-    An exception is converted to a PluginError with the interface, type and distribution of the
-    component. If the `field` of the component is given, an ExperimentError is raised again with
-    that field. A KeyboardInterrupt is raised again with a message that names the component.
+    An exception is converted to a PluginError that names the interface, type and distribution of
+    the component. Two exceptions are not converted. An ExperimentError is raised again with the
+    `field` of the component, if it is given. A KeyboardInterrupt is raised again with a message
+    that names the component.
     """
     try:
         yield
@@ -89,7 +90,7 @@ A parameter is missing, or rejected by a validator of the component.
 def load_builtin() -> Plugin:
     """Load the built-in components by their entry point, without other plugins.
 
-    They are not checked, because tests do this.
+    The built-in components are not checked here, because the tests of pbdkit check them.
     """
     source = distribution(GROUP)
     (entry,) = source.entry_points.select(group=GROUP)
@@ -99,8 +100,8 @@ def load_builtin() -> Plugin:
 def loaded(plugin: Plugin) -> Plugin:
     """Import a plugin and call its hook `pbdkit_components`.
 
-    Errors are stored as the state of the plugin and its reason; disabled plugins are not imported.
-    An unusable class does not affect the others.
+    An error is not raised but stored as the state of the plugin, with a reason. Disabled plugins
+    are not imported. An unusable class does not affect the other classes of the plugin.
     """
 
     def load(entry: EntryPoint, package: str) -> Plugin:
@@ -130,12 +131,12 @@ def _offer(component: Any, package: str) -> Offer:
 
 
 def checked(component: Any) -> Offer:
-    """Return the offer of a component class if it is usable.
+    """Return the offer of a component class if the class is usable.
 
     Raises
     ------
     TypeError
-        If it is not, with the remedy.
+        If the class is not usable. The message contains the remedy.
     """
     if isinstance(component, Component):
         name = type(component).__name__
@@ -219,7 +220,7 @@ class Retired:
     difference
         How results differ.
     renumbers
-        Whether particles have other numbers under the successor.
+        Whether the numbers of the particles change if the successor is used.
     """
 
     field: str

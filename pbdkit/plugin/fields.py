@@ -34,10 +34,13 @@ from pbdkit.plugin.units import LENGTH, PATTERN, Quantity, or_text
 from pbdkit.seeds import random_field_seed
 
 Held = Mapping[str, NDArray[np.bool_]]
-"""Type of the masks of places inside each region, in the order of the experiment."""
+"""Type of a map from each region to the mask of the places inside it, in the order of the
+experiment."""
 MAX_TEXT_VALUES = 1000
-"""Maximum number of values that are written as numbers; more values are written as bytes in base
-64."""
+"""Maximum number of values that are written as numbers.
+
+More values are written as bytes in base 64.
+"""
 MAX_VALUES = 2**24
 """Maximum number of values on a grid."""
 
@@ -48,7 +51,10 @@ class Varying(ABC):
     @property
     @abstractmethod
     def samples(self) -> dict[str, float]:
-        """Values by place for validation; the first is used where a single number is required."""
+        """Values for validation, by a description of their place.
+
+        The first value is used where a single number is required.
+        """
 
     @abstractmethod
     def at(self, x: Floats, y: Floats, regions: Held, reach: float = 0.0) -> Floats:
@@ -61,17 +67,18 @@ class Varying(ABC):
         regions
             Masks of the places inside each region.
         reach
-            Maximum distance from the data at which a place outside receives the nearest value.
+            Maximum distance from the data within which a place outside the data has the nearest
+            value.
 
         Returns
         -------
         NDArray
-            Values in the shape of the places; NaN where there is none.
+            Values in the shape of the places; NaN at places without a value.
         """
 
     @abstractmethod
     def written(self) -> dict[str, Any]:
-        """Return the parameter as in an experiment file."""
+        """Return the parameter as it is written in an experiment file."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +110,9 @@ class ByRegion(Varying):
 
 
 class Gridded(Varying):
-    """Values on a grid (x, y) with bilinear interpolation; constant along an axis with one
-    coordinate.
+    """Values on a grid (x, y) with bilinear interpolation.
+
+    The parameter is constant along an axis with only one coordinate.
 
     Parameters
     ----------
@@ -116,7 +124,8 @@ class Gridded(Varying):
     Raises
     ------
     ValueError
-        If coordinates do not increase, shapes differ, or numbers are not finite.
+        If coordinates do not increase, the shapes of coordinates and values differ, or a number is
+        not finite.
     """
 
     def __init__(self, x: Any, y: Any, values: Any) -> None:
@@ -168,7 +177,8 @@ class Gridded(Varying):
         return result
 
     def written(self) -> dict[str, Any]:
-        """Return coordinates and values; many values as bytes in base 64."""
+        """Return coordinates and values; more than `MAX_TEXT_VALUES` values are bytes in base
+        64."""
         is_text = self.values.size <= MAX_TEXT_VALUES
         packed = base64.b64encode(self.values.astype("<f8").tobytes()).decode()
         return {
@@ -182,7 +192,8 @@ class Gridded(Varying):
 class OfPlace(Varying):
     """Function of arrays x and y.
 
-    An experiment stores its values on a grid, so that the dataset is complete; see `sampled`.
+    An experiment replaces the function by its values on a grid, so that the dataset contains the
+    whole experiment; see `sampled`.
     """
 
     function: Callable[[Floats, Floats], Any]
@@ -267,9 +278,9 @@ def _unpacked(data: dict[str, Any]) -> Any:
 
 
 MAX_RANDOM_VALUES = 2**22
-"""Maximum number of values of a random field, which takes minutes to compute."""
+"""Maximum number of values of a random field. This number of values takes minutes to compute."""
 COORDINATE_RTOL = 1e-9
-"""Relative difference up to which coordinates of two grids are the same."""
+"""Relative difference up to which the coordinates of two grids are considered equal."""
 
 
 class Drawn(Strict):
@@ -298,7 +309,7 @@ class Drawn(Strict):
         return self._grid
 
     def matches(self, parameters: Mapping[str, float], x: Floats, y: Floats) -> bool:
-        """Return whether the values belong to these parameters and coordinates."""
+        """Return whether the values were generated with these parameters on these coordinates."""
         if any(getattr(self, name) != number for name, number in parameters.items()):
             return False
         pairs = (self._grid.x, x), (self._grid.y, y)
@@ -310,28 +321,33 @@ class Drawn(Strict):
 
 
 class RandomField(Strict, Varying):
-    """Lognormal random field with a mean and a standard deviation of `scatter` times the mean.
+    """Lognormal random field with a given mean.
 
-    All values are positive. The seed is that of the experiment. Z = mean · exp(σ g - σ²/2) with σ²
-    = ln(1 + scatter²), where g is a standard Gaussian field with the covariance
-    exp(-(r/correlation_length)²) over the distance r. g is a sum of waves with random wave vectors,
-    by the randomisation method (Heße et al., Environ. Model. Softw. 55 (2014) 32-48) of GSTools,
-    and depends on the position only, not on spacing and body.
+    The standard deviation is `scatter` times the mean, and all values are positive. The seed is
+    that of the experiment. The field is Z = mean · exp(σ g - σ²/2) with σ² = ln(1 + scatter²). Here
+    g is a standard Gaussian field; its covariance at two points with the distance r is
+    exp(-(r/correlation_length)²). g is a sum of waves with random wave vectors, computed by the
+    randomisation method (Heße et al., Environ. Model. Softw. 55 (2014) 32-48) of GSTools. It
+    depends only on the position, and not on the lattice constant or the body.
     """
 
     mean: Annotated[float, ModelField(gt=0.0, le=1e100)]
     scatter: Annotated[float, ModelField(gt=0.0, lt=1.0)]
     correlation_length: Annotated[float, ModelField(gt=1e-100, le=1e100), LENGTH]
     drawn: Drawn | None = None
-    """Values on a grid; computed again if they do not match parameters and grid."""
+    """Values on a grid.
+
+    They are computed again if they do not match the parameters and the grid.
+    """
 
     @property
     def samples(self) -> dict[str, float]:
-        """Values for validation: those of the grid, or the mean before values are drawn."""
+        """Values for validation: the values on the grid or, before these are generated, the
+        mean."""
         return self.drawn.grid.samples if self.drawn else {"the mean": self.mean}
 
     def at(self, x: Floats, y: Floats, regions: Held, reach: float = 0.0) -> Floats:
-        """Return the values at places, or the mean before values are drawn."""
+        """Return the values at places or, before values are generated, the mean."""
         if self.drawn is None:
             return np.full(np.shape(x), self.mean)
         return self.drawn.grid.at(x, y, regions, reach)
@@ -343,7 +359,8 @@ class RandomField(Strict, Varying):
     def drawn_at(self, x: Floats, y: Floats, seed: int, stream: str) -> RandomField:
         """Return the field with its values on a grid.
 
-        All fields of one stream use the same realisation g, each with its correlation length.
+        All fields of one stream use the same random waves, with the correlation length of each
+        field.
 
         Parameters
         ----------
@@ -386,7 +403,7 @@ def _standard(x: Floats, y: Floats, length: float, seed: int, stream: str) -> Fl
 
 
 class _RandomFields(RootModel[dict[str, RandomField]]):
-    """Random fields by name, so that errors have a path."""
+    """Random fields by name; the name is part of the path in messages of errors."""
 
     model_config = ConfigDict(defer_build=True)
 
@@ -418,7 +435,8 @@ def _is_random(value: Any) -> bool:
 
 
 RESERVED = ("otherwise", "file", "steps")
-"""Names that regions cannot have, because they distinguish the forms of a map."""
+"""Names that regions cannot have, because they are keys by which the form of a map is
+recognised."""
 ABOUT = ("title", "description", "examples", "default")
 """Keys of a JSON Schema that describe a parameter of any form."""
 ALTERNATIVES: dict[str, Any] = {
@@ -471,7 +489,7 @@ ALTERNATIVES: dict[str, Any] = {
         },
     ],
 }
-"""JSON Schema of the values in place of a number."""
+"""JSON Schema of the values that can replace a number."""
 
 
 class Field(RootModel[Any]):
@@ -481,11 +499,11 @@ class Field(RootModel[Any]):
 
 
 class TakesFields(Component):
-    """Component with numbers that can vary in space or time.
+    """Component with parameters that can vary in space or time.
 
-    The attribute of a parameter contains the value that is used where a single number is required;
-    for a time-dependent parameter this is the last value. `varying` and `courses` contain the
-    functions of space and time.
+    The attribute of such a parameter contains the value that is used where a single number is
+    required; for a time-dependent parameter this is the last value. `varying` contains the
+    functions of space, and `courses` the functions of time.
     """
 
     _varying: dict[str, Varying] = PrivateAttr(default_factory=dict)
@@ -502,11 +520,13 @@ class TakesFields(Component):
         return self._courses
 
     def at(self, moment: float) -> Any:
-        """Return the component with its parameters at a moment."""
+        """Return the component with the values of its parameters at a time, in steps."""
         return self.with_more(**{name: c.at(moment) for name, c in self._courses.items()})
 
     def with_more(self, **values: Any) -> Any:
-        """Return the component with some parameters changed; all others vary as before.
+        """Return the component with some parameters changed.
+
+        All other parameters vary in space or time as before.
 
         Raises
         ------
@@ -516,13 +536,15 @@ class TakesFields(Component):
         return self.with_values(**{**self._varying, **self._courses, **values})
 
     def in_place_of_numbers(self) -> dict[str, Any]:
-        """Return the varying parameters as in an experiment file."""
+        """Return the varying parameters as they are written in an experiment file."""
         fields = {name: field.written() for name, field in self._varying.items()}
         courses = {name: course.model_dump(mode="json") for name, course in self._courses.items()}
         return fields | courses
 
     def with_values(self, **values: Any) -> Any:
-        """Return the component with some parameters changed; all others become single numbers.
+        """Return the component with some parameters changed.
+
+        All other parameters are replaced by the single numbers of their attributes.
 
         Raises
         ------
@@ -558,7 +580,7 @@ class TakesFields(Component):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
-        """Return the JSON Schema with all forms of numbers."""
+        """Return the JSON Schema with all forms that can replace a number."""
         schema: dict[str, Any] = handler(core)
         field = handler(core_schema.union_schema([Field.__pydantic_core_schema__]))
         properties = handler.resolve_ref_schema(schema).get("properties", {})
@@ -575,7 +597,7 @@ class TakesFields(Component):
 
     @classmethod
     def _number_of(cls, name: str, data: Any, info: ValidationInfo) -> Any:
-        """Convert text with units in a varying parameter to numbers in lattice units."""
+        """Convert the texts with units in a varying parameter to numbers in lattice units."""
         field = cls.model_fields.get(name)
         quantity = (
             next((m for m in field.metadata if isinstance(m, Quantity)), None) if field else None
@@ -629,7 +651,7 @@ def _fault(name: str, text: str) -> PydanticCustomError:
 def unknown_regions(
     part: TakesFields, regions: Mapping[str, Any]
 ) -> Iterator[tuple[str, str, str]]:
-    """Generate the parameters that refer to unknown regions, as parameter, region and message."""
+    """Yield parameter, region and message for each parameter that refers to an unknown region."""
     for name, field in part.varying.items():
         for region, _ in field.values if isinstance(field, ByRegion) else ():
             if region not in regions:

@@ -1,5 +1,7 @@
-"""The interface FractureModel: the condition under which a bond breaks, and the difference that
-replaces it."""
+"""The interface FractureModel.
+
+It defines the condition under which a bond breaks, and what replaces the neighbour afterwards.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +27,16 @@ class FractureModel(TakesFields):
     """Breaks bonds permanently and replaces the lost neighbour by a fictitious point.
 
     To add a model, write `constants`, `breaks` and `fictitious`; the latter two are static and
-    elementwise functions, like those of a rule. Arguments: d = u_k - u_j is the difference along
-    the bond, r its rest offset, c the constants of the slot and the state variables of the bond by
-    name, and p the parameters.
+    elementwise functions, like those of a rule. Their arguments are d = u_k - u_j, the difference
+    between the displacements of the two ends; r, the rest offset of the bond; c, the constants of
+    the slot and the state variables of the bond by name; and p, the parameters.
 
-    In the intermediate configuration, for each intact bond that can break, a model that derives
-    from `RenewsBonds` first updates its state variables; then ``breaks`` is evaluated. The state
-    variables of broken bonds no longer change. Afterwards a model that derives from `Softens`
-    replaces the difference that the rule uses at intact bonds. Optional capabilities are further
-    base classes: `Remembers`, `Draws`, `RenewsBonds`, `Softens`, `SoftensCells`, `StartsCracked`,
-    `BreaksAtStrain`, `KnowsStiffness`.
+    In each step the intact bonds that can break are tested in the intermediate configuration. A
+    model that derives from `RenewsBonds` first updates the state variables of a bond; then
+    ``breaks`` is evaluated. The state variables of broken bonds no longer change. Afterwards, for a
+    model that derives from `Softens`, the rule receives another difference in place of d at intact
+    bonds. Optional capabilities are further base classes: `Remembers`, `Draws`, `RenewsBonds`,
+    `Softens`, `SoftensCells`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
     """
 
     has_axes: ClassVar[bool] = False
@@ -54,8 +56,9 @@ class FractureModel(TakesFields):
         return True
 
     def parameters(self) -> dict[str, float]:
-        """Return the numbers that functions receive as ``p.name``; by default the model's numeric
-        fields.
+        """Return the numbers that functions receive as ``p.name``.
+
+        By default these are the numeric fields of the model.
 
         Returns
         -------
@@ -84,7 +87,8 @@ class FractureModel(TakesFields):
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """Return whether the bond breaks in the intermediate configuration, elementwise.
 
-        It is called for one end of a bond only, so the result must be the same for (-d, -r).
+        pbdkit evaluates the function at one end of a bond only. At the other end d and r have the
+        opposite signs, so that the result must be the same for (-d, -r).
 
         Parameters
         ----------
@@ -106,7 +110,7 @@ class FractureModel(TakesFields):
     @staticmethod
     @abstractmethod
     def fictitious(u: Vector, r: Vector, p: Parameters) -> Vector:
-        """Return the difference that replaces d at a broken bond, elementwise.
+        """Return the difference that the rule receives in place of d at a broken bond, elementwise.
 
         Parameters
         ----------
@@ -120,7 +124,7 @@ class FractureModel(TakesFields):
         Returns
         -------
         Vector
-            Difference from the particle to its fictitious neighbour.
+            Displacement of the fictitious neighbour minus the displacement of the particle.
         """
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
@@ -139,7 +143,7 @@ class FractureModel(TakesFields):
         Raises
         ------
         ExperimentError
-            If the model cannot be combined with them.
+            If the model cannot be combined with these shells.
         """
         return []
 
@@ -150,11 +154,11 @@ class RenewsBonds(Remembers):
     @staticmethod
     @abstractmethod
     def update(d: Vector, r: Vector, c: Constants, p: Parameters) -> tuple[Number, ...]:
-        """Return the new values of the numbers that change, in their order, elementwise.
+        """Return the new values of the state variables that change, elementwise.
 
-        It is called for one end of a bond only. If the configuration no longer changes, the values
-        must converge (a maximum over the steps does, a number of steps does not); otherwise the
-        solver `equilibrium` finds no equilibrium.
+        The order is that of `remembered`. pbdkit evaluates the function at one end of a bond only.
+        If the configuration no longer changes, the values must converge: a maximum over the steps
+        converges, a number of steps does not. Otherwise the solver `equilibrium` cannot converge.
 
         Parameters
         ----------
@@ -175,8 +179,10 @@ class RenewsBonds(Remembers):
 
 
 class KnowsStiffness(ABC):
-    """A fracture model for calibrated rules, with constants that follow from the material and the
-    cells."""
+    """A fracture model for calibrated rules.
+
+    Some of its constants depend on the material and the cells.
+    """
 
     @abstractmethod
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
@@ -204,19 +210,24 @@ class KnowsStiffness(ABC):
 
 
 class Softens(ABC):
-    """A fracture model that replaces the difference that the rule uses at intact bonds."""
+    """A fracture model that softens intact bonds.
+
+    At intact bonds the rule receives the result of `seen` in place of d, the difference between the
+    displacements of the two ends.
+    """
 
     @staticmethod
     @abstractmethod
     def seen(d: Vector, lost: Vector, r: Vector, c: Constants, p: Parameters) -> Vector:
-        """Return the difference that the rule uses, elementwise.
+        """Return the difference that the rule receives in place of d, elementwise.
 
         Parameters
         ----------
         d : Vector
             Difference u_k - u_j, in lattice units.
         lost : Vector
-            Difference to the fictitious point. Damage D softens a bond as (1 - D) d + D lost.
+            Displacement of the fictitious point minus that of the particle. A bond with the damage
+            D is softened by the result (1 - D) d + D lost.
         r : Vector
             Rest offset X_k - X_j, in lattice units.
         c : Constants
@@ -227,7 +238,7 @@ class Softens(ABC):
         Returns
         -------
         Vector
-            Difference in place of d.
+            Difference that replaces d.
         """
 
 
@@ -239,7 +250,7 @@ class CellStress(NamedTuple):
     xx, yy, xy : Number
         Components σ_xx, σ_yy and σ_xy.
     share : Number
-        Share of the cell in the body, 0 to 1; 0 if there is no cell.
+        Area fraction of the cell inside the body, 0 to 1; 0 if there is no cell.
     """
 
     xx: Number
@@ -251,11 +262,11 @@ class CellStress(NamedTuple):
 class SoftensCells(RenewsBonds):
     """A fracture model that softens bonds by the stress of the two cells beside them.
 
-    It requires a rule that derives from `TearsCells`, and a frame that weighs cells. Its numbers
-    come in pairs, with names that end in `_left` and `_right`, as seen along the slot of the bond.
-    All start at 0 and stay there until the cell softens. `damage_left` and `damage_right` are the
-    fractions by which the force of the bond is reduced in each of the two cells. A diagonal has the
-    same cell on both sides.
+    It requires a rule that derives from `TearsCells`, and a frame that weighs cells. Each of its
+    state variables has two values for a bond, one for the cell to the left and one for the cell to
+    the right, as seen along the slot of the bond. Their names end in `_left` and `_right`. All
+    values are 0 until the cell softens. `damage_left` and `damage_right` are the fractions by which
+    the force of the bond is reduced in the two cells. A diagonal has the same cell on both sides.
     """
 
     @staticmethod
@@ -263,7 +274,7 @@ class SoftensCells(RenewsBonds):
     def update(  # type: ignore[override]  # cells are arguments, too
         d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
     ) -> tuple[Number, ...]:
-        """Return the new values of the numbers that change, in their order, elementwise.
+        """Return the new values of the state variables that change, in their order, elementwise.
 
         Parameters
         ----------
@@ -287,10 +298,10 @@ class SoftensCells(RenewsBonds):
     @staticmethod
     @abstractmethod
     def load(stress: CellStress, c: Constants, p: Parameters) -> Number:
-        """Return the stress of a cell relative to that at which it begins to soften, elementwise.
+        """Return the stress of a cell divided by that at which it begins to soften, elementwise.
 
-        With the solver `equilibrium`, the most loaded of several cells at their limit softens
-        first.
+        If several cells have reached their limit, the solver `equilibrium` softens the one with the
+        largest value first.
 
         Parameters
         ----------
@@ -304,12 +315,12 @@ class SoftensCells(RenewsBonds):
         Returns
         -------
         Number
-            Stress over the stress at which softening begins; 1 at the limit.
+            Ratio of the stresses; 1 at the limit.
         """
 
 
 class StartsCracked(ABC):
-    """A fracture model with cracks in the initial state."""
+    """A fracture model with initial cracks."""
 
     @abstractmethod
     def segments(self) -> Sequence[Segment]:

@@ -1,4 +1,4 @@
-"""Interface of frame policies: how frame points follow the body, as a linear map."""
+"""Interface of frame policies, which determine frame points by a linear map from the body."""
 
 from __future__ import annotations
 
@@ -17,18 +17,22 @@ from pbdkit.plugin.rule import FollowerRule
 
 @dataclass(frozen=True)
 class FrameMap:
-    """Linear map to the frame: u of frame point `point[e]` is Σ_e weight[e] · u[body[e]].
+    """Linear map from the body to the frame.
+
+    The displacement of a frame point p is Σ weight[e] · u[body[e]] over all entries e with
+    `point[e]` = p.
 
     Parameters
     ----------
     point : array of int, shape (entry,)
-        Index of the frame point of each entry, in the order of their numbers, sorted.
+        Index of the frame point of each entry, sorted. Frame points are counted in the order of
+        their numbers.
     body : array of int, shape (entry,)
-        Row of the body particle of each entry in the particle table.
+        Row of the body particle of each entry in the table of particles.
     weight : array of float, shape (entry,) or (entry, axis, axis)
         Number or matrix for each entry.
     lag : int
-        Delay in steps; with 1 the displacements of the previous step are used.
+        Delay in steps: with 1 the frame is computed from the displacements of the previous step.
     """
 
     point: Indices
@@ -61,20 +65,21 @@ class FrameSites(ABC):
     def rule(self) -> FollowerRule:
         """Rule of the followers with its parameters at a step.
 
-        If the policy uses the rule to create the map, the map is created again whenever these
-        parameters change.
+        If `follow` reads this rule, pbdkit computes the map again whenever the parameters change.
         """
 
     @abstractmethod
     def nearest(self) -> tuple[Indices, Indices]:
         """Return the body particles nearest to each frame point in the reference configuration.
 
-        All particles with a distance of at most d_min (1 + 1e-9) count as nearest.
+        If d_min is the smallest distance, all particles with a distance of at most d_min (1 + 1e-9)
+        are nearest ones.
 
         Returns
         -------
         point, body : array of int, shape (pair,)
-            Frame point and row of the body particle of each pair, sorted by both.
+            Frame point and row of the body particle of each pair, sorted by frame point and then by
+            row.
         """
 
     @abstractmethod
@@ -94,23 +99,25 @@ class FrameSites(ABC):
 
 
 class FramePolicy(Component):
-    """Points around the body that remove the edge effect, and how they follow the body.
+    """Points around the body that replace missing neighbours at its edges and follow its motion.
 
-    To implement a policy, define `depth` and `follow`. The map is linear and has no memory.
+    To implement a policy, define `depth` and `follow`. The map of `follow` is linear and depends
+    only on the displacements of one step.
     """
 
     weighs_cells: ClassVar[bool] = False
-    """True if the body consists of cells, each weighted by its share inside the outline.
+    """True if the body consists of cells that are weighted by their area fractions inside the
+    outline.
 
-    Such frames are used with rules that declare `uses_cells`. The corners of cut cells on both
-    sides of the outline are then particles of the body.
+    Such frames are used with rules that declare `uses_cells`. All corners of cells that the outline
+    cuts are then particles of the body, inside and outside the outline.
     """
     local: ClassVar[bool] = False
-    """True if each frame point can be mapped independently, to particles near it.
+    """True if each frame point can be mapped independently of the others, to particles near it.
 
-    Particles near a frame point are the nearest particles, or those within a distance of twice the
-    number of layers in site index. Several processes then build the frame in parts; otherwise each
-    builds the whole frame.
+    A particle is near a frame point if it is one of the nearest ones, or if its site index differs
+    by at most twice the number of layers. Several processes then each build a part of the frame;
+    otherwise each process builds the whole frame.
     """
     has_axes: ClassVar[bool] = False
     """True if the map depends on directions or on the order of sites.
@@ -118,7 +125,10 @@ class FramePolicy(Component):
     A body that is reflected, or rotated by a right angle, may then move differently.
     """
     edges_are_free: ClassVar[bool] = False
-    """True if edges are traction-free under a calibrated rule; otherwise a warning is issued."""
+    """True if edges are traction-free with a calibrated rule.
+
+    With other frames a calibrated rule causes a warning.
+    """
 
     @abstractmethod
     def depth(self, reach: int) -> int:
@@ -152,6 +162,7 @@ class FramePolicy(Component):
 
 
 class Anchors:
-    """Frame that fixes the body in space: moves change if the body is translated. Under all other
-    frames the weights of each point sum to 1, and moves do not change.
+    """Frame that fixes the body in space: moves change if the body is translated.
+
+    With all other frames the weights of each frame point sum to 1, and moves do not change.
     """

@@ -1,4 +1,4 @@
-"""The interface ParticleOperation, and selections of body particles, as experiments write them."""
+"""The interface ParticleOperation, and selections of body particles in experiments."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ Points = Annotated[tuple[Place, ...], Field(strict=False, min_length=1)]
 class Selection(Strict):
     """Selection of body particles in the reference configuration, by one of five criteria.
 
-    `edge`: the outermost particle of every row (left, right) or column (bottom, top); `box`: the
-    particles within [xmin, ymin, xmax, ymax], inclusive; `numbers`: particle numbers; `nearest`:
-    the particle nearest to each point; `region`: the particles inside a region.
+    - `edge`: the outermost particle of every row (left, right) or column (bottom, top).
+    - `box`: the particles within [xmin, ymin, xmax, ymax], including its sides.
+    - `numbers`: the particles with these numbers.
+    - `nearest`: the particle nearest to each point.
+    - `region`: the particles inside a region.
     """
 
     model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})
@@ -52,23 +54,24 @@ class ParticleOperation(Component):
     """Changes the displacement of selected particles in each step, after the move of their rule.
 
     To add an operation, write `displacement`, a static and elementwise function, like those of a
-    rule. It is applied after the move with relaxation and memory, and before obstacles; leaders are
-    placed at their prescribed positions afterwards, and frame points follow. Operations are applied
-    in the order in which the experiment lists them.
+    rule. In a step it is applied after the move with relaxation and momentum and before obstacles.
+    Afterwards leaders are placed at their prescribed positions, and frame points follow. Operations
+    are applied in the order in which the experiment lists them.
     """
 
     rests: ClassVar[bool] = False
-    """True if ``displacement(u, u, p)`` is exactly u, and differs from u for any other `new`.
-    Equilibria are then those of the rule alone; an experiment that computes an equilibrium cannot
-    contain other operations."""
+    """True if ``displacement(u, new, p)`` is exactly u for `new` = u and differs from u for any
+    other `new`. The operation then does not change the equilibria of the rule. An experiment that
+    computes an equilibrium can contain only such operations."""
 
     select: Selection | None = Field(
         None, description="The particles that are changed; by default all of the body."
     )
 
     def parameters(self) -> dict[str, float]:
-        """Return the numbers that `displacement` receives as ``p.name``; by default the numeric
-        fields.
+        """Return the numbers that `displacement` receives as ``p.name``.
+
+        By default these are the numeric fields.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Registry, which finds the class that implements a `type` of an experiment."""
+"""Registry, which maps a `type` in an experiment to the class that implements it."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ class Registry:
     """Built-in components, components passed as Python objects and, on demand, installed
     components.
 
-    An experiment that uses only built-in components imports no third-party code; an experiment that
-    specifies a distribution imports only that distribution.
+    Third-party code is imported only when it is needed: an experiment that uses only built-in
+    components imports none, and an experiment that names a distribution imports only that
+    distribution.
 
     Parameters
     ----------
@@ -44,16 +45,16 @@ class Registry:
 
     @cached_property
     def installed(self) -> list[Plugin]:
-        """Third-party plugins, which are imported on first access."""
+        """Third-party plugins, imported when this property is read for the first time."""
         return self._load(self._found)
 
     @property
     def plugins(self) -> list[Plugin]:
-        """Plugins with components, the built-in one first."""
+        """All plugins with components, beginning with the built-in one."""
         return [p for p in self._local if p.offers] + self.installed
 
     def find(self, interface: type[Component], name: str) -> type[Component]:
-        """Return the class of an interface and type.
+        """Return the class that implements a type of an interface.
 
         Parameters
         ----------
@@ -98,8 +99,9 @@ class Registry:
     def spellings(
         self, interface: type[Component], *, installed: bool = True
     ) -> dict[type[Component], list[str]]:
-        """Return the usable components of an interface, each with all its names, the shortest
-        first.
+        """Return the usable components of an interface, each with all its names.
+
+        The first name is the shortest.
 
         Parameters
         ----------
@@ -132,8 +134,8 @@ class Registry:
     def name_of(self, component: Component) -> str:
         """Return the type by which another experiment can select the class of a component.
 
-        The name includes the distribution if another distribution provides the same type, as far as
-        is known.
+        The name includes the distribution if another plugin that has been imported provides the
+        same type.
         """
         offers = [(p, o) for p in [*self._local, *self._loaded.values()] for o in p.offers]
         names = (self._name_in(p, o) for p, o in offers if o.component is type(component))
@@ -182,13 +184,13 @@ class Registry:
 def _offers(
     plugins: Iterable[Plugin], interface: type[Component] | None, name: str | None = None
 ) -> list[tuple[Plugin, Offer]]:
-    """Return the offers of an interface, optionally of one type, including broken ones."""
+    """Return the offers for an interface, optionally for one type only, including unusable ones."""
     offers = [(plugin, o) for plugin in plugins for o in plugin.offers if o.interface is interface]
     return [(plugin, o) for plugin, o in offers if name in (None, o.name)]
 
 
 def _judged(plugins: list[Plugin], builtin: Plugin) -> list[Plugin]:
-    """Add the reason to each offer that is in conflict with others."""
+    """Add a reason to each offer that conflicts with another one."""
     result = []
     for plugin in plugins:
         offers = tuple(_judged_offer(plugin, o, plugins, builtin) for o in plugin.offers)

@@ -29,8 +29,11 @@ FORMS = (PLAIN, COURSE, WORD)
 
 
 class Course(Strict, Generic[Value]):
-    """Time-dependent number: `values` at the end of `steps`, interpolated linearly, constant
-    outside."""
+    """Time-dependent number, piecewise linear in time.
+
+    It has the `values` at the end of the `steps`, is interpolated linearly between them, and is
+    constant before the first and after the last one.
+    """
 
     steps: Annotated[
         tuple[Annotated[int, Field(ge=0, lt=2**53)], ...],
@@ -54,13 +57,13 @@ class Course(Strict, Generic[Value]):
 
     @property
     def samples(self) -> dict[str, float]:
-        """Values for validation, by description; the first is the value at the end."""
+        """Values for validation, by a description of their step; the first is the last value."""
         values = self._values
         return {"the last value": self.last, "the smallest value": min(values),
                 "the largest value": max(values)}  # fmt: skip
 
     def at(self, moment: float) -> float:
-        """Return the value at the end of a step, or at a moment within it."""
+        """Return the value at the end of a step or, for a fractional number, within it."""
         return float(np.interp(moment, self.steps, self._values))
 
     @cached_property
@@ -73,10 +76,9 @@ class Course(Strict, Generic[Value]):
         return tuple(step for step, (first, second) in pairs if first != second)
 
     def bends_within(self, begin: int, end: int) -> list[int]:
-        """Return the bends from step `begin` to step `end`, and `end` if the number changes in that
-        step.
+        """Return the bends from step `begin` to step `end`, and `end` if the number changes in it.
 
-        Empty if the end precedes the beginning.
+        The result is empty if `end` precedes `begin`.
         """
         if end < begin:
             return []
@@ -84,14 +86,14 @@ class Course(Strict, Generic[Value]):
         return bends if end in bends or self.next_change(end - 1) > end else [*bends, end]
 
     def next_change(self, step: int) -> float:
-        """Return the first step after `step` with another value, or infinity."""
+        """Return the first step after `step` with another value than at `step`, or infinity."""
         k = bisect_right(self.steps, step)
         if 0 < k < len(self.steps) and self.values[k - 1] != self.values[k]:
             return step + 1
         return min((bend + 1 for bend in self.bends[:-1] if bend > step), default=math.inf)
 
     def way(self, begin: float, end: float) -> float:
-        """Return the change between two moments, relative to the largest absolute value."""
+        """Return the change between two times, divided by the largest absolute value."""
         largest = max(map(abs, self._values))
         return abs(self.at(end) - self.at(begin)) / largest if largest else 0.0
 
@@ -103,8 +105,9 @@ class Course(Strict, Generic[Value]):
 
 
 class NumberCourse(Course[float]):
-    """Time-dependent plain number. Each kind of number is a separate class, so that it can be
-    pickled.
+    """Time-dependent number without a unit.
+
+    Each kind of number is a separate class, so that objects can be pickled.
     """
 
 
@@ -136,12 +139,12 @@ def as_course(value: Any) -> Course[float] | None:
 
 
 def at(number: float | Course[float], moment: float) -> float:
-    """Return the value of a constant or time-dependent number at a moment."""
+    """Return the value of a constant or time-dependent number at a time, in steps."""
     return number.at(moment) if isinstance(number, Course) else number
 
 
 def last(number: float | Course[float]) -> float:
-    """Return the value of a constant or time-dependent number at the end."""
+    """Return the last value of a constant or time-dependent number."""
     return number.last if isinstance(number, Course) else number
 
 

@@ -35,7 +35,7 @@ COMMON = {
     "N": ("N", "kN", "MN", "mN"),
     "mJ": ("mJ", "J", "kJ", "N*mm"),
 }
-"""Units suggested for misspelt ones, by the unit of the quantity."""
+"""Units that messages suggest in place of misspelt ones, by the unit of the quantity."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +51,15 @@ class Quantity:
     meaning : str
         Name of the quantity in messages.
     lattice : str
-        Unit in datasets, in which "stress unit" denotes the unit of Young's modulus, and "thickness
-        unit" that of the thickness.
+        Unit in datasets. In it "stress unit" denotes the unit of Young's modulus, and "thickness
+        unit" the unit of the thickness.
     unit : str
         Unit in terms of mm and MPa.
     length, youngs_modulus, thickness : int
         Exponents.
     also : Quantity, optional
-        Quantity that is accepted too, such as a length for a fracture energy over Young's modulus.
+        Second quantity that is accepted, such as a length for a fracture energy, which is then
+        divided by Young's modulus.
     """
 
     meaning: str
@@ -76,7 +77,7 @@ class Quantity:
         return or_text(handler(schema))
 
     def number(self, value: Any, info: ValidationInfo) -> Any:
-        """Return a number in lattice units; values without unit are not changed.
+        """Return a number in lattice units. Values without unit are not changed.
 
         Parameters
         ----------
@@ -149,8 +150,8 @@ class Units(Strict):
     """Units of the lattice: the lattice unit of length, Young's modulus, and the thickness of the
     body.
 
-    Numbers in the experiment remain in lattice units; lengths can have a unit. Results contain mm,
-    MPa and N. Units are read with pint (extra `units`).
+    Numbers without a unit in the experiment are in lattice units; lengths can be given with a unit.
+    Results are also in mm, MPa and N. Units are read with pint (extra `units`).
     """
 
     length: Annotated[str, _positive("mm", "length")] = Field(
@@ -175,11 +176,11 @@ class Units(Strict):
         return magnitude(self.length, LENGTH.unit, LENGTH.meaning)
 
     def lacks(self, quantity: Quantity) -> list[str]:
-        """Return the missing entries of `units` for a quantity."""
+        """Return the entries of `units` that a quantity needs but that are missing."""
         return [n for n in type(self).model_fields if getattr(quantity, n) and not getattr(self, n)]
 
     def scale(self, quantity: Quantity) -> float:
-        """Return the size, in terms of mm and MPa, of the lattice's unit of a quantity.
+        """Return the factor that converts a quantity from lattice units to its unit of mm and MPa.
 
         Raises
         ------
@@ -196,17 +197,18 @@ class Units(Strict):
 
 
 class Scales(Strict):
-    """Units of an experiment, which are validated before the rest."""
+    """The part `units` of an experiment, which is validated before all other parts."""
 
     units: Units | None = None
 
 
 @dataclass(frozen=True)
 class FromUnits:
-    """Parameter of diagnostics that `units` can give: `youngs_modulus` in MPa, `thickness` in mm.
+    """Parameter of diagnostics that `units` can replace: `youngs_modulus` in MPa, `thickness` in
+    mm.
 
     A parameter that is not given has the value in `units` or, without `units`, the value
-    `otherwise`; it is an error if there is no such value. The default of the field is `unset`.
+    `otherwise`. If neither exists, the parameter is required. The default of the field is `unset`.
     """
 
     name: str
@@ -233,24 +235,26 @@ class FromUnits:
 
 
 def unset() -> Any:
-    """Return None, the default of parameters that `units` can give."""
+    """Return None, the default of parameters that `units` can replace."""
     return None
 
 
 def is_needed(field: FieldInfo) -> bool:
-    """Return whether a parameter is required without `units`."""
+    """Return whether a parameter is required if the experiment has no `units`."""
     annotations = (m for m in field.metadata if isinstance(m, FromUnits))
     return field.is_required() or any(m.otherwise is None for m in annotations)
 
 
 def in_lengths(units: Units | None) -> tuple[float, str]:
-    """Return the factor that converts lattice units to mm, and the name "mm"; without `units`
-    return 1 and "lattice units"."""
+    """Return the factor that converts lattice units to mm, and the name "mm".
+
+    Without `units` return 1 and "lattice units".
+    """
     return (units.length_mm, LENGTH.unit) if units else (1.0, f"{LENGTH.lattice}s")
 
 
 def given_by_units(part: Component) -> list[str]:
-    """Return the parameters of a component that `units` can give."""
+    """Return the parameters of a component that `units` can replace."""
     fields = type(part).model_fields.items()
     return [n for n, field in fields if any(isinstance(m, FromUnits) for m in field.metadata)]
 
@@ -278,8 +282,8 @@ def magnitude(text: str, unit: str, meaning: str) -> float:
     Raises
     ------
     PydanticCustomError
-        If the text is not a number with a suitable unit, or its unit differs and pint is not
-        installed.
+        If the text is not a number with a suitable unit. Also if its unit is not `unit` itself and
+        pint is not installed.
     """
     match = TEXT.fullmatch(text)
     number, name = match.groups() if match else (text, "")
@@ -305,7 +309,7 @@ def magnitude(text: str, unit: str, meaning: str) -> float:
 
 
 def _is_of(text: str, unit: str) -> bool:
-    """Return whether text is a number with a unit of the same dimension."""
+    """Return whether a text is a number with a unit of the same dimension as `unit`."""
     try:
         magnitude(text, unit, "")
     except PydanticCustomError:

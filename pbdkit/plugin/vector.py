@@ -1,7 +1,7 @@
 """Vectors, and functions for elementwise code.
 
-The functions of a rule are called with vectors of which each component is an array, a number or a
-probe. They use + - * /, the functions of numpy, and `where` in place of conditions.
+The components of the vectors that the functions of a rule receive are arrays or numbers. The
+functions use + - * /, the functions of numpy, and `where` in place of conditions.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from typing_extensions import TypeVar
 
 Number: TypeAlias = float | NDArray[np.floating[Any]]
-"""Value of an elementwise function: a number, or an array with one for each place."""
+"""Value of an elementwise function: a number, or an array with a number for each particle or
+bond."""
 Condition: TypeAlias = bool | NDArray[np.bool_]
-"""Comparison of such values."""
+"""Result of a comparison of numbers or of arrays."""
 
 T = TypeVar("T", covariant=True, default=Number)
 V = TypeVar("V", bound="Vector[Any]")
@@ -42,7 +43,7 @@ else:  # named tuples, which numba compiles
 
 
 class Vector(_Plane[T]):
-    """A vector by components: numbers, or arrays of one shape.
+    """A vector with components that are numbers or arrays of one shape.
 
     The operators + - * / are those of vectors and scalars: `+` adds components and does not
     concatenate.
@@ -63,12 +64,12 @@ class Vector(_Plane[T]):
     __array_ufunc__ = None  # array * vector is then computed by the vector
 
     def each(self, function: Callable[..., Any], *vectors: Iterable[Any]) -> Self:
-        """Return the vector of ``function(component, ...)`` for each component.
+        """Return the vector with the components ``function(component, ...)``.
 
         Parameters
         ----------
         function : callable
-            Function of one component of each vector.
+            Function that receives the same component of each vector.
         *vectors : iterable
             Further vectors with as many components.
 
@@ -196,7 +197,7 @@ def dot(a: Vector[T], b: Vector[T]) -> T:
 
 
 def squared_length(v: Vector[T]) -> T:
-    """Return v·v, which is bitwise equal for v and -v.
+    """Return v·v. The result for v and that for -v are equal to the last bit.
 
     Parameters
     ----------
@@ -235,7 +236,10 @@ def length(v: Vector[T]) -> T:
 
 
 class Numbers:
-    """Named numbers that an elementwise function reads as attributes; a named tuple at run time."""
+    """Named numbers that an elementwise function reads as attributes.
+
+    The object that the function receives is a named tuple.
+    """
 
     if TYPE_CHECKING:
 
