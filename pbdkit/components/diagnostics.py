@@ -24,8 +24,8 @@ from pbdkit.plugin.units import AREA, ENERGY, FORCE, LENGTH, STRESS, FromUnits, 
 class PE1(Diagnostic):
     """Pseudo-energy PE1_j = Σ_k (|x_j - x_k| - |X_j - X_k|)² over all reference neighbours.
 
-    The sum includes broken bonds and frame points. Evaluated at every particle of the body,
-    including leaders.
+    It is evaluated at every particle of the body, including leaders. The sum includes broken bonds
+    and bonds to frame points.
     """
 
     type: Literal["pe1"] = "pe1"
@@ -81,7 +81,7 @@ class PE2(Diagnostic):
 
 
 class Displacement(Diagnostic):
-    """Displacement u = x - X, with full precision however far from the origin the body lies."""
+    """Displacement u = x - X, with a precision that does not depend on the position of the body."""
 
     type: Literal["displacement"] = "displacement"
 
@@ -144,7 +144,7 @@ class SmallestCellArea(Diagnostic):
     """Smallest signed area of a cell, relative to its area at rest.
 
     It is 1 at rest, 0 if a cell is flat and negative if a cell is inverted. Cells with broken bonds
-    are included, cells with corners outside the body are not.
+    are included. Cells with a corner that does not belong to the body are excluded.
     """
 
     type: Literal["smallest-cell-area"] = "smallest-cell-area"
@@ -162,9 +162,10 @@ class SmallestCellArea(Diagnostic):
 
 
 class CrackPath(Diagnostic):
-    """Broken bonds in the order of breaking: by step, within a step by decreasing stretch.
+    """Broken bonds in the order in which they broke, and in a step by decreasing strain.
 
-    Bonds that were cut, or broken from the start, come first and have no strain.
+    In each step bonds that were cut come before all others. They have no strain, and neither have
+    bonds that were broken from the start.
     """
 
     type: Literal["crack-path"] = "crack-path"
@@ -237,12 +238,13 @@ ROOT_12 = math.sqrt(12.0)
 class Strain(Diagnostic):
     """Strain of the particles inside the outline of the body; 0 at a particle without cells.
 
-    The strain follows from the displacement gradient H = ∂u/∂X of the cells around the particle.
-    `measure: small` is ε = (H + Hᵀ)/2, which is not invariant under rotations; `measure:
-    green-lagrange`, for finite deformation, is (FᵀF - 1)/2 = (H + Hᵀ + HᵀH)/2 with F = 1 + H. The
-    component xy is that of the tensor, half the engineering shear strain. The equivalent strain is
-    the von Mises strain at constant volume, √(2/3 ε:ε) with ε_zz = -(ε_xx + ε_yy): (2/√3) √(ε_xx² +
-    ε_yy² + ε_xx ε_yy + ε_xy²). Principal values are those in the plane.
+    The strain is computed from the displacement gradient H = ∂u/∂X of the cells around the
+    particle. With `measure: small` it is ε = (H + Hᵀ)/2, which is not invariant under rotations.
+    With `measure: green-lagrange`, for finite deformation, it is (FᵀF - 1)/2 = (H + Hᵀ + HᵀH)/2
+    with F = 1 + H. The component xy is that of the tensor, half the engineering shear strain. The
+    equivalent strain is the von Mises strain √(2/3 ε:ε) at constant volume, that is, with ε_zz =
+    -(ε_xx + ε_yy). It is equal to (2/√3) √(ε_xx² + ε_yy² + ε_xx ε_yy + ε_xy²). Principal values are
+    those in the plane.
     """
 
     type: Literal["strain"] = "strain"
@@ -267,10 +269,10 @@ class Strain(Diagnostic):
 
 
 class LocalRotation(Diagnostic):
-    """Rotation angle of the neighbourhood of each particle inside the outline; 0 without cells.
+    """Rotation angle of the cells around each particle inside the outline; 0 without cells.
 
-    This is the angle of R in the polar decomposition F = R U, atan2(F_yx - F_xy, F_xx + F_yy),
-    counterclockwise from -π to π.
+    With the polar decomposition F = R U it is the angle of the rotation R, counterclockwise from -π
+    to π: atan2(F_yx - F_xy, F_xx + F_yy).
     """
 
     type: Literal["rotation"] = "rotation"
@@ -291,12 +293,13 @@ class LocalRotation(Diagnostic):
 class Stress(Diagnostic):
     """Stress of the particles inside the outline of the body; 0 at a particle without cells.
 
-    The stress is Young's modulus times the stiffness of the calibrated rule times the strain, in
-    plane stress or plane strain as in the rule, minus the stress that softened bonds of the
-    surrounding cells have lost. With `measure: small` it is the Cauchy stress of linear elasticity;
-    with `measure: green-lagrange`, for finite rotation (rule `springs`), the second Piola-Kirchhoff
-    stress. The von Mises stress includes σ_zz, which is 0 in plane stress and ν (σ_xx + σ_yy) in
-    plane strain. Principal values are those in the plane.
+    The stress is computed from the strain with Young's modulus and the stiffness of the calibrated
+    rule, in plane stress or plane strain as in the rule. The stress that softened bonds of the
+    surrounding cells have lost is subtracted. With `measure: small` it is the Cauchy stress of
+    linear elasticity. With `measure: green-lagrange`, which is meant for finite rotations (rule
+    `springs`), it is the second Piola-Kirchhoff stress. The von Mises stress includes σ_zz, which
+    is 0 in plane stress and ν (σ_xx + σ_yy) in plane strain. Principal values are those in the
+    plane.
     """
 
     type: Literal["stress"] = "stress"
@@ -366,7 +369,7 @@ def principal(xx: Floats, yy: Floats, xy: Floats) -> Floats:
 
 
 def _inside(now: Moment, *values: Floats) -> tuple[Floats, ...]:
-    """Set the values of particles outside the outline to NaN; values are (particle, ...)."""
+    """Set the values of particles outside the outline to NaN, in arrays (particle, ...)."""
     outside = ~now.inside
     for value in values:
         value[outside] = np.nan
@@ -404,9 +407,9 @@ TwoPoints = Annotated[tuple[Place, Place], Field(strict=False)]
 class StrainEnergy(Diagnostic):
     """Strain energy of the body.
 
-    It is ½ uᵀK u with the stiffness K of a linear calibrated rule, and the energy of the bonds
-    under a nonlinear rule ('springs'). Under a frame with points it is -½ Σ u·f with the forces f,
-    which in linear elasticity is the work of the leaders.
+    For a linear calibrated rule with the stiffness K it is ½ uᵀK u, for a nonlinear rule
+    ('springs') the energy of the bonds. With a frame that has points it is -½ Σ u·f with the forces
+    f. In linear elasticity this is the work of the leaders.
     """
 
     type: Literal["strain-energy"] = "strain-energy"
@@ -427,12 +430,13 @@ class StrainEnergy(Diagnostic):
 class Reaction(Diagnostic):
     """Reaction force of each leader group; 0 while the group is inactive.
 
-    The reaction is minus the sum of neighbour forces and loads on the particles of the group; for a
-    particle in two groups, half of these forces is assigned to each. A group with motion prescribed
-    along some axes only has no reaction along the others; forces of obstacles on its particles are
-    included along the prescribed axes. Under the natural frame the reactions of all groups sum to
-    zero, or to minus the loads and the forces of obstacles. Frame points exert forces too; at the
-    corners of prescribed edges these forces are artefacts of the frame, and a warning is issued.
+    The reaction is minus the sum of the forces on the particles of the group, which are exerted by
+    neighbours and loads. For a particle in two groups, half of these forces is assigned to each
+    group. If a group prescribes the motion along some axes only, its reaction is 0 along the other
+    axes. Along the prescribed axes the reaction includes the forces of obstacles on the particles
+    of the group. With the natural frame the reactions of all groups, the loads and the forces of
+    obstacles sum to zero. In other frames, frame points exert forces too. At the corners of
+    prescribed edges these forces are artefacts of the frame, and a warning is issued.
     """
 
     type: Literal["reaction"] = "reaction"
@@ -460,8 +464,8 @@ class LoadDisplacement(Diagnostic):
     """Load-displacement curve of each load.
 
     The curve consists of the resultant of the load, which is 0 while the load does not act, and the
-    mean displacement of its particles, weighted by their shares of the load, so that the area under
-    the curve is the work of the load.
+    mean displacement of its particles. The mean is weighted by the shares of the particles in the
+    load, so that the area under the curve is the work of the load.
     """
 
     type: Literal["load-displacement"] = "load-displacement"
@@ -489,12 +493,13 @@ class LoadDisplacement(Diagnostic):
 class StressStrain(Diagnostic):
     """Stress-strain curve of a tensile test along `axis`.
 
-    Nominal stress is the reaction of the leader group `group` (its index among the leaders of the
-    experiment, from 0) along the axis, divided by the initial cross-section, `width` times
-    thickness; the thickness cancels. Nominal strain is the elongation of the gauge along the axis,
-    divided by its initial length. The gauge lies between the body particles nearest to two
-    `points`, or between two particles given by `numbers`, or by default between the mean positions
-    of `group` and `against`.
+    The nominal stress is a reaction along the axis, divided by the initial cross-section. The
+    reaction is that of the leader group `group`, an index among the leaders of the experiment, from
+    0. The cross-section is `width` times the thickness, so that the stress does not depend on the
+    thickness. The nominal strain is the elongation of the gauge along the axis, divided by the
+    initial length of the gauge. The ends of the gauge are the body particles nearest to two
+    `points`, or two particles given by `numbers`, or by default the mean positions of the groups
+    `group` and `against`.
     """
 
     type: Literal["stress-strain"] = "stress-strain"
@@ -564,13 +569,16 @@ class StressStrain(Diagnostic):
 
 
 MIN_SINE = 1e-6
-"""Sine of an angle below which normals count as parallel, or as perpendicular to an axis."""
+"""Sine of the angle below which two normals are treated as parallel.
+
+It also limits the sine below which a normal is treated as perpendicular to an axis.
+"""
 RESIDUAL_RTOL = 1e-9
-"""Relative difference of residuals below which contact forces balance a force equally well."""
+"""Relative difference between residuals below which two sets of contact forces are equally good."""
 
 
 def reactions(now: Moment) -> Floats:
-    """Compute the reaction of each leader group over Young's modulus and thickness.
+    """Compute the reaction of each leader group, divided by Young's modulus and thickness.
 
     Returns
     -------
@@ -593,8 +601,9 @@ def reactions(now: Moment) -> Floats:
 
 
 def forces_on_particles(now: Moment) -> Floats:
-    """Return the forces of neighbours and loads over Young's modulus and thickness, (particle,
-    axis).
+    """Return the forces of neighbours and loads, (particle, axis).
+
+    They are divided by Young's modulus and thickness.
     """
     forces = np.array(now.forces.on_particles())
     for load in now.loads():
@@ -610,16 +619,17 @@ def contact_pushes(now: Moment, touching: tuple[TouchingRows, ...], forces: Floa
     now
         State of the run at the step.
     touching
-        Rows that touch each obstacle, with the normals of the obstacle there.
+        Rows of the particles that touch each obstacle, with the normals of the obstacle at the
+        particles.
     forces
-        Forces on particles over Young's modulus and thickness, (particle, axis).
+        Forces on particles divided by Young's modulus and thickness, (particle, axis).
 
     Returns
     -------
     list
-        Contact forces of each obstacle, (row, axis): nonnegative multiples of the normals that
-        balance the forces in the least-squares sense, along the axes along which a particle
-        follows.
+        Contact forces of each obstacle, (row, axis). They are nonnegative multiples of the normals
+        and balance the forces in the least-squares sense. Only the axes along which a particle is a
+        follower are considered.
     """
     if not touching:
         return []
@@ -640,7 +650,7 @@ def contact_pushes(now: Moment, touching: tuple[TouchingRows, ...], forces: Floa
 
 
 def _single_pushes(targets: Floats, directions: Floats) -> Floats:
-    """Return λ ≥ 0 that minimises |λ · direction - target|, for each target."""
+    """Return the number λ ≥ 0 that minimises |λ · direction - target|, for each target."""
     squares = (directions * directions).sum(axis=-1)
     is_pushed = squares > MIN_SINE * MIN_SINE
     sizes = np.maximum(0.0, (targets * directions).sum(axis=-1)) / np.where(is_pushed, squares, 1.0)
@@ -648,7 +658,7 @@ def _single_pushes(targets: Floats, directions: Floats) -> Floats:
 
 
 def _joint_pushes(target: Floats, directions: Floats) -> Floats:
-    """Return λ ≥ 0 that minimises |Σ λ · direction - target|.
+    """Return the numbers λ ≥ 0 that minimise |Σ λ · direction - target|, one for each direction.
 
     The result is the mean over all minimisers with at most two nonzero entries, so that it does not
     depend on the order of the directions.
@@ -670,11 +680,11 @@ def _joint_pushes(target: Floats, directions: Floats) -> Floats:
 class ContactForces(Diagnostic):
     """Force of each obstacle on the body and on every particle.
 
-    On a follower that touches one obstacle, f = max(0, -F·n) n balances the force F of neighbours
-    and loads along the outward normal n of the obstacle. On a follower that touches several
-    obstacles, or an edge where two sides of one meet, contact forces along all normals balance F
-    together. On a particle with prescribed motion along one axis they balance F along the other
-    axis.
+    A follower that touches one obstacle is subject to the contact force f = max(0, -F·n) n. It
+    balances the force F of neighbours and loads along the outward normal n of the obstacle. If a
+    follower touches several obstacles, or an edge at which two sides of an obstacle meet, the
+    contact forces along all normals balance F together. If the motion of a particle is prescribed
+    along one axis, contact forces balance F along the other axis.
     """
 
     type: Literal["contact"] = "contact"
@@ -693,8 +703,7 @@ class ContactForces(Diagnostic):
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return contact forces by obstacle and by particle, times Young's modulus and
-        thickness."""
+        """Return contact forces by obstacle and by particle, multiplied by E and the thickness."""
         forces, touching = forces_on_particles(now), now.touching()
         on_particles, sums = 0.0 * forces, np.zeros((len(touching), 2))  # NaN at frame points.
         size = self.youngs_modulus * self.thickness

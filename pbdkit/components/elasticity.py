@@ -1,6 +1,6 @@
 """Rules of linear elasticity, calibrated to a material.
 
-The coefficients of bonds derive from the stiffness of the cells of the lattice, which are
+The weights of bonds are computed from the stiffness of the cells of the lattice, which are
 rectangles or equilateral triangles.
 """
 
@@ -38,7 +38,10 @@ from pbdkit.plugin.lattice import Tiling
 from pbdkit.plugin.units import LENGTH
 
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-"""Corners of a rectangular cell relative to its centre, counterclockwise, in half side lengths."""
+"""Corners of a rectangular cell relative to its centre, counterclockwise.
+
+The unit along each axis is half of the side.
+"""
 
 
 @cache
@@ -48,14 +51,14 @@ def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
     Parameters
     ----------
     c
-        Stiffness of the material over the modulus.
+        Stiffness of the material divided by the modulus.
     a, b
         Side lengths of the cell.
 
     Returns
     -------
     NDArray
-        Stiffness over modulus and thickness, (corner, axis, corner, axis); read-only.
+        Stiffness divided by modulus and thickness, (corner, axis, corner, axis); read-only.
     """
     # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
     K = _of_mean_strain(c, CORNERS / (2 * np.array([a, b])), a * b)
@@ -89,7 +92,7 @@ def bond_weights(slot: Slot, c: Stiffness, cells: Tiling) -> dict[str, float]:
     slot
         The bond.
     c
-        Stiffness of the material over the modulus.
+        Stiffness of the material divided by the modulus.
     cells
         Cells of the lattice.
 
@@ -112,22 +115,22 @@ def bond_springs(slot: Slot, c: Stiffness, cells: Tiling) -> float:
     slot
         The bond.
     c
-        Stiffness of the material over the modulus.
+        Stiffness of the material divided by the modulus.
     cells
         Cells of the lattice.
 
     Returns
     -------
     float
-        Stiffness over the modulus and the squared length of the bond. If the same cell lies on both
-        sides, each side has half of it.
+        Stiffness divided by the modulus and the squared length of the bond. If the same cell lies
+        on both sides, each side has half of the stiffness.
 
     Notes
     -----
-    The springs of a cell are as stiff as possible without exceeding the stiffness of the cell: the
-    remainder is positive semidefinite. On squares of an isotropic material with 0 ≤ ν ≤ 1/3 the
-    remainder is pure shear, so that the edges beside a straight cut carry the stress along the cut
-    like half a cell.
+    The springs of a cell are as stiff as possible under one condition: the stiffness of the cell
+    minus that of its springs must be positive semidefinite. On squares of an isotropic material
+    with 0 ≤ ν ≤ 1/3 this remainder is a pure shear stiffness. The edges beside a straight cut
+    therefore carry the stress along the cut like half a cell.
     """
     x, y = slot.rest
     if cells.regular == 3:
@@ -147,15 +150,15 @@ def rectangle_springs(c: Stiffness, a: float, b: float) -> tuple[float, float, f
     Parameters
     ----------
     c
-        Stiffness of the material over the modulus.
+        Stiffness of the material divided by the modulus.
     a, b
         Side lengths of the cell.
 
     Returns
     -------
     tuple
-        Stiffnesses over modulus and thickness of the springs along an edge of length a, along an
-        edge of length b, and along a diagonal.
+        Stiffnesses of the springs along an edge of length a, along an edge of length b, and along a
+        diagonal, divided by modulus and thickness.
 
     Notes
     -----
@@ -174,24 +177,24 @@ def rectangle_springs(c: Stiffness, a: float, b: float) -> tuple[float, float, f
 
 
 def springs_in(stiffness: Floats, c: Stiffness, cells: Tiling) -> Floats:
-    """Compute the largest factor by which the springs of a material can be multiplied without
-    exceeding the stiffness of cells.
+    """Compute the largest factor for the stiffness of the springs of a material in other cells.
 
-    Uniform strains and hourglass modes are considered.
+    With a larger factor the springs would be stiffer than the cell, for a uniform strain or for an
+    hourglass mode.
 
     Parameters
     ----------
     stiffness
-        Stiffness of cells over the modulus, (cell, 3, 3).
+        Stiffness of cells divided by the modulus, (cell, 3, 3).
     c
-        Stiffness over the modulus of the material of the springs.
+        Stiffness of the material of the springs, divided by the modulus.
     cells
         Cells of the lattice.
 
     Returns
     -------
     NDArray
-        Multiples, (cell,).
+        Factors, (cell,).
     """
     if cells.regular == 3:
         share = min(2 / 3 * (c.xx + c.xy), 8 / 3 * c.shear)
@@ -282,12 +285,14 @@ Factor = Annotated[
 class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
     """Base class of the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k with weights from the stiffness of cells.
 
-    The 2 × 2 weights are the stiffness of the cells on both sides of each bond, -K_jk of the
-    matrices of these cells. A rectangle has the energy of its mean strain and the hourglass
-    stiffness G (a/b + b/a)/4; a triangle is the linear finite element. In the interior of a body on
-    a square lattice the isotropic weights are W_E = W_W = diag(3 - ν, 1 - 3ν)/(2(5 - 3ν)), W_N =
-    W_S with the entries exchanged, and (1 + ν)/(4(5 - 3ν)) [[1, s], [s, 1]] on the diagonals (s =
-    ±1).
+    The weight W_k of a bond is a 2 × 2 matrix: the sum of the blocks -K_jk in the stiffness
+    matrices of the two cells beside the bond. A rectangle has the energy of its mean strain and the
+    hourglass stiffness G (a/b + b/a)/4. A triangle is the linear finite element. In the interior of
+    a body on a square lattice an isotropic rule has the following weights, with s = ±1:
+
+    - W_E = W_W = diag(3 - ν, 1 - 3ν)/(2(5 - 3ν)) along x;
+    - the same with exchanged entries along y, W_N = W_S;
+    - (1 + ν)/(4(5 - 3ν)) [[1, s], [s, 1]] along the diagonals.
     """
 
     linear: ClassVar[bool] = True
@@ -303,7 +308,7 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
         """
 
     def elasticity(self) -> Stiffness | None:
-        """Return the stiffness over Young's modulus, or None if the modulus is not finite."""
+        """Return the stiffness divided by Young's modulus, or None if the modulus is not finite."""
         modulus, ratios = self.material()
         modulus *= self.stiffness
         finite = math.isfinite(modulus)
@@ -335,9 +340,10 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """Return the weights xx, xy, yx, yy of the cells beside a bond, and `spring`.
 
-        The weight of the left cell is [[xx, xy], [yx, yy]], that of the right cell its transpose.
-        If the same cell lies on both sides, each side has half of it. `spring` is the stiffness
-        that remains along the bond in a torn cell, over the squared length of the bond.
+        The weight of the left cell is [[xx, xy], [yx, yy]], that of the right cell is its
+        transpose. If the same cell lies on both sides, each side has half of its weight. `spring`
+        is the stiffness that remains along the bond in a torn cell, divided by the squared length
+        of the bond.
         """
         material, cells = self.material()[1], setting.cells
         springs = {"spring": bond_springs(slot, material, cells)}
@@ -350,34 +356,39 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
         return whole | {"spring": 0.0}
 
     def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """Return the weights with `spring` alone."""
+        """Return the weights in which all entries except `spring` are 0."""
         weights = self.weights(slot, setting)
         return dict.fromkeys(weights, 0.0) | {"spring": weights["spring"]}
 
     def spring_share(self, c: Floats, setting: Setting) -> Floats:
-        """Return the largest factor by which the springs can be multiplied without exceeding the
-        stiffnesses."""
+        """Return the largest factor for the stiffness of all springs of each cell.
+
+        With larger factors the springs would be stiffer than the material of the cell.
+        """
         modulus, material = self.material()
         return springs_in(c / (self.stiffness * modulus), material, setting.cells)
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Weights, p: Parameters) -> Sums:
-        """Return W d and the entries xx, xy, yy of W; the sum of W over all slots is symmetric."""
+        """Return W d and the entries xx, xy, yy of W.
+
+        The entry yx is not needed, because the sum of W over all slots is symmetric.
+        """
         return pulled(d, w)
 
     @staticmethod
     def torn(d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters) -> Sums:
-        """Return the force in torn cells in place of W d, and the entries of W.
+        """Return the force in torn cells, which replaces W d, and the entries of W.
 
-        The entries of W are not reduced, so that moves for a given force do not increase with
-        damage.
+        The entries of W are not reduced by damage, so that the move that a given force causes does
+        not increase with damage.
         """
         _, xx, xy, yy = pulled(d, w)
         return torn_pull(d, r, w, t), xx, xy, yy
 
     @staticmethod
     def apply(total: Sums, here: Here, p: Parameters) -> Vector:
-        """Return (Σ W)⁻¹ Σ W d, or a move of zero where there is no cell."""
+        """Return (Σ W)⁻¹ Σ W d, or zero at a particle without cells."""
         return mean_move(total)
 
     @staticmethod
@@ -393,7 +404,10 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
 
 
 class IsotropicElastic(CellElastic):
-    """Base class of the isotropic rules: a Poisson ratio, in plane stress or plane strain."""
+    """Base class of the isotropic rules, with Poisson's ratio as parameter.
+
+    They represent plane stress or plane strain.
+    """
 
     poisson_ratio: Annotated[float, Field(ge=-1.0, le=0.5)] = Field(
         description="Poisson's ratio ν, from -1 to 0.5.", examples=[0.3, -1.0]
@@ -409,10 +423,11 @@ class IsotropicElastic(CellElastic):
         return self
 
     def material(self) -> tuple[float, Stiffness]:
-        """Return the modulus over Young's modulus, and the ratios 1, 1, ν', (1 - ν')/2.
+        """Return a modulus divided by Young's modulus, and the ratios 1, 1, ν', (1 - ν')/2.
 
-        In plane stress ν' = ν and the modulus is 1/(1 - ν²). In plane strain ν' = ν/(1 - ν) and the
-        modulus is 1/((1 - ν²)(1 - ν'²)).
+        The ratios are xx, yy, xy and shear of the stiffness, divided by the modulus. In plane
+        stress ν' = ν and the modulus is 1/(1 - ν²). In plane strain ν' = ν/(1 - ν) and the modulus
+        is 1/((1 - ν²)(1 - ν'²)).
         """
         nu, in_plane, out_of_plane = self.poisson_ratio, self.poisson_ratio, 1.0
         if self.plane == "strain":
@@ -430,10 +445,11 @@ class IsotropicElastic(CellElastic):
 class Elastic(IsotropicElastic):
     """Isotropic linear elasticity, in plane stress or plane strain.
 
-    Requires the square or rectangular lattice with 8 neighbours, or the hexagonal lattice with 6,
-    where the rule is that of linear triangles. At ν = -1 the rule is the barycentre rule with the
-    four nearest or with all six neighbours. Stable for a relaxation below (5 - 3ν)/4 (square, ν ≥
-    0) or 3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
+    The rule requires the square or rectangular lattice with 8 neighbours, or the hexagonal lattice
+    with 6 neighbours. On the hexagonal lattice the cells are linear triangles. For ν = -1 it is the
+    barycentre rule, on the square lattice with the four nearest neighbours and on the hexagonal
+    lattice with all six. The rule is stable for a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or
+    3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
     """
 
     type: Literal["elastic"] = "elastic"
@@ -470,8 +486,9 @@ class Orthotropic(CellElastic):
         return self
 
     def material(self) -> tuple[float, Stiffness]:
-        """Return 1/(1 - ν_xy ν_yx), and the ratios 1, E_y/E_x, ν_xy E_y/E_x and G_xy over the
-        modulus.
+        """Return the modulus 1/(1 - ν_xy ν_yx), and four ratios.
+
+        The ratios are 1, E_y/E_x, ν_xy E_y/E_x, and G_xy divided by the modulus.
         """
         modulus = 1 / (1 - self.poisson_ratio**2 * self.modulus_ratio)
         coupled = self.poisson_ratio * self.modulus_ratio
@@ -481,13 +498,14 @@ class Orthotropic(CellElastic):
 class StrainGradient(AppliesTwice, IsotropicElastic):
     """Strain-gradient elasticity with an internal length l.
 
-    The move is the elastic move z minus c = l²/D times the elastic move evaluated on z. D is the
-    diffusion coefficient of longitudinal waves, 2h²/(5 - 3ν') on the square lattice and h²/(3 - ν')
-    on the hexagonal lattice. Along an axis the equilibrium is u'' - l² u'''' = 0; the internal
-    length of shear waves is √((1 - ν')/2) l. Leaders on an edge prescribe its displacement and its
-    slope. Requires cells of equal sides and the natural frame. Stable for a relaxation below 2/(λ +
-    cλ²), where 2/λ is the bound of the elastic rule. In most cases this bound is very small, and
-    solver: {type: equilibrium} is more efficient.
+    The move is z - c z', where z is the move of the elastic rule, z' is the move that this rule
+    computes from z in place of the displacements, and c = l²/D. D is the diffusion coefficient of
+    longitudinal waves, 2h²/(5 - 3ν') on the square lattice and h²/(3 - ν') on the hexagonal
+    lattice. Along an axis the equilibrium satisfies u'' - l² u'''' = 0. The internal length for
+    shear waves is √((1 - ν')/2) l. Leaders on an edge prescribe its displacement and its slope. The
+    rule requires cells of equal sides and the natural frame. It is stable for a relaxation below
+    2/(λ + cλ²), where 2/λ is the bound of the elastic rule. In most cases this bound is very small,
+    and solver: {type: equilibrium} is more efficient.
     """
 
     type: Literal["strain-gradient"] = "strain-gradient"
@@ -544,8 +562,9 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
 
     @staticmethod
     def loaded(total: Sums, load: Vector, p: Parameters) -> Sums:
-        """Subtract the load, divided by the modulus, from c Σ W d, which enters the move
-        with the opposite sign.
+        """Subtract the load, divided by the modulus, from c Σ W d.
+
+        The sign is negative because c Σ W d is subtracted in the move.
         """
         pull, xx, xy, yy = total
         return pull - load / p.modulus, xx, xy, yy

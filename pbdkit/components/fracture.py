@@ -1,8 +1,13 @@
 """Built-in fracture models.
 
-The models are: none; a threshold on length (the paper's section 5); a limit of strain, with or
-without gradual damage; and cohesive cells, which dissipate the same energy per crack length for
-every lattice constant (docs/fracture.md).
+There are five models:
+
+- no fracture;
+- a threshold on the length of bonds (section 5 of the paper);
+- a limit on the strain of bonds;
+- gradual damage of bonds between two strains;
+- softening cells, which dissipate the same energy per crack length for every lattice constant
+  (docs/fracture.md).
 """
 
 from __future__ import annotations
@@ -83,17 +88,18 @@ class NoFracture(FractureModel):
 
     @staticmethod
     def fictitious(u: Vector, r: Vector, p: Parameters) -> Vector:
-        """Return a zero difference, the undeformed cell."""
+        """Return a difference of zero."""
         return 0.0 * r
 
 
 class Parting(StartsCracked, FractureModel):
     """Base class of the models with fictitious points at m_j + λ R or at X_k.
 
-    The fictitious point that replaces the neighbour across a broken bond lies at m_j + λ R
-    (`fictitious: cell`; `placement` λ = 1 is the undeformed cell, λ > 1 expands and λ < 1 contracts
-    it) or at X_k (`fictitious: reference`). If `frame_bonds` is false, bonds to frame points do not
-    break. `cracks` are segments [[x, y], [x, y]]; bonds that cross them are broken from the start.
+    A fictitious point replaces the neighbour across a broken bond. With `fictitious: cell` it lies
+    at m_j + λ R. The value λ = 1 of `placement` gives the undeformed cell; λ > 1 expands the cell,
+    and λ < 1 contracts it. With `fictitious: reference` the point lies at X_k. If `frame_bonds` is
+    false, bonds to frame points do not break. `cracks` are segments [[x, y], [x, y]]; bonds that
+    cross them are broken from the start.
     """
 
     placement: float = Field(
@@ -136,11 +142,11 @@ class Parting(StartsCracked, FractureModel):
 class Threshold(BreaksAtStrain, Parting):
     """A bond breaks when |r + d|² > threshold², with one threshold for each shell.
 
-    This is the model of the paper's section 5. The fictitious point that replaces the neighbour
-    across a broken bond lies at m_j + λ R (`fictitious: cell`; `placement` λ = 1 is the undeformed
-    cell, λ > 1 expands and λ < 1 contracts it) or at X_k (`fictitious: reference`). If
-    `frame_bonds` is false, bonds to frame points do not break. `cracks` are segments [[x, y], [x,
-    y]]; bonds that cross them are broken from the start.
+    This is the model of section 5 of the paper. A fictitious point replaces the neighbour across a
+    broken bond. With `fictitious: cell` it lies at m_j + λ R. The value λ = 1 of `placement` gives
+    the undeformed cell; λ > 1 expands the cell, and λ < 1 contracts it. With `fictitious:
+    reference` the point lies at X_k. If `frame_bonds` is false, bonds to frame points do not break.
+    `cracks` are segments [[x, y], [x, y]]; bonds that cross them are broken from the start.
     """
 
     type: Literal["threshold"] = "threshold"
@@ -152,7 +158,7 @@ class Threshold(BreaksAtStrain, Parting):
 
     @property
     def thresholds(self) -> tuple[float, ...]:
-        """Threshold of each shell, at the end of its time dependence."""
+        """Last value of the threshold of each shell."""
         return tuple(map(last, self.limits))
 
     @property
@@ -170,7 +176,7 @@ class Threshold(BreaksAtStrain, Parting):
     def constants(self, slot: Slot) -> dict[str, float]:
         """Return `limit`, the squared threshold of the shell of the slot.
 
-        A threshold that equals the rest length within rounding breaks no bond at rest.
+        If the threshold equals the rest length except for a rounding error, no bond breaks at rest.
         """
         threshold, rest = self.thresholds[slot.shell - 1], squared_length(slot.rest)
         at_rest = threshold >= math.sqrt(rest) * (1 - 1e-12)
@@ -192,8 +198,8 @@ class Threshold(BreaksAtStrain, Parting):
         Raises
         ------
         ExperimentError
-            If the number of thresholds is not that of the shells, or a threshold is below every
-            rest length of its shell.
+            If the number of thresholds differs from the number of shells, or a threshold is below
+            every rest length of its shell.
         """
         if len(self.thresholds) != len(shells):
             raise ExperimentError(
@@ -218,17 +224,18 @@ class Threshold(BreaksAtStrain, Parting):
 
 
 StrainLimit = Annotated[float, Field(gt=0.0, le=1e75), STRESS]
-"""Type of a strain; with a unit a stress, which is divided by Young's modulus."""
+"""Type of a strain. A value with a unit is a stress, which is divided by Young's modulus."""
 Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
 """Type of the relative scatter of strengths."""
 PERCENT = 1.0
-"""Smallest strain for which a warning suggests that the value is in per cent."""
+"""Strain from which on a warning suggests that the value was given in per cent."""
 SCATTER = "Scatter s: strengths are multiplied by random factors, uniform in 1 ± s."
 """Description of the parameter `scatter`."""
 
 
 def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strains: float) -> Drawn:
-    """Return each strain times one random factor per bond, or nothing if there is no scatter."""
+    """Return each strain of every bond times a random factor of the bond; without scatter
+    nothing."""
     if not scatter:
         return {}
     factors = 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
@@ -236,7 +243,7 @@ def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strai
 
 
 def _in_percent(**strains: float) -> list[str]:
-    """Return a warning for each strain, by its field, that may be given in per cent."""
+    """Return a warning, with the field, for each strain that was possibly given in per cent."""
     return [
         f"fracture.{name}: {strain:g} is a strain of {100 * strain:g} %; {strain:g} % is written "
         f"{strain / 100:g}"
@@ -248,8 +255,9 @@ def _in_percent(**strains: float) -> list[str]:
 class StrainFracture(Draws, BreaksAtStrain, Parting):
     """A bond of any shell breaks when its strain |r + d| / |r| - 1 exceeds `failure`.
 
-    Bonds under compression do not break. The failure strain of each bond is drawn from the uniform
-    distribution over `failure` (1 ± `scatter`), by the seed of the experiment.
+    Bonds under compression do not break. The failure strain of each bond is a random number from
+    the uniform distribution over `failure` (1 ± `scatter`). It depends on the seed of the
+    experiment.
     """
 
     type: Literal["strain"] = "strain"
@@ -264,7 +272,8 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
         """Return `square` and, if there is no scatter, `failure_strain`.
 
         With scatter `square` is |r|². Without scatter it is (1 + failure)² |r|², and
-        `failure_strain` is 0, which saves one rounded multiplication.
+        `failure_strain` is 0. The product is then computed once and not in every step, which avoids
+        one rounding error.
         """
         rest = squared_length(slot.rest)
         if self.scatter:
@@ -280,7 +289,7 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
         return _drawn(owners, self.scatter, generator, failure_strain=self.failure)
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
-        """Return a warning if the strain may be given in per cent."""
+        """Return a warning if the strain was possibly given in per cent."""
         return _in_percent(failure=self.failure)
 
     @staticmethod
@@ -298,14 +307,15 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
 class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
     """A bond softens above the strain `onset` and breaks at the strain `failure`.
 
-    Its damage is the maximum over time of D = failure / (failure - onset) (1 - onset / ε), 0 at the
-    onset and 1 at failure. Damage is irreversible and does not increase under compression. The rule
-    is evaluated with the difference (1 - D) d + D lost, where `lost` is the difference to the
-    fictitious point. Under the barycentre rule the force (1 - D) ε of the bond decreases linearly
-    from its value at the onset to zero at failure.
+    With the strain ε of a bond its damage is the maximum over time of D = failure / (failure -
+    onset) (1 - onset / ε). This is 0 at the onset and 1 at failure. Damage is irreversible and does
+    not increase under compression. In place of d the rule receives the difference (1 - D) d + D
+    lost, where `lost` is the displacement of the fictitious point minus that of the particle. With
+    the barycentre rule the force (1 - D) ε of the bond decreases linearly from its value at the
+    onset to zero at failure.
 
-    With `scatter` s both strains of each bond are multiplied by one random factor from the uniform
-    distribution over 1 ± s, by the seed of the experiment.
+    With `scatter` s both strains of a bond are multiplied by the same random factor, from the
+    uniform distribution over 1 ± s. It depends on the seed of the experiment.
     """
 
     type: Literal["damage"] = "damage"
@@ -331,7 +341,7 @@ class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
         return {"per_rest": 1.0 / length(slot.rest)} | strains
 
     def remembered(self) -> tuple[Remembered, ...]:
-        """Declare `damage`, and with scatter first `onset_strain` and `failure_strain`."""
+        """Declare `damage`; with scatter, declare `onset_strain` and `failure_strain` before it."""
         return (_ONSET_STRAIN, _FAILURE_STRAIN, _DAMAGE) if self.scatter else (_DAMAGE,)
 
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
@@ -339,7 +349,7 @@ class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
         return _drawn(owners, self.scatter, generator, **self._strains())
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
-        """Return a warning for each strain that may be given in per cent."""
+        """Return a warning for each strain that was possibly given in per cent."""
         return _in_percent(onset=self.onset, failure=self.failure)
 
     def _strains(self) -> dict[str, float]:
@@ -402,9 +412,10 @@ _DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is brok
 
 
 CROSSED = 0.09
-"""Smallest squared cosine between a bond and the normal of a crack that crosses it."""
+"""Squared cosine between a bond and the normal of a crack above which the crack crosses the
+bond."""
 DIRECTIONS = 360
-"""Number of crack directions at which the bound on the spacing is evaluated."""
+"""Number of crack directions for which the largest admissible lattice constant is computed."""
 
 
 class Cohesive(KnowsStiffness, SoftensCells, Parting):
@@ -412,13 +423,16 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
 
     Softening localises in a band one cell wide. The band is torn when it has dissipated `energy`
     per unit length of the crack. The stress is the effective stress, that of the undamaged cell.
-    When its largest principal value reaches the onset, the principal direction becomes the fixed
-    normal e of the crack in the cell. Bonds of the cell that cross the crack, |n · e| > 0.3, lose
-    force in the cell according to the maximum κ over time of the stress over Young's modulus: D =
-    failure / (failure - onset) (1 - onset / κ). Other bonds are not damaged. The failure strain is
-    chosen such that a band of cells that a straight crack crosses, without contraction along it,
-    dissipates the energy: its width is that of the cell along e (Bažant and Oh 1983, Oliver 1989).
-    A bond is broken where D = 1 in all cells beside it. Cracks do not close under compression.
+    When its largest principal value reaches the onset, the principal direction becomes the normal e
+    of the crack in the cell and does not change any more. A bond with the unit vector n crosses the
+    crack if |n · e| > 0.3. The force of such a bond in the cell is reduced by the damage D =
+    failure / (failure - onset) (1 - onset / κ). Here κ is the principal stress divided by Young's
+    modulus, as the maximum over time. Other bonds of the cell are not damaged.
+
+    The failure strain is computed from the energy: it is the strain at which a band of cells along
+    a straight crack has dissipated this energy, if the band does not contract along the crack. The
+    width of the band is the width of the cell along e (Bažant and Oh 1983, Oliver 1989). A bond is
+    broken when D = 1 in all cells beside it. Cracks do not close under compression.
     """
 
     type: Literal["cohesive"] = "cohesive"
@@ -446,15 +460,17 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
         """Return the constants of the softening law and of the bonds of a cell.
 
-        `release` is 2 energy / onset times the stiffness along x over the squared modulus along x,
-        a length; `along_y` and `across` are compliances divided by that along x, `stiff_y` and
-        `stiff_across` stiffnesses divided by that along x; `x0` to `y2` are the bonds of a cell.
+        - `release` is a length, 2 energy / onset times the stiffness along x divided by the squared
+          modulus along x.
+        - `along_y` and `across` are compliances divided by the compliance along x.
+        - `stiff_y` and `stiff_across` are stiffnesses divided by the stiffness along x.
+        - `x0` to `y2` are the vectors of the bonds of a cell.
 
         Raises
         ------
         ExperimentError
-            If the failure strain of a crack in some direction does not exceed the onset, because
-            the spacing is too large for the energy.
+            If the lattice constant is too large for the energy, so that for some direction of a
+            crack the failure strain does not exceed the onset.
         """
         release, ratios = _material(rule)
         bonds = _bonds_of_a_cell(setting)
@@ -490,8 +506,10 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
     def update(  # type: ignore[override]  # models of SoftensCells receive the cells
         d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
     ) -> tuple[Number, ...]:
-        """Return damage and failure strain in both cells; if there is one cell, both sides have its
-        values."""
+        """Return damage and failure strain in both cells.
+
+        If there is a cell on one side only, both sides have its values.
+        """
         left_damage, left_failure = _of_cell(left, c.damage_left, c.failure_left, r, c)
         right_damage, right_failure = _of_cell(right, c.damage_right, c.failure_right, r, c)
         has_left, has_right = left.share > 0.0, right.share > 0.0
@@ -504,7 +522,7 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
 
     @staticmethod
     def load(stress: CellStress, c: Constants, p: Parameters) -> Number:
-        """Return κ over the onset."""
+        """Return κ divided by the onset."""
         largest, cos, sin = _principal(stress)
         return largest * _along(cos, sin, c.along_y, c.across) / c.onset_strain
 
@@ -535,7 +553,8 @@ def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> A
 
 
 def _principal(stress: CellStress) -> tuple[Number, Number, Number]:
-    """Return the largest principal stress, and cos and sin of twice the angle of its direction."""
+    """Return the largest principal stress, and cosine and sine of twice the angle of its
+    direction."""
     mean, half = 0.5 * (stress.xx + stress.yy), 0.5 * (stress.xx - stress.yy)
     radius = np.sqrt(half * half + stress.xy * stress.xy)
     has_direction = radius > 0.0
@@ -548,13 +567,13 @@ def _principal(stress: CellStress) -> tuple[Number, Number, Number]:
 
 
 def _projection(r: Any, cos: Any, sin: Any) -> Any:
-    """Return (r · e)² along the direction given by cos and sin of twice its angle."""
+    """Return (r · e)² for the direction e, given by cosine and sine of twice its angle."""
     x, y = r.x * r.x, r.y * r.y
     return 0.5 * (x + y + cos * (x - y)) + sin * r.x * r.y
 
 
 def _along(cos: Number, sin: Number, along_y: Number, across: Number) -> Number:
-    """Return the ratio of a compliance or stiffness along a direction to that along x."""
+    """Return a compliance or stiffness along a direction, divided by that along x."""
     x, y = 0.5 * (1.0 + cos), 0.5 * (1.0 - cos)
     return x * x + along_y * y * y + across * 0.25 * sin * sin
 
@@ -562,8 +581,9 @@ def _along(cos: Number, sin: Number, along_y: Number, across: Number) -> Number:
 def _material(rule: Calibrated) -> tuple[float, tuple[float, float, float, float]]:
     """Return the release factor of a material, and its anisotropy ratios.
 
-    The release factor is the stiffness along x over the squared modulus along x. The ratios are
-    S_yy and 2 S_xy + S_shear over S_xx, and C_yy and 2 C_xy + 4 C_shear over C_xx, in the plane.
+    The release factor is the stiffness along x divided by the squared modulus along x. With the
+    compliance S and the stiffness C in the plane the ratios are S_yy / S_xx, (2 S_xy + S_shear) /
+    S_xx, C_yy / C_xx and (2 C_xy + 4 C_shear) / C_xx.
     """
     material = rule.elasticity()
     assert material is not None
@@ -576,7 +596,7 @@ def _material(rule: Calibrated) -> tuple[float, tuple[float, float, float, float
 def _bonds_of_a_cell(setting: Setting) -> tuple[Vector, Vector, Vector]:
     """Return the sides of a triangle, or the diagonals of a rectangle.
 
-    These are the bonds that are longest in some direction.
+    For every direction, the bond of the cell with the largest extent along it is one of these.
     """
     a, b, c, *rest = setting.cells.polygons[0].rest
     if rest:

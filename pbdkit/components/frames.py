@@ -57,7 +57,10 @@ class CopyingFrame(LayeredFrame):
 
 
 class MeanFrame(CopyingFrame):
-    """Frame points move by the mean displacement of the nearest body particles, including ties."""
+    """Frame points move by the mean displacement of the nearest body particles.
+
+    If several particles are equally near, the mean is taken over all of them.
+    """
 
     type: Literal["mean"] = "mean"
 
@@ -68,8 +71,9 @@ class MeanFrame(CopyingFrame):
 
 
 class FirstFrame(CopyingFrame):
-    """Frame points move with the nearest body particle; among equally near particles with that of
-    the lowest number.
+    """Frame points have the displacement of the nearest body particle.
+
+    If several particles are equally near, it is the one with the lowest number.
 
     The paper uses this frame in case g.
     """
@@ -77,7 +81,7 @@ class FirstFrame(CopyingFrame):
     type: Literal["first"] = "first"
 
     def follow(self, frame: FrameSites) -> FrameMap:
-        """Return a map from each frame point to its first nearest particle."""
+        """Return a map from each frame point to the nearest particle with the lowest number."""
         point, body = frame.nearest()
         points, first = np.unique(point, return_index=True)
         return FrameMap(points, body[first], np.ones(len(points)), self.lag)
@@ -86,10 +90,11 @@ class FirstFrame(CopyingFrame):
 class MirrorFrame(Anchors, LayeredFrame):
     """Frame points mirror the displacement of body particles: u_f = R u_b.
 
-    The particle b is the site reflected in the outermost row or column of the body. R changes the
-    sign of the component normal to that row or column, and at corners the signs of both components.
-    This is the paper's mirroring to represent an infinite sample. The planes of reflection are
-    fixed in space. Requires a body that fills a rectangle of a square or rectangular lattice.
+    The site of b is the site of the frame point f, reflected in the outermost row or column of the
+    body. R changes the sign of the component normal to that row or column, and at corners the signs
+    of both components. In the paper such a frame represents an infinite sample. The lines of
+    reflection are fixed in space. The frame requires a body that fills a rectangle of a square or
+    rectangular lattice.
     """
 
     type: Literal["mirror"] = "mirror"
@@ -112,9 +117,9 @@ class MirrorFrame(Anchors, LayeredFrame):
 class Natural(Frameless):
     """No frame points; the body consists of the cells of the lattice.
 
-    A cell that the outline cuts is weighted by the fraction of its area inside, and all its corners
-    are particles of the body, so that curved bodies converge at second order. Free edges are free
-    of traction.
+    A cell that the outline cuts is weighted by the fraction of its area inside the outline, and all
+    its corners are particles of the body. The error for curved bodies is therefore of second order
+    in the lattice constant. Free edges have no traction.
     """
 
     type: Literal["natural"] = "natural"
@@ -124,6 +129,7 @@ class Natural(Frameless):
 
 
 def is_upright(cell: Cell) -> bool:
-    """Return whether the cell is that of a square or rectangular lattice along the axes."""
+    """Return whether the cell is the repeat cell of a square or rectangular lattice along the
+    axes."""
     a, b = cell.vectors
     return cell.period == (1, 1) and a.y == b.x == 0.0

@@ -16,7 +16,7 @@ from pbdkit.plugin import Cell, Nearness, NeighbourMetric, Offset, Vector
 from pbdkit.plugin.units import LENGTH
 
 MAX_NEIGHBOURS = 4224
-"""Largest number of neighbours of a particle: 32 shells of chebyshev neighbours."""
+"""Largest number of neighbours of a particle, as with 32 shells of Chebyshev neighbours."""
 BALL = {2: math.pi, 3: 4 * math.pi / 3}
 """Area or volume of the unit ball, by the number of axes."""
 Shells = Annotated[int, Field(ge=1, le=32)]
@@ -26,7 +26,7 @@ Weight = Annotated[float, Field(gt=0.0)]
 
 
 class LatticeNeighbours(NeighbourMetric):
-    """Base class of metrics by shells of the lattice, which are not re-evaluated."""
+    """Base class of metrics that select shells of the lattice once, before the first step."""
 
     shells: Shells = Field(1, description="Number of shells, from the nearest.", examples=[2])
     reevaluate: bool = Field(False, description="Always false: these neighbours do not change.")
@@ -42,7 +42,10 @@ class LatticeNeighbours(NeighbourMetric):
 
 
 class Coordination(LatticeNeighbours):
-    """Neighbours by shells of equal distance (to 1e-6 relative) on the infinite lattice."""
+    """Neighbours in shells of equal distance on the infinite lattice.
+
+    Distances with a relative difference of at most 1e-6 are equal.
+    """
 
     type: Literal["coordination"] = "coordination"
 
@@ -54,7 +57,8 @@ class Coordination(LatticeNeighbours):
         groups: list[list[Offset]] = []
         room = 8 * self.shells * size_of(cell) / len(cell.sites)
         radius = (room / BALL[cell.axes]) ** (1 / cell.axes)
-        while len(groups) <= self.shells:  # With one more group, all shells before it are complete.
+        # If there is one more group than requested shells, all these shells are complete.
+        while len(groups) <= self.shells:
             offsets = [cell.offsets(s, radius) for s in range(len(cell.sites))]
             sorted_offsets = sorted((o for ends in offsets for o in ends), key=lambda o: o.length)
             groups = _ranked(sorted_offsets, [o.length for o in sorted_offsets])
@@ -64,13 +68,15 @@ class Coordination(LatticeNeighbours):
 
 
 class Chebyshev(LatticeNeighbours):
-    """Neighbours by index distance max(|Δp|, |Δq|) in the primitive basis; a shell is one
-    distance."""
+    """Neighbours by the index distance max(|Δp|, |Δq|) in the primitive basis.
+
+    A shell contains all neighbours at one index distance.
+    """
 
     type: Literal["chebyshev"] = "chebyshev"
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
-        """Return every offset up to the index distance `shells`, grouped by that distance."""
+        """Return all offsets up to the index distance `shells`, grouped by their index distance."""
         shells: list[list[Offset]] = [[] for _ in range(self.shells)]
         m, n = self._cells(cell)
         ends = product(range(len(cell.sites)), product(range(-m, m + 1), range(-n, n + 1)))
@@ -96,9 +102,9 @@ class Chebyshev(LatticeNeighbours):
 class Euclidean(NeighbourMetric):
     """Neighbours within a weighted distance: √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9).
 
-    A shell consists of the offsets at one distance. With unequal weights the neighbourhood is
-    anisotropic, and so is the body. With `reevaluate` the neighbours are determined again at every
-    step, in the intermediate configuration. More than `MAX_NEIGHBOURS` neighbours are an error.
+    A shell consists of all offsets at one distance. With unequal weights the neighbourhood and thus
+    the body are anisotropic. With `reevaluate` the neighbours are determined again in every step,
+    in the intermediate configuration. More than `MAX_NEIGHBOURS` neighbours are an error.
     """
 
     type: Literal["euclidean"] = "euclidean"
@@ -143,7 +149,7 @@ class Euclidean(NeighbourMetric):
 
 
 def size_of(cell: Cell) -> float:
-    """Return the area of the repeat cell, in space its volume."""
+    """Return the area of the repeat cell; in three dimensions its volume."""
     return abs(float(np.linalg.det(np.array(cell.vectors))))
 
 

@@ -33,8 +33,9 @@ from pbdkit.plugin.units import PER_LENGTH
 class Barycentre(FollowerRule):
     """Each follower moves to the barycentre of its neighbours, x_j = (1/N) Σ x_k.
 
-    The rest offsets are summed separately from the differences of displacements: with all
-    neighbours present they cancel exactly, and small differences keep all their digits.
+    The rest offsets are summed separately from the differences of displacements. If no neighbour is
+    missing, the rest offsets cancel exactly, so that small differences of displacements are not
+    rounded.
     """
 
     type: Literal["barycentre"] = "barycentre"
@@ -73,10 +74,10 @@ class MeanDisplacement(FollowerRule):
 class DistanceWeighted(FollowerRule):
     """Each follower moves to the mean of its neighbours weighted by distance.
 
-    x_j = Σ |x_k - x_j| x_k / Σ |x_k - x_j|; a particle for which the sum of distances is 0 does not
-    move. As printed in the paper, the rule is linearly unstable on every lattice: after about 50
-    steps rounding errors dominate. A relaxation below 1 makes it stable (0.66 on the square
-    lattice).
+    The target is x_j = Σ |x_k - x_j| x_k / Σ |x_k - x_j|. A particle for which the sum of distances
+    is 0 does not move. As printed in the paper, the rule is linearly unstable on every lattice:
+    after about 50 steps rounding errors dominate. With a relaxation below 1 it is stable (0.66 on
+    the square lattice).
     """
 
     type: Literal["distance-weighted"] = "distance-weighted"
@@ -98,9 +99,10 @@ class DistanceWeighted(FollowerRule):
 class MixedCoordinate(FollowerRule):
     """Barycentre along the loading axis; y_j = K (x_j - X_j) da + (1/N) Σ y_k across it.
 
-    x_j is the new coordinate along the loading axis, and da = Y_j - (Y_min + Y_max)/2 refers to the
-    body in its reference configuration. K < 0 contracts the body under extension. K is not a
-    Poisson ratio: its effect increases with x and with the number of rows.
+    Here x is the coordinate along the loading axis, and x_j its new value. da = Y_j - (Y_min +
+    Y_max)/2 is the distance from the middle of the body in its reference configuration. K < 0
+    contracts the body under extension. K is not a Poisson ratio: its effect increases with x and
+    with the number of rows.
     """
 
     type: Literal["mixed-coordinate"] = "mixed-coordinate"
@@ -125,8 +127,8 @@ class MixedCoordinate(FollowerRule):
 
     @staticmethod
     def apply(total: tuple[Vector, Vector, Number], here: Here, p: Parameters) -> Vector:
-        """Return the move of the barycentre, plus K · (u + move along the axis) · da across the
-        axis.
+        """Return the move of the barycentre rule, plus K (u_x + move_x) da across the loading axis
+        x.
         """
         move = (total[0] + total[1]) / total[2]
         displacement = here.u + move
@@ -136,22 +138,22 @@ class MixedCoordinate(FollowerRule):
 
 
 SQUARE_EDGE_STIFFNESS = 0.75
-"""Stiffness of a spring along an edge of a square cell, over Young's modulus and thickness."""
+"""Stiffness of a spring along an edge of a square cell, divided by E and thickness."""
 SQUARE_DIAGONAL_STIFFNESS = 0.375
-"""Stiffness of a spring along a diagonal of a square cell, over Young's modulus and thickness."""
+"""Stiffness of a spring along a diagonal of a square cell, divided by E and thickness."""
 TRIANGLE_STIFFNESS = math.sqrt(0.75)
-"""Stiffness of a spring along an edge of a triangle, over Young's modulus and thickness."""
+"""Stiffness of a spring along an edge of a triangle, divided by E and thickness."""
 
 
 class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
-    """Network of springs: each follower moves to the weighted mean of the positions at which each
-    spring alone would be relaxed.
+    """Network of springs.
 
-    The spring to neighbour k, of rest length l₀, is relaxed at x_k + l₀ (x_j - x_k)/|x_j - x_k|.
-    Weights are equal on the hexagonal lattice with 6 neighbours, 2 : 1 for edges and diagonals on
-    the square lattice with 8, and half as large on free edges. For small strain the network is
-    linear elastic in plane stress with ν = 1/3. Rotations are exact, and the energy of the springs
-    does not increase with relaxation 1.
+    At the position x_k + l₀ (x_j - x_k)/|x_j - x_k| of a follower the spring to neighbour k, of
+    rest length l₀, has no force. The follower moves to the weighted mean of these positions over
+    its neighbours. The weights are equal on the hexagonal lattice with 6 neighbours. On the square
+    lattice with 8 neighbours edges have twice the weight of diagonals. Weights of bonds on free
+    edges are half as large. For small strain the network is linear elastic in plane stress with ν =
+    1/3. Rotations are exact, and the energy of the springs does not increase with relaxation 1.
     """
 
     type: Literal["springs"] = "springs"
@@ -165,8 +167,10 @@ class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
         return Stiffness(*(self.stiffness * ratio for ratio in (9 / 8, 9 / 8, 3 / 8, 3 / 8)))
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """Return the rest length of the spring, and half of its stiffness, the part of each
-        adjacent cell."""
+        """Return the rest length of the spring, and half of its stiffness.
+
+        Each of the two cells beside the bond contributes one half.
+        """
         cells, rest = setting.cells, math.hypot(*slot.rest)
         if cells.regular == 3:
             return {"half": self.stiffness * TRIANGLE_STIFFNESS / 2, "rest": rest}
@@ -189,14 +193,15 @@ class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
     def torn(d: Vector, r: Vector, w: Weights, t: Torn, p: Parameters) -> tuple[Vector, Number]:
         """Return ((1 - D) k e n, k).
 
-        The stiffness k is not reduced, so that moves for a given force do not increase with damage.
+        The stiffness k is not reduced by damage, so that the move that a given force causes does
+        not increase with damage.
         """
         left, right = w.left * (1.0 - t.bond_left), w.right * (1.0 - t.bond_right)
         return spring_pull(d, r, w.half * (left + right), w.rest), w.half * (w.left + w.right)
 
     @staticmethod
     def apply(total: tuple[Vector, Number], here: Here, p: Parameters) -> Vector:
-        """Return Σ k e n / Σ k, or no move where there is no cell."""
+        """Return Σ k e n / Σ k, or zero at a particle without cells."""
         pull, stiffness = total
         return pull / where(stiffness > 0.0, stiffness, 1.0)
 
@@ -212,7 +217,8 @@ class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
 
     @staticmethod
     def energy(d: Vector, r: Vector, w: Weights, p: Parameters) -> Number:
-        """Return half of ½ k e²; the other end of the bond has the other half."""
+        """Return half of the energy ½ k e² of the spring; the other half belongs to the other
+        end."""
         v = r + d
         elongation = dot(d, r + v) / (length(v) + w.rest)
         return w.half * (w.left + w.right) * elongation * elongation / 4
