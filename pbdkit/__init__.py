@@ -1,6 +1,6 @@
 """pbdkit: position-based dynamics of deformable bodies on lattices, rules instead of forces.
 
-The public names are those of `__init__.pyi`; each is imported when it is first used, so that
+The public names are listed in `__init__.pyi`. Each is imported when it is first used, so that
 `import pbdkit` is fast. The interfaces for authors of components are in `pbdkit.plugin`.
 """
 
@@ -13,8 +13,11 @@ from pbdkit.lazy_accessor import register_accessor
 
 
 def _public_names() -> dict[str, str]:
-    """Return the module of each public name: the stub has ``from MODULE import NAME as NAME``."""
-    # The same as `pkgutil.get_data`, which takes 13 ms to import; archives are supported, too.
+    """Return the module of each public name, from the lines of the stub.
+
+    A line of the stub is ``from MODULE import NAME as NAME``.
+    """
+    # This replaces `pkgutil.get_data`, which takes 13 ms to import; it also reads from archives.
     stub = __spec__.loader.get_data(f"{__file__}i").decode()  # type: ignore[union-attr]  # optional
     lines = (line for line in stub.splitlines() if not line.startswith("#"))
     words = " ".join(lines).replace("(", " ").replace(")", " ").replace(",", " ").split()

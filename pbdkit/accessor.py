@@ -44,7 +44,7 @@ def _method(
 
 
 def _with_figure(function: Callable[P, Axes | list[Axes]]) -> Callable[P, Axes | Figure]:
-    """Return the function with a Figure in place of a list of its Axes."""
+    """Return a function that returns a Figure where the original returns a list of its Axes."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Axes | Figure:
@@ -107,14 +107,14 @@ class PbdAccessor:
         Parameters
         ----------
         **choice : object
-            Values by name of the parameter, for instance ``relaxation=0.5``: numbers, or texts such
-            as the type of a component.
+            Values by name of the parameter, for instance ``relaxation=0.5``. A value is a number,
+            or a text such as the type of a component.
 
         Returns
         -------
         xarray.Dataset
-            The selected members. If every parameter is given, this is the dataset of one run, with
-            its experiment.
+            The selected members. If every parameter is given, the result is the dataset of one run
+            and contains its experiment.
 
         Raises
         ------

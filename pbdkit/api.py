@@ -50,7 +50,7 @@ def load(
         Values that replace those of the file: ``{"steps": 20, "rule": {"relaxation": 0.3}}`` or
         ``["steps=20", "rule.relaxation=0.3"]``.
     allow_outside : bool
-        Accept files of fields and motions outside the folder of the experiment.
+        Accept files of fields and motions that are outside the folder of the experiment.
 
     Returns
     -------
@@ -95,9 +95,9 @@ def run(
     settings : mapping, or iterable of str
         Values that replace those of the experiment, as for `load`.
     output : str or path, optional
-        File to write, with checksums and checkpoints: `resume` continues an interrupted run. The
-        values of the returned dataset are then read from the file when they are used. By default
-        no file is written.
+        File to which the result is written, with checksums and checkpoints, so that `resume` can
+        continue an interrupted run. The values of the returned dataset are then read from the file
+        when they are used. By default no file is written.
     force : bool
         Replace an existing file.
     progress : bool
@@ -116,13 +116,13 @@ def run(
         If the file cannot be written.
     DivergedError
         If displacements are not finite, no equilibrium is found, or the body separates into parts.
-        The attribute `dataset` of the error contains the records until then.
+        The attribute `dataset` of the error contains the records before the failure.
 
     Warns
     -----
     SceneWarning, StabilityWarning, AccuracyWarning
-        If a part of the experiment is probably a mistake, if steps can diverge, or if cells have
-        turned over in the last state.
+        If a part of the experiment is probably a mistake, if steps can diverge, or if cells are
+        inverted in the last state.
 
     See Also
     --------
@@ -198,8 +198,8 @@ def analyse(
     Returns
     -------
     Analysis
-        Spectrum, bounds, number of steps to a tolerance, and the step operator as a sparse matrix
-        (``.operator``). ``print`` shows a summary.
+        Spectrum, bounds and the number of steps to a tolerance. The attribute ``operator`` is the
+        step operator as a sparse matrix. ``print`` shows a summary.
 
     Raises
     ------
@@ -246,7 +246,8 @@ def identify(
 
     Notes
     -----
-    The constants follow from the response of the rule to plane waves on its lattice and neighbours.
+    The constants are computed from the response of the rule to plane waves, on the lattice and with
+    the neighbours of the experiment.
 
     Examples
     --------
@@ -312,7 +313,7 @@ def resume(
     steps : int, optional
         Total number of steps to which a finished run is extended.
     anyway : bool
-        Continue even if the experiment, pbdkit or a plugin has changed.
+        Continue even if the experiment, pbdkit or a plugin has changed since the run began.
     progress : bool
         Show a progress bar.
 
@@ -328,7 +329,7 @@ def resume(
     StorageError
         If the checkpoints are damaged, or the file cannot be written.
     DivergedError
-        As for `run`, except that the error has no dataset: the records are in the file.
+        As for `run`, except that the error has no dataset, because the records are in the file.
 
     Examples
     --------
@@ -386,16 +387,17 @@ def sweep(
     vary : mapping
         Lists of values by path of the parameter; all combinations are run.
     together : mapping
-        Lists of equal length by path of the parameter; these parameters are varied simultaneously.
+        Lists of equal length by path of the parameter. These parameters are varied together: each
+        run uses one entry of every list.
     replicates : int
         Number of runs of each combination, with different seeds.
     keep : mapping
-        ``variables`` and ``times`` to keep; by default all.
+        ``variables`` and ``times`` that the dataset contains; by default all.
     names : mapping
         Names of the new dimensions by path; by default the last word of the path.
     folder : str or path, optional
-        Folder for finished members. A second call with the same folder runs only the members that
-        are missing.
+        Folder to which finished members are written. A second call with the same folder runs only
+        the members that are missing.
     workers : int, optional
         Number of processes; by default one for each processor. With 1 no process is started.
     client : dask.distributed.Client, optional
@@ -444,7 +446,7 @@ def fit(
     measured: xarray.Dataset | None = None,
     components: ComponentClasses = (),
 ) -> Fitted | FittedStrength:
-    """Fit parameters of an experiment to measurements, or strengths to peaks of repeated tests.
+    """Fit parameters of an experiment to measurements, or strengths to the peaks of repeated tests.
 
     Parameters
     ----------
@@ -453,8 +455,9 @@ def fit(
     experiment : Experiment, mapping, str or path, optional
         Experiment that replaces the one in the description.
     measured : xarray.Dataset, optional
-        Measurement in place of the file of the description: a variable for each of its
-        ``columns``, all of one shape, for instance x, y, ux and uy of a displacement field.
+        Measurement that replaces the file of the description. It has a variable for each of the
+        ``columns`` of the description, for instance x, y, ux and uy of a displacement field. All
+        variables have the same shape.
     components : iterable of classes
         Component classes that the experiment uses in addition to the installed ones.
 
@@ -473,8 +476,9 @@ def fit(
 
     Notes
     -----
-    The sum of squared residuals, each divided by its noise, is minimised by the Gauss–Newton
-    method; the derivatives follow from the linear system of the equilibrium (docs/fitting.md).
+    Each residual is divided by its noise, and the sum of the squares is minimised by the
+    Gauss–Newton method. The derivatives are computed from the linear system of the equilibrium
+    (docs/fitting.md).
 
     Examples
     --------

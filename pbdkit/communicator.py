@@ -1,7 +1,7 @@
 """Collective operations among the processes that share a run.
 
-Every operation is called by all processes in the same order, and returns the same value in all of
-them. `SERIAL` is the communicator of a process that runs alone; that of MPI is in
+All processes must call every operation in the same order, and all receive the same value. `SERIAL`
+is the communicator of a process that runs alone. The communicator of MPI is defined in
 `pbdkit.mpi.communicator`.
 """
 
@@ -25,7 +25,7 @@ class Communicator(ABC):
 
     @property
     def is_root(self) -> bool:
-        """True if this process reads, writes and prints for all."""
+        """True if this process is the root, which reads, writes and prints for all processes."""
         return self.rank == 0
 
     @abstractmethod
@@ -34,19 +34,22 @@ class Communicator(ABC):
 
     @abstractmethod
     def raise_together(self) -> AbstractContextManager[None]:
-        """Run the block; at its end the exception of the lowest rank that has one is raised in all
-        processes."""
+        """Run the block, and raise an exception of any process in all processes.
+
+        The exception is raised at the end of the block. If several processes have one, that of the
+        lowest rank is raised.
+        """
 
     def bcast(self, value: Any) -> Any:
         """Return the value of the root."""
         return self.allgather(value)[0]
 
     def any(self, value: Any) -> bool:
-        """Return whether the value is true in any process."""
+        """Return whether the value is true in at least one process."""
         return any(self.allgather(bool(value)))
 
     def first(self, value: Any) -> Any:
-        """Return the value of the lowest rank with a value that is not None, or None."""
+        """Return the first value that is not None, in the order of ranks; None if there is none."""
         return next((item for item in self.allgather(value) if item is not None), None)
 
     def sum(self, value: Any) -> Any:
@@ -54,16 +57,16 @@ class Communicator(ABC):
         return sum(self.allgather(value))
 
     def largest(self, value: float) -> float:
-        """Return the largest number of all processes; NaN if one is NaN."""
+        """Return the largest value of all processes; NaN if one of them is NaN."""
         values = [float(number) for number in self.allgather(value)]
         return math.nan if any(map(math.isnan, values)) else max(values)
 
     @abstractmethod
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """Return the elementwise minimum of the arrays of all processes, which have one shape."""
+        """Return the elementwise minimum of arrays of all processes, which have the same shape."""
 
     def processes_on_machine(self) -> int:
-        """Return the number of processes on the machine of this one."""
+        """Return the number of processes on the machine on which this process runs."""
         name = node()
         return self.allgather(name).count(name)
 
@@ -76,7 +79,7 @@ class SerialCommunicator(Communicator):
         return [value]
 
     def raise_together(self) -> AbstractContextManager[None]:
-        """Run the block; nothing is communicated."""
+        """Run the block. There is no other process to which an exception must be sent."""
         return nullcontext()
 
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:

@@ -23,7 +23,7 @@ MAX_CHARACTERS = 3900
 MAX_LINES = 20
 """Largest number of lines of a message."""
 MAX_SUGGESTIONS = 8
-"""Largest number of names with the same beginning that are suggested."""
+"""Largest number of names that are suggested if several begin with the same word."""
 
 
 class PbdkitError(Exception):
@@ -54,10 +54,10 @@ class PbdkitError(Exception):
 
 
 def printable(text: str) -> str:
-    """Return the text as a terminal can show it.
+    """Return the text in a form that a terminal can show.
 
-    Unprintable characters are escaped. Of long lines the beginning, with the place, and the end,
-    with the remedy, are kept.
+    Unprintable characters are escaped. A long line is shortened in the middle, because its
+    beginning contains the place and its end the remedy.
     """
     lines = text.split("\n")[:MAX_LINES]
     limit = min(1000, MAX_CHARACTERS // len(lines))
@@ -102,16 +102,18 @@ class PluginError(PbdkitError):
 
 
 class DivergedError(PbdkitError):
-    """A run diverged, did not converge to an equilibrium, or separated into parts on the way to
-    one.
+    """A run diverged or found no equilibrium.
+
+    It found none if the iteration did not converge, or if the body separated into parts under the
+    load.
 
     Parameters
     ----------
     message : str
         Text for the user.
     dataset : xarray.Dataset, optional
-        The records before the failure, with status "diverged", "unconverged" or "separated"; None
-        if the run writes to a file, which contains the same.
+        The records before the failure, with the status "diverged", "unconverged" or "separated".
+        None if the run writes to a file, because the file contains these records.
     """
 
     exit_status = 4
@@ -130,8 +132,8 @@ class StorageError(PbdkitError):
 class WriteError(StorageError):
     """A file could not be written. An earlier file of this name is unchanged.
 
-    The message begins with the place of this file. Code that was reading another file at the time
-    does not add that file to the message.
+    The message begins with the name of this file. If the error occurs while another file is read,
+    the name of that file is not added to the message.
     """
 
 
@@ -141,7 +143,7 @@ class PbdkitWarning(UserWarning):
 
 
 class SceneWarning(PbdkitWarning):
-    """A part of the experiment has no effect, or is probably not what was meant."""
+    """A part of the experiment has no effect, or is probably a mistake."""
 
 
 class StabilityWarning(PbdkitWarning):
@@ -149,16 +151,19 @@ class StabilityWarning(PbdkitWarning):
 
 
 class AccuracyWarning(PbdkitWarning):
-    """Results may be less accurate than their digits: edges that are not free of stress, cells that
-    lock or have turned over."""
+    """Results may have large errors.
+
+    Causes are edges that are not free of stress, cells that lock, and cells that are inverted.
+    """
 
 
 class ReproducibilityWarning(PbdkitWarning):
-    """A run is repeated by other versions than those that made the dataset."""
+    """A run is repeated with other versions of pbdkit or plugins than those that made the
+    dataset."""
 
 
 class StorageWarning(PbdkitWarning):
-    """A file has no seal, or a part of it was damaged and is computed again."""
+    """A file has no checksums, or a part of it was damaged and is computed again."""
 
 
 class SweepWarning(PbdkitWarning):
@@ -170,7 +175,7 @@ class RetirementWarning(PbdkitWarning):
 
 
 class WarningText(str):
-    """The text of a warning, and the class with which it is issued in Python."""
+    """The text of a warning, which also stores the class with which it is issued in Python."""
 
     category: type[PbdkitWarning]
 
@@ -182,7 +187,7 @@ class WarningText(str):
 
 
 def of_category(category: type[PbdkitWarning], texts: Iterable[str]) -> list[str]:
-    """Return the texts of warnings with the class with which they are issued."""
+    """Return the texts as `WarningText` objects of one class of warnings."""
     return [WarningText(text, category) for text in texts]
 
 
@@ -192,9 +197,10 @@ def warn_caller(text: str, category: type[PbdkitWarning] | None = None) -> None:
     Parameters
     ----------
     text : str
-        What is doubtful, and the remedy.
+        Description of the probable mistake, and the remedy.
     category : class, optional
-        The class of the warning; by default that of a WarningText, and else SceneWarning.
+        The class of the warning. By default it is the class that a WarningText contains, and
+        SceneWarning for any other text.
     """
     level, frame = 1, sys._getframe()
     while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] == "pbdkit":
@@ -211,7 +217,7 @@ def dotted(where: Sequence[Any]) -> str:
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:
     """Return ``; did you mean 'x'?`` with similar names, or an empty string.
 
-    Names that begin with the word are suggested, else the nearest one.
+    All names that begin with `name` are suggested or, if there are none, the most similar one.
     """
     by_lower, lower = {key.lower(): key for key in candidates}, name[:80].lower()
     similar = (
@@ -227,7 +233,7 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str:
 
 
 class AnswerError(TypeError):
-    """A function returned an object of the wrong kind; the message contains the correct kind."""
+    """A function returned an object of the wrong kind. The message contains the correct kind."""
 
 
 LONGEST_LINE = 400

@@ -1,5 +1,7 @@
-"""Hooks that a distribution may implement, and installed plugins. Each plugin is loaded in
-isolation, so that an error in its code becomes a message with the name of the plugin.
+"""Hooks that a distribution may implement, and installed plugins.
+
+Each plugin is loaded in isolation, so that an error in its code becomes a message with the name of
+the plugin.
 
 This module does not import the interfaces of components, so that commands start without them.
 """
@@ -26,8 +28,10 @@ from pbdkit.errors import AnswerError, did_you_mean, one_line
 GROUP = "pbdkit"
 """The entry-point group of plugins, and the project name that pluggy's hook markers require."""
 COMMAND_GROUP = "pbdkit.commands"
-"""The entry-point group of modules that implement `pbdkit_commands`. They are imported to list
-commands, unlike those of the group "pbdkit"."""
+"""The entry-point group of modules that implement `pbdkit_commands`.
+
+These modules are imported when commands are listed; the modules of the group "pbdkit" are not.
+"""
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
@@ -82,14 +86,16 @@ class Hooks:
 
     @hookspec
     def pbdkit_commands(self) -> list[Command]:
-        """Return the commands that the distribution adds to the program `pbdkit`. The modules of
-        the commands are imported when they are called, so the module of this hook should import
-        nothing but `pbdkit.plugin`."""
+        """Return the commands that the distribution adds to the program `pbdkit`.
+
+        The module of a command is imported when the command is called. For this to be fast, the
+        module of this hook should import nothing except `pbdkit.plugin`.
+        """
         raise NotImplementedError
 
 
 NUMBERS = {"Parameters": "p", "Weights": "w", "Constants": "c", "Own": "here.own"}
-"""Names of the arguments of elementwise functions, by the class of their named tuple."""
+"""Names of the arguments of elementwise functions, by the name of the class of the argument."""
 
 NO_REFERENCE = (
     "`here.X` and `here.centred` exist only in rules that declare `uses_reference: ClassVar[bool] "
@@ -108,9 +114,9 @@ def worded(error: BaseException, package: str = "", component: type[Any] | None 
     error
         The error.
     package
-        Package; the last place of the traceback that lies in it is appended.
+        Package of the foreign code. The last line of the traceback that lies in it is appended.
     component
-        Component; the remedy for its error is appended.
+        Component in which the error occurred. The remedy for the error is appended.
     """
     try:
         message = str(error)
@@ -162,7 +168,7 @@ of its entry point.
 DISABLE = "PBDKIT_DISABLE_PLUGINS"
 """Environment variable that lists plugins to be disabled, by distribution or entry point."""
 ALL = "*"
-"""Value of that variable that disables all plugins."""
+"""Value of the environment variable that disables all plugins."""
 
 SEVERITY = ("ok", "conflict", "broken")
 """States of an offer in the order of increasing severity; a plugin has the most severe state of its
@@ -258,8 +264,9 @@ class Plugin:
 
 
 def installed_plugins(group: str = GROUP) -> list[Plugin]:
-    """Return the entry points that other distributions have in a group, sorted by name, without
-    loading them.
+    """Return the entry points of other distributions in a group, sorted by name.
+
+    They are not loaded.
 
     A distribution with unreadable metadata is returned as a broken plugin, and one that the user
     disables as a disabled plugin. Of two distributions with the same name, the first on the Python
@@ -329,7 +336,7 @@ class IncompatibleError(Exception):
 def with_commands(plugin: Plugin) -> Plugin:
     """Import a plugin and call its hook `pbdkit_commands`.
 
-    Errors become state and reason of the plugin; disabled plugins are not imported.
+    An error is stored as the state and reason of the plugin; disabled plugins are not imported.
     """
 
     def load(entry: EntryPoint, package: str) -> Plugin:
@@ -340,10 +347,10 @@ def with_commands(plugin: Plugin) -> Plugin:
 
 
 def guarded(plugin: Plugin, load: Callable[[EntryPoint, str], Plugin]) -> Plugin:
-    """Load a plugin; errors become its state and reason.
+    """Load a plugin, and store an error as its state and reason.
 
-    Output of the plugin at import goes to standard error; its warning filters and working folder
-    are isolated.
+    Text that the plugin prints at import is written to standard error. Changes of the warning
+    filters and of the working folder by the plugin are undone.
     """
     if plugin.unusable or plugin.entry is None:
         return plugin
@@ -360,7 +367,7 @@ def guarded(plugin: Plugin, load: Callable[[EntryPoint, str], Plugin]) -> Plugin
 
 
 def hook_answer(entry: EntryPoint, hook: str, elements: str) -> list[Any]:
-    """Return the list of `elements` that a hook of the module of an entry point returns."""
+    """Call a hook in the module of an entry point, and return its list of `elements`."""
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
     module = entry.load()
@@ -391,7 +398,7 @@ def _checked_command(command: Any) -> Command:
     Raises
     ------
     TypeError
-        If it is not, with the remedy.
+        If the command is not usable. The message contains the remedy.
     """
     if not isinstance(command, Command):
         raise TypeError(f"{command!r} is not a pbdkit.plugin.Command")

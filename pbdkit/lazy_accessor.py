@@ -1,5 +1,7 @@
-"""Registration of the accessor `pbd` of xarray.Dataset at the time when xarray is imported, without
-importing it."""
+"""Registration of the accessor `pbd` of xarray.Dataset as soon as xarray is imported.
+
+This module does not import xarray itself.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ LIBRARY = "xarray"
 
 
 def register_accessor() -> None:
-    """Register `pbd` now if xarray is imported, and otherwise when it is."""
+    """Register `pbd` now if xarray has been imported, and otherwise when it is imported."""
     if LIBRARY in sys.modules:
         _register(sys.modules[LIBRARY])
     else:

@@ -1,4 +1,4 @@
-"""Available memory: of the machine, of a container, and under a limit of address space."""
+"""Available memory of the machine or container, and the limit on address space."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from contextlib import suppress
 from pathlib import Path
 
 LIBRARIES = 2**30
-"""Number of bytes of address space for the libraries that are loaded (560 MiB were measured while a
-kernel was compiled). Some libraries crash or hang with less."""
+"""Number of bytes of address space that is reserved for libraries.
+
+560 MiB were measured while a kernel was compiled. Some libraries crash or hang if there is less.
+"""
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
 """File with the memory limit of a container."""
 
@@ -35,7 +37,8 @@ def machine_memory(processes: int = 1) -> int:
 def refuse_little_memory() -> None:
     """Raise MemoryError if the limit on address space is too small for the libraries.
 
-    If there is a limit, libraries use one thread, since each thread takes address space.
+    If there is a limit, libraries are restricted to one thread, because each thread takes address
+    space.
     """
     limit = address_limit()
     if limit is None:

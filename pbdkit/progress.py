@@ -1,4 +1,4 @@
-"""Progress reporting and cancellation: a bar on a terminal or a line in a notebook, and signals."""
+"""Display of progress by a bar or a line of text, and cancellation by signals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Watch:
     Attributes
     ----------
     load
-        Name of the load increment, if there are several; it precedes the description.
+        Name of the load increment, which precedes the description. Empty if there is only one.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Watch:
         self.look(0.0, task)
 
     def look(self, fraction: float, what: str = "") -> None:
-        """Report the completed fraction of a task, by default of the task that was reported last.
+        """Report the completed fraction of a task; by default the task is that of the last report.
 
         Raises
         ------
@@ -69,7 +69,8 @@ class Watch:
 def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
     """Show progress after a delay of `DELAY_S` seconds, until the block ends.
 
-    A bar is drawn on stderr. In a notebook, where bars need further packages, a line is updated.
+    A bar is drawn on stderr. In a notebook a bar would need further packages, so that a line of
+    text is updated instead.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
     Yields
     ------
     callable
-        Function of the description of a task and the fraction that is done.
+        Function that receives the description of a task and the fraction that is done.
     """
     display: _Bar | _Line | None = None
     due = time.perf_counter() + DELAY_S
@@ -145,7 +146,8 @@ def in_notebook() -> bool:
 
 @contextmanager
 def waiting(task: str, *, silent: bool = False) -> Iterator[Callable[[str], None]]:
-    """Show a task and its duration on stderr after a second, until the block ends.
+    """Show a task and its duration on stderr from one second after the start to the end of the
+    block.
 
     Nothing is shown if `silent`, or if stderr is no terminal.
 
@@ -184,12 +186,15 @@ def _line(task: str) -> Any:
 
 
 SIGNAL_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
-"""Signals that end a run: Ctrl-C, termination, a closed terminal, and the warning of batch systems.
-Some do not exist on every system."""
+"""Signals that end a run. Some of them do not exist on every system.
+
+They are sent by Ctrl-C, by a request for termination, when a terminal is closed, and by batch
+systems before the time limit.
+"""
 
 
 class Stop:
-    """Request to stop the process, by a signal; calling it returns whether there was one."""
+    """Request to stop the process by a signal. A call returns whether there was a request."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
@@ -200,13 +205,13 @@ class Stop:
 
     @property
     def exit_status(self) -> int:
-        """Return 130 for Ctrl-C, else 128 plus the number of the signal."""
+        """Return 128 plus the number of the signal, which is 130 for Ctrl-C."""
         return 128 + (self.signal or signal.SIGINT)
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
-    """Record signals in the block instead of ending the process; a second Ctrl-C ends it at once.
+    """In the block, record signals instead of ending the process. A second Ctrl-C ends it at once.
 
     Outside the main thread signals cannot be handled.
     """

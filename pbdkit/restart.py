@@ -1,5 +1,4 @@
-"""Resume a run: from the checkpoint of an unfinished run, or from the end of a finished one that is
-to be continued."""
+"""Resume an unfinished run from its checkpoint, or extend a finished run from its last state."""
 
 from __future__ import annotations
 
@@ -40,9 +39,12 @@ def restore(
     communicator: Communicator,
     recorded: int | None = None,
 ) -> None:
-    """Restore the checkpoint of the root in a run that has not begun, so that the run continues
-    there. `recorded` is the last recorded step, if it differs from that of the checkpoint. Raises
-    StorageError for a checkpoint that is damaged or of another scene."""
+    """Restore a checkpoint in a run that has not begun, so that the run continues from it.
+
+    The checkpoint is that of the root, the process that reads and writes files. `recorded` is the
+    last recorded step, if it differs from that of the checkpoint. StorageError is raised if the
+    checkpoint is damaged or belongs to another scene.
+    """
     initial, parts = driver.state_dict(), dict[str, Any]()
     with communicator.raise_together():
         if checkpoint:
@@ -61,7 +63,7 @@ def restore(
 CONTINUABLE = ("complete", "settled", "interrupted")
 """Status of results that can be continued."""
 BLOCK_BYTES = 2**22
-"""Number of bytes of a result that are read together, at least one row."""
+"""Number of bytes of a result that are read together. At least one row is read."""
 
 
 def unfinished_source(
@@ -74,7 +76,7 @@ def unfinished_source(
     Raises
     ------
     ExperimentError
-        If the experiment or a version changed, unless `anyway`.
+        If the experiment or a version has changed, unless `anyway` is true.
     """
     about, origin = unfinished.about, unfinished.about.get("origin")
     if not isinstance(origin, dict):
@@ -105,13 +107,13 @@ def chosen_parameters(facts: Mapping[str, Any]) -> tuple[str, ...]:
 def longer(
     dataset: Any, output: Path, steps: int, anyway: bool, stack: ExitStack | None = None
 ) -> tuple[Source, Checkpoint]:
-    """Return the experiment of a result, with a larger number of steps, and the result's final
-    state.
+    """Return the experiment of a result with a larger number of steps, and the final state.
 
     Parameters
     ----------
     stack
-        Stack that keeps the file of the arrays open; if it is None, the arrays are read at once.
+        Stack that keeps the file open while the arrays are used. If it is None, the arrays are read
+        completely and the file is closed.
 
     Raises
     ------
@@ -142,7 +144,7 @@ def longer(
 def history(
     dataset: Any, columns: list[Column], experiment: Experiment, *, pieced: bool = False
 ) -> Iterator[Values]:
-    """Yield the records of a result that the longer run shares.
+    """Yield those records of a result that the extended run contains too.
 
     Parameters
     ----------
@@ -244,7 +246,7 @@ def _refuse_changed_file(output: Path, about: Mapping[str, Any], origin: Any) ->
     if not isinstance(file, str) or not Path(file).is_file():
         return
     try:
-        source = read_experiment(file, allow_outside=True)  # The file is compared, not run.
+        source = read_experiment(file, allow_outside=True)  # only to compare it
         source = with_settings(source, settings, Experiment.defaults())
         current = json.loads(Experiment.build(source).model_dump_json(by_alias=True))
     except PbdkitError:
@@ -264,7 +266,10 @@ def _refuse_changed_file(output: Path, about: Mapping[str, Any], origin: Any) ->
 
 
 WEIGHT_TOLERANCE = 1e-6
-"""Tolerance for relaxation and momentum that were computed on different machines."""
+"""Relative difference up to which values of relaxation and momentum are considered equal.
+
+The values were computed on different machines.
+"""
 
 
 @dataclass(frozen=True)
@@ -313,7 +318,7 @@ def resumption(
     watch
         Progress and cancellation.
     steps
-        Step to which a finished result is continued.
+        Total number of steps to which a finished run is extended.
     anyway
         Whether changes of the experiment or of versions are ignored.
     execution
@@ -322,13 +327,13 @@ def resumption(
     Returns
     -------
     Resumption or None
-        None if all steps were done; the result then has its final name.
+        None if all steps were already done. The result then has its final name.
 
     Raises
     ------
     ExperimentError
-        If there is nothing to resume, or if the experiment, pbdkit or a plugin changed, unless
-        `anyway`.
+        If there is nothing to resume. Also if the experiment, pbdkit or a plugin has changed,
+        unless `anyway` is true.
     StorageError
         If the checkpoint is damaged.
     """
@@ -341,8 +346,7 @@ def resumption(
 
 
 def _is_unfinished(output: Path, steps: int | None) -> bool:
-    """Return whether there is an unfinished run of an output; else there is a result to
-    continue."""
+    """Return whether the run of an output is unfinished. If not, its result can be extended."""
     refuse_store(output)
     if is_unfinished(output):
         return True
@@ -412,7 +416,7 @@ def _unfinished(
 def _continued(
     output: Path, watch: Watch, steps: int, anyway: bool, execution: Execution
 ) -> Resumption:
-    """Continue a result, which is replaced only by the complete longer one."""
+    """Extend the run of a result. The result is replaced only when the extended run is complete."""
     communicator = execution.communicator
     with ExitStack() as stack:
         source, checkpoint, dataset, chosen = None, None, None, tuple[str, ...]()
@@ -450,8 +454,7 @@ def _continued(
 def _refuse_other_weights(
     place: str, scene: Scene, chosen: tuple[str, ...], execution: Execution
 ) -> None:
-    """Raise ExperimentError if a run with another number of steps would select other values for
-    `auto`.
+    """Raise ExperimentError if the extended run would select other values for `auto`.
 
     The values of `auto` depend on the roles of the particles in the last step.
     """

@@ -1,7 +1,7 @@
-"""Random numbers of an experiment: the generators and seeds that follow from its `seed`.
+"""Random number generators and seeds that are derived from the `seed` of an experiment.
 
-The streams are independent of each other, so that the numbers of one component do not depend on how
-many another draws.
+The streams are independent: the random numbers of a component do not depend on how many random
+numbers other components generate.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One run of a scene: its drivers (stepping and equilibrium), checkpoints and recording."""
+"""One run of a scene: the drivers of the solvers `stepping` and `equilibrium`, and recording."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Driver(ABC):
     Attributes
     ----------
     scene, state, watch
-        Scene, current state, and display of progress.
+        Scene, current state, and the object that displays progress and cancels the run.
     choice : Choice
         Engine of the run, number of its threads, and the reason for the choice.
     ends_early : bool
@@ -66,16 +66,18 @@ class Driver(ABC):
     interruption : RunOutcome or None
         Outcome of a run that was interrupted on request.
     automatic : tuple of str
-        Solver parameters that the experiment gives as `auto`; they have values now.
+        Solver parameters that are `auto` in the experiment; in the scene they are replaced by
+        values.
     load_time : float or None
-        Time within a step at which the current state is an equilibrium to be recorded; None
-        otherwise.
+        Time of the current state, in steps, if it is an equilibrium within a step that is to be
+        recorded; otherwise None.
     requested_step : int
         Step at which the state is yielded even if no record is due; -1 for none.
     certificate : Certificate or None
-        Error bound of the equilibrium, once it is reached.
+        Error bound of the equilibrium; None before it is reached.
     rejection : FloatingPointError or None
-        Error raised by the recorder for the current state. The driver decides how to continue.
+        Error of the recorder, if the current state cannot be recorded. The driver then either ends
+        the run or raises the error.
     """
 
     choice: Choice
@@ -92,9 +94,9 @@ class Driver(ABC):
 
     @abstractmethod
     def states(self) -> States:
-        """Generate the states of the run, including the first, and return its outcome.
+        """Generate the states of the run, including the first, and return the outcome of the run.
 
-        Each state is valid until the next is generated.
+        Each state is valid only until the next one is generated.
 
         Raises
         ------
@@ -104,7 +106,7 @@ class Driver(ABC):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that determines how the run continues from the current state."""
+        """Return all data that determine how the run continues from the current state."""
 
     def restart(self, state: State) -> None:
         """Continue from another state of the same step."""
@@ -116,8 +118,10 @@ class Driver(ABC):
 
 
 LONGEST_CALL_S = 0.2
-"""Maximum duration of one call of an engine in seconds. Progress is shown and interruptions are
-handled between calls."""
+"""Maximum duration of one call of an engine in seconds.
+
+Progress is shown and interruptions are handled between calls.
+"""
 SECONDS_A_VALUE = 2e-9
 """First estimate of the time for one step of one particle in seconds."""
 MOST_STEPS = 100_000
@@ -127,7 +131,7 @@ MOST_STEPS = 100_000
 class SteppingDriver(Driver):
     """Driver of the solver `stepping`.
 
-    States are yielded at every step that is recorded, and at some steps between.
+    States are yielded at every recorded step, and at some steps between these.
     """
 
     def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
@@ -144,7 +148,7 @@ class SteppingDriver(Driver):
         """Last step that was yielded for recording and not rejected."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state, and those of the guard and of the steady-state monitor."""
+        """Return the state of the scene, of the divergence test and of the convergence test."""
         monitor = self.monitor
         pace = {"pace": monitor.pace, "obstacle": monitor.obstacle} if monitor else {}
         guard = {"good_step": self.guard.good_step, "next_look": self.guard.next_look}
@@ -153,8 +157,8 @@ class SteppingDriver(Driver):
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """Restore the result of `state_dict`.
 
-        Two values are not restored, because they follow from the scene: the size of the body and,
-        if convergence has not been tested yet, the first step at which it is tested.
+        Two values are not restored, because they are computed from the scene. These are the size of
+        the body and, if convergence has not been tested yet, the first step at which it is tested.
         """
         self.state, self.recorded_step = parts["state"], parts["kept"]
         is_good = parts["guard"]["good_step"] == self.state.step
@@ -165,7 +169,7 @@ class SteppingDriver(Driver):
 
     def _restore_monitor(self, monitor: SteadyStateMonitor, pace: Pace, obstacle: str) -> None:
         step, new_pace = self.state.step, monitor.pace
-        if new_pace.next_look > step:  # The earlier run may not have planned those tests.
+        if new_pace.next_look > step:  # The earlier run may have had no such tests.
             return
         if pace.begin != new_pace.begin:
             experiment = self.scene.experiment
@@ -178,15 +182,15 @@ class SteppingDriver(Driver):
         monitor.pace, monitor.obstacle = pace, obstacle
 
     def restart(self, state: State) -> None:
-        """Continue from another state, which becomes the last good state of the guard."""
+        """Continue from another state, which becomes the last good state of the divergence test."""
         super().restart(state)
         self.guard = replace(self.guard, good_step=state.step, good_copy=state.copy())
 
     def states(self) -> States:
         """Generate the states of the run.
 
-        If the run diverges, its last state is the last good one, provided that it is later than
-        the last recorded one.
+        If the run diverges, the last good state is yielded as the last one, unless a later state
+        has already been recorded.
         """
         try:
             return (yield from self._stepped())
@@ -215,7 +219,7 @@ class SteppingDriver(Driver):
         return RunOutcome("complete", f"completed all steps{obstacle}", steps)
 
     def _advance(self) -> None:
-        """Step to the next state that is recorded or tested. Raises FloatingPointError."""
+        """Make steps to the next state that is recorded or tested. Raises FloatingPointError."""
         experiment, state = self.scene.experiment, self.state
         stops = [experiment.next_recorded(state.step), self.guard.next_look]
         stops += [self.monitor.pace.next_look] if self.monitor else []
@@ -234,7 +238,7 @@ class SteppingDriver(Driver):
         return max(1, min(MOST_STEPS, int(LONGEST_CALL_S / max(seconds_a_step, 1e-9))))
 
     def _current_state(self) -> Iterator[State]:
-        """Yield the state; raise the error of the recorder, if any."""
+        """Yield the current state, and raise the error of the recorder if there is one."""
         yield self.state
         if self.rejection:
             raise self.rejection
@@ -293,15 +297,15 @@ class SteppingDriver(Driver):
 class EquilibriumDriver(Driver):
     """Driver of the solver `equilibrium`.
 
-    Yields the initial state, the states after increments of the load, and the equilibrium.
+    It yields the initial state, the states after increments of the load, and the equilibrium.
     """
 
     choice = Choice("equilibrium", 1, "requested")
     moment = 0.0
-    """Time that the load has reached, in steps."""
+    """Time up to which the load has been applied, in steps."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return state and time, from which the next increment starts."""
+        """Return the state and the time from which the next increment starts."""
         return {"state": self.state, "moment": self.moment}
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
@@ -311,7 +315,8 @@ class EquilibriumDriver(Driver):
     def states(self) -> States:
         """Generate the states of the run.
 
-        If it is interrupted or finds no equilibrium, its last state is the last one reached.
+        If the run is interrupted or an equilibrium is not found, the last state is the last
+        equilibrium that was found.
         """
         from pbdkit.equilibrium.error_bound import UnconvergedError
         from pbdkit.equilibrium.load_stepping import SeparatedError
@@ -387,14 +392,14 @@ DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
 FAILED = ("diverged", "unconverged", "separated")
 """Statuses of runs that reach neither their last step nor equilibrium."""
 LARGEST = 50_000
-"""Maximum number of particles for which the diagnostics are evaluated before the run."""
+"""Maximum number of particles for which the diagnostics are evaluated once before the run."""
 
 
 class Simulation:
     """Simulation of an experiment, step by step or to its end.
 
-    The results are bitwise equal to those of `pbdkit.run`, independent of the number of steps in
-    each call, and the same warnings are issued.
+    The results are equal to those of `pbdkit.run` to the last bit, for any number of steps in each
+    call. The same warnings are issued.
 
     Parameters
     ----------
@@ -405,8 +410,9 @@ class Simulation:
     settings : mapping, or iterable of str
         Values that replace those of the experiment, as for `load`.
     start : Simulation, optional
-        Simulation with the state and step from which this one starts. The body must have the same
-        particles and bonds. By default the initial state of the experiment.
+        Simulation that provides the state and the step from which this one starts. Its body must
+        have the same particles and bonds. By default the simulation starts from the initial state
+        of the experiment.
 
     Raises
     ------
@@ -485,11 +491,11 @@ class Simulation:
     """Outcome of the simulation; None before its end."""
 
     def __iter__(self) -> Iterator[State]:
-        """Yield the states to the end of the run; possible once.
+        """Yield the states to the end of the run. This is possible only once.
 
         The states are those of every recorded step, including the first and the last, and of some
-        steps between. Each is valid, and may be modified, until the next is generated;
-        ``state.copy()`` keeps it.
+        steps between these. A state is valid until the next one is generated, and may be modified.
+        ``state.copy()`` returns a state that remains valid.
         """
         with _located(self.scene):
             self.outcome = yield from self.driver.states()
@@ -500,7 +506,7 @@ class Simulation:
         Parameters
         ----------
         n : int
-            Number of steps. A run that converges ends earlier; `outcome` is set then.
+            Number of steps. A run that converges makes fewer steps and sets `outcome`.
 
         Raises
         ------
@@ -541,9 +547,9 @@ class Simulation:
     def equilibrate(self) -> Certificate:
         """Compute the equilibrium for the current leaders, loads and parameters.
 
-        Bonds that exceed their limit in equilibrium break. The time does not change, and steps
-        continue from the equilibrium. With ``solver: equilibrium`` the load is followed to the last
-        step, as in `run`.
+        Bonds that exceed their limit in equilibrium break. The number of the current step does not
+        change, and further steps start from the equilibrium. With ``solver: equilibrium``
+        equilibria are computed for increasing load up to the last step, as in `run`.
 
         Returns
         -------
@@ -574,7 +580,7 @@ class Simulation:
         return certificate
 
     def record(self, path: str | Path | None = None, *, force: bool = False) -> Recording:
-        """Record from the current state on, as the field `record` of the experiment specifies.
+        """Begin to record at the current state, as the field `record` of the experiment specifies.
 
         The current and the last state are always recorded. Recording ends with the ``with`` block,
         by `Recording.close`, or with the simulation.
@@ -619,13 +625,13 @@ class Simulation:
     _states: Iterator[State] | None = None
 
     def _start(self) -> None:
-        """Start the driver, which yields the current state to be recorded."""
+        """Start the driver. Its first state is the current one, which is recorded."""
         if self._states is None:
             self._states, self._recordings = iter(self), []
             next(self._states)
 
     def _go(self, is_reached: Callable[[], bool]) -> None:
-        """Advance until a condition holds or the run ends; record each state before it is left."""
+        """Advance until a condition holds or the run ends, and record each state."""
         self._start()
         assert self._states is not None
         while not self.outcome and not is_reached():
@@ -650,7 +656,7 @@ class Simulation:
 
     @property
     def experiment(self) -> Experiment:
-        """Experiment, with values in place of `auto`."""
+        """Experiment, in which `auto` is replaced by values."""
         return self.scene.experiment
 
     @property
@@ -664,8 +670,8 @@ class Simulation:
 
         It contains `position`, `u` and `kind` of every particle, the state variables of rule and
         fracture model, and `broken_step` of every bond if bonds can break. Names, coordinates and
-        units are those of the dataset of a run at one time. The values are read-only, and later
-        steps do not change them.
+        units are the same as in the dataset of a run. The values are read-only, and later steps do
+        not change them.
         """
         return self._snapshots.dataset(self.driver.state)
 
@@ -684,7 +690,7 @@ class Simulation:
         return self.scene.raster.count
 
     def recorder(self, sink: Sink) -> Recorder:
-        """Return a recorder of the variables of the dataset into a sink."""
+        """Return a recorder that writes the variables of the dataset to a sink."""
         return Recorder(self.scene, sink)
 
     def sink(self, file: KeepingSink) -> KeepingSink:
@@ -693,7 +699,8 @@ class Simulation:
 
     @cached_property
     def prediction(self) -> dict[str, Any]:
-        """Prediction of stability before the first step, as attributes of the dataset."""
+        """Prediction of stability before the first step, in the form of the attribute of the
+        dataset."""
         return prediction(self.scene, self.waves)
 
     @cached_property
@@ -707,15 +714,19 @@ class Simulation:
         return quick_warnings(self.scene, self.waves)
 
     def outlook(self) -> list[str]:
-        """Return the further warnings of `check` if they are computed in less than a second."""
+        """Return those warnings of `check` that `warnings` lacks, if they take less than a
+        second."""
         repeats = bool(self.waves) and "solver.relaxation" in " ".join(self.warnings)
         warnings = outlook(self.scene)
         return [w for w in warnings if not (repeats and w.startswith("solver.relaxation"))]
 
 
 class Execution:
-    """Executes runs: in one process, or, in `pbdkit.mpi.distributed_run`, on all ranks of a
-    communicator, which call each method together."""
+    """Executes runs in one process.
+
+    The subclass in `pbdkit.mpi.distributed_run` executes them on all ranks of a communicator. There
+    all ranks call each method together.
+    """
 
     def __init__(self, communicator: Communicator = SERIAL) -> None:
         self.communicator = communicator
@@ -729,7 +740,7 @@ class Execution:
         return tuned(scene)
 
     def by_root(self, work: Callable[[], int]) -> int:
-        """Return the result of work that the root does alone."""
+        """Return the result of a function that only the root evaluates."""
         return work()
 
     def run(self, scene: Scene, watch: Watch) -> Simulation:
@@ -752,9 +763,9 @@ class RunReport:
     choice
         Engine of the run.
     warnings
-        Warnings at the end of the run.
+        Warnings that were issued at the end of the run.
     first
-        Step at which this part of the run started.
+        Step at which this run started; larger than 0 if it was resumed.
     processes
         Number of processes that shared the lattice.
     """
@@ -777,8 +788,8 @@ class RunReport:
 def peak_memory() -> int:
     """Return the largest resident memory of this process in bytes; 0 if it is not available.
 
-    The value of `ru_maxrss` includes memory of the parent process on Linux, so that VmHWM of
-    /proc/self/status is used where it exists.
+    Where /proc/self/status exists, its value VmHWM is used, because `ru_maxrss` includes memory of
+    the parent process on Linux.
     """
     status = Path("/proc/self/status")
     if status.exists() and (match := re.search(r"VmHWM:\s*(\d+)", status.read_text())):
@@ -793,7 +804,8 @@ def peak_memory() -> int:
 class Recording:
     """Recording of a simulation, as the field `record` of its experiment specifies.
 
-    Returned by `Simulation.record`. As a context manager it ends with its block.
+    `Simulation.record` returns it. If it is used as a context manager, recording ends with the
+    block.
     """
 
     def __init__(
@@ -826,7 +838,7 @@ class Recording:
     def close(self) -> None:
         """End recording with the current state.
 
-        The status of a run before its last step is then "interrupted".
+        If the run has not reached its last step, its status in the dataset is "interrupted".
 
         Raises
         ------
@@ -875,7 +887,7 @@ class Recording:
         except FloatingPointError as error:
             driver.rejection = error
             return
-        # A run is not resumed from its last state, which needs no checkpoint.
+        # No run is resumed from its last state.
         steps = simulation.experiment.steps
         ends = driver.ends_early or driver.is_complete or state.step >= steps
         if self._checkpoints and not ends and self._checkpoints.due():
@@ -889,7 +901,7 @@ class Recording:
         return self._report(outcome)
 
     def finish(self, outcome: RunOutcome) -> RunReport:
-        """Record the variables and attributes that are known at the end of the run."""
+        """Record the variables and attributes that exist only at the end of the run."""
         simulation, driver = self._simulation, self._simulation.driver
         if self._checkpoints:
             self._checkpoints.keep_final(checkpoint_of(driver, self._recorder))
@@ -912,8 +924,8 @@ class Recording:
 def record(simulation: Simulation, sink: Sink, *, recorder: Recorder | None = None) -> RunReport:
     """Run a simulation to its end and record it into a sink.
 
-    A `recorder` that has begun continues an earlier recording. If the simulation is interrupted on
-    request, a checkpoint is written, provided that the sink supports checkpoints.
+    If `recorder` is given and has begun, it continues an earlier recording. If the simulation is
+    interrupted on request and the sink supports checkpoints, a checkpoint is written.
     """
     recording = Recording(simulation, sink, recorder)
     try:
@@ -929,7 +941,8 @@ def record(simulation: Simulation, sink: Sink, *, recorder: Recorder | None = No
 
 
 def rehearse(scene: Scene) -> None:
-    """Evaluate the diagnostics of the initial state, to raise their errors before the run."""
+    """Evaluate the diagnostics for the initial state, so that their errors are raised before the
+    run."""
     if not scene.experiment.diagnostics or scene.raster.count > LARGEST:
         return
     recorder = Recorder(scene, MemorySink())

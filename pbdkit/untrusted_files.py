@@ -1,10 +1,13 @@
-"""Reading of files without a seal in a separate process, with bounds on memory and time, and checks
-of the declarations and references of an HDF5 file.
+"""Reading of untrusted files: in a separate process, after checks of their structure.
+
+The seal of a result is its set of checksums. Files without a seal are read in a separate process
+with limits on memory and time. Before an HDF5 file is read, its declared sizes and its references
+are checked.
 
 A file of some kilobytes can declare arrays of terabytes, refer to the bytes of other files, and
 name filters that HDF5 loads as programs. Damaged bytes can crash the libraries or make them hang,
-which does no harm in a separate process. A seal is no protection against such files, since anyone
-can create one.
+which does no harm in a separate process. A seal does not protect against malicious files, because
+anyone can create one.
 """
 
 from __future__ import annotations
@@ -33,15 +36,21 @@ if TYPE_CHECKING:
 
 
 DENSEST = 1100
-"""Largest ratio of declared to stored bytes of a compressed variable (deflate: 1032)."""
+"""Largest ratio of declared to stored bytes of a compressed variable.
+
+The largest ratio of deflate is 1032.
+"""
 SPARSEST = 16
-"""Largest ratio of the bytes that a variable declares, written or not, to those of the file."""
+"""Largest ratio of the declared size of a variable to the size of the file.
+
+It also limits variables of which parts have not been written.
+"""
 EMPTY = 2**20
-"""Number of bytes that a variable may declare whatever the size of the file."""
+"""Number of bytes that a variable may declare in a file of any size."""
 LARGEST_CHUNK = 2**26
-"""Number of bytes that a chunk may declare whatever the size of the file."""
+"""Number of bytes that a chunk may declare in a file of any size."""
 MAX_OBJECTS = 10_000
-"""Maximum number of objects and of links in a file, and of attributes of each."""
+"""Maximum number of objects in a file, of links in a file, and of attributes of an object."""
 LARGEST_TEXTS = 2**28
 """Maximum number of bytes of a block of texts that is checked."""
 FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32"}
@@ -162,7 +171,7 @@ def _is_dimension_only(dataset: Any) -> bool:
 
 
 def _check_texts(dataset: Any, name: str, size: int) -> None:
-    """Read texts of variable length in blocks; each is stored once in the file."""
+    """Read texts of variable length in blocks, to test that they are not larger than the file."""
     import h5py
 
     texts, total = h5py.Dataset(dataset), 0
@@ -193,15 +202,15 @@ BEGINNINGS = (b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"CDF\x02", b"CDF\x05")
 PATIENCE_S = 10.0
 """Time limit in seconds for reading one piece."""
 PIECE = 2**26
-"""Bytes read at once, if an entry along the first dimension is not larger."""
+"""Number of bytes that are read at once. At least one entry along the first dimension is read."""
 FAULT = 9
 """Exit status of a child process that has printed a fault."""
 
 
 def refuse_no_result(path: Path) -> None:
-    """Raise StorageError if a file does not begin as netCDF files do.
+    """Raise StorageError if the first bytes of a file are not those of a netCDF file.
 
-    An OSError is raised if it cannot be read.
+    An OSError is raised if the file cannot be read.
     """
     with path.open("rb") as file:
         if not file.read(8).startswith(BEGINNINGS):
@@ -211,8 +220,10 @@ def refuse_no_result(path: Path) -> None:
 
 
 def try_reading(path: Path) -> None:
-    """Raise StorageError if a file is no netCDF file, or if reading it fails, crashes or does not
-    end."""
+    """Raise StorageError if a file cannot be read as a netCDF file in a separate process.
+
+    Reading can fail, crash the process, or exceed the time limit.
+    """
     refuse_no_result(path)
     read_apart(path)
 
@@ -223,7 +234,7 @@ def read_apart(path: Path, *arguments: str) -> bytes:
     Raises
     ------
     StorageError
-        If reading fails, crashes or does not end. The message names the file.
+        If reading fails, crashes or exceeds the time limit. The message names the file.
     """
     # The child process imports this module from the same place as this process.
     paths = os.pathsep.join([*filter(None, sys.path), str(Path(__file__).parents[1])])
@@ -268,7 +279,7 @@ def _exit_with(fault: str) -> None:
 
 
 def bound_time() -> None:
-    """End this process with a traceback unless this is called again within `PATIENCE_S`."""
+    """End this process with a traceback after `PATIENCE_S`, unless the function is called again."""
     faulthandler.dump_traceback_later(PATIENCE_S, exit=True)
 
 
@@ -291,7 +302,7 @@ def check_hdf5(path: Path) -> None:
 
 
 def _read(path: Path) -> None:
-    """Read all of a file in pieces, with a time limit for each."""
+    """Read a whole file in blocks, with a time limit for each block."""
     library = import_module(MODULE)
     bound_time()
     check_hdf5(path)

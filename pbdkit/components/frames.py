@@ -59,7 +59,7 @@ class CopyingFrame(LayeredFrame):
 class MeanFrame(CopyingFrame):
     """Frame points move by the mean displacement of the nearest body particles.
 
-    If several particles are equally near, the mean is taken over all of them.
+    If several particles are equally near, it is the mean of all of them.
     """
 
     type: Literal["mean"] = "mean"

@@ -50,7 +50,7 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """All plugins with components, beginning with the built-in one."""
+        """Plugins with components, beginning with the built-in one."""
         return [p for p in self._local if p.offers] + self.installed
 
     def find(self, interface: type[Component], name: str) -> type[Component]:
