@@ -138,7 +138,7 @@ def model_section(name: str, models: Schema) -> Iterator[str]:
 
 def is_object(model: Schema) -> bool:
     """Return whether a definition describes a component rather than a value."""
-    return "properties" in model and "Course" not in model.get("title", "")
+    return "properties" in model and "TimeDependent" not in model.get("title", "")
 
 
 def referenced(part: Any) -> list[str]:
@@ -180,7 +180,7 @@ def reference_text(name: str, models: Schema) -> str:
     model = models[name]
     if name == "Field":
         return "[field](fields.md)"
-    if "Course" in name:
+    if "TimeDependent" in name:
         return "[time-dependent](time-dependent.md)"
     constant = model.get("properties", {}).get("type", {}).get("const")
     return f"`{constant}`" if constant else name

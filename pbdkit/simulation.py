@@ -27,7 +27,7 @@ from pbdkit.model.loading import as_experiment
 from pbdkit.model.solver import Equilibrium, Solver, Stepping
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.stability.forecast import outlook, prediction, quick_warnings
+from pbdkit.stability.forecast import further_warnings, prediction, quick_warnings
 from pbdkit.stability.relaxation import tuned
 from pbdkit.stepping.divergence import EVERY, Guard
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
@@ -37,8 +37,8 @@ from pbdkit.stepping.state import State, initial_state, unmoved_state
 if TYPE_CHECKING:
     import xarray
 
-    from pbdkit.equilibrium.error_bound import Certificate, Pace, SteadyStateMonitor
-    from pbdkit.equilibrium.load_stepping import Way
+    from pbdkit.equilibrium.error_bound import ErrorBound, Pace, SteadyStateMonitor
+    from pbdkit.equilibrium.load_stepping import EquilibriumPath
     from pbdkit.model.experiment import Experiment
     from pbdkit.model.loading import ComponentClasses, ExperimentLike
     from pbdkit.model.reading import Settings
@@ -73,7 +73,7 @@ class Driver(ABC):
         recorded; otherwise None.
     requested_step : int
         Step at which the state is yielded even if no record is due; -1 for none.
-    certificate : Certificate or None
+    error_bound : ErrorBound or None
         Error bound of the equilibrium; None before it is reached.
     rejection : FloatingPointError or None
         Error of the recorder, if the current state cannot be recorded. The driver then either ends
@@ -89,7 +89,7 @@ class Driver(ABC):
         self.automatic: tuple[str, ...] = ()
         self.load_time: float | None = None
         self.requested_step = -1
-        self.certificate: Certificate | None = None
+        self.error_bound: ErrorBound | None = None
         self.rejection: FloatingPointError | None = None
 
     @abstractmethod
@@ -124,7 +124,7 @@ Progress is shown and interruptions are handled between calls.
 """
 SECONDS_A_VALUE = 2e-9
 """First estimate of the time for one step of one particle in seconds."""
-MOST_STEPS = 100_000
+MAX_STEPS_A_CALL = 100_000
 """Maximum number of steps in one call of an engine."""
 
 
@@ -235,7 +235,7 @@ class SteppingDriver(Driver):
 
     def _steps_in(self, seconds_a_step: float) -> int:
         """Return the number of steps in one call of the engine."""
-        return max(1, min(MOST_STEPS, int(LONGEST_CALL_S / max(seconds_a_step, 1e-9))))
+        return max(1, min(MAX_STEPS_A_CALL, int(LONGEST_CALL_S / max(seconds_a_step, 1e-9))))
 
     def _current_state(self) -> Iterator[State]:
         """Yield the current state, and raise the error of the recorder if there is one."""
@@ -324,10 +324,10 @@ class EquilibriumDriver(Driver):
         state = self.state
         yield state
         try:
-            self.certificate = certificate = yield from self._increments(state)
-            outcome = RunOutcome("complete", str(certificate), state.step, certificate.as_dict())
+            self.error_bound = error_bound = yield from self._increments(state)
+            outcome = RunOutcome("complete", str(error_bound), state.step, error_bound.as_dict())
         except UnconvergedError as error:
-            bound = error.certificate
+            bound = error.error_bound
             outcome = RunOutcome(
                 "unconverged", (f"{error}; the state is {bound}"), state.step, bound.as_dict()
             )
@@ -344,7 +344,7 @@ class EquilibriumDriver(Driver):
             return RunOutcome("unconverged", f"{self.rejection} diverged", state.step)
         return outcome
 
-    def _way(self, state: State) -> Way:
+    def _path(self, state: State) -> EquilibriumPath:
         """Follow the load from a state to equilibrium."""
         from pbdkit.equilibrium.load_stepping import increments
 
@@ -356,18 +356,18 @@ class EquilibriumDriver(Driver):
         experiment = self.scene.experiment
         return list(experiment.record.steps_before(experiment.steps))
 
-    def _increments(self, state: State) -> Generator[State, None, Certificate]:
+    def _increments(self, state: State) -> Generator[State, None, ErrorBound]:
         """Yield the states after increments of the load and return the error bound.
 
         Raises FloatingPointError if a state cannot be recorded.
         """
-        way, records_all = self._way(state), self.scene.experiment.record.increments
+        path, records_all = self._path(state), self.scene.experiment.record.increments
         while True:
             try:
-                reached = next(way)
+                reached = next(path)
             except StopIteration as end:
-                certificate: Certificate = end.value
-                return certificate
+                error_bound: ErrorBound = end.value
+                return error_bound
             self.moment, self.is_complete = reached.moment, reached.is_last
             is_within = records_all and reached.at_rest and reached.moment != reached.state.step
             self.load_time = reached.moment if is_within else None
@@ -428,7 +428,7 @@ class Simulation:
     >>> simulation.time
     50
     >>> x, y = simulation.state.position.sel(particle=67)
-    >>> certificate = simulation.equilibrate()
+    >>> error_bound = simulation.equilibrate()
     """
 
     processes: int = 1
@@ -544,7 +544,7 @@ class Simulation:
         """
         self._go(lambda: False)
 
-    def equilibrate(self) -> Certificate:
+    def equilibrate(self) -> ErrorBound:
         """Compute the equilibrium for the current leaders, loads and parameters.
 
         Bonds that exceed their limit in equilibrium break. The number of the current step does not
@@ -553,7 +553,7 @@ class Simulation:
 
         Returns
         -------
-        Certificate
+        ErrorBound
             A posteriori bound on the distance from equilibrium; ``print`` displays it.
 
         Raises
@@ -564,20 +564,20 @@ class Simulation:
             If no equilibrium exists.
         """
         from pbdkit.equilibrium.error_bound import UnconvergedError
-        from pbdkit.equilibrium.load_stepping import settle_at_step
+        from pbdkit.equilibrium.load_stepping import equilibrate_at_step
 
         if not self.experiment.solver.makes_steps:
             self.run()
-            assert self.driver.certificate is not None
-            return self.driver.certificate
+            assert self.driver.error_bound is not None
+            return self.driver.error_bound
         state = self.driver.state.copy()
         try:
             with _located(self.scene):
-                certificate = settle_at_step(self.scene, state)
+                error_bound = equilibrate_at_step(self.scene, state)
         except UnconvergedError as error:
-            raise DivergedError(f"{error}: {error.certificate}") from None
+            raise DivergedError(f"{error}: {error.error_bound}") from None
         self.driver.restart(state)
-        return certificate
+        return error_bound
 
     def record(self, path: str | Path | None = None, *, force: bool = False) -> Recording:
         """Begin to record at the current state, as the field `record` of the experiment specifies.
@@ -713,11 +713,11 @@ class Simulation:
         """Warnings before the first step, about the scene and its stability."""
         return quick_warnings(self.scene, self.waves)
 
-    def outlook(self) -> list[str]:
+    def further_warnings(self) -> list[str]:
         """Return those warnings of `check` that `warnings` lacks, if they take less than a
         second."""
         repeats = bool(self.waves) and "solver.relaxation" in " ".join(self.warnings)
-        warnings = outlook(self.scene)
+        warnings = further_warnings(self.scene)
         return [w for w in warnings if not (repeats and w.startswith("solver.relaxation"))]
 
 

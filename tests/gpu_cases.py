@@ -93,11 +93,11 @@ COMPOSITE = {
     "steps": 12,
     "solver": {"type": "stepping", "relaxation": 0.5},
 }
-COURSES = test_courses.sheet(**test_courses.CHANGING["both"])
+TIME_DEPENDENT = test_courses.sheet(**test_courses.CHANGING["both"])
 OTHERS = {
     "composite": COMPOSITE | FIELDS["torn composite"],
     "parameters by particle": COMPOSITE | FIELDS["K"],
-    "numbers that change": COURSES | SMALL,
+    "numbers that change": TIME_DEPENDENT | SMALL,
     "loads": test_loads.loaded(test_loads.TIP | {"from": 3}, solver={"type": "stepping"}, steps=20),
     "cut on the way": PLATE | {"cuts": cut(3)},
     "seen by neighbours": vanes(**CASES["hole"] | {"leaders": sheet()["leaders"]}),

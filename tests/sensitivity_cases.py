@@ -14,7 +14,7 @@ import numpy as np
 import pbdkit
 from pbdkit.equilibrium.system import Moves, one_thread
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.sensitivity import Resting
+from pbdkit.fitting.sensitivity import RestingScene
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.scene.leader_groups import guided_at, kinds_of_places
 from pbdkit.scene.scene import build_scene
@@ -233,7 +233,7 @@ def errors(given, paths):
     others). Raises ExperimentError where the rule does not take the frame."""
     plain, found = Plain(given), []
     with one_thread():
-        resting = Resting.of(plain.experiment)
+        resting = RestingScene.of(plain.experiment)
         weights = np.random.default_rng(0).normal(size=resting.state.u.shape)
         known = np.zeros(resting.state.u[0].size, bool)
         known[resting.scene.raster.place_of(np.arange(len(resting.scene.raster.table_kind)))] = True

@@ -134,7 +134,9 @@ def test_the_page_lists_the_operations_in_the_order_of_a_step():
 
 def test_kernel_on_the_page_is_the_generated_one(monkeypatch):
     sources = []
-    monkeypatch.setattr(engine, "load_blamed", lambda levels, source, given: sources.append(source))
+    monkeypatch.setattr(
+        engine, "load_plugin_kernel", lambda levels, source, given: sources.append(source)
+    )
     engine.CompiledStepper(build_scene(pbdkit.load("paper/a")))
     lines = sources[0].splitlines()
     for line in PAGE.split("```text\n")[1].split("```")[0].splitlines():

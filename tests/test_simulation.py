@@ -308,13 +308,13 @@ def test_intermediate_equilibrium_is_recorded_and_continued(tensile: dict[str, A
     simulation = pbdkit.Simulation(tensile | {"steps": 40})
     with simulation.record() as recording:
         simulation.step(20)
-        certificate = simulation.equilibrate()
+        error_bound = simulation.equilibrate()
         rest = simulation.state
         simulation.step(1)
     straight = tensile | {"steps": 20, "solver": {"type": "equilibrium"}}
     expected = pbdkit.run(straight, progress=False).position[-1]
     np.testing.assert_allclose(rest.position, expected, rtol=0, atol=1e-9)
-    assert certificate.share < 1e-8
+    assert error_bound.share < 1e-8
     assert simulation.time == 21
     ds = recording.dataset
     assert ds.time.values.tolist() == list(range(22))

@@ -173,7 +173,7 @@ def histories(
         for ax, y in zip(panels, (rest[0] + u[:, 0], rest[1] + u[:, 1], pe1), strict=True):
             ax.plot(np.arange(len(y)), y, label=label if ax is panels[0] else None, **style)
     for ax, title in zip(panels, ("x", "y", "PE1"), strict=True):
-        _dress(ax, "step", title)
+        _label_axes(ax, "step", title)
     panels[1].ticklabel_format(axis="y", useOffset=False)
     if log:
         panels[2].set(yscale="log", ylim=(1e-5, None))
@@ -195,12 +195,12 @@ def curves(
             x, y, color=LINES[n], lw=1.2, marker="o", ms=2.5 + 2 * (len(lines) - 1 - n), label=label
         )
     ax.set(**axis)
-    _dress(ax, *labels)
+    _label_axes(ax, *labels)
     ax.legend(frameon=False, fontsize=8)
     return save(figure, name)
 
 
-def _dress(ax: Axes, x: str, y: str) -> None:
+def _label_axes(ax: Axes, x: str, y: str) -> None:
     ax.set_xlabel(x, fontsize=8.5)
     ax.set_ylabel(y, fontsize=8.5)
     ax.tick_params(labelsize=7.5)

@@ -30,7 +30,7 @@ def _swing(ax: Axes) -> None:
     """Draw y of the middle of the sheet after its release, and the envelope with √b^t."""
     experiment = pbdkit.load(NAME)
     ds = pbdkit.run(experiment, progress=False)
-    found = pbdkit.analyse(experiment).swing(1.0, experiment.solver.memory)
+    found = pbdkit.analyse(experiment).oscillation(1.0, experiment.solver.memory)
     assert found is not None
     y = ds.u.sel(particle=PARTICLE, axis="y").values[LET_GO:]
     t = np.arange(len(y))

@@ -33,10 +33,10 @@ from pbdkit.api import load
 from pbdkit.array_types import Floats
 from pbdkit.cli.output import refuse_output, refuse_unwritable, save
 from pbdkit.cli.tables import SIMPLE_HEAD, Table, add_rows, show_table
-from pbdkit.equilibrium.error_bound import Certificate, UnconvergedError, scale_of
+from pbdkit.equilibrium.error_bound import ErrorBound, UnconvergedError, scale_of
 from pbdkit.equilibrium.lattice_system import SlowMode
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.load_stepping import settle
+from pbdkit.equilibrium.load_stepping import equilibrate
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
 from pbdkit.io.atomic_file import write
 from pbdkit.lattice.raster import FOLLOWER
@@ -47,7 +47,7 @@ from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import peak_memory
 from pbdkit.stability.relaxation import tuned
-from pbdkit.stepping.engine_choice import choose, make_engine, obstacle, processors, what_is_missing
+from pbdkit.stepping.engine_choice import choose, make_engine, missing_for_gpu, obstacle, processors
 from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ def engines() -> list[tuple[str, str, int]]:
     """Return the combinations of engine, precision and number of threads with which steps are
     measured. The first one is the reference."""
     combinations = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
-    combinations += [] if what_is_missing() else [("gpu", 1)]
+    combinations += [] if missing_for_gpu() else [("gpu", 1)]
     return [
         (name, kind, threads) for name, threads in combinations for kind in ("float64", "float32")
     ]
@@ -353,7 +353,7 @@ def _rows_of_method(
             return
         tolerances = tolerances[-1:]
     try:
-        measured = run_job("settle", f"solver.method={base.method}", tolerances=tolerances)
+        measured = run_job("equilibrate", f"solver.method={base.method}", tolerances=tolerances)
     except (ExperimentError, PluginError) as error:
         yield replace(base, reason=" ".join(str(error).split()))
         return
@@ -594,7 +594,9 @@ def main(answer: Path) -> None:
 def result_of(job: Task) -> Task:
     """Run a job and return its result. If an error occurs, the result contains the error."""
     try:
-        return {"step": _step, "settle": _settle, "exact": _compute_exact}[job["what"]](job)
+        return {"step": _step, "equilibrate": _equilibrate, "exact": _compute_exact}[job["what"]](
+            job
+        )
     except PbdkitError as error:
         return {"fault": type(error).__name__, "message": str(error)}
 
@@ -676,7 +678,7 @@ def _largest_norm(u: Floats) -> float:
     return float(np.sqrt((u * u).sum(axis=0)).max(initial=0.0))
 
 
-def _settle(job: Task) -> Task:
+def _equilibrate(job: Task) -> Task:
     """Measure the solver for each tolerance, beginning with the largest, until a measurement takes
     too long."""
     imports, rows = _import(*SOLVERS), []
@@ -686,24 +688,24 @@ def _settle(job: Task) -> Task:
         runs: list[Floats] = []
         for _ in _repetitions(runs):
             start = _times()
-            scene, state, certificate = _equilibrium(experiment)
+            scene, state, error_bound = _equilibrium(experiment)
             runs.append(_times() - start)
         seconds, cpu_s = np.min(runs, axis=0)
         distance, _ = _compared(scene, state, Path(job["truth"]))
-        figures = {"steps": certificate.inner_iterations, "certified": certificate.share}
+        figures = {"steps": error_bound.inner_iterations, "certified": error_bound.share}
         rows.append(figures | {"seconds": seconds, "cpu_s": cpu_s, "distance": distance})
         if seconds > MAX_SOLVING_S:
             break
     return {"rows": rows, "peak_memory_mib": (peak_memory() - imports) / 2**20}
 
 
-def _equilibrium(experiment: Experiment) -> tuple[Scene, State, Certificate]:
+def _equilibrium(experiment: Experiment) -> tuple[Scene, State, ErrorBound]:
     scene = build_scene(experiment)
     state = initial_state(scene)
     try:
-        return scene, state, settle(scene, state)
+        return scene, state, equilibrate(scene, state)
     except UnconvergedError as error:
-        return scene, state, error.certificate
+        return scene, state, error.error_bound
 
 
 def _compute_exact(job: Task) -> Task:
@@ -714,11 +716,11 @@ def _compute_exact(job: Task) -> Task:
     if experiment.fracture.type != "none":
         reason = "speed against error is measured without fracture; set fracture={type: none}"
         raise experiment.located(ExperimentError(reason, ("fracture",)))
-    scene, state, certificate = _equilibrium(experiment)
+    scene, state, error_bound = _equilibrium(experiment)
     exact = _of_followers(scene, state)
     np.save(Path(job["truth"]) / "exact.npy", exact)
     decay = decay_of(scene, exact)
-    result = {"how": certificate.method, "within": certificate.share, "rate": decay.rate}
+    result = {"how": error_bound.method, "within": error_bound.share, "rate": decay.rate}
     steps = [decay.steps_to(tolerance) for tolerance in job["tolerances"]]
     scale = scale_of(scene, initial_state(scene))
     return result | {"particles": scene.raster.count, "scale": scale, "steps": steps}

@@ -156,7 +156,7 @@ def _force(load: Load, units: Units | None) -> str:
     """Format a load in the units of the experiment: N or kN, and N/mm²."""
     force, unit = load.force_at(max(load.from_, 1)), ""
     quantity = FORCE if load.force else BODY_FORCE
-    if units and not units.lacks(quantity):
+    if units and not units.missing_entries(quantity):
         force, unit = force * units.scale(quantity), f" {quantity.unit}".replace("^2", "²")
         if load.force and np.abs(force).max() >= 1e3:
             force, unit = force / 1e3, f" k{FORCE.unit}"

@@ -142,7 +142,7 @@ class CommandTable(click.Group):
             rivals = " and ".join(str(plugin) for plugin, _ in offers)
             raise PluginError(f"the command '{name}' is offered by {rivals}; {DISABLE_ONE}")
         (plugin, offer), *_ = offers
-        loaded = _blamed(plugin, offer, offer.load)
+        loaded = _call_plugin(plugin, offer, offer.load)
         if not isinstance(loaded, click.Command):
             raise PluginError(
                 f"the command '{name}' of {plugin} cannot be used: {offer.target} is not a click "
@@ -218,7 +218,7 @@ def _no_command(name: str, plugins: list[Plugin]) -> str:
     return f"there is no command '{name}'{near}{unusable}"
 
 
-def _blamed(plugin: Plugin, command: Command, call: Callable[[], T]) -> T:
+def _call_plugin(plugin: Plugin, command: Command, call: Callable[[], T]) -> T:
     """Call the plugin's code; its errors become a PluginError that names the plugin."""
     try:
         return call()

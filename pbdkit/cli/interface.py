@@ -30,7 +30,7 @@ from pbdkit.cli.options import (
     times_option,
     verbose_option,
 )
-from pbdkit.cli.streams import folder_kept
+from pbdkit.cli.streams import restoring_folder
 from pbdkit.errors import PbdkitWarning
 
 LOOK = [
@@ -108,7 +108,7 @@ def run(
     with launched() as communicator:
         quiet = quiet or not communicator.is_root
         with communicator.raise_together():
-            with folder_kept(), warnings.catch_warnings():
+            with restoring_folder(), warnings.catch_warnings():
                 if quiet:
                     warnings.simplefilter("ignore", PbdkitWarning)
                 loaded = load_experiment(experiment, settings)

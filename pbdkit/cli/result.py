@@ -58,14 +58,14 @@ def _run_facts(explained: BondRecords) -> dict[str, Any]:
 def _bond_facts(explained: BondRecords, a: int, b: int) -> dict[str, Any]:
     row = explained.row(a, b)
     step, strain = explained.most_strained(row)
-    (standing,) = explained.statuses(np.array([row]))
+    (status,) = explained.statuses(np.array([row]))
     return {
         "fracture": explained.model.type,
-        "bond": standing,
+        "bond": status,
         "most_strained": {"step": step, "strain": strain},
         "remembered": explained.remembered(row),
         "broken_in_all": len(explained.order),
-        "around": explained.statuses(explained.around(row), standing.step),
+        "around": explained.statuses(explained.around(row), status.step),
     }
 
 
@@ -74,21 +74,22 @@ def _run_in_words(facts: dict[str, Any]) -> Iterator[str]:
     further = {"cut": facts["cut"], "broken from the start": facts["broken_from_the_start"]}
     rest = "".join(f", {count} {kind}" for kind, count in further.items() if count)
     yield f"fracture {model}: {broken} of {facts['bonds']} bonds broke{rest}"
-    rows = [standing for standing in facts["in_order"] if standing.state == "broken"]
+    rows = [status for status in facts["in_order"] if status.state == "broken"]
     if rows:
         yield f"first in step {rows[0].step}, last in step {rows[-1].step}"
         yield "order  step  bond           strain       breaks above"
-    for standing in rows[:MAX_LISTED]:
-        strain, limit = _number(standing.strain_at_break), _number(standing.breaks_above)
-        position = f"{standing.order:>5}  {standing.step:>4}  {_name(standing):<13}"
+    for status in rows[:MAX_LISTED]:
+        strain, limit = _number(status.strain_at_break), _number(status.breaks_above)
+        position = f"{status.order:>5}  {status.step:>4}  {_name(status):<13}"
         yield f"{position}  {strain:<11}  {limit}"
-    if rows and all(standing.breaks_above is None for standing in rows):
+    if rows and all(status.breaks_above is None for status in rows):
         remedy = "a fracture model declares it by `breaking_strain`"
         yield f"{model} declares no strain above which a bond breaks: {remedy}"
     if len(rows) > MAX_LISTED:
         yield f"and {len(rows) - MAX_LISTED} more; --json lists all"
     if facts["nearest"]:
-        yield f"nearest to breaking: {_name(facts['nearest'])}: {_standing(facts['nearest'])}"
+        nearest = facts["nearest"]
+        yield f"nearest to breaking: {_name(nearest)}: {_describe_status(nearest)}"
 
 
 def _bond_in_words(facts: dict[str, Any]) -> Iterator[str]:
@@ -103,7 +104,7 @@ def _bond_in_words(facts: dict[str, Any]) -> Iterator[str]:
     elif s.state == "cut":
         yield f"cut at the beginning of step {s.step}"
     else:
-        yield _standing(s)
+        yield _describe_status(s)
     if s.state == "intact":
         step, strain = facts["most_strained"]["step"], facts["most_strained"]["strain"]
         yield f"largest strain in a recorded step: {strain:.6g}, in step {step}"
@@ -114,7 +115,7 @@ def _bond_in_words(facts: dict[str, Any]) -> Iterator[str]:
 def _around_in_words(around: list[BondStatus], step: int | None) -> Iterator[str]:
     """Describe the other bonds at the ends of a bond: those that broke before it, with it and after
     it."""
-    broken = [standing for standing in around if standing.step is not None]
+    broken = [status for status in around if status.step is not None]
     groups = {"adjacent bonds broken": broken}
     if step is not None:
         relations: dict[str, Any] = {
@@ -123,16 +124,18 @@ def _around_in_words(around: list[BondStatus], step: int | None) -> Iterator[str
             "adjacent bonds broken after": gt,
         }
         groups = {
-            title: [standing for standing in broken if relation(standing.step, step)]
+            title: [status for status in broken if relation(status.step, step)]
             for title, relation in relations.items()
         }
     for title, group in groups.items():
-        bonds = ", ".join(f"{_name(standing)} (step {standing.step})" for standing in group)
+        bonds = ", ".join(f"{_name(status)} (step {status.step})" for status in group)
         yield f"{title}: {bonds or 'none'}"
-    unbroken = [standing for standing in around if standing.step is None]
-    maximum = max(unbroken, key=lambda standing: standing.strain, default=None)
+    unbroken = [status for status in around if status.step is None]
+    maximum = max(unbroken, key=lambda status: status.strain, default=None)
     remark = (
-        f"; the largest strain is that of {_name(maximum)}: {_standing(maximum)}" if maximum else ""
+        f"; the largest strain is that of {_name(maximum)}: {_describe_status(maximum)}"
+        if maximum
+        else ""
     )
     yield f"adjacent bonds not broken: {len(unbroken)}{remark}"
 
@@ -141,7 +144,7 @@ def _name(s: BondStatus) -> str:
     return f"{s.bond[0]}-{s.bond[1]}"
 
 
-def _standing(s: BondStatus) -> str:
+def _describe_status(s: BondStatus) -> str:
     """Describe an unbroken bond in a few words."""
     words = f"{s.state}, strain {s.strain:.6g} in step {s.at_step}"
     if s.breaks_above is not None and s.share is not None:

@@ -66,7 +66,7 @@ def run(
         with progress_of_run(path, quiet or as_json, file) as (stop, watch):
             simulation = execution.run(scene, watch)
             del scene  # Each of several processes keeps its part of the scene alone.
-            warn([*simulation.warnings, *([] if quiet else simulation.outlook())], quiet)
+            warn([*simulation.warnings, *([] if quiet else simulation.further_warnings())], quiet)
             report = record(simulation, simulation.sink(file))
         if execution.communicator.is_root:
             report_end(simulation, report, file, path, quiet, as_json)
@@ -134,7 +134,7 @@ def advice_on_failure(path: Path, file: NetcdfSink) -> Iterator[None]:
     except NotSharedError:
         raise
     except ExperimentError:
-        if file.kept:
+        if file.has_checkpoint:
             click.echo(
                 f"the records up to this step are kept, and `pbdkit plot {path}` draws them; "
                 "resuming would fail in the same way: change the experiment, and run it with "
@@ -143,7 +143,7 @@ def advice_on_failure(path: Path, file: NetcdfSink) -> Iterator[None]:
             )
         raise
     except BaseException:
-        if file.kept:
+        if file.has_checkpoint:
             click.echo(_resume_advice(path), err=True)
         raise
 
@@ -168,7 +168,9 @@ def report_end(
         click.echo(json.dumps(_figures(report, file.written)))
     elif not quiet and outcome.status in SUCCESSFUL:
         _print_summary(
-            report, file.written, settling=run.scene.experiment.stepping.settle is not None
+            report,
+            file.written,
+            ends_at_convergence=run.scene.experiment.stepping.settle is not None,
         )
     outcome_text = f"pbdkit: {outcome.status}: {outcome.stop_reason}"
     if outcome.status == "interrupted":
@@ -187,16 +189,16 @@ def exit_status(outcome: RunOutcome, stop: Stop) -> int:
     return stop.exit_status if outcome.status == "interrupted" else 4
 
 
-def _print_summary(report: RunReport, path: Path, *, settling: bool) -> None:
+def _print_summary(report: RunReport, path: Path, *, ends_at_convergence: bool) -> None:
     outcome = report.outcome
     count = f"{outcome.steps - report.first} of {outcome.steps}" if report.first else outcome.steps
     steps = "step" if count == 1 else "steps"
     size = f"{report.particles} particles, {count} {steps} in {report.wall_s:.2g} s"
     size += f" on {report.processes} processes" if report.processes > 1 else ""
     click.echo(f"{outcome.status}: {size}, written to {path}")
-    if outcome.certificate:
-        click.echo(f"{outcome.certificate['method']}: {outcome.stop_reason}")
-    elif settling:
+    if outcome.error_bound:
+        click.echo(f"{outcome.error_bound['method']}: {outcome.stop_reason}")
+    elif ends_at_convergence:
         click.echo(outcome.stop_reason)
     if report.choice.engine != "equilibrium":
         threads = f" on {report.choice.threads} threads" if report.choice.threads > 1 else ""

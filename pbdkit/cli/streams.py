@@ -53,7 +53,7 @@ def standard_streams() -> Iterator[None]:
 
 
 @contextmanager
-def folder_kept() -> Iterator[None]:
+def restoring_folder() -> Iterator[None]:
     """Return to the current folder after the block: plugins may change it when they are imported.
 
     Raises

@@ -23,7 +23,7 @@ from pbdkit.model.schema import experiment_schema
 from pbdkit.plotting.fit_figures import draw_fit
 from pbdkit.plugin.registry import Registry
 from pbdkit.progress import Stop, progress_bar, stop_on_signals, waiting
-from pbdkit.sweeps.execute import Summary, carry_out, crew_of
+from pbdkit.sweeps.execute import Summary, carry_out, executor_of
 from pbdkit.sweeps.specification import SweepPlan, read_sweep, sweep_schema
 
 CONNECT_S = 10.0
@@ -44,7 +44,7 @@ def sweep(
         stop_on_signals() as stopping,
         progress_bar(not quiet and sys.stderr.isatty()) as show,
     ):
-        summary = carry_out(plan, path, crew_of(workers, client), stopping, show)
+        summary = carry_out(plan, path, executor_of(workers, client), stopping, show)
     for fault in summary.faults:
         click.echo(f"warning: {fault}", err=True)
     return _report_end(summary, path, stopping, quiet)

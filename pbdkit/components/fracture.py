@@ -31,7 +31,6 @@ from pbdkit.plugin import (
     Constants,
     Draws,
     FractureModel,
-    KnowsStiffness,
     Number,
     Parameters,
     Remembered,
@@ -41,6 +40,7 @@ from pbdkit.plugin import (
     Softens,
     SoftensCells,
     StartsCracked,
+    UsesStiffness,
     Vector,
     length,
     squared_length,
@@ -48,19 +48,20 @@ from pbdkit.plugin import (
 )
 from pbdkit.plugin.component import Drawn
 from pbdkit.plugin.fracture_model import Segment
-from pbdkit.plugin.schedule import COURSE, PLAIN, Course, at, form_of, last
+from pbdkit.plugin.schedule import PLAIN, TIME_DEPENDENT, TimeDependent, at, form_of, last
 from pbdkit.plugin.units import LENGTH, STRESS
 
 Limit = Annotated[float, Field(gt=0.0, le=1e150), LENGTH]
 """Type of the length at which a bond breaks."""
 
 
-class LimitCourse(Course[Limit]):
+class TimeDependentLimit(TimeDependent[Limit]):
     """Threshold that depends on time."""
 
 
 LimitInTime = Annotated[
-    Annotated[Limit, Tag(PLAIN)] | Annotated[LimitCourse, Tag(COURSE)], Discriminator(form_of)
+    Annotated[Limit, Tag(PLAIN)] | Annotated[TimeDependentLimit, Tag(TIME_DEPENDENT)],
+    Discriminator(form_of),
 ]
 """Type of a threshold, constant or time-dependent."""
 Thresholds = Annotated[tuple[LimitInTime, ...], Field(strict=False)]
@@ -162,11 +163,13 @@ class Threshold(BreaksAtStrain, Parting):
         return tuple(map(last, self.limits))
 
     @property
-    def courses(self) -> Mapping[str, Course[float]]:
+    def time_dependent(self) -> Mapping[str, TimeDependent[float]]:
         """Time-dependent thresholds and other parameters, by their path in the file."""
         limits = enumerate(self.limits)
-        courses = {f"thresholds.{n}": limit for n, limit in limits if isinstance(limit, Course)}
-        return {**super().courses, **courses}
+        time_dependent = {
+            f"thresholds.{n}": limit for n, limit in limits if isinstance(limit, TimeDependent)
+        }
+        return {**super().time_dependent, **time_dependent}
 
     def at(self, moment: float) -> Any:
         """Return the model with the thresholds at a given time."""
@@ -418,7 +421,7 @@ DIRECTIONS = 360
 """Number of crack directions for which the largest admissible lattice constant is computed."""
 
 
-class Cohesive(KnowsStiffness, SoftensCells, Parting):
+class Cohesive(UsesStiffness, SoftensCells, Parting):
     """A cell softens once its largest principal stress exceeds `onset` times Young's modulus.
 
     Softening localises in a band one cell wide. The band is torn when it has dissipated `energy`

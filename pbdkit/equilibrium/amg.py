@@ -51,11 +51,13 @@ class _Level:
         middle, half = (high + low) / 2, (high - low) / 2
         share = half / middle
         r = b if x is None else b - self.matrix @ x
-        way = (self.own @ r) / middle
-        x = way if x is None else x + way
+        correction = (self.own @ r) / middle
+        x = correction if x is None else x + correction
         further = 1.0 / (2.0 / share - share)
-        way = further * share * way + 2.0 * further / half * (self.own @ (b - self.matrix @ x))
-        return np.asarray(x + way)
+        correction = further * share * correction + 2.0 * further / half * (
+            self.own @ (b - self.matrix @ x)
+        )
+        return np.asarray(x + correction)
 
 
 class SparseGrids:

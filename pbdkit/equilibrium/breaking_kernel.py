@@ -32,11 +32,11 @@ from pbdkit.linear.block_matrix import frame_matrices
 from pbdkit.linear.response import by_sublattice
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import RenewsBonds, SoftensCells
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.progress import Watch
-from pbdkit.scene.constants import Home
+from pbdkit.scene.constants import Owner
 from pbdkit.scene.leader_groups import kinds_at
-from pbdkit.scene.memory_estimate import LARGEST_ANEW
+from pbdkit.scene.memory_estimate import LARGEST_REPEATED
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.engine_choice import PATIENCE_S, obstacle
 from pbdkit.stepping.frame_following import FollowFrame
@@ -44,7 +44,7 @@ from pbdkit.stepping.kernel import Function
 from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.numba_engine.arrays import Arrays, constant_arrays, find_runs, state_arrays
 from pbdkit.stepping.numba_engine.emitter import LatticeWriter, write_module
-from pbdkit.stepping.numba_engine.plan import Passes, Plan, levels_of, load_blamed
+from pbdkit.stepping.numba_engine.plan import Passes, Plan, levels_of, load_plugin_kernel
 from pbdkit.stepping.numba_engine.sweeps import write_bond_pass, write_general
 from pbdkit.stepping.state import State, unmoved_state
 
@@ -187,7 +187,7 @@ def norm(table: Any) -> Any:
     return math.sqrt(squares)
 
 
-SETTLING_S = 6e-3
+EQUILIBRIUM_S = 6e-3
 """Estimated time of one equilibrium by numpy, in seconds."""
 PARTICLE_S = 1e-5
 """Estimated additional time for each particle, in seconds."""
@@ -197,7 +197,7 @@ EQUILIBRIA_IF_BREAKING = 2
 """Estimated number of equilibria in an increment if bonds only break."""
 
 
-def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
+def breaking_kernel_of(scene: Scene, tolerance: float, watch: Watch) -> BreakingKernel | None:
     """Return the kernel of a scene with a linear rule.
 
     Returns None if compiling would take longer than numpy, if nothing can be compiled, or if the
@@ -206,16 +206,16 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
     """
     solver = scene.experiment.solver.equilibrium
     direct = solver.method == "lu" or (
-        solver.method == "auto" and scene.raster.count <= LARGEST_ANEW
+        solver.method == "auto" and scene.raster.count <= LARGEST_REPEATED
     )
     if not (direct and _is_plain(scene)) or _seconds(scene) < PATIENCE_S or obstacle():
         return None
 
     try:
-        settler = Settler(scene, tolerance, watch)
+        kernel = BreakingKernel(scene, tolerance, watch)
     except PluginError:
         return None
-    return settler if settler.is_small else None
+    return kernel if kernel.is_small else None
 
 
 def _is_plain(scene: Scene) -> bool:
@@ -227,7 +227,7 @@ def _is_plain(scene: Scene) -> bool:
         (
             experiment.cuts,
             experiment.loads,
-            experiment.courses,
+            experiment.time_dependent,
             constants.by_bond,
             constants.by_particle,
         )
@@ -242,10 +242,10 @@ def _is_plain(scene: Scene) -> bool:
 def _seconds(scene: Scene) -> float:
     """Estimate the time by numpy in seconds."""
     renews = isinstance(scene.experiment.fracture, RenewsBonds)
-    settlings = scene.experiment.solver.equilibrium.increments * (
+    equilibria = scene.experiment.solver.equilibrium.increments * (
         EQUILIBRIA_IF_SOFTENING if renews else EQUILIBRIA_IF_BREAKING
     )
-    return settlings * (SETTLING_S + PARTICLE_S * scene.raster.count)
+    return equilibria * (EQUILIBRIUM_S + PARTICLE_S * scene.raster.count)
 
 
 Entry = tuple[Indices, Indices, Indices, Floats]
@@ -342,7 +342,7 @@ def _followed(scene: Scene, places: Indices) -> Iterator[tuple[Indices, Indices,
 
 UNFINISHED = 0
 """Result of a call: bonds may still change."""
-SETTLED = 1
+CONVERGED = 1
 """Result of a call: no bond changes any more."""
 FAILED = 2
 """Result of a call: the band matrix is not accurate enough. Followers are at the last
@@ -351,12 +351,12 @@ ROWS = "int64(0)", "int64(kind.shape[1])"
 """Arguments that stand for all rows of the lattice."""
 
 
-def write_settling(plan: Plan) -> tuple[str, list[str]]:
-    """Return the source of a module with ``run(arrays, step, tolerance, slack, most)``.
+def write_breaking_kernel(plan: Plan) -> tuple[str, list[str]]:
+    """Return the source of a module with ``run(arrays, step, tolerance, slack, max_changes)``.
 
-    The function computes at most `most` equilibria. Their error is at most the length `tolerance`,
-    and relative changes of state variables of at most `slack` are ignored. It returns the number of
-    changes of bonds, and the result.
+    The function computes at most `max_changes` equilibria. Their error is at most the length
+    `tolerance`, and relative changes of state variables of at most `slack` are ignored. It returns
+    the number of changes of bonds, and the result.
     """
     (level,) = plan.levels
     general = write_general(plan, level, None)
@@ -366,15 +366,15 @@ def write_settling(plan: Plan) -> tuple[str, list[str]]:
         frame.emit_for(LatticeWriter(plan, follow, Passes(None, [])), "flat_u")
     moves, derive = _write_moves(plan, follow, general), _write_derivative(plan, general)
     judge, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
-    update, settle = _write_known(plan, derive), _write_settle(plan, follow, moves)
-    run = Function(plan.shared, "run", "arrays", "step", "tolerance", "slack", "most")
-    run.add(0, "for n in range(most):", f"    {mark.call()}")
-    run.add(1, f"if not {update.call()} or not {settle.call('tolerance')}:")
+    update, equilibrate = _write_known(plan, derive), _write_equilibrate(plan, follow, moves)
+    run = Function(plan.shared, "run", "arrays", "step", "tolerance", "slack", "max_changes")
+    run.add(0, "for n in range(max_changes):", f"    {mark.call()}")
+    run.add(1, f"if not {update.call()} or not {equilibrate.call('tolerance')}:")
     run.add(2, f"return n, {FAILED}")
     run.add(1, judge.call(*ROWS, "0", "kind.shape[2]"), f"if not {changed.call('slack')}:")
-    run.add(2, f"return n, {SETTLED}")
-    run.add(0, f"return most, {UNFINISHED}")
-    functions = [general, moves, derive, judge, mark, changed, update, settle]
+    run.add(2, f"return n, {CONVERGED}")
+    run.add(0, f"return max_changes, {UNFINISHED}")
+    functions = [general, moves, derive, judge, mark, changed, update, equilibrate]
     return write_module(plan, [follow, *functions] if follow.lines else functions, run)
 
 
@@ -416,18 +416,18 @@ def _write_mark(plan: Plan) -> Function:
     """Write the function that marks followers if their bonds, or those of the cells around them,
     have changed since the last call."""
     out = Function(plan.shared, "mark")
-    differs = _bonds(plan, " or flat_bond#[home] != flat_known#[home]")
+    differs = _bonds(plan, " or flat_bond#[owner] != flat_known#[owner]")
     out.add(0, "cells = broken.size // len(ends)", "for n in range(len(ends)):")
-    out.add(1, "way = ends[n, 2] * kind.shape[2] + ends[n, 3]", "for e in range(cells):")
-    out.add(2, "home = n * cells + e")
-    out.add(2, f"if flat_broken[home] != flat_known_broken[home]{''.join(differs)}:")
-    out.add(3, "flat_known_broken[home] = flat_broken[home]")
-    out.add(3, *_bonds(plan, "flat_known#[home] = flat_bond#[home]"))
+    out.add(1, "offset = ends[n, 2] * kind.shape[2] + ends[n, 3]", "for e in range(cells):")
+    out.add(2, "owner = n * cells + e")
+    out.add(2, f"if flat_broken[owner] != flat_known_broken[owner]{''.join(differs)}:")
+    out.add(3, "flat_known_broken[owner] = flat_broken[owner]")
+    out.add(3, *_bonds(plan, "flat_known#[owner] = flat_bond#[owner]"))
     if plan.tears:
         out.add(3, "for m in range(mark_steps.shape[1]):")
         out.add(4, "end = ends[n, 0] * cells + e + mark_steps[n, m]")
     else:
-        out.add(3, "for end in (ends[n, 0] * cells + e, ends[n, 1] * cells + e + way):")
+        out.add(3, "for end in (ends[n, 0] * cells + e, ends[n, 1] * cells + e + offset):")
     out.add(4, "if 0 <= end < equation.size and equation[end] >= 0:")
     out.add(5, "stale[equation[end]] = 1")
     return out
@@ -437,16 +437,16 @@ def _write_changed(plan: Plan) -> Function:
     """Write the function that returns whether bonds broke or changed; if not, it restores the state
     variables of the bonds."""
     out = Function(plan.shared, "changed", "slack")
-    numbers = [n for n in plan.levels[-1].seen.bond if n.home is Home.BOND]
+    numbers = [n for n in plan.levels[-1].seen.bond if n.owner is Owner.BOND]
     changing = [str(n) for n, number in enumerate(numbers) if number.changes]
-    out.add(0, "for home in range(broken.size):")
-    out.add(1, "if flat_broken[home] >= 0 and flat_known_broken[home] < 0:", "    return True")
+    out.add(0, "for owner in range(broken.size):")
+    out.add(1, "if flat_broken[owner] >= 0 and flat_known_broken[owner] < 0:", "    return True")
     for n in changing:
-        out.add(1, f"new, old = flat_bond{n}[home], flat_known{n}[home]")
+        out.add(1, f"new, old = flat_bond{n}[owner], flat_known{n}[owner]")
         out.add(1, "if abs(new - old) > slack * max(1.0, abs(old)):", "    return True")
     if changing:
-        out.add(0, "for home in range(broken.size):")
-        out.add(1, *(f"flat_bond{n}[home] = flat_known{n}[home]" for n in changing))
+        out.add(0, "for owner in range(broken.size):")
+        out.add(1, *(f"flat_bond{n}[owner] = flat_known{n}[owner]" for n in changing))
     out.add(0, "return False")
     return out
 
@@ -463,21 +463,21 @@ def _write_known(plan: Plan, derive: Function) -> Function:
     return out
 
 
-def _write_settle(plan: Plan, follow: Function, moves: Function) -> Function:
+def _write_equilibrate(plan: Plan, follow: Function, moves: Function) -> Function:
     """Write the function that moves the followers to equilibrium, and returns whether it
     succeeded."""
-    out = Function(plan.shared, "settle", "tolerance")
+    out = Function(plan.shared, "equilibrate", "tolerance")
     at = plan.each("flat_u_@[place[e]]")
     out.add(0, "factors, before = (diagonal, inverse, randoms), 0.0", "for e in range(place.size):")
     out.add(1, *(f"kept[e, {a}] = {value}" for a, value in enumerate(at)))
     out.add(0, "for n in range(corrections[0]):", f"    {moves.call()}")
     out.add(1, "correct(band, factors, facts, residual, correction)")
-    out.add(1, "size, left, ways = 0.0, norm(residual), 0.0")
+    out.add(1, "size, left, bound = 0.0, norm(residual), 0.0")
     out.add(1, *plan.each("size = max(size, largest(u_@.reshape(-1, 1)))"))
     out.add(1, "unsure = facts[2] * facts[5] * size", "floor = unsure * residual.size**0.5")
     out.add(1, "for a in range(correction.shape[1]):")
-    out.add(2, "ways += (largest(correction[:, a : a + 1]) + facts[1] * unsure) ** 2")
-    out.add(1, "if n > 0 and ways <= tolerance**2:", "    return True")
+    out.add(2, "bound += (largest(correction[:, a : a + 1]) + facts[1] * unsure) ** 2")
+    out.add(1, "if n > 0 and bound <= tolerance**2:", "    return True")
     out.add(1, "before = left if n == 0 else before")
     out.add(1, "allowed = left if n == 0 else max(facts[6] * before + floor, 1e3 * floor)")
     out.add(1, "if not left <= allowed:")
@@ -492,7 +492,7 @@ def _write_settle(plan: Plan, follow: Function, moves: Function) -> Function:
 
 FUNCTIONS = (refactor, correct, largest, norm)
 """Functions that are part of every kernel."""
-MOST_CORRECTIONS = 8
+MAX_CORRECTIONS = 8
 """Maximum number of corrections until an equilibrium is reached."""
 LARGEST_BAND = 10_000_000
 """Largest number of entries of a band: 80 MB."""
@@ -501,7 +501,7 @@ OPERATIONS_A_CALL = 100_000_000
 a second."""
 
 
-class Settler:
+class BreakingKernel:
     """Kernel for a linear rule, with its band matrix, which is all that is stored between two
     increments. All bits of the matrix are determined by the bonds, so that a resumed run has the
     same results.
@@ -534,18 +534,18 @@ class Settler:
         start = unmoved_state(scene, scene.raster.shape[1:])
         self._take_roles(scene.experiment.steps, start)
         shared = ("step", *self._named(start))
-        source, self._names = write_settling(replace(plan, shared=shared))
+        source, self._names = write_breaking_kernel(replace(plan, shared=shared))
         functions = {function.__name__: function for function in FUNCTIONS}
-        self._run = load_blamed(levels, source, self._given(start, 0.0, 0), functions)
+        self._run = load_plugin_kernel(levels, source, self._given(start, 0.0, 0), functions)
 
     @property
     def is_small(self) -> bool:
         """True if the band matrix of the body is small enough to be factorised."""
         return bool(self._of_roles["band"].size <= LARGEST_BAND)
 
-    def settle(self, state: State, moment: float, most: int) -> tuple[bool, int]:
+    def equilibrate(self, state: State, moment: float, max_changes: int) -> tuple[bool, int]:
         """Move a state, in place, from an equilibrium to the equilibrium at a moment, and update
-        bonds, until no bond changes or `most` equilibria have been computed.
+        bonds, until no bond changes or `max_changes` equilibria have been computed.
 
         Returns whether no bond changes any more, and the number of changes of bonds. If the band
         matrix is not accurate enough, the state is that of the last equilibrium.
@@ -556,15 +556,15 @@ class Settler:
         place(state.u, placed)
         self._take_roles(math.ceil(moment), state)
         changes, became = 0, UNFINISHED
-        while became == UNFINISHED and changes < most:
+        while became == UNFINISHED and changes < max_changes:
             self._watch.begin("equilibria and broken bonds")
-            a_call = max(1, min(most - changes, OPERATIONS_A_CALL // self._work))
-            with blaming(self._scene.experiment.rule, f"at step {moment:.6g}"):
+            a_call = max(1, min(max_changes - changes, OPERATIONS_A_CALL // self._work))
+            with errors_attributed_to(self._scene.experiment.rule, f"at step {moment:.6g}"):
                 breaks, became = self._run(*self._given(state, moment, a_call))
             changes += breaks
         state.step = math.floor(moment)
         state.previous[...] = state.u
-        return became == SETTLED, changes
+        return became == CONVERGED, changes
 
     def _take_roles(self, step: int, state: State) -> None:
         """Prepare the arrays for the roles of a step, if they have changed."""
@@ -612,7 +612,7 @@ class Settler:
             "inverse": np.zeros(count * axes),
             "randoms": signs,
             "facts": np.array(facts, float),
-            "corrections": np.array([MOST_CORRECTIONS + 1]),
+            "corrections": np.array([MAX_CORRECTIONS + 1]),
             **{name: np.zeros((count, axes)) for name in ("residual", "correction", "kept")},
             **{name: np.zeros(raster.shape) for name in planes},
         }
@@ -622,7 +622,7 @@ class Settler:
         nobody = np.zeros_like(state.u)
         return self._constant | state_arrays(self._plan, state.u, nobody, state) | self._of_roles
 
-    def _given(self, state: State, moment: float, most: int) -> tuple[Any, ...]:
+    def _given(self, state: State, moment: float, max_changes: int) -> tuple[Any, ...]:
         arrays = self._named(state)
         values = tuple(arrays[name] for name in self._names)
-        return values, math.ceil(moment), self._tolerance, self._share, most
+        return values, math.ceil(moment), self._tolerance, self._share, max_changes

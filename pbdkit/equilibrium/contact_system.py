@@ -30,9 +30,9 @@ from pbdkit.array_types import Floats, Indices
 from pbdkit.equilibrium.linear_solver import Coordinates
 from pbdkit.equilibrium.sparse import (
     ConstrainedSubsystem,
-    DriftingError,
     SingularSubsystem,
     Subsystem,
+    UnbalancedLoadError,
 )
 from pbdkit.equilibrium.system import PUSH, Moves, NoEquilibriumError, System
 from pbdkit.linear.block_matrix import connected, one_minus
@@ -110,8 +110,8 @@ class ContactSystem(System):
     def bound_kind(self) -> str:
         """Kind of the bound: computed from the inverse matrices or, if the inverse of some part is
         not available, from a solution."""
-        ways = {part.bound_kind for _, part in self._parts}
-        return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
+        kinds = {part.bound_kind for _, part in self._parts}
+        return next((kind for kind in ("solution", "inverse") if kind in kinds), "nothing to solve")
 
     @property
     def iterations(self) -> int:
@@ -134,7 +134,11 @@ class ContactSystem(System):
         return planes
 
     def solve(
-        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+        self,
+        moves: Floats,
+        tolerance: float,
+        invariant_state: State | None = None,
+        rounding: float = 0.0,
     ) -> Floats:
         """Return the solution, computed part by part."""
         r = self._table(moves)
@@ -142,7 +146,7 @@ class ContactSystem(System):
         for members, part in self._parts:
             try:
                 x[members] = part.solve(r[members], None, rounding)
-            except DriftingError:
+            except UnbalancedLoadError:
                 raise NoEquilibriumError(
                     f"there is no equilibrium: a part of {self._named(members)} is loaded, but not "
                     f"constrained by leaders or obstacles; {REMEDY}",
@@ -210,15 +214,15 @@ class ContactSystem(System):
         """Return the moves of followers in contact, zero elsewhere."""
         return self._planes(np.where(self._on_outlines, self._table(moves), 0.0))
 
-    def solve_loose(self, moves: Floats, most: float) -> Floats:
-        """Return a correction of at most `most`, computed with weak springs on all parts. It moves
-        floating parts towards obstacles."""
+    def solve_loose(self, moves: Floats, max_move: float) -> Floats:
+        """Return a correction of at most `max_move`, computed with weak springs on all parts. It
+        moves floating parts towards obstacles."""
         matrix = self._matrix + WEAK * _one(self._matrix)
         coordinates = Coordinates(2, self._X, self._led)
         correction = ConstrainedSubsystem(matrix, "lu", coordinates, self._watch).solve(
             self._table(moves)
         )
-        correction *= min(1.0, most / np.abs(correction).max())
+        correction *= min(1.0, max_move / np.abs(correction).max())
         return self._planes(correction)
 
     @property
@@ -253,7 +257,7 @@ def hold(
     """
     y, codes = contact.positions(u, place), contact.led(math.ceil(moment))
     roles = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
-    x = y + contact.ways(u, place, moment)
+    x = y + contact.corrections(u, place, moment)
     C = contact.compliance_at(place)
     S = np.array([[C[2], -C[1]], [-C[1], C[0]]])
     count, faces = np.zeros(len(place), np.intp), np.full((len(place), 2), NO_FACE)
@@ -273,13 +277,13 @@ def hold(
     return faces, np.where(free.T[:, :, None], turned, 0.0)
 
 
-def _along(face: Face, S: Floats, way: Floats) -> Floats:
+def _along(face: Face, S: Floats, displacement: Floats) -> Floats:
     """Return T of particles on a face, (follower, axis, axis)."""
     n = face.normal
     t = np.stack([-n[1], n[0]])
     along = np.einsum("abe,be->ae", S, t)
     straight = (t * along).sum(axis=0)
-    bent = straight - face.curvature * np.einsum("ae,abe,be->e", n, S, way)
+    bent = straight - face.curvature * np.einsum("ae,abe,be->e", n, S, displacement)
     bent = np.where(bent > STRAIGHTEST * straight, bent, straight)
     return np.asarray(np.einsum("ae,be->eab", t, along / bent))
 

@@ -15,23 +15,23 @@ from pbdkit.equilibrium.system import (
     ALL,
     Moves,
     Rows,
-    StuckError,
+    StagnationError,
     System,
     one_thread,
     random_displacements,
     solved,
 )
 from pbdkit.errors import ExperimentError
-from pbdkit.model.solver import Settle
+from pbdkit.model.solver import SteadyStateCriterion
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaking import Fracturing
-from pbdkit.stepping.divergence import way_of
+from pbdkit.stepping.divergence import largest_offset
 from pbdkit.stepping.leaders import is_cut_short
-from pbdkit.stepping.program import bends_of, last_event
+from pbdkit.stepping.program import breakpoints_of, last_event
 from pbdkit.stepping.state import State
 
-WAYS = {
+BOUND_KINDS = {
     "inverse": "the solution for the residual and the inverse for its rounding error",
     "solution": "the solution for the residual",
     "iteration": "further iterations and their rate of convergence",
@@ -47,7 +47,7 @@ CORRECTION = "correction, "
 
 
 @dataclass(frozen=True)
-class Certificate:
+class ErrorBound:
     """A posteriori bound on the error of an equilibrium.
 
     Parameters
@@ -91,16 +91,16 @@ class Certificate:
         return asdict(self)
 
     def __str__(self) -> str:
-        way = WAYS[self.bound.removeprefix(CORRECTION)]
+        description = BOUND_KINDS[self.bound.removeprefix(CORRECTION)]
         if self.bound.startswith(CORRECTION):
-            way = f"the correction to it; the error after it is bounded by {way}"
+            description = f"the correction to it; the error after it is bounded by {description}"
         return (
             f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of the largest "
-            f"prescribed displacement), by {way}"
+            f"prescribed displacement), by {description}"
         )
 
 
-UNKNOWN = Certificate(
+UNKNOWN = ErrorBound(
     method="nothing to solve",
     iterations=0,
     inner_iterations=0,
@@ -117,9 +117,9 @@ class UnconvergedError(Exception):
     """The best state found is not an equilibrium. The exception contains the error bound of this
     state."""
 
-    def __init__(self, reason: str, certificate: Certificate = UNKNOWN) -> None:
+    def __init__(self, reason: str, error_bound: ErrorBound = UNKNOWN) -> None:
         super().__init__(reason)
-        self.certificate = certificate
+        self.error_bound = error_bound
 
 
 class RoundingError(UnconvergedError):
@@ -130,8 +130,8 @@ def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
     """Return the largest displacement that leaders or the initial state prescribe. If all are zero,
     return the largest displacement caused by loads; without loads, the length of the shortest
     bond."""
-    ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
-    prescribed = rows.communicator.largest(max([rows.max_norm(start.u), *ways]))
+    offsets = [largest_offset(leading, scene.experiment.steps) for leading in scene.driven]
+    prescribed = rows.communicator.largest(max([rows.max_norm(start.u), *offsets]))
     return prescribed or _displacement_under_loads(scene, start, rows) or spacing_of(scene)
 
 
@@ -139,19 +139,19 @@ def _displacement_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
     """Return the largest displacement that changes of the loads cause, computed by the
     linearisation at rest; 0 if nothing holds the body against the loads. If obstacles prevent every
     displacement, return the largest move that the loads cause without obstacles."""
-    steps, moves, ways = scene.experiment.steps, Moves(scene), [0.0]
+    steps, moves, displacements = scene.experiment.steps, Moves(scene), [0.0]
     rest = replace(rest, u=np.zeros(rest.u.shape))
-    moments = {*scene.loads.changes(steps), *bends_of(scene)} if scene.loads else ()
+    moments = {*scene.loads.changes(steps), *breakpoints_of(scene)} if scene.loads else ()
     pushes = [moves.at(rest, moment) for moment in sorted(moments)]
     if scene.barriers:
-        ways += [rows.max_norm(moves.free(rest, moment)) for moment in moments]
+        displacements += [rows.max_norm(moves.free(rest, moment)) for moment in moments]
     if rows.communicator.any(any(push.any() for push in pushes)):
-        with suppress(ExperimentError, StuckError), one_thread():
+        with suppress(ExperimentError, StagnationError), one_thread():
             system = linearised(scene, rest, steps, "auto", Watch(), rows=rows)
             for push in pushes:
                 solution = solved(system, push, spacing_of(scene), rows)
-                ways.append(rows.max_norm(solution))
-    return max(ways)
+                displacements.append(rows.max_norm(solution))
+    return max(displacements)
 
 
 def spacing_of(scene: Scene) -> float:
@@ -186,11 +186,11 @@ class PredictedEquilibrium:
     `obstacle` is the reason."""
 
     u: Floats
-    certificate: Certificate
+    error_bound: ErrorBound
     obstacle: str
 
 
-class ErrorBound:
+class EquilibriumPredictor:
     """Prediction of the equilibrium from states of a scene with the roles of its last step.
 
     The correction c, with A c = move, leads from u to the equilibrium. Its error follows from the
@@ -209,23 +209,23 @@ class ErrorBound:
         self._at_rest: System | None = None
         self._broken = 0
 
-    def from_(self, state: State) -> PredictedEquilibrium:
+    def predict(self, state: State) -> PredictedEquilibrium:
         """Predict the equilibrium from the end of a step; the state is not changed.
 
         The distance is infinite if no bound is known: for bodies under a load that nothing
         balances, and for floating parts under rules that are not linear.
         """
         with one_thread():
-            return self._from(state)
+            return self._predict(state)
 
-    def _from(self, state: State) -> PredictedEquilibrium:
+    def _predict(self, state: State) -> PredictedEquilibrium:
         u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
         start = replace(state, u=u, previous=previous)
         if not self._scene.barriers:
             at_rest = self._system_at_rest(start)
             if self._is_linear(start, at_rest):
-                return self._predict(start, at_rest)
-        return self._predict(start, self._linearised(start, u), anew=True)
+                return self._predict_by(start, at_rest)
+        return self._predict_by(start, self._linearised(start, u), relinearised=True)
 
     def _system_at_rest(self, state: State) -> System:
         system, broken = self._at_rest, broken_bonds(state)
@@ -238,26 +238,28 @@ class ErrorBound:
         at, steps = replace(state, u=u), self._scene.experiment.steps
         return linearised(self._scene, at, steps, "auto", self._watch)
 
-    def _predict(self, state: State, system: System, *, anew: bool = False) -> PredictedEquilibrium:
-        """Predict by the system at rest or, with `anew`, by a system that is linearised at the
-        state."""
+    def _predict_by(
+        self, state: State, system: System, *, relinearised: bool = False
+    ) -> PredictedEquilibrium:
+        """Predict by the system at rest or, with `relinearised`, by a system that is linearised at
+        the state."""
         moves = self._moves.at(state, self._scene.experiment.steps)
         ahead, distance = state.u.copy(), math.inf
-        correction, obstacle = self._correction(state, system, moves, anew)
+        correction, obstacle = self._correction(state, system, moves, relinearised)
         if correction is not None:
             ahead += correction
             remainder = self._moves.at(replace(state, u=ahead), self._scene.experiment.steps)
             bound = system.distance(remainder, self._moves.rounding(ahead)) * (
-                FIRST_ORDER if anew else 1.0
+                FIRST_ORDER if relinearised else 1.0
             )
             distance = float(np.sqrt((correction**2).sum(axis=0)).max(initial=0.0)) + bound
             limit = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + self._moves.rounding(
                 ahead
             )
-            if anew and not np.abs(remainder).max(initial=0.0) <= limit:
+            if relinearised and not np.abs(remainder).max(initial=0.0) <= limit:
                 distance, obstacle = math.inf, TOO_NONLINEAR
         distance = math.inf if math.isnan(distance) else distance
-        certificate = Certificate(
+        error_bound = ErrorBound(
             method=system.methods,
             iterations=1,
             inner_iterations=system.iterations,
@@ -265,16 +267,16 @@ class ErrorBound:
             distance=distance,
             share=distance / self._scale,
             bound=CORRECTION + system.bound_kind,
-            linearised=anew,
+            linearised=relinearised,
         )
-        return PredictedEquilibrium(ahead, certificate, obstacle)
+        return PredictedEquilibrium(ahead, error_bound, obstacle)
 
     def _correction(
-        self, state: State, system: System, moves: Floats, anew: bool
+        self, state: State, system: System, moves: Floats, relinearised: bool
     ) -> tuple[Floats | None, str]:
         """Return the correction, or None with the reason why no equilibrium can be predicted."""
         try:
-            if anew:
+            if relinearised:
                 system.refuse_moving_floats(moves, self._moves.rounding(state.u))
             rounding = system.amplification * self._moves.rounding(state.u)
             return system.solve(moves, ACCURACY * self._scale, state, rounding), ""
@@ -397,69 +399,71 @@ class SteadyStateMonitor:
     added to the distance.
     """
 
-    def __init__(self, scene: Scene, settle: Settle, start: State, watch: Watch) -> None:
+    def __init__(
+        self, scene: Scene, criterion: SteadyStateCriterion, start: State, watch: Watch
+    ) -> None:
         self._scale = scale_of(scene, start)
-        self._tolerance = settle.tolerance * self._scale
+        self._tolerance = criterion.tolerance * self._scale
         steps, leading = scene.experiment.steps, scene.driven
         ends = not any(is_cut_short(group, steps) for group in leading)
         first = max(last_event(scene), start.step + 1) if ends else NEVER
         self.pace = Pace(first, self._tolerance, first - 1)
-        self._foresight = ErrorBound(scene, self._scale, watch)
+        self._predictor = EquilibriumPredictor(scene, self._scale, watch)
         self._fracturing = Fracturing.of(scene)
-        self._carrying = _carrying(scene)
+        self._remaining_motion = _remaining_motion(scene)
         unended = "leaders do not come to rest before its end"
         self.obstacle = "there are too few steps" if ends else unended
         """Reason why the state at the last check was not a steady state."""
 
-    def look(self, state: State) -> Certificate | None:
+    def look(self, state: State) -> ErrorBound | None:
         """Return the error bound if the end of a step is a steady state.
 
         Raises StoppedError if the user interrupts. If there is no bound or the user interrupts, the
         schedule is not changed, so that repeating the check has the same result.
         """
-        pace, certificate = replace(self.pace), None
+        pace, error_bound = replace(self.pace), None
         try:
-            certificate = self._look(state)
+            error_bound = self._look(state)
         except StoppedError:
             self.pace = pace
             raise
-        if certificate:
+        if error_bound:
             self.pace = pace
-        return certificate
+        return error_bound
 
-    def _look(self, state: State) -> Certificate | None:
+    def _look(self, state: State) -> ErrorBound | None:
         with np.errstate(all="ignore"):
-            way = (state.u - state.previous).ravel()
-            longest, size = float(np.abs(way).max()), float(np.linalg.norm(way))
+            move = (state.u - state.previous).ravel()
+            longest, size = float(np.abs(move).max()), float(np.linalg.norm(move))
         if not self.pace.is_near(state.step, longest, size):
             self.obstacle = f"in step {state.step} particles still moved by up to {longest:.2g}"
             return None
-        outlook = self._foresight.from_(state)
-        distance = outlook.certificate.distance + self._carrying * longest
-        self.obstacle = self._obstacle(state, outlook, distance)
+        prediction = self._predictor.predict(state)
+        distance = prediction.error_bound.distance + self._remaining_motion * longest
+        self.obstacle = self._obstacle(state, prediction, distance)
         if not self.obstacle:
             share = distance / self._scale
-            return replace(outlook.certificate, distance=distance, share=share)
+            return replace(prediction.error_bound, distance=distance, share=share)
         self.pace.note_distance(state.step, distance)
         return None
 
-    def _obstacle(self, state: State, outlook: PredictedEquilibrium, distance: float) -> str:
+    def _obstacle(self, state: State, prediction: PredictedEquilibrium, distance: float) -> str:
         at = f"at step {state.step}"
         if not math.isfinite(distance):
-            return f"{at} {outlook.obstacle or 'the distance from equilibrium has no bound'}"
+            return f"{at} {prediction.obstacle or 'the distance from equilibrium has no bound'}"
         if distance > self._tolerance:
             return (
                 f"{at} the distance from equilibrium, {distance:.2g}, exceeds {self._tolerance:.2g}"
             )
         ahead = 2.0 * distance  # Each end of a bond can move by the distance.
-        if self._fracturing and self._fracturing.may_break(outlook.u, state, ahead):
+        if self._fracturing and self._fracturing.may_break(prediction.u, state, ahead):
             return f"{at} a bond may break within the remaining distance of {distance:.2g}"
         return ""
 
 
-def _carrying(scene: Scene) -> float:
+def _remaining_motion(scene: Scene) -> float:
     """Return a bound on the displacement after the last step, divided by the displacement in that
     step. For the momentum b it is |b| / (1 - |b|), because each further displacement is b times the
     previous one. The frame delay is added."""
     memory = abs(scene.experiment.stepping.memory)
-    return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + scene.lag
+    return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + scene.frame_delay

@@ -21,11 +21,11 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
-KEPT = globals().get("KEPT", False)
+CACHED = globals().get("CACHED", False)
 """True if numba caches the compiled functions on disk."""
 
 
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def runs(code, first, begin, end, lone, place, which):
     """Fill the lists of runs and lone places of a grid, and return how many there are of each.
     Lists that are too short are not filled."""
@@ -51,7 +51,7 @@ def runs(code, first, begin, end, lone, place, which):
     return r, s
 
 
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def coarse_kinds(kind, halved, out):
     """Compute the kinds of the next grid. A place of the next grid that lies outside the body is
     free if values at free places of this grid are interpolated from it, unless leaders are
@@ -72,7 +72,7 @@ def coarse_kinds(kind, halved, out):
             out[n, m] = place_kind
 
 
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def coarse_codes(code, kind, halved, out):
     """Compute the codes of the next grid, and return the largest. The code is -1 where no particle
     is free, and 0 where all stencils of this grid around the place are the most frequent one. All
@@ -97,7 +97,7 @@ def coarse_codes(code, kind, halved, out):
     return count
 
 
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def beside(q, half):
     """Return the two places of the next grid between which a place of this grid lies, and the
     weight of the first of them in the interpolation. The place of this grid is q places away from
@@ -108,7 +108,7 @@ def beside(q, half):
     return (q - 1) // 2 if q % 2 else q // 2, (q + 1) // 2, 0.5 if q % 2 else 1.0
 
 
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def galerkin(code, stencils, coarse, halved, out):
     """Compute out[k], the stencil of Pᵀ K P at the place of the next grid that has the code k."""
     a1, b1 = halved
@@ -137,7 +137,7 @@ def galerkin(code, stencils, coarse, halved, out):
                                         out[k, 3 * ta + tb + 4, e] += w * stencils[code[i, j], s, e]
 
 
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def asymmetry(code, stencils):
     """Return the largest entry of K - Kᵀ. Of the places with the most frequent stencil, one pair of
     neighbours in each direction is sufficient."""
@@ -160,7 +160,7 @@ def asymmetry(code, stencils):
     return worst
 
 
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def symmetrise(code, stencils):
     """Replace K by (K + Kᵀ) / 2 at places with separate stencils."""
     for i in range(1, code.shape[0] - 1):
@@ -175,7 +175,7 @@ def symmetrise(code, stencils):
                     stencils[number, s, e] = stencils[neighbour, 8 - s, t] = mean
 
 
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def balance(code, stencils, factor):
     """Compute the row factors that make K as symmetric as possible. Places that already have a
     factor, which is not 0, keep it; from them the computation spreads to their neighbours, until no
@@ -197,11 +197,11 @@ def balance(code, stencils, factor):
                     a, b = i + s // 3 - 1, j + s % 3 - 1
                     if s != 4 and code[a, b] >= 0 and factor[a, b] > 0.0:
                         for e in range(4):
-                            mine = stencils[code[i, j], s, e]
+                            entry = stencils[code[i, j], s, e]
                             both += (
-                                mine * factor[a, b] * stencils[code[a, b], 8 - s, (0, 2, 1, 3)[e]]
+                                entry * factor[a, b] * stencils[code[a, b], 8 - s, (0, 2, 1, 3)[e]]
                             )
-                            square += mine * mine
+                            square += entry * entry
                 if square > 0.0 and both > 0.0:
                     factor[i, j] = both / square
                     progress += 1
@@ -227,7 +227,7 @@ def run_coarsening():
     balance(code, stencils, np.zeros((8, 8)))
 
 
-FAST = {"error_model": "numpy", "nogil": True, "cache": KEPT, "fastmath": True}
+FAST = {"error_model": "numpy", "nogil": True, "cache": CACHED, "fastmath": True}
 """Options of numba for loops over fields."""
 
 
@@ -514,11 +514,11 @@ def whole_residual(grid, i, b, x, out):
 
 
 @njit(**FAST)
-def add_rows(sums, row, share, anew):
-    """Add share · row to `sums` for both axes or, with `anew`, replace `sums` by it."""
+def add_rows(sums, row, share, overwrite):
+    """Add share · row to `sums` for both axes or, with `overwrite`, replace `sums` by it."""
     for v in range(2):
         to, of = sums[v], row[v]
-        if anew:
+        if overwrite:
             for j in range(of.size):
                 to[j] = share * of[j]
         else:

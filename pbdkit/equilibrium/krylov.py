@@ -202,10 +202,10 @@ class BiconjugateGradients(LatticeKrylov):
             self.product(r_smooth, t)
             square = self.dot(t, t)
             weight = self.dot(t, r) / square if square else 0.0
-            way = step * p_smooth + weight * r_smooth
-            iteration.x += way
+            correction = step * p_smooth + weight * r_smooth
+            iteration.x += correction
             r -= weight * t
-            iteration.jumps.append(self._rows.max_norm(way))
+            iteration.jumps.append(self._rows.max_norm(correction))
             if is_done(iteration) or not weight:
                 break
             previous, rho = rho, self.dot(shadow, r)

@@ -30,10 +30,10 @@ from pbdkit.equilibrium.krylov import (
     best_of,
 )
 from pbdkit.equilibrium.multigrid import (
-    FloatingError,
     Multigrid,
     PartedGrids,
     StencilGrid,
+    UnconstrainedMotionError,
     grids_of,
 )
 from pbdkit.equilibrium.stencil_matrix import (
@@ -57,7 +57,7 @@ from pbdkit.equilibrium.system import (
     IndefiniteError,
     Moves,
     Rows,
-    StuckError,
+    StagnationError,
     System,
     random_displacements,
 )
@@ -160,7 +160,7 @@ class LatticeSystem(System):
     """Linear system solved by multigrid on stencils; `has_leaders` is true if the matrix contains
     the coupling of followers to leaders.
 
-    Raises FloatingError if leaders do not hold the whole body.
+    Raises UnconstrainedMotionError if leaders do not hold the whole body.
     """
 
     def __init__(
@@ -202,14 +202,18 @@ class LatticeSystem(System):
         return self._iterations
 
     def solve(
-        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+        self,
+        moves: Floats,
+        tolerance: float,
+        invariant_state: State | None = None,
+        rounding: float = 0.0,
     ) -> Floats:
-        """Iterate until the estimated distance is within the tolerance. `owed` is not used, since
-        the whole body is held."""
+        """Iterate until the estimated distance is within the tolerance. `invariant_state` is not
+        used, since the whole body is held."""
         self._watch.begin("solving")
         iteration = self._iterate(self._pull(moves), lambda d: d.ahead <= tolerance)
         if iteration.jumps and not iteration.ahead <= tolerance:
-            raise StuckError
+            raise StagnationError
         return self._planes(iteration.x)
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
@@ -256,7 +260,7 @@ class LatticeSystem(System):
 
         iteration = self._iterate(b, is_near)
         if iteration.jumps and not is_near(iteration):
-            raise StuckError
+            raise StagnationError
         return np.asarray(start + iteration.x)
 
     def slowest(self) -> SlowMode:
@@ -293,7 +297,7 @@ class LatticeSystem(System):
             iteration = self._iterate(r, lambda d: d.ahead <= NEAR * d.jumps[0])
             remainder = SAFETY * iteration.ahead if iteration.jumps else 0.0
             if not math.isfinite(remainder):
-                raise StuckError
+                raise StagnationError
         return remainder, math.sqrt(self._rows.max_norm((iteration.x * iteration.x).sum(axis=0)))
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
@@ -331,7 +335,7 @@ class LatticeSystem(System):
             ):
                 raise IndefiniteError
             if not math.isfinite(iteration.residual_energy):
-                raise StuckError
+                raise StagnationError
             if len(iteration.steps) > 1:
                 self._smallest = min(self._smallest, iteration.smallest())
             if self._smallest <= 0.0:
@@ -404,7 +408,7 @@ def lattice_system(
         # Couplings of frame points to leaders are not part of the stencils.
         has_leaders = not (moves or scene.frame)
         system = LatticeSystem(matrix, is_symmetric, state.u.shape, watch, has_leaders, rows)
-    except FloatingError:
+    except UnconstrainedMotionError:
         return None
     if not system.may_be_stable:
         if state.u.any():

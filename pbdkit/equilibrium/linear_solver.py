@@ -219,7 +219,7 @@ class PreconditionedKrylov(LinearSolver):
         self._matrix, self._symmetric, self._watch = matrix, symmetric, watch
         self._grids = grids
         self._cycle = grids(matrix) if grids else np.copy
-        self._most = MAX_ITERATIONS + (0 if grids else 20 * math.isqrt(matrix.shape[0]))
+        self._maxiter = MAX_ITERATIONS + (0 if grids else 20 * math.isqrt(matrix.shape[0]))
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
         """Iterate until the residual is small enough or the maximum number of iterations is
@@ -247,7 +247,7 @@ class PreconditionedKrylov(LinearSolver):
         # The preconditioner may be invalid for A; the residual is checked afterwards.
         with np.errstate(all="ignore"):
             if self._symmetric:
-                x, _ = cg(self._matrix, b, maxiter=self._most, **how)
+                x, _ = cg(self._matrix, b, maxiter=self._maxiter, **how)
             else:
                 how |= {"callback": report, "callback_type": "pr_norm", "restart": 30}
                 x, _ = gmres(self._matrix, b, maxiter=MAX_ITERATIONS // 30, **how)

@@ -19,7 +19,7 @@ from pbdkit.equilibrium.system import (
     IndefiniteError,
     Moves,
     Rows,
-    StuckError,
+    StagnationError,
     System,
     one_thread,
     random_displacements,
@@ -98,10 +98,16 @@ class _Replaceable(System):
         self._at_rest = at_rest
 
     def solve(
-        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+        self,
+        moves: Floats,
+        tolerance: float,
+        invariant_state: State | None = None,
+        rounding: float = 0.0,
     ) -> Floats:
         """Return the solution of the first system that converges."""
-        return self._first_able(lambda system: system.solve(moves, tolerance, owed, rounding))
+        return self._first_able(
+            lambda system: system.solve(moves, tolerance, invariant_state, rounding)
+        )
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
         """Return the solution of the first system that converges."""
@@ -134,7 +140,7 @@ class _Replaceable(System):
     def _first_able(self, does: Callable[[System], T]) -> T:
         try:
             return does(self._system)
-        except StuckError as error:
+        except StagnationError as error:
             if isinstance(error, IndefiniteError) and not self._at_rest:
                 raise
             self._past += self._system.iterations
@@ -147,9 +153,9 @@ class _Replaceable(System):
         return self._system.methods
 
     @property
-    def is_stuck(self) -> bool:
+    def has_stagnated(self) -> bool:
         """True if the current system makes no progress."""
-        return self._system.is_stuck
+        return self._system.has_stagnated
 
     @property
     def bound_kind(self) -> str:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pbdkit.equilibrium.error_bound import (
-    Certificate,
+    ErrorBound,
     RoundingError,
     UnconvergedError,
     broken_bonds,
@@ -28,14 +28,14 @@ from pbdkit.equilibrium.newton import Finder, follow_contact
 from pbdkit.equilibrium.system import ALL, NoEquilibriumError, Rows
 from pbdkit.errors import ExperimentError
 from pbdkit.linear.operator import step_operator
-from pbdkit.linear.spectrum import TooDearError, excess, spectrum
+from pbdkit.linear.spectrum import TooExpensiveError, excess, spectrum
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaking import Fracturing
-from pbdkit.stepping.divergence import Guard, most_of, size_of, way_of
+from pbdkit.stepping.divergence import Guard, largest_displacement, largest_offset, size_of
 from pbdkit.stepping.engine_choice import chosen_engine, obstacle
 from pbdkit.stepping.leaders import place, prescribe
-from pbdkit.stepping.program import bends_of, last_event
+from pbdkit.stepping.program import breakpoints_of, last_event
 from pbdkit.stepping.state import State, cut_bonds, initial_state
 
 
@@ -64,7 +64,12 @@ def events(scene: Scene) -> list[int]:
     load. Between two successive ones each leader moves according to a single formula, no role
     changes, no bond is cut, and loads and parameters are linear functions of the step."""
     steps, last = scene.experiment.steps, last_event(scene)
-    steps_of_events = {0, last, *bends_of(scene), *(cut.at - 1 for cut in scene.experiment.cuts)}
+    steps_of_events = {
+        0,
+        last,
+        *breakpoints_of(scene),
+        *(cut.at - 1 for cut in scene.experiment.cuts),
+    }
     for change in scene.loads.changes(steps) if scene.loads else ():
         steps_of_events |= {change - 1, change}
     for leading in scene.driven:
@@ -85,12 +90,12 @@ def moments(scene: Scene, count: int) -> list[float]:
     ends = events(scene)
     intervals = list(pairwise(ends)) or [(0, ends[-1])]
     shares, ends_of_increments = (
-        _in_parts(count, [_way(scene, *i) for i in intervals]),
+        _in_parts(count, [_path_length(scene, *i) for i in intervals]),
         list[float](),
     )
-    ways = [course.way for course in scene.experiment.courses.values()]
-    for way in [*ways, *([scene.loads.way] if scene.loads else [])]:
-        shares = list(map(max, shares, _in_parts(count, [way(*i) for i in intervals])))
+    measures = [number.relative_change for number in scene.experiment.time_dependent.values()]
+    for measure in [*measures, *([scene.loads.relative_change] if scene.loads else [])]:
+        shares = list(map(max, shares, _in_parts(count, [measure(*i) for i in intervals])))
     for (begin, end), parts in zip(intervals, shares, strict=True):
         a_step = round(parts / (end - begin))
         if a_step > 0:
@@ -101,14 +106,14 @@ def moments(scene: Scene, count: int) -> list[float]:
     return ends_of_increments
 
 
-def _in_parts(count: int, ways: list[float]) -> list[float]:
+def _in_parts(count: int, path_lengths: list[float]) -> list[float]:
     """Return the number of increments in each interval. It is proportional to the path of the
     leaders in the interval; if all paths are zero, it is one."""
-    whole = sum(ways)
-    return [count * way / whole if whole > 0.0 else 1.0 for way in ways]
+    whole = sum(path_lengths)
+    return [count * path_length / whole if whole > 0.0 else 1.0 for path_length in path_lengths]
 
 
-def _way(scene: Scene, begin: int, end: int) -> float:
+def _path_length(scene: Scene, begin: int, end: int) -> float:
     """Return the longest path of a leader between two events."""
     longest = 0.0
     for leading in scene.driven:
@@ -117,16 +122,16 @@ def _way(scene: Scene, begin: int, end: int) -> float:
             continue
         times = np.linspace(begin, end, SAMPLES + 1) - group.from_ + 1
         at = [leading.offset(n) for n in times.tolist()]
-        ways = sum(np.hypot.reduce(abs(b - a), axis=1) for a, b in pairwise(at))
-        longest = max(longest, float(np.max(ways)))
+        lengths = sum(np.hypot.reduce(abs(b - a), axis=1) for a, b in pairwise(at))
+        longest = max(longest, float(np.max(lengths)))
     return longest if math.isfinite(longest) else 0.0
 
 
 def spacings(scene: Scene) -> int:
     """Return the length of the longest path of an obstacle in lattice spacings, rounded up, and at
     least 1."""
-    ways = [way_of(barrier, scene.experiment.steps) for barrier in scene.barriers]
-    return max(1, math.ceil(max(ways, default=0.0) / spacing_of(scene)))
+    offsets = [largest_offset(barrier, scene.experiment.steps) for barrier in scene.barriers]
+    return max(1, math.ceil(max(offsets, default=0.0) / spacing_of(scene)))
 
 
 def changes(scene: Scene, steps: int) -> list[int]:
@@ -144,7 +149,7 @@ GROWING = 1e-6
 """A mode grows if its eigenvalue exceeds 1 by more than this number."""
 RECORD_LAST = "; or record the equilibrium of the last step only, `record: {{at: [{}]}}`"
 """Remedy if the equilibrium of an intermediate step does not exist."""
-MOST_SETTLINGS = 2000
+MAX_BOND_CHANGES = 2000
 """Maximum number of changes of bonds in an increment."""
 TINY = 1e-9
 """Relative length up to which the remainder of a path is joined to the last part."""
@@ -155,7 +160,7 @@ REMEDY = (
     "record: {increments: true} keeps the equilibria within steps"
 )
 """Remedy for a body that has broken into parts."""
-MOST_ROUNDS = 40
+MAX_ROUNDS = 40
 """Maximum number of rounds of steps that are made if an equilibrium cannot be followed."""
 STEPS_A_ROUND = 50
 """Number of steps in a round."""
@@ -176,7 +181,7 @@ class Reached(NamedTuple):
     """True for the last point of the path."""
 
 
-Way = Generator[Reached, None, Certificate]
+EquilibriumPath = Generator[Reached, None, ErrorBound]
 
 
 class SeparatedError(Exception):
@@ -190,7 +195,7 @@ def increments(
     since: float = 0.0,
     finder: Finder | None = None,
     stops: Sequence[int] = (),
-) -> Way:
+) -> EquilibriumPath:
     """Move a scene, in place, from its initial state, or from its state at the moment `since`, to
     the equilibrium of its last step, and yield the states on the way. These include the equilibria
     at the steps `stops`, which are earlier than the last step.
@@ -223,21 +228,21 @@ def increments(
     return (yield from _of_linear(scene, state, finder, [s for s in stops if s > since]))
 
 
-def settle(
+def equilibrate(
     scene: Scene, state: State, watch: Watch | None = None, finder: Finder | None = None
-) -> Certificate:
+) -> ErrorBound:
     """Move a state to the last equilibrium in one call. A given `finder` is used; otherwise one is
     built."""
-    way = increments(scene, state, watch or Watch(), finder=finder)
+    path = increments(scene, state, watch or Watch(), finder=finder)
     while True:
         try:
-            next(way)
+            next(path)
         except StopIteration as end:
-            certificate: Certificate = end.value
-            return certificate
+            error_bound: ErrorBound = end.value
+            return error_bound
 
 
-def settle_at_step(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
+def equilibrate_at_step(scene: Scene, state: State, watch: Watch | None = None) -> ErrorBound:
     """Move a state, in place, to the equilibrium with the leaders, loads and parameters of its
     step, and break bonds that are too long in that equilibrium.
 
@@ -245,31 +250,31 @@ def settle_at_step(scene: Scene, state: State, watch: Watch | None = None) -> Ce
     """
     finder = finder_of(scene, initial_state(scene), watch)
     step = state.step
-    return _settle_bonds_at(scene, state, finder, step, step, MOST_SETTLINGS, step)
+    return _equilibrate_bonds_at(scene, state, finder, step, step, MAX_BOND_CHANGES, step)
 
 
-def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
+def equilibrium_state(scene: Scene) -> tuple[State, ErrorBound]:
     """Return the equilibrium of a scene as a new state."""
     state = initial_state(scene)
-    certificate = settle(scene, state)
-    return state, certificate
+    error_bound = equilibrate(scene, state)
+    return state, error_bound
 
 
-def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int]) -> Way:
+def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int]) -> EquilibriumPath:
     """Compute the equilibria of some steps and of the last one. The state itself is moved to the
     equilibria before changes of roles or loads."""
-    steps, settled, last = scene.experiment.steps, None, last_event(scene)
+    steps, converged, last = scene.experiment.steps, None, last_event(scene)
     for stop in [*stops, steps]:
         for change in changes(scene, stop):
             if change <= state.step:
                 continue
-            if settled and settled.step == change:
-                vars(state).update(vars(settled.copy()))
+            if converged and converged.step == change:
+                vars(state).update(vars(converged.copy()))
                 continue
             start = state.copy()
             try:
                 with _at_step(change):
-                    _settle_at(scene, state, finder, change)
+                    _equilibrate_at(scene, state, finder, change)
             except NoEquilibriumError:
                 vars(state).update(vars(start))
                 if not _steps_shrink(scene, change):
@@ -278,17 +283,17 @@ def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int])
                 continue
             yield Reached(change, state, at_rest=True)
         if stop == steps:
-            return _settle_at(scene, state, finder, stop)
-        if settled is None or settled.step < last:
-            settled = state.copy()
+            return _equilibrate_at(scene, state, finder, stop)
+        if converged is None or converged.step < last:
+            converged = state.copy()
             try:
                 with _at_step(stop, RECORD_LAST.format(steps)):
-                    _settle_at(scene, settled, finder, stop)
+                    _equilibrate_at(scene, converged, finder, stop)
             except UnconvergedError:
-                vars(state).update(vars(settled), step=stop)
+                vars(state).update(vars(converged), step=stop)
                 raise
-        settled.step = stop
-        yield Reached(stop, settled, at_rest=True)
+        converged.step = stop
+        yield Reached(stop, converged, at_rest=True)
     raise AssertionError
 
 
@@ -300,7 +305,7 @@ def _steps_shrink(scene: Scene, step: int) -> bool:
     operator = step_operator(scene.at(step), step=step)
     try:
         return spectrum(operator.augmented().matrix()).radius < 1.0 + GROWING
-    except TooDearError:
+    except TooExpensiveError:
         return True
 
 
@@ -328,18 +333,18 @@ def _at_step(step: int, remedy: str = "") -> Iterator[None]:
         raise NoEquilibriumError(text, *error.args[1:]) from None
 
 
-def _settle_at(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
+def _equilibrate_at(scene: Scene, state: State, finder: Finder, moment: float) -> ErrorBound:
     start = state.u.copy(), state.starts
     placed, state.starts = prescribe(scene, state, moment)
     place(state.u, placed)
     try:
-        certificate = finder.find(state, moment)
+        error_bound = finder.find(state, moment)
     except StoppedError:
         state.u[...], state.starts = start
         raise
     state.step = math.floor(moment)
     state.previous[...] = state.u
-    return certificate
+    return error_bound
 
 
 def _load(
@@ -349,33 +354,35 @@ def _load(
     every: list[float],
     since: float,
     stops: Sequence[int],
-) -> Way:
+) -> EquilibriumPath:
     """Move in increments to the last motion or the last change of roles or loads, and break bonds
     after each increment."""
-    certificate: Certificate | None = None
+    error_bound: ErrorBound | None = None
     last = every[-1]
     every = sorted({*every, *(stop for stop in stops if stop < last)})
     planned = [moment for moment in every if moment > since] or every[-1:]
     quick = None
     if finder.linear and scene.has_fracture and not obstacle():
-        from pbdkit.equilibrium.breaking_kernel import settler_of  # imports numba
+        from pbdkit.equilibrium.breaking_kernel import breaking_kernel_of  # imports numba
 
-        quick = settler_of(scene, finder.tolerance, finder.watch)
+        quick = breaking_kernel_of(scene, finder.tolerance, finder.watch)
     farthest = size_of(scene) + finder.scale
     for moment in planned:
         finder.watch.load = f"step {moment:.6g} of {last:g}, "
         start = state.copy()
         step = math.floor(since) + 1
         try:
-            max_changes = MOST_SETTLINGS
+            max_changes = MAX_BOND_CHANGES
             if since == step - 1 and cut_bonds(scene, state.broken_step, step) and since > 0:
                 # If a cut makes other bonds break, they break under the load at which the cut is
                 # made.
-                _settle_bonds_at(scene, state, finder, since, since, max_changes, step)
-            settled, changes = quick.settle(state, moment, max_changes) if quick else (False, 0)
-            if not settled or moment == last:  # It was an equilibrium.
+                _equilibrate_bonds_at(scene, state, finder, since, since, max_changes, step)
+            converged, changes = (
+                quick.equilibrate(state, moment, max_changes) if quick else (False, 0)
+            )
+            if not converged or moment == last:  # It was an equilibrium.
                 remaining = max(1, max_changes - changes)
-                certificate = _settle_bonds_at(scene, state, finder, since, moment, remaining)
+                error_bound = _equilibrate_bonds_at(scene, state, finder, since, moment, remaining)
             _refuse_thrown_off(scene, state, farthest)
         except StoppedError:
             vars(state).update(vars(start))
@@ -397,8 +404,8 @@ def _load(
         state.step = stop
         yield Reached(stop, state, at_rest=True, is_last=True)
     state.step = scene.experiment.steps
-    assert certificate is not None
-    return certificate
+    assert error_bound is not None
+    return error_bound
 
 
 def _torn(state: State) -> int:
@@ -409,7 +416,7 @@ def _torn(state: State) -> int:
 def _refuse_thrown_off(scene: Scene, state: State, farthest: float) -> None:
     """Raise NoEquilibriumError if bonds broke and a particle has moved farther than the size of the
     body plus all prescribed displacements: nothing holds the particle."""
-    if _torn(state) and not (longest := most_of(state)) <= farthest:
+    if _torn(state) and not (longest := largest_displacement(state)) <= farthest:
         number = Guard(farthest, 0, 0, None).worst(scene, state)
         raise NoEquilibriumError(
             f"particle {number} would be displaced by {longest:.6g}, more than the size of the "
@@ -425,7 +432,7 @@ def _is_worth_keeping(
     state."""
     if not (isinstance(error, UnconvergedError) and finder.linear and moment == int(moment)):
         return False
-    if not math.isfinite(error.certificate.distance):
+    if not math.isfinite(error.error_bound.distance):
         return False
     scene = finder.scene
     fracturing = Fracturing.of(scene.at(moment))
@@ -453,8 +460,10 @@ def _parting(
     flat = before.u.reshape(len(before.u), -1)
     step = max(1, math.ceil(since))
     leader_displacements = [flat[:, each.place] for each in scene.leading if each.group.leads(step)]
-    way = max((float(np.abs(u).max(initial=0.0)) for u in leader_displacements), default=0.0)
-    leads = f", with leaders displaced by up to {way:.6g}" if way else ""
+    displacement = max(
+        (float(np.abs(u).max(initial=0.0)) for u in leader_displacements), default=0.0
+    )
+    leads = f", with leaders displaced by up to {displacement:.6g}" if displacement else ""
     cause = str(error).partition("; ")[0]
     return (
         f"{what} between step {since:.6g} and step {moment:.6g}: {first}{cause}; the last "
@@ -462,7 +471,7 @@ def _parting(
     )
 
 
-def _settle_bonds_at(
+def _equilibrate_bonds_at(
     scene: Scene,
     state: State,
     finder: Finder,
@@ -470,7 +479,7 @@ def _settle_bonds_at(
     moment: float,
     max_changes: int,
     step: int = 0,
-) -> Certificate:
+) -> ErrorBound:
     """Move to equilibrium until no bond changes any more, at most `max_changes` times.
 
     Bonds that break are recorded with `step` or, by default, with the step of the moment.
@@ -478,19 +487,19 @@ def _settle_bonds_at(
     fracturing = Fracturing.of(scene.at(moment))
     for _ in range(max_changes):
         if finder.linear:
-            certificate = _settle_at(scene, state, finder, moment)
+            error_bound = _equilibrate_at(scene, state, finder, moment)
         else:
-            certificate = _follow(scene, state, finder, since, moment)
+            error_bound = _follow(scene, state, finder, since, moment)
         if not fracturing or not _bonds_change(scene, fracturing, state, step or math.ceil(moment)):
-            return certificate
+            return error_bound
         since = moment
     raise UnconvergedError(
-        f"bonds still change after {MOST_SETTLINGS} equilibria at step {moment:.6g}",
-        certificate,
+        f"bonds still change after {MAX_BOND_CHANGES} equilibria at step {moment:.6g}",
+        error_bound,
     )
 
 
-def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: float) -> Certificate:
+def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: float) -> ErrorBound:
     """Move from the equilibrium at one moment to the equilibrium at a later moment. The increment
     is divided into parts that are so small that the equilibrium changes continuously. If no part is
     small enough (snap-through), steps are made. If bonds have just broken, implicit steps are made
@@ -502,7 +511,7 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         placed, state.starts = prescribe(scene, state, target)
         place(state.u, placed)
         try:
-            certificate = _nearby(finder, state, target, start)
+            error_bound = _nearby(finder, state, target, start)
         except (NoEquilibriumError, UnconvergedError) as error:
             torn = _torn(start) and not scene.barriers
             if isinstance(error, RoundingError) and not torn:
@@ -515,27 +524,27 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
             part /= 2.0
             if part > (moment - since) * SMALLEST:
                 continue
-            certificate = _stepped(scene, state, finder, target, error)
+            error_bound = _stepped(scene, state, finder, target, error)
         reached = target
         state.step = math.floor(target)
         state.previous[...] = state.u
         if reached >= moment:
-            return certificate
+            return error_bound
         part = min(2.0 * part, moment - reached)
 
 
-def _relaxed(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
+def _relaxed(scene: Scene, state: State, finder: Finder, moment: float) -> ErrorBound:
     """Make implicit steps from a state in which bonds have broken, with leaders at their positions
     at a moment."""
     placed, state.starts = prescribe(scene, state, moment)
     place(state.u, placed)
-    certificate = finder.relax(state, moment)
+    error_bound = finder.relax(state, moment)
     state.step = math.floor(moment)
     state.previous[...] = state.u
-    return certificate
+    return error_bound
 
 
-def _nearby(finder: Finder, state: State, moment: float, before: State) -> Certificate:
+def _nearby(finder: Finder, state: State, moment: float, before: State) -> ErrorBound:
     if finder.scene.barriers:
         return follow_contact(finder.at(moment), state, moment)
     return finder.follow(state, moment, before)
@@ -543,7 +552,7 @@ def _nearby(finder: Finder, state: State, moment: float, before: State) -> Certi
 
 def _stepped(
     scene: Scene, state: State, finder: Finder, moment: float, failed: UnconvergedError
-) -> Certificate:
+) -> ErrorBound:
     """Make steps with leaders at their positions at a moment, until the state is close enough to an
     equilibrium for Newton's method.
 
@@ -551,20 +560,20 @@ def _stepped(
     """
     placed, state.starts = prescribe(scene, state, moment)
     place(state.u, placed)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         for _ in range(STEPS_A_ROUND):
             state.u += finder.at(moment).moves.at(state, moment)
         if not np.isfinite(state.u).all():
             break
         candidate = state.copy()
         with suppress(UnconvergedError):
-            certificate = _nearby(finder, candidate, moment, candidate.copy())
+            error_bound = _nearby(finder, candidate, moment, candidate.copy())
             vars(state).update(vars(candidate))
-            return certificate
+            return error_bound
     raise UnconvergedError(
         f"at step {moment:.6g} the load path cannot be followed: it branches into several "
         f"equilibria, as in buckling, and rounding errors would select one of them ({failed})",
-        failed.certificate,
+        failed.error_bound,
     )
 
 

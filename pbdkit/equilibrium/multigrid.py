@@ -209,14 +209,14 @@ SINGULAR = 1e-12
 """Reciprocal condition number of the coarsest grid below which the body counts as not held."""
 
 
-class FloatingError(Exception):
+class UnconstrainedMotionError(Exception):
     """A motion of the body is not constrained by leaders."""
 
 
 class Multigrid(Grids):
     """Hierarchy of grids in one process.
 
-    Raises FloatingError if a motion of the body is not constrained by leaders.
+    Raises UnconstrainedMotionError if a motion of the body is not constrained by leaders.
     """
 
     def __init__(self, grid: StencilGrid) -> None:
@@ -229,9 +229,9 @@ class Multigrid(Grids):
         try:
             inverse = np.linalg.inv(K)
         except np.linalg.LinAlgError:
-            raise FloatingError from None
+            raise UnconstrainedMotionError from None
         if not np.abs(inverse).max() * np.abs(K).max() * SINGULAR < 1.0:
-            raise FloatingError
+            raise UnconstrainedMotionError
         self._coarsest = K
         self._inverse, self._gives_way = inverse.astype(PRECISION), inverse.diagonal()
 
@@ -307,7 +307,7 @@ of unknowns of the coarsest grid, so that at least two grids are not distributed
 class PartedGrids(Grids):
     """Hierarchy of grids for several processes, each of which stores a strip of the finer grids.
 
-    Raises FloatingError if a motion of the body is not constrained by leaders.
+    Raises UnconstrainedMotionError if a motion of the body is not constrained by leaders.
     """
 
     def __init__(self, grid: StencilGrid, rows: Rows, strip: Strip) -> None:

@@ -21,7 +21,7 @@ from pbdkit.equilibrium.error_bound import (
     FIRST_ORDER,
     LINEAR,
     UNKNOWN,
-    Certificate,
+    ErrorBound,
     RoundingError,
     UnconvergedError,
     spacing_of,
@@ -33,7 +33,7 @@ from pbdkit.equilibrium.system import (
     IndefiniteError,
     Moves,
     Rows,
-    StuckError,
+    StagnationError,
     System,
     one_thread,
 )
@@ -41,7 +41,7 @@ from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-MOST_CORRECTIONS = 12
+MAX_CORRECTIONS = 12
 """Maximum number of corrections."""
 MAX_PROPOSED_TOLERANCE = 0.1
 """Largest tolerance that messages propose."""
@@ -107,7 +107,7 @@ class Finder:
     compiles: bool = True
     rows: Rows = ALL
     at_rest: list[System] = field(default_factory=list, repr=False, compare=False)
-    rest: list[Rest] = field(default_factory=list, repr=False, compare=False)
+    rest: list[RestSystem] = field(default_factory=list, repr=False, compare=False)
 
     @cached_property
     def moves(self) -> Moves:
@@ -135,7 +135,7 @@ class Finder:
         scene = self.scene.at(moment)
         return self if scene is self.scene else replace(self, scene=scene)
 
-    def find(self, state: State, moment: float) -> Certificate:
+    def find(self, state: State, moment: float) -> ErrorBound:
         """Move the followers of `state`, in place, to the equilibrium with the roles, loads and
         parameters of a moment. Corrections are computed with the linearisation at rest, which is
         exact for linear rules.
@@ -145,7 +145,7 @@ class Finder:
         with one_thread():
             return _Linear(self.at(moment), state, moment).run()
 
-    def relax(self, state: State, moment: float) -> Certificate:
+    def relax(self, state: State, moment: float) -> ErrorBound:
         """Move the followers by implicit steps to the equilibrium that sufficiently small steps
         approach. This method is used for rules that are not linear, after bonds have just broken.
 
@@ -154,7 +154,7 @@ class Finder:
         with one_thread():
             return _Relaxing(self.at(moment), state, moment).run()
 
-    def follow(self, state: State, moment: float, before: State) -> Certificate:
+    def follow(self, state: State, moment: float, before: State) -> ErrorBound:
         """Move the followers by Newton's iteration, for rules that are not linear and a small
         change of the load since the equilibrium at the moment `before`. Each correction has to be
         much smaller than the previous one, so that no other equilibrium is nearer. The result is
@@ -167,7 +167,7 @@ class Finder:
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestSystem:
     """Data that determine a system at rest: the scene with its parameters, the leader groups that
     act, the bonds, and the methods of the solver. If they are unchanged, a later search uses the
     system again."""
@@ -178,14 +178,14 @@ class Rest:
     methods: str
 
     @classmethod
-    def of(cls, finder: Finder, state: State, moment: float, methods: str) -> Rest:
+    def of(cls, finder: Finder, state: State, moment: float, methods: str) -> RestSystem:
         """Return the data of a state with the roles of a moment's step."""
         leads = tuple(led.group.leads(math.ceil(moment)) for led in finder.scene.leading)
         broken = () if state.broken_step is None else (state.broken_step >= 0,)
         bonds = (*broken, *(value.copy() for value in state.bond_values))
         return cls(finder.scene, leads, bonds, methods)
 
-    def serves(self, other: Rest) -> bool:
+    def serves(self, other: RestSystem) -> bool:
         """Return whether these data and `other` determine the same system."""
         same = self.scene is other.scene and (self.leads, self.methods) == (
             other.leads,
@@ -208,21 +208,21 @@ class Search(ABC):
         """The last distance, with the moves and the system for which it was computed."""
 
     @abstractmethod
-    def run(self) -> Certificate:
+    def run(self) -> ErrorBound:
         """Move the state to the equilibrium, and return its error bound."""
 
-    def _certified(self) -> Certificate:
-        certificate = self._certificate(self._distance())
-        if not certificate.distance <= self._finder.tolerance:
+    def _checked_error_bound(self) -> ErrorBound:
+        error_bound = self._error_bound(self._distance())
+        if not error_bound.distance <= self._finder.tolerance:
             best = self._floor() / self._finder.scale
-            is_near = certificate.distance <= MAX_ROUNDING_RATIO * self._rounding()
+            is_near = error_bound.distance <= MAX_ROUNDING_RATIO * self._rounding()
             kind = RoundingError if is_near and self._is_rounding(best) else UnconvergedError
-            raise kind(self._why(best), certificate)
-        return certificate
+            raise kind(self._why(best), error_bound)
+        return error_bound
 
     def _floor(self) -> float:
         """Return the part of the distance that is caused by rounding of the moves."""
-        with suppress(StuckError):
+        with suppress(StagnationError):
             nothing = np.zeros_like(self._residual)
             distance = self._system.distance(nothing, self._rounding())
             return distance * (1.0 if self._linear else FIRST_ORDER)
@@ -234,12 +234,12 @@ class Search(ABC):
         finite = math.isfinite(self._finder.rows.max_norm(self._residual))
         return (
             finite
-            and not self._system.is_stuck
+            and not self._system.has_stagnated
             and share * self._finder.scale > SHARE * self._finder.tolerance
         )
 
-    def _certificate(self, distance: float) -> Certificate:
-        return Certificate(
+    def _error_bound(self, distance: float) -> ErrorBound:
+        return ErrorBound(
             method=self._system.methods,
             iterations=self._linearisations,
             inner_iterations=self._inner + self._system.iterations,
@@ -254,7 +254,7 @@ class Search(ABC):
         finder = self._finder
         if not math.isfinite(finder.rows.max_norm(self._residual)):
             return "displacements are not finite"
-        if self._system.is_stuck:
+        if self._system.has_stagnated:
             return (
                 f"{self._system.methods} does not converge, as for slender or soft bodies; "
                 "set solver.method: lu"
@@ -319,40 +319,42 @@ class _Linear(Search):
         at_rest = replace(state, u=np.zeros_like(state.u))
         super().__init__(finder, state, moment, at_rest, "assembling")
         finder.at_rest[:] = [self._system]
-        finder.rest[:] = [Rest.of(finder, state, moment, self._system.methods)]
-        self._owed: State | None = state.copy()
+        finder.rest[:] = [RestSystem.of(finder, state, moment, self._system.methods)]
+        self._invariant_state: State | None = state.copy()
 
     def _linearised(self, at: State, what: str) -> System:
         """Return the system. It is factorised again only if roles, parameters or bonds have
         changed."""
         systems = self._finder.at_rest
         if systems and self._finder.rest:
-            rest = Rest.of(self._finder, at, self._moment, systems[0].methods)
+            rest = RestSystem.of(self._finder, at, self._moment, systems[0].methods)
             if self._finder.rest[0].serves(rest):
                 self._linearisations, self._inner = 1, -systems[0].iterations
                 return systems[0]
         return super()._linearised(at, what)
 
-    def run(self) -> Certificate:
+    def run(self) -> ErrorBound:
         """Correct until the tolerance is reached."""
         self._linear = True
         start = self._residual, self._state.u, self._state.previous
         if self._finder.rows.communicator.any(any(planes.any() for planes in start)):
             self._correct()  # Otherwise the initial state is already the equilibrium.
-        return self._certified()
+        return self._checked_error_bound()
 
     def _correct(self) -> None:
-        for n in range(MOST_CORRECTIONS):
+        for n in range(MAX_CORRECTIONS):
             moves, previous = self._residual, self._finder.rows.norm(self._residual)
-            correction = self._system.solve(moves, self._wanted, self._owed, self._rounding())
+            correction = self._system.solve(
+                moves, self._wanted, self._invariant_state, self._rounding()
+            )
             self._shift(correction)
-            self._owed = None
+            self._invariant_state = None
             norm = self._finder.rows.norm(self._residual)
             floor = self._rounding() * math.sqrt(self._finder.rows.size(self._residual))
             if n == 0 and previous > 1e3 * floor:
                 mismatch = self._system.mismatch(correction, moves, self._residual)
                 if not mismatch <= LINEAR + floor / previous:
-                    raise UnconvergedError(NOT_LINEAR, self._certificate(self._distance()))
+                    raise UnconvergedError(NOT_LINEAR, self._error_bound(self._distance()))
             if not norm <= 0.5 * previous or self._distance() <= self._finder.tolerance:
                 return
 
@@ -366,17 +368,17 @@ class _Newton(Search):
         self._load_change = float(np.abs(self._leader_change).max())
         """Largest change of the displacements of leaders or, under loads, of followers."""
 
-    def run(self) -> Certificate:
+    def run(self) -> ErrorBound:
         """Correct until the tolerance is reached.
 
         Raises UnconvergedError if corrections do not shrink or the result is not stable.
         """
         self._go_ahead()
         self._correct()
-        certificate = self._certified()
+        error_bound = self._checked_error_bound()
         if not self._system.is_stable():
-            raise UnconvergedError(UNSTABLE, certificate)
-        return certificate
+            raise UnconvergedError(UNSTABLE, error_bound)
+        return error_bound
 
     def _go_ahead(self) -> None:
         """Predict the equilibrium at the end of the increment from the previous equilibrium. The
@@ -397,7 +399,7 @@ class _Newton(Search):
 
     def _correct(self) -> None:
         distance, size, previous_distance = math.inf, math.inf, self._load_change
-        for _ in range(MOST_CORRECTIONS):
+        for _ in range(MAX_CORRECTIONS):
             if distance > MAX_REUSE_RATIO * previous_distance:
                 self._system = self._linearised(self._state, "following the load")
                 self._system.refuse_moving_floats(self._residual, self._rounding())
@@ -418,7 +420,7 @@ class _Newton(Search):
                 if size <= self._floor():
                     return  # The difference is only rounding.
                 reason = "corrections do not decrease"
-                raise UnconvergedError(reason, self._certificate(math.inf))
+                raise UnconvergedError(reason, self._error_bound(math.inf))
             self._shift(correction)
             previous_distance, distance = distance, self._distance()
 
@@ -442,7 +444,7 @@ class _Relaxing(Search):
         step, method = math.ceil(self._moment), finder.method
         return MatrixSystem(finder.scene, at, method, finder.watch, step, self._damping)
 
-    def run(self) -> Certificate:
+    def run(self) -> ErrorBound:
         """Make implicit steps until the tolerance is reached.
 
         Raises UnconvergedError if moves do not decay or the result is not stable.
@@ -465,10 +467,10 @@ class _Relaxing(Search):
                 share = min(MAX_DAMPING_RATIO, share)
             self._damping = min(1.0, max(MIN_DAMPING, self._damping * share))
             self._system = self._linearised(self._state, "relaxing after bonds broke")
-        certificate = self._certified()
+        error_bound = self._checked_error_bound()
         if not self._system.is_stable():
-            raise UnconvergedError(UNSTABLE, certificate)
-        return certificate
+            raise UnconvergedError(UNSTABLE, error_bound)
+        return error_bound
 
     def _is_near(self) -> bool:
         """Return whether the tolerance is reached if motions of almost no stiffness are excluded
@@ -488,7 +490,7 @@ MIN_PART = 2.0**-6
 correction would separate particles from obstacles that hold them."""
 
 
-def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:
+def follow_contact(finder: Finder, state: State, moment: float) -> ErrorBound:
     """Move the followers of `state`, in place, to a stable equilibrium nearby, with obstacles at a
     moment.
 
@@ -506,7 +508,7 @@ class _ContactSearch(Search):
     that would enter an obstacle are added to the set and constrained, until the set does not change
     any more. Floating parts that no obstacle holds yet are moved with weak springs."""
 
-    def run(self) -> Certificate:
+    def run(self) -> ErrorBound:
         """Correct until the active set and the state converge.
 
         Raises UnconvergedError if the active set does not become constant, corrections do not
@@ -541,10 +543,10 @@ class _ContactSearch(Search):
         # A step would place particles in contact exactly on the outline. The linear solution moves
         # them along its tangent, so that they have to be placed on it.
         self._shift(system.of_held(self._residual))
-        certificate = self._certified()
+        error_bound = self._checked_error_bound()
         if not system.is_stable():
-            raise UnconvergedError(UNSTABLE, certificate)
-        return certificate
+            raise UnconvergedError(UNSTABLE, error_bound)
+        return error_bound
 
     def _go(self, correction: Floats) -> None:
         system = self._newest()

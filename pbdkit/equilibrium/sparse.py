@@ -67,11 +67,11 @@ LARGEST_FALLBACK = 400_000
 progress."""
 
 
-class DriftingError(Exception):
+class UnbalancedLoadError(Exception):
     """A floating part is under a load that is not balanced."""
 
 
-class TooSoftError(DriftingError):
+class TooSoftError(UnbalancedLoadError):
     """A part is held so softly that it cannot be distinguished from a floating part in double
     precision."""
 
@@ -86,15 +86,17 @@ class Subsystem(ABC):
     ) -> None:
         self._size, self._solver, self._watch, self._borders = size, solver, watch, borders
 
-    is_stuck = False
+    has_stagnated = False
     """True if an iteration makes no progress and no other method can replace it."""
 
     @abstractmethod
-    def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """Return the x to which steps from x = 0 converge. `owed` is the change of the invariants
-        that the previous state causes, and `rounding` the rounding error of r.
+    def solve(
+        self, r: Floats, invariant_change: Floats | None = None, rounding: float = 0.0
+    ) -> Floats:
+        """Return the x to which steps from x = 0 converge. `invariant_change` is the change of the
+        invariants that the previous state causes, and `rounding` the rounding error of r.
 
-        Raises DriftingError if there is no such x.
+        Raises UnbalancedLoadError if there is no such x.
         """
 
     @abstractmethod
@@ -201,9 +203,11 @@ class ConstrainedSubsystem(Subsystem):
         if _left_kernel(matrix).size:
             raise np.linalg.LinAlgError("singular")
 
-    def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
-        """Return the solution by the method; `owed` is not used, since a part that is held has no
-        invariants."""
+    def solve(
+        self, r: Floats, invariant_change: Floats | None = None, rounding: float = 0.0
+    ) -> Floats:
+        """Return the solution by the method; `invariant_change` is not used, since a part that is
+        held has no invariants."""
         if not r.any():
             return np.zeros_like(r)
         self._watch.begin("solving")
@@ -214,10 +218,11 @@ class ConstrainedSubsystem(Subsystem):
         return self._solved(weights, ACCURACY, 100 * ACCURACY, transposed=True)
 
     def _solved(
-        self, b: Floats, accuracy: float, most: float, *, transposed: bool = False
+        self, b: Floats, accuracy: float, max_residual: float, *, transposed: bool = False
     ) -> Floats:
-        """Return the solution. If the residual of an iteration remains larger than `most`, the
-        iteration is replaced by an LU factorisation where the method of the solver permits this."""
+        """Return the solution. If the residual of an iteration remains larger than `max_residual`,
+        the iteration is replaced by an LU factorisation where the method of the solver permits
+        this."""
         matrix = self._matrix.T if transposed else self._matrix
         for _ in range(2):
             assert self._solver is not None
@@ -226,9 +231,9 @@ class ConstrainedSubsystem(Subsystem):
             if not isinstance(self._solver, PreconditionedKrylov):
                 break
             residual = float(np.linalg.norm(b - matrix @ x))
-            self._is_short = not residual <= most * float(np.linalg.norm(b))
+            self._is_short = not residual <= max_residual * float(np.linalg.norm(b))
             if not (self._is_short and self._has_choice):
-                self.is_stuck |= self._is_short
+                self.has_stagnated |= self._is_short
                 break
             self._solver = linear_solver(self._matrix, "lu", coordinates=self._coordinates)
             self._is_short = False
@@ -282,19 +287,23 @@ class SingularSubsystem(Subsystem):
         if solver is not None and not self._spread < TOO_SOFT:
             self._solver = None
 
-    def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
+    def solve(
+        self, r: Floats, invariant_change: Floats | None = None, rounding: float = 0.0
+    ) -> Floats:
         """Return the solution by the method."""
         if self._solver is None:
             if r.any():
                 raise TooSoftError
             return np.zeros_like(r)
         push = self._left @ (self._left.T @ r)
-        invariants = np.zeros(self._borders) if owed is None else self._left.T @ owed
+        invariants = (
+            np.zeros(self._borders) if invariant_change is None else self._left.T @ invariant_change
+        )
         x = self._solver.solve(np.concatenate([r - push, invariants]), ACCURACY)[: self._size]
         terms = abs(self._matrix) @ np.abs(x) + np.abs(r)
         large = NOTHING * float(terms.max(initial=0.0)) + 8.0 * rounding
         if not np.abs(push).max(initial=0.0) <= large:
-            raise DriftingError
+            raise UnbalancedLoadError
         return x
 
     def solve_transposed(self, weights: Floats) -> Floats:
@@ -410,8 +419,8 @@ class MatrixSystem(System):
         not available, from a solution."""
         if self._damping:
             return "damped"
-        ways = {part.bound_kind for block in self._blocks for _, part in block.parts}
-        return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
+        kinds = {part.bound_kind for block in self._blocks for _, part in block.parts}
+        return next((kind for kind in ("solution", "inverse") if kind in kinds), "nothing to solve")
 
     @property
     def iterations(self) -> int:
@@ -447,30 +456,34 @@ class MatrixSystem(System):
                     )
 
     @property
-    def is_stuck(self) -> bool:
+    def has_stagnated(self) -> bool:
         """True if the iteration for some part makes no progress."""
-        return any(part.is_stuck for block in self._blocks for _, part in block.parts)
+        return any(part.has_stagnated for block in self._blocks for _, part in block.parts)
 
     def solve(
-        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+        self,
+        moves: Floats,
+        tolerance: float,
+        invariant_state: State | None = None,
+        rounding: float = 0.0,
     ) -> Floats:
         """Return the solution, computed block by block and part by part."""
-        back = None if owed is None else self._owed(owed)
+        back = None if invariant_state is None else self._invariant_change(invariant_state)
         return self._planes(self._solved(self._table(moves), back, rounding))
 
-    def _solved(self, moves: Floats, owed: Floats | None, rounding: float) -> Floats:
+    def _solved(self, moves: Floats, invariant_change: Floats | None, rounding: float) -> Floats:
         solution = np.zeros_like(moves)
         for block in self._blocks:
             r = moves[:, block.axes].ravel()
             if block.into is not None:
                 r = r + block.into @ solution[:, 1 - block.axes[0]]
-            back = None if owed is None else owed[:, block.axes].ravel()
+            back = None if invariant_change is None else invariant_change[:, block.axes].ravel()
             x = np.zeros_like(r)
             for members, part in block.parts:
                 try:
-                    part_owed = None if back is None else back[members]
-                    x[members] = part.solve(r[members], part_owed, rounding)
-                except DriftingError as error:
+                    part_change = None if back is None else back[members]
+                    x[members] = part.solve(r[members], part_change, rounding)
+                except UnbalancedLoadError as error:
                     soft = isinstance(error, TooSoftError) or (
                         part.is_soft and self._is_fixed(block.axes, members)
                     )
@@ -502,7 +515,7 @@ class MatrixSystem(System):
         solution[self._guided] = 0.0
         return self._planes(solution)
 
-    def _owed(self, state: State) -> Floats | None:
+    def _invariant_change(self, state: State) -> Floats | None:
         """Return before · (u(t-1) - u(t)), (follower, axis), by which the previous state changes
         the invariants. Return None if a step does not depend on the previous state."""
         if not self._operator.couplings_previous.parts:

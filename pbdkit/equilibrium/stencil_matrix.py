@@ -53,7 +53,7 @@ def most_first(
     """Return code, stencils and scales, renumbered such that the most frequent stencil is number 0.
     All places with an equal stencil get the number 0 too."""
     tables = stencils, scale
-    frequent = _most(code[..., rows.own, :], tables, rows)
+    frequent = _most_frequent(code[..., rows.own, :], tables, rows)
     differences = [
         np.abs(table - entry).max(axis=tuple(range(1, table.ndim)))
         for table, entry in zip(tables, frequent, strict=True)
@@ -70,7 +70,9 @@ def most_first(
     return number[code], first, second
 
 
-def _most(own: Integers, tables: tuple[Floats, Floats], rows: Rows) -> tuple[Floats, Floats]:
+def _most_frequent(
+    own: Integers, tables: tuple[Floats, Floats], rows: Rows
+) -> tuple[Floats, Floats]:
     """Return the stencil that is most frequent over all processes, and its scale. Only the most
     frequent stencils of each process are considered."""
     counts = np.bincount(own[own >= 0], minlength=len(tables[0]))
@@ -229,8 +231,8 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     group, groups = (_number(grid.index(particles).T % 3 - 1) for particles in (place, body))
     # numbers[n, g] is the index in a stencil at which the stencils of particles of group g contain
     # a particle of group n.
-    ways = np.stack(np.unravel_index(np.arange(WINDOW), (3, 3)))
-    numbers = _number((ways[:, :, None] - ways[:, None] + 1) % 3 - 1)
+    offsets = np.stack(np.unravel_index(np.arange(WINDOW), (3, 3)))
+    numbers = _number((offsets[:, :, None] - offsets[:, None] + 1) % 3 - 1)
     stencils, every = np.empty((len(place), WINDOW, 2, 2)), np.arange(len(place))
     nudged, nudge = replace(state, u=state.u.copy()), NUDGE * scene.neighbourhood.nudge_unit
     still, largest = moves.at(nudged, step).reshape(2, -1).copy(), 0.0
@@ -366,9 +368,9 @@ class _Assembly:
         return numbers, rows
 
 
-def _number(way: Any) -> Any:
+def _number(offset: Any) -> Any:
     """Return the index in a stencil of the place at `way`, (row, place), from the centre."""
-    return 3 * (way[0] + 1) + way[1] + 1
+    return 3 * (offset[0] + 1) + offset[1] + 1
 
 
 def inverses(matrices: Floats) -> Floats:
@@ -542,8 +544,8 @@ def transposed(matrix: StencilMatrix) -> StencilMatrix:
 def leads_one_way(matrix: StencilMatrix, rows: Rows = ALL) -> bool:
     """Return whether one axis depends on the other but not the reverse. It is then better to solve
     for the axes one after the other."""
-    ways = matrix.stencils[..., 1], matrix.stencils[..., 2]
-    return len({rows.communicator.any(bool(way.any())) for way in ways}) > 1
+    couplings = matrix.stencils[..., 1], matrix.stencils[..., 2]
+    return len({rows.communicator.any(bool(coupling.any())) for coupling in couplings}) > 1
 
 
 def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: Rows = ALL) -> bool:

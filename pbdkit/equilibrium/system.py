@@ -288,7 +288,7 @@ PUSH = 1e-10
 moves may have an error of this size, for instance if they are computed by differences."""
 
 
-class StuckError(Exception):
+class StagnationError(Exception):
     """An iteration makes no progress."""
 
 
@@ -296,7 +296,7 @@ class NoEquilibriumError(ExperimentError):
     """A part of the body has no equilibrium, or no unique one."""
 
 
-class IndefiniteError(StuckError):
+class IndefiniteError(StagnationError):
     """The energy decreases along some direction: the body is not stable."""
 
 
@@ -312,7 +312,7 @@ class System(ABC):
     @property
     @abstractmethod
     def bound_kind(self) -> str:
-        """Kind of the bound on the distance from the solution, a key of `error_bound.WAYS`."""
+        """Kind of the bound on the distance from the solution, a key of `BOUND_KINDS`."""
 
     @property
     @abstractmethod
@@ -320,7 +320,7 @@ class System(ABC):
         """Number of iterations of all linear solvers."""
 
     @property
-    def is_stuck(self) -> bool:
+    def has_stagnated(self) -> bool:
         """True if an iteration makes no progress and the method has no alternative."""
         return False
 
@@ -332,13 +332,17 @@ class System(ABC):
 
     @abstractmethod
     def solve(
-        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+        self,
+        moves: Floats,
+        tolerance: float,
+        invariant_state: State | None = None,
+        rounding: float = 0.0,
     ) -> Floats:
         """Solve for the correction c with an error of at most `tolerance`, a length.
 
-        `owed` is given if the step also depends on the previous state: it is the current state, by
-        which the invariants of floating parts have to change. `rounding` is the rounding error of
-        the moves.
+        `invariant_state` is given if the step also depends on the previous state: it is the current
+        state, by which the invariants of floating parts have to change. `rounding` is the rounding
+        error of the moves.
 
         Raises ExperimentError if a floating part is under a load.
         """

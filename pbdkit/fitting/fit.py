@@ -19,7 +19,7 @@ from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import Problem, Solution, Unknown, solved
 from pbdkit.fitting.uncertainty import (
     Candidate,
-    Posed,
+    SolvedProblem,
     compare_models,
     profile_likelihood,
     refuse_no_sampler,
@@ -90,14 +90,14 @@ def _fit(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitt
     }
     sample = sample_posterior(problem, solution, **dict(fit.sampler)) if fit.sampler else None
     candidates = _compare_candidates(
-        fit, experiment, Posed(BASE_MODEL, problem, solution), components
+        fit, experiment, SolvedProblem(BASE_MODEL, problem, solution), components
     )
     result = fitted(fit, problem, solution)
     return replace(result, profiles=profiles, sample=sample, candidates=candidates)
 
 
 def _compare_candidates(
-    fit: Fit, experiment: Experiment, base: Posed, components: ComponentClasses
+    fit: Fit, experiment: Experiment, base: SolvedProblem, components: ComponentClasses
 ) -> tuple[Candidate, ...]:
     """Compare the experiment with the candidates of the fit."""
     if not fit.candidates:
@@ -116,7 +116,7 @@ def _compare_candidates(
             problem,
             observations=tuple(observation.with_noise(noise) for observation, noise in pairs),
         )
-        models.append(Posed(name, problem, solved(problem, problem.start(), fit.loss)))
+        models.append(SolvedProblem(name, problem, solved(problem, problem.start(), fit.loss)))
     return compare_models(models, fit.folds, fit.loss, seed=0)
 
 

@@ -313,7 +313,7 @@ class Force(Strict):
     noise: Annotated[float, Field(ge=0.0)] = 0.0
 
 
-class Rival(Strict):
+class AlternativeModel(Strict):
     """Another model for the same data: changes of the experiment, by path, and its unknown
     parameters if they differ."""
 
@@ -352,7 +352,7 @@ class Fit(Strict):
     loss: Loss = "linear"
     profile: Annotated[tuple[str, ...], Field(strict=False)] = ()
     sampler: Sampler | None = None
-    candidates: dict[str, Rival] = Field(default_factory=dict)
+    candidates: dict[str, AlternativeModel] = Field(default_factory=dict)
     folds: Annotated[int, Field(ge=2, le=20)] = 5
 
     _files: FileResolver = FileResolver()

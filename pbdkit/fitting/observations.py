@@ -29,7 +29,7 @@ from pbdkit.components.diagnostics import reactions
 from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.sensitivity import Resting, scene_like
+from pbdkit.fitting.sensitivity import RestingScene, scene_like
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.io.vtkhdf import polygons_of
 from pbdkit.lattice.cells import tiling_of
@@ -374,9 +374,9 @@ class FieldEvidence:
                 columns.append(column)
         return np.stack(columns, axis=1) if columns else np.zeros((2 * n, 0))
 
-    def predict(self, planes: Floats, resting: Resting) -> Floats:
+    def predict(self, planes: Floats, resting_scene: RestingScene) -> Floats:
         """Interpolate displacements, given as planes, at the points."""
-        return self.interpolation.of(planes, resting.scene).T.ravel()
+        return self.interpolation.of(planes, resting_scene.scene).T.ravel()
 
 
 @dataclass(frozen=True)
@@ -385,19 +385,19 @@ class GroupReaction:
 
     Parameters
     ----------
-    resting
+    resting_scene
         The equilibrium.
     group
         Number of the group.
     """
 
-    resting: Resting
+    resting_scene: RestingScene
     group: int
 
     @cached_property
     def predicted(self) -> Floats:
         """Return the force, (axis,)."""
-        return self._reaction(self.resting.scene, self.resting.state.u)
+        return self._reaction(self.resting_scene.scene, self.resting_scene.state.u)
 
     def change(self, du: Floats, parameter: Parameter | None = None) -> Floats:
         """Return the derivative of the force, (axis,).
@@ -409,11 +409,11 @@ class GroupReaction:
         parameter
             Parameter that changes with them.
         """
-        scene, u = self.resting.scene, self.resting.state.u
-        if self.resting.finder.linear:
+        scene, u = self.resting_scene.scene, self.resting_scene.state.u
+        if self.resting_scene.finder.linear:
             result: Floats = self._reaction(scene, u + du) - self.predicted
         else:
-            result = self.resting.along(lambda u: self._reaction(scene, u), du)
+            result = self.resting_scene.along(lambda u: self._reaction(scene, u), du)
         if parameter is not None:
             result = result + parameter.derivative(
                 scene.experiment,
@@ -422,7 +422,7 @@ class GroupReaction:
         return np.asarray(result)
 
     def _reaction(self, scene: Scene, u: Floats) -> Floats:
-        state = self.resting.state.copy()
+        state = self.resting_scene.state.copy()
         state.u = u
         moment = StateMoment(state, Tables(scene))
         return np.asarray(reactions(moment)[self.group])
@@ -871,7 +871,7 @@ class FieldPrediction(Prediction):
 
     Parameters
     ----------
-    resting
+    resting_scene
         The equilibrium.
     changes
         Derivatives of its displacements with respect to the parameters, as planes.
@@ -884,10 +884,10 @@ class FieldPrediction(Prediction):
         Distance of the parameters from those of `answering`, as in `NearbyPrediction`.
     """
 
-    resting: Resting
+    resting_scene: RestingScene
     changes: tuple[Floats, ...] = field(repr=False)
     answers: tuple[Floats, ...] = field(repr=False)
-    answering: Resting = field(repr=False)
+    answering: RestingScene = field(repr=False)
     away: float = 0.0
 
 
@@ -973,37 +973,40 @@ class FieldObservation(Observation):
         previous = (
             near.prediction if near and isinstance(near.prediction, FieldPrediction) else None
         )
-        resting = Resting.of(experiment, previous.resting if previous else self.scene, DERIVATIVES)
-        changes = [resting.change(parameter) for parameter in parameters]
+        resting_scene = RestingScene.of(
+            experiment, previous.resting_scene if previous else self.scene, DERIVATIVES
+        )
+        changes = [resting_scene.change(parameter) for parameter in parameters]
         away = previous.away + near.away if previous and near else np.inf
-        if previous and away < CLOSE and resting.finder.linear:
+        if previous and away < CLOSE and resting_scene.finder.linear:
             answers, answering = previous.answers, previous.answering
         else:
-            answers, answering, away = self._boundary_derivatives(resting), resting, 0.0
+            answers, answering, away = self._boundary_derivatives(resting_scene), resting_scene, 0.0
         columns = [
-            self.evidence.predict(du, resting) / self.weighted_noise for du in (*changes, *answers)
+            self.evidence.predict(du, resting_scene) / self.weighted_noise
+            for du in (*changes, *answers)
         ]
         rows, count = len(self.measured), len(parameters)
         distortions = self.evidence.distortions / self.weighted_noise
-        predicted = self.evidence.predict(resting.state.u, resting)
+        predicted = self.evidence.predict(resting_scene.state.u, resting_scene)
         residuals = (self.measured - predicted) / self.weighted_noise - distortions @ own_values[n:]
         return FieldPrediction(
             residuals,
             np.array(columns[:count]).T.reshape(rows, count),
             np.column_stack([*columns[count:], distortions]) if columns[count:] else distortions,
             np.zeros(rows),
-            resting,
+            resting_scene,
             tuple(changes),
             answers,
             answering,
             away,
         )
 
-    def _boundary_derivatives(self, resting: Resting) -> tuple[Floats, ...]:
+    def _boundary_derivatives(self, resting_scene: RestingScene) -> tuple[Floats, ...]:
         """Return the derivatives of the displacements with respect to the coefficients of the
         boundaries."""
         return tuple(
-            resting.answer(boundary.planes(resting.scene, n))
+            resting_scene.answer(boundary.planes(resting_scene.scene, n))
             for boundary in self.boundaries
             for n in range(boundary.size)
         )

@@ -313,7 +313,7 @@ class Problem:
 
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
-TELLS = 0.25
+IDENTIFIABLE_RATIO = 0.25
 """Ratio of the standard error along a direction to the interval between bounds below which the
 direction is identifiable."""
 MIN_COMPONENT = 0.3
@@ -393,8 +393,8 @@ class Directions:
         """Return a mask of the unknowns for which the data determine the value along a direction
         insufficiently, (direction, unknown)."""
         components = np.abs(self.vectors)
-        is_large = components * np.sqrt(self.variance)[:, None] > TELLS
-        is_uncertain = (self.variance > TELLS**2)[:, None]
+        is_large = components * np.sqrt(self.variance)[:, None] > IDENTIFIABLE_RATIO
+        is_uncertain = (self.variance > IDENTIFIABLE_RATIO**2)[:, None]
         return np.where(
             self.is_null[:, None],
             components > 0.0,
@@ -609,7 +609,7 @@ def _identify_directions(
     vectors[rank:][shares < INVOLVED * shares.max(axis=1, initial=0.0)[:, None]] = 0.0
     directions = Directions(vectors, variance, scale)
     spread = np.sqrt(np.diag(directions.covariance)) / scale
-    is_unidentified = (directions.unsure.any(axis=0) | (spread > TELLS))[:count]
+    is_unidentified = (directions.unsure.any(axis=0) | (spread > IDENTIFIABLE_RATIO))[:count]
     names = [unknown.parameter.path for unknown in problem.unknowns]
     return directions, tuple(
         name for name, flag in zip(names, is_unidentified, strict=True) if flag

@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 
 from pbdkit.array_types import Floats
-from pbdkit.equilibrium.error_bound import Certificate, spacing_of
+from pbdkit.equilibrium.error_bound import ErrorBound, spacing_of
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.load_stepping import finder_of, settle
+from pbdkit.equilibrium.load_stepping import equilibrate, finder_of
 from pbdkit.equilibrium.newton import Finder
 from pbdkit.equilibrium.system import Moves, System, one_thread
 from pbdkit.errors import ExperimentError
@@ -63,7 +63,7 @@ def scene_like(scene: Scene, experiment: Experiment) -> Scene:
     return new_scene
 
 
-__all__ = ["Adjoint", "Resting", "along", "scene_like"]
+__all__ = ["Adjoint", "RestingScene", "along", "scene_like"]
 
 ACCURACY = 1e-12
 """Relative accuracy of solutions."""
@@ -72,14 +72,14 @@ FORMER = 2
 
 
 @dataclass(frozen=True)
-class Resting:
+class RestingScene:
     """A scene in equilibrium.
 
     Parameters
     ----------
     scene, state
         The scene and its state.
-    certificate
+    error_bound
         Error bound of the equilibrium.
     finder
         Solver, with the parameters of the last step.
@@ -91,7 +91,7 @@ class Resting:
 
     scene: Scene
     state: State
-    certificate: Certificate
+    error_bound: ErrorBound
     finder: Finder = field(repr=False)
     accuracy: float = ACCURACY
     former: tuple[dict[bytes, Floats], ...] = field(default=(), repr=False)
@@ -100,9 +100,9 @@ class Resting:
     def of(
         cls,
         experiment: Experiment,
-        start: Scene | Resting | None = None,
+        start: Scene | RestingScene | None = None,
         accuracy: float = ACCURACY,
-    ) -> Resting:
+    ) -> RestingScene:
         """Compute the equilibrium of an experiment.
 
         Parameters
@@ -121,7 +121,7 @@ class Resting:
             If bonds changed on the way, or if the scene has obstacles: the equilibrium then depends
             on the path.
         """
-        similar = start.scene if isinstance(start, Resting) else start
+        similar = start.scene if isinstance(start, RestingScene) else start
         scene = scene_like(similar, experiment) if similar else build_scene(experiment)
         if scene.barriers:
             raise ExperimentError(
@@ -131,7 +131,7 @@ class Resting:
             )
         state = initial_state(scene)
         initial_bonds, finder = _bonds(state), finder_of(scene, state, compiles=False)
-        certificate = settle(scene, state, finder=finder)
+        error_bound = equilibrate(scene, state, finder=finder)
         if any((a != b).any() for a, b in zip(initial_bonds, _bonds(state), strict=True)):
             raise ExperimentError(
                 (
@@ -141,8 +141,8 @@ class Resting:
                 ),
                 ("fracture",),
             )
-        former = start.guesses if isinstance(start, Resting) else ()
-        return cls(scene, state, certificate, finder.at(experiment.steps), accuracy, former)
+        former = start.guesses if isinstance(start, RestingScene) else ()
+        return cls(scene, state, error_bound, finder.at(experiment.steps), accuracy, former)
 
     @property
     def guesses(self) -> tuple[dict[bytes, Floats], ...]:

@@ -41,7 +41,7 @@ from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.fit_file import Peaks, StrengthFit
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.problem import TELLS
+from pbdkit.fitting.problem import IDENTIFIABLE_RATIO
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import FOLLOWER, Places
@@ -151,9 +151,9 @@ def strengths(scene: Scene, state: State) -> Floats:
     limits = np.zeros(len(bonds.ends))
     for n, plane in enumerate(scene.neighbourhood.planes):
         rows = np.flatnonzero(bonds.plane == n)
-        home = Places(scene.raster.shape, bonds.place[rows])
-        values = [home.within(value[n]) for value in state.bond_values]
-        c = scene.constants.of_bond(*scene.constants.limits_at(plane.slot, n, home), *values)
+        owner = Places(scene.raster.shape, bonds.place[rows])
+        values = [owner.within(value[n]) for value in state.bond_values]
+        c = scene.constants.of_bond(*scene.constants.limits_at(plane.slot, n, owner), *values)
         limits[rows] = model.breaking_strain(plane.slot.rest, c, scene.constants.fracture)
     return limits
 
@@ -172,7 +172,7 @@ class MachineReading(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Pull:
+class LoadedGroup:
     """Leader group that loads a body.
 
     Parameters
@@ -190,7 +190,7 @@ class Pull:
     factor: float
 
     @classmethod
-    def of(cls, scene: Scene, state: State, peaks: Peaks) -> Pull:
+    def of(cls, scene: Scene, state: State, peaks: Peaks) -> LoadedGroup:
         """Return the selected group, or the one with the largest displacement.
 
         Raises
@@ -250,7 +250,7 @@ class ElasticResponse:
     """
 
     strains: BondStrains
-    pull: Pull | None
+    pull: LoadedGroup | None
     full: MachineReading
     u: Floats
 
@@ -277,7 +277,7 @@ class ElasticResponse:
         strains = bond_strains(scene, state)
         if peaks.of == "factor":
             return cls(strains, None, MachineReading(1.0, 1.0), state.u)
-        pull = Pull.of(scene, state, peaks)
+        pull = LoadedGroup.of(scene, state, peaks)
         return cls(strains, pull, pull.read(Tables(scene), state), state.u)
 
 
@@ -375,7 +375,7 @@ class Specimens:
         pull = self.elastic.pull if self.elastic else None
         peak, last, growth = first or MachineReading(0.0, 0.0), MachineReading(0.0, 0.0), 1.0
         for _ in chain(increments(scene, state, Watch(), start), [None]):
-            pull = pull or Pull.of(scene, state, self.peaks)
+            pull = pull or LoadedGroup.of(scene, state, self.peaks)
             reading = pull.read(tables, state)
             if growth > 1.0 and last.displacement > 0.0:
                 share = min(growth, reading.displacement / last.displacement)
@@ -395,8 +395,8 @@ class Specimens:
     @property
     def _has_known_breaks(self) -> bool:
         model = self.scene.experiment.fracture
-        tells = isinstance(model, BreaksAtStrain) and not isinstance(model, Softens)
-        return tells and self.elastic is not None
+        is_deterministic = isinstance(model, BreaksAtStrain) and not isinstance(model, Softens)
+        return is_deterministic and self.elastic is not None
 
     def _advance_to_first_break(self, state: State, first: MachineReading) -> float:
         """Set a state to the last increment before the first break, and return its moment.
@@ -847,7 +847,7 @@ def fitted_strength(
         estimate = _estimate(draws.values[:, n], draws.weights)
         cut = min(estimate.low / low, high / estimate.high) < CUT
         values[path] = replace(
-            estimate, identifiable=estimate.error <= TELLS * (high - low), cut=cut
+            estimate, identifiable=estimate.error <= IDENTIFIABLE_RATIO * (high - low), cut=cut
         )
     variation = None
     if law is not None:

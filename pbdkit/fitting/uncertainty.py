@@ -37,9 +37,9 @@ from pbdkit.errors import ExperimentError, refuse_without
 from pbdkit.fitting.fit_file import Force
 from pbdkit.fitting.observations import FieldPrediction, GroupReaction
 from pbdkit.fitting.problem import (
+    IDENTIFIABLE_RATIO,
     MODULUS,
     RANK,
-    TELLS,
     Directions,
     Loss,
     Problem,
@@ -99,7 +99,9 @@ def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) ->
     unit = STRESS.unit if units else ""
     if problem.with_modulus:
         value, error = float(solution.z[count]), float(solution.errors[count])
-        return Estimate(value, error, identifiable=error < TELLS * abs(value), unit=unit)
+        return Estimate(
+            value, error, identifiable=error < IDENTIFIABLE_RATIO * abs(value), unit=unit
+        )
     if force is None:
         return None
     estimate, size = (
@@ -115,7 +117,7 @@ def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> E
     direction = np.array(force.value) / np.hypot(*force.value)
     count, prediction = len(problem.unknowns), solution.at.predictions[0]
     assert isinstance(prediction, FieldPrediction)
-    reaction = GroupReaction(prediction.resting, force.group)
+    reaction = GroupReaction(prediction.resting_scene, force.group)
     unit, gradient = float(direction @ reaction.predicted), np.zeros(problem.size)
     for n, (du, unknown) in enumerate(zip(prediction.changes, problem.unknowns, strict=True)):
         gradient[n] = direction @ reaction.change(du, unknown.parameter)
@@ -188,7 +190,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Posed:
+class SolvedProblem:
     """Least-squares problem of a model, and its solution."""
 
     name: str
@@ -197,7 +199,7 @@ class Posed:
 
 
 def compare_models(
-    models: Sequence[Posed], folds: int, loss: Loss, seed: int
+    models: Sequence[SolvedProblem], folds: int, loss: Loss, seed: int
 ) -> tuple[Candidate, ...]:
     """Compare models by cross-validation, the best first, over blocks of the points that all of
     them include.
@@ -240,7 +242,7 @@ def _mean(score: Floats) -> tuple[float, float]:
     return float(score.mean()), float(score.std(ddof=1) / np.sqrt(len(score)))
 
 
-def _fit_common_rows(models: Sequence[Posed], loss: Loss) -> list[Posed]:
+def _fit_common_rows(models: Sequence[SolvedProblem], loss: Loss) -> list[SolvedProblem]:
     """Fit each model to the rows that all of them can predict."""
     groups = zip(*(model.problem.observations for model in models), strict=True)
     common_rows = [
@@ -253,17 +255,17 @@ def _fit_common_rows(models: Sequence[Posed], loss: Loss) -> list[Posed]:
             observation.part(np.isin(observation.rows, rows)) for observation, rows in pairs
         )
         problem = replace(model.problem, observations=parts)
-        result.append(Posed(model.name, problem, solved(problem, model.solution.z, loss)))
+        result.append(SolvedProblem(model.name, problem, solved(problem, model.solution.z, loss)))
     return result
 
 
-def _values(model: Posed) -> dict[str, float]:
+def _values(model: SolvedProblem) -> dict[str, float]:
     names = [unknown.parameter.path for unknown in model.problem.unknowns]
     return dict(zip(names, map(float, model.solution.z), strict=False))
 
 
 def _cross_validate(
-    model: Posed, blocks: Sequence[NDArray[np.intp]], folds: int, loss: Loss
+    model: SolvedProblem, blocks: Sequence[NDArray[np.intp]], folds: int, loss: Loss
 ) -> Floats:
     """Return the mean square residual of each block, predicted by a fit to the other folds,
     (block,)."""
@@ -734,5 +736,7 @@ def _identifiable_combination(
     size = abs(combination.estimate.value) if is_product else 1.0
     return replace(
         combination,
-        estimate=Estimate(combination.estimate.value, error * size, error < TELLS * largest),
+        estimate=Estimate(
+            combination.estimate.value, error * size, error < IDENTIFIABLE_RATIO * largest
+        ),
     )

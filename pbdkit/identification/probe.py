@@ -34,7 +34,7 @@ from pbdkit.identification.waves import (
 )
 from pbdkit.linear.stencil import NOWHERE, Stencil, linearised, move
 from pbdkit.plugin import Here, Slot
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 
@@ -249,7 +249,7 @@ def identified(scene: Scene) -> Identity:
     """
     experiment, cell = scene.experiment, scene.experiment.lattice.cell()
     spacing = spacing_of(cell)
-    with blaming(experiment.rule, "when evaluated for small displacements", "rule"):
+    with errors_attributed_to(experiment.rule, "when evaluated for small displacements", "rule"):
         response = probe(scene, spacing)
     _refuse_no_numbers(response.stencil, experiment.rule.type)
     stencil, degree = primitive(cell, response.stencil), len(scene.neighbourhood.slots[0])

@@ -111,9 +111,13 @@ def primitive(cell: Cell, stencil: Stencil) -> Primitive:
     }
     basis = _shortest(vectors, np.array([positions[s] - positions[0] for s in images]))
     sites, number = np.unique(np.min(list(images.values()), axis=0), return_inverse=True)
-    is_kept = np.isin(source, sites)
-    source, target, centre = number[source[is_kept]], number[target[is_kept]], stencil.centre[sites]
-    return Primitive(spacing, basis, centre, source, target, rest[is_kept], matrix[is_kept])
+    is_selected = np.isin(source, sites)
+    source, target, centre = (
+        number[source[is_selected]],
+        number[target[is_selected]],
+        stencil.centre[sites],
+    )
+    return Primitive(spacing, basis, centre, source, target, rest[is_selected], matrix[is_selected])
 
 
 def _image(positions: Floats, vectors: Floats, shift: Floats) -> NDArray[np.intp] | None:

@@ -186,7 +186,7 @@ class NewFile(io.RawIOBase):
         self.check()
         os.fsync(self.disk.fileno())
 
-    def settle(self) -> None:
+    def finalize(self) -> None:
         """Finish the file. Raises OSError if any write failed."""
         self.sync()
 
@@ -248,7 +248,7 @@ def open_atomic(path: Path, kind: type[File], *, replace: bool) -> Iterator[File
                 with _refusing(path):
                     file.check()
             with _refusing(path):
-                file.settle()
+                file.finalize()
                 destination.take(temporary, "complete")
     finally:
         with suppress(OSError):

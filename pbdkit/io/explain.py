@@ -97,7 +97,7 @@ class BondRecords:
         the model does not define it."""
         limits, last = np.full(len(self.bonds), np.nan), math.ceil(self._dataset["time"].values[-1])
         moments = np.where(self.steps > 0, self.steps, last)
-        if not self._scene.experiment.courses:
+        if not self._scene.experiment.time_dependent:
             moments[:] = last
         for moment in np.unique(moments).tolist():
             at = moments == moment
@@ -113,8 +113,8 @@ class BondRecords:
         memories = [_last(self._dataset[name]).astype(float) for name in self._remembered]
         for n, plane in enumerate(self._scene.neighbourhood.planes):
             rows = np.flatnonzero(self._scene.bonds.plane == n)
-            home = Places(self._scene.raster.shape, self._scene.bonds.place[rows])
-            fixed = constants.limits_at(plane.slot, n, home)
+            owner = Places(self._scene.raster.shape, self._scene.bonds.place[rows])
+            fixed = constants.limits_at(plane.slot, n, owner)
             c = constants.of_bond(*fixed, *(values[rows] for values in memories))
             limits[rows] = model.breaking_strain(plane.slot.rest, c, constants.fracture)
         return limits

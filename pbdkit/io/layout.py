@@ -242,7 +242,7 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
     return {"$schema": DIALECT, "title": "pbdkit dataset"} | _object(parts, sorted(parts))
 
 
-def makers_of(names: set[str]) -> list[str]:
+def diagnostics_that_provide(names: set[str]) -> list[str]:
     """Return the built-in diagnostics, as written in experiments, that provide a variable of one of
     these names, or of a name that begins with one of them and `_`."""
     prefixes = tuple(f"{name}_" for name in names if name)

@@ -279,9 +279,9 @@ class NetcdfSink(KeepingSink):
         return self._destination.written
 
     @property
-    def kept(self) -> bool:
+    def has_checkpoint(self) -> bool:
         """Return whether there is a checkpoint to resume from."""
-        return self.unfinished is not None and self.unfinished.kept
+        return self.unfinished is not None and self.unfinished.has_checkpoint
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
         """Open the file, so that errors are found before the first step."""
@@ -316,10 +316,10 @@ class NetcdfSink(KeepingSink):
         self.unfinished, self._temporary = unfinished, unfinished.records
         file, status = unfinished.file(read_only=False), unfinished.facts["finished"]
         with self._storing():
-            settled = is_whole(file.disk)
-            if settled and not file.is_settled():
+            finalized = is_whole(file.disk)
+            if finalized and not file.is_finalized():
                 raise damage_error(unfinished.records, "its content belongs to another result")
-            self._complete(file, status, settled=settled)
+            self._complete(file, status, finalized=finalized)
 
     def put(self, values: Values) -> None:
         """Write values to the file, chunk by chunk."""
@@ -363,11 +363,11 @@ class NetcdfSink(KeepingSink):
                 self.unfinished.conclude(file.file, attributes["status"])
             self._complete(file.file, attributes["status"])
 
-    def _complete(self, file: PagedFile, status: str, *, settled: bool = False) -> None:
+    def _complete(self, file: PagedFile, status: str, *, finalized: bool = False) -> None:
         """Verify a complete file, write its pages, and rename it. Raises OSError."""
-        if not settled:
+        if not finalized:
             file.verify()
-            file.settle()
+            file.finalize()
         try:
             self._destination.take(self._temporary, status)
         finally:

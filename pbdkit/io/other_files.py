@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pbdkit.errors import ExperimentError
 from pbdkit.io.run_store import STORE
-from pbdkit.model.reading import EXPERIMENT, kind_of, read_file, what_takes
+from pbdkit.model.reading import EXPERIMENT, command_for, kind_of, read_file
 from pbdkit.model.shipped import shipped_names
 from pbdkit.untrusted_files import BEGINNINGS
 
@@ -40,7 +40,7 @@ def other_file(path: Path) -> str:
         return "is not a result; by its name it is an experiment" if path.suffix in TEXTS else ""
     if kind == EXPERIMENT:
         return f"is an experiment; `pbdkit run {path}` computes its result and prints the path"
-    description = f"is {kind}, not a result; {what_takes(kind, str(path))}"
+    description = f"is {kind}, not a result; {command_for(kind, str(path))}"
     return description if kind else "is not a result; the names of results end in .nc"
 
 

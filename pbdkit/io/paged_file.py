@@ -42,7 +42,7 @@ class Header(NamedTuple):
     commits: int
 
 
-SETTLED = Header(b"", 1)
+FINALIZED = Header(b"", 1)
 """Header returned for a file in which the superblock of HDF5 has already replaced the header, which
 happens after at least one commit."""
 
@@ -65,7 +65,7 @@ def read_header(file: io.FileIO) -> Header | None:
         if not data.strip(b"\0"):
             return None
         if data.startswith(HDF5):
-            return SETTLED
+            return FINALIZED
         fields = data[: LAYOUT.size]
         if data.startswith(MAGIC) and data[LAYOUT.size :] == xxhash.xxh3_64_digest(fields):
             return Header(*LAYOUT.unpack(fields)[1:])
@@ -86,8 +86,8 @@ class PagedFile(NewFile):
 
     Large writes are appended to the file on the disk, after all bytes that existed at the last
     `commit`. Each extent is written once. Everything else, such as the metadata that HDF5 rewrites,
-    stays in memory until `settle`. The bytes on the disk together with the pages, extents and size
-    of a commit therefore form the file as of that commit, independent of later writes. With
+    stays in memory until `finalize`. The bytes on the disk together with the pages, extents and
+    size of a commit therefore form the file as of that commit, independent of later writes. With
     `read_only` all writes stay in memory.
 
     Extents passed to the constructor are verified before any of their bytes are returned; damage
@@ -131,7 +131,7 @@ class PagedFile(NewFile):
         return self._place
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the size, as in any file; on the disk it is set by `settle`."""
+        """Set the size, as in any file; on the disk it is set by `finalize`."""
         self.size = self._place if size is None else size
         return self.size
 
@@ -194,7 +194,7 @@ class PagedFile(NewFile):
         self._append_from = max(self._append_from, self.size)
         self.noted, self.changed = len(self.extents), set()
 
-    def settle(self) -> None:
+    def finalize(self) -> None:
         """Write the pages to their positions, seal and sync the file, and read all of it back.
         Raises OSError if it cannot be written, or differs from what was written."""
         self.check()
@@ -202,14 +202,16 @@ class PagedFile(NewFile):
             self.disk.seek(number * PAGE)
             write_all(self.disk, page)
         self.disk.truncate(self.size)
-        put_seal(self.disk, [self._settled(e) for e in self.extents if e.stop <= self.size])
+        put_seal(
+            self.disk, [self._with_present_digest(e) for e in self.extents if e.stop <= self.size]
+        )
         self.sync()
         if not is_whole(self.disk):
             raise OSError(
                 f"{self.disk.name}: the bytes that the disk returns differ from those written"
             )
 
-    def is_settled(self) -> bool:
+    def is_finalized(self) -> bool:
         """Return whether the pages are at their positions on the disk; the seal is written after
         the last page."""
         for number, page in self.pages.items():
@@ -218,7 +220,7 @@ class PagedFile(NewFile):
                 return False
         return True
 
-    def _settled(self, extent: ByteRange) -> ByteRange:
+    def _with_present_digest(self, extent: ByteRange) -> ByteRange:
         """Return an extent with its present digest, which differs where a page overlaps it."""
         pages = range(extent.start // PAGE, -(-extent.stop // PAGE))
         if not any(page in self.pages for page in pages):

@@ -60,7 +60,7 @@ class Physical:
     def _defines_units(self, diagnostic: Diagnostic, quantity: Quantity) -> bool:
         """Return whether the diagnostic's modulus, and thickness where needed, are those of
         `units`."""
-        if self._units is None or self._units.lacks(quantity):
+        if self._units is None or self._units.missing_entries(quantity):
             return False
         fields = [n for n in ("youngs_modulus", "thickness") if getattr(quantity, n)]
         return {*fields} <= {*given_by_units(diagnostic)} and all(

@@ -26,7 +26,7 @@ from pbdkit.lattice.raster import FRAME
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import Diagnostic, Moment, RenewsBonds, RenewsParticles, Variable
 from pbdkit.plugin.component import as_values
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -177,7 +177,7 @@ class RecordedVariables:
             if not which(diagnostic):
                 continue
             sizes, dimension = dict(self.sizes), diagnostic.own_dimension
-            with blaming(diagnostic, occasion, "diagnostics", n):
+            with errors_attributed_to(diagnostic, occasion, "diagnostics", n):
                 results = as_values(diagnostic.measure(moment), "measure")
                 for (variable, factor), value in zip(variables, results, strict=True):
                     if dimension in variable.dims and np.ndim(value) == len(variable.dims):
@@ -222,12 +222,12 @@ def _refuse_infinite(variable: Variable, value: Any, moment: Moment, offset: int
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """Outcome of a run; `certificate` holds the error bound of an equilibrium."""
+    """Outcome of a run; `error_bound` holds the error bound of an equilibrium."""
 
     status: str
     stop_reason: str
     steps: int
-    certificate: dict[str, Any] | None = None
+    error_bound: dict[str, Any] | None = None
 
 
 class Recorder:
@@ -358,7 +358,7 @@ class Recorder:
             "status": outcome.status,
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        } | ({"certificate": json.dumps(outcome.certificate)} if outcome.certificate else {})
+        } | ({"certificate": json.dumps(outcome.error_bound)} if outcome.error_bound else {})
 
 
 def provenance_of(experiment: Experiment) -> dict[str, str]:

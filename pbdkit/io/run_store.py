@@ -26,8 +26,8 @@ from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.io.atomic_file import FULL, is_full, lock, open_locked, sync_folder
 from pbdkit.io.checkpoint import Arrays, Checkpoint
 from pbdkit.io.paged_file import (
+    FINALIZED,
     PAGE,
-    SETTLED,
     Header,
     PagedFile,
     PiecedArray,
@@ -42,7 +42,7 @@ from pbdkit.io.sqlite_file import (
     files_of,
     is_database,
     journal_mode,
-    look,
+    open_read_only,
     size_of,
 )
 
@@ -92,7 +92,7 @@ class RunStore:
         self._verified: dict[str, bytes] = {}
         self._listed: dict[str, bytes] = {}
         """Digests of the pieces written or read so far, and of all pieces, by key."""
-        self._settled, self._closing = False, ExitStack()
+        self._is_checkpointed, self._closing = False, ExitStack()
         _refuse_others(path)
         try:
             with self._sqlite():
@@ -129,9 +129,9 @@ class RunStore:
             self._listed, self.commits = listed, number
             self._verified |= digests
             # The table and the first commit are written last, in case the log is lost.
-            if not self._settled:
+            if not self._is_checkpointed:
                 _, frames, moved = self._file.execute("PRAGMA wal_checkpoint").fetchone()
-                self._settled = frames == moved
+                self._is_checkpointed = frames == moved
 
     def keys(self, begin: str) -> list[str]:
         """Return the keys with a prefix."""
@@ -179,7 +179,7 @@ class RunStore:
             raise StorageError(f"{self.path}: is damaged: it is missing, or not a database")
         if mode == "ro":
             try:
-                self._file = look(self.path, self._closing)
+                self._file = open_read_only(self.path, self._closing)
             except OSError as error:
                 raise StorageError(f"{self.path}: cannot be read: {error}") from None
         else:
@@ -509,7 +509,7 @@ class UnfinishedRun:
         self.output, self.disk, self._store = output, disk, store
         self._arrays: set[str] = set()
         self.records = records_of(output)
-        self.kept = False
+        self.has_checkpoint = False
         """True once anything was committed."""
 
     @classmethod
@@ -565,7 +565,7 @@ class UnfinishedRun:
         except BaseException:
             disk.close()
             raise
-        opened.kept = True
+        opened.has_checkpoint = True
         return opened
 
     def keep(
@@ -594,18 +594,18 @@ class UnfinishedRun:
     def _commit(self, file: PagedFile, pieces: Iterable[Piece], obsolete: set[str]) -> None:
         self._note_commits()
         file.sync()
-        numbers = file.changed if self.kept else file.pages
+        numbers = file.changed if self.has_checkpoint else file.pages
         pages = [(f"{PAGES}{n}", bytes(file.pages[n])) for n in numbers]
-        added = file.added if self.kept else file.extents
+        added = file.added if self.has_checkpoint else file.extents
         extents = [(f"{EXTENTS}{len(file.extents)}", np.array(added, EXTENT).tobytes())]
         layout = {"size": file.size, "pages": len(file.pages), "extents": len(file.extents)}
         contents = [*pages, *(extents if added else []), ("file", json_piece(layout))]
         self._store.commit(chain(pieces, contents), obsolete)
         self._note_commits()
         file.commit()
-        if not self.kept:
+        if not self.has_checkpoint:
             sync_folder(self.output.absolute().parent)
-        self.kept = True
+        self.has_checkpoint = True
 
     @property
     def about(self) -> dict[str, Any]:
@@ -656,7 +656,7 @@ class UnfinishedRun:
         """Close the store, which remains for `resume` if anything was committed and is removed
         otherwise."""
         self._store.close()
-        if not self.kept and not self.disk.closed:
+        if not self.has_checkpoint and not self.disk.closed:
             remove_unfinished(self.output)
         self.disk.close()
 
@@ -686,9 +686,9 @@ class UnfinishedRun:
         """Raise StorageError if the records belong to another run or, unless opened with `anyway`,
         if the store has fewer commits than the header of the records states."""
         commits, store = self._store.commits, self._store.path
-        if header is None or (header is SETTLED and "finished" not in self.facts):
+        if header is None or (header is FINALIZED and "finished" not in self.facts):
             raise damage_error(self.records, "its first bytes have changed since they were written")
-        if header is not SETTLED and header.identity != self._store.identity:
+        if header is not FINALIZED and header.identity != self._store.identity:
             raise damage_error(store, f"{self.records} belongs to another run")
         if commits < header.commits and not anyway:
             raise StorageError(

@@ -104,7 +104,7 @@ class MemorySink(Sink):
 LARGE_BYTES = 2**20
 """Number of bytes below which values are written directly, because a second thread would not save
 time."""
-MOST_WAITING = 2
+MAX_WAITING = 2
 """Maximum number of pending large values; beyond it the run waits."""
 MAX_CALLS = 100
 """Maximum number of pending calls; beyond it the run waits."""
@@ -133,7 +133,7 @@ class OverlappingSink(KeepingSink):
         while self._waiting and self._waiting[0][1].done():
             self._waiting.popleft()[1].result()
         if self._waiting or large:
-            self._hand_over(large, self._inner.put, values)
+            self._submit(large, self._inner.put, values)
         else:
             self._inner.put(values)
 
@@ -143,7 +143,7 @@ class OverlappingSink(KeepingSink):
 
     def keep(self, checkpoint: Checkpoint) -> None:
         """Store a copy of the checkpoint while the run continues."""
-        self._keeping = self._hand_over(True, self._inner.keep, checkpoint.copied())
+        self._keeping = self._submit(True, self._inner.keep, checkpoint.copied())
 
     def suspend(self, checkpoint: Checkpoint) -> None:
         """Store a checkpoint after all values are written."""
@@ -166,12 +166,12 @@ class OverlappingSink(KeepingSink):
         self._waiting.clear()
         self._inner.abandon()
 
-    def _hand_over(self, large: bool, call: Callable[[Any], None], what: Any) -> Future[None]:
-        while len(self._waiting) >= MAX_CALLS or (large and self._large_ones() >= MOST_WAITING):
+    def _submit(self, large: bool, call: Callable[[Any], None], what: Any) -> Future[None]:
+        while len(self._waiting) >= MAX_CALLS or (large and self._large_ones() >= MAX_WAITING):
             self._waiting.popleft()[1].result()
-        handed = self._thread.submit(call, what)
-        self._waiting.append((large, handed))
-        return handed
+        future = self._thread.submit(call, what)
+        self._waiting.append((large, future))
+        return future
 
     def _large_ones(self) -> int:
         return sum(large for large, _ in self._waiting)

@@ -45,7 +45,7 @@ from pbdkit.plugin import (
     length,
 )
 from pbdkit.plugin.diagnostic import BondHistory, CellValues, ForceValues
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.lattice import Side, area_share, corner_share, signed_area
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import (
@@ -468,9 +468,9 @@ class StateCells(CellValues):
         if self._state.broken_step is None:
             return intact
         for block, slot in patch.bonds(self._scene.neighbourhood.slots):
-            plane, at_this_end = self._scene.neighbourhood.home[slot]
-            home = block if at_this_end else block.seen_through(slot)
-            intact = intact & (home.within(self._state.broken_step[plane]) < 0)
+            plane, at_this_end = self._scene.neighbourhood.owner[slot]
+            owner = block if at_this_end else block.seen_through(slot)
+            intact = intact & (owner.within(self._state.broken_step[plane]) < 0)
         return intact
 
 
@@ -681,18 +681,20 @@ class StateForces(ForceValues):
 
     @cached_property
     def _on_particles(self) -> Floats:
-        with self._blaming_rule():
+        with self._errors_attributed_to_rule():
             forces = self._tables.followers.forces(self._u, self._state)
         return self._tables.of_body(forces)
 
     def energy(self) -> float:
         """Return the energy of the rule."""
-        with self._blaming_rule():
+        with self._errors_attributed_to_rule():
             return self._tables.followers.energy(self._u, self._state)
 
     @property
     def _u(self) -> Floats:
         return self._state.u.astype(float, copy=False)
 
-    def _blaming_rule(self) -> AbstractContextManager[None]:
-        return blaming(self._rule, f"to return forces at step {self._state.step}", "rule")
+    def _errors_attributed_to_rule(self) -> AbstractContextManager[None]:
+        return errors_attributed_to(
+            self._rule, f"to return forces at step {self._state.step}", "rule"
+        )

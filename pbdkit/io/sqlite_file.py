@@ -78,7 +78,7 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
     return connection
 
 
-def look(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connection:
+def open_read_only(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connection:
     """Open a database to read one commit of it; `closing` closes it.
 
     A connection with write access would drop a damaged write-ahead log when it is closed. A

@@ -351,7 +351,7 @@ class CellBond:
         Index of the plane that stores the bond.
     slot
         Slot of the plane.
-    home
+    owner
         Slot from the particle to the neighbour at which the bond is stored; None if the bond is
         stored at the particle itself.
     on_left, on_right
@@ -361,7 +361,7 @@ class CellBond:
 
     plane: int
     slot: Slot
-    home: Slot | None
+    owner: Slot | None
     on_left: bool
     on_right: bool
 
@@ -435,6 +435,6 @@ def _bonds(
         for (a, start), (b, end) in permutations(corners, 2):
             if (slot.source, slot.target, slot.cell) == (a, b, tuple(map(sub, end, start))):
                 on_left, on_right = (_key(a, start, side) == key for side in tiling.beside[slot])
-                home = neighbours.get((a, start))
-                bonds.append(CellBond(plane, slot, home, on_left, on_right))
+                owner = neighbours.get((a, start))
+                bonds.append(CellBond(plane, slot, owner, on_left, on_right))
     return tuple(bonds)

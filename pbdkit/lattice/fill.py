@@ -27,7 +27,7 @@ from pbdkit.lattice.raster import (
     EMPTY,
     FOLLOWER,
     FRAME,
-    LeftOut,
+    OmittedCells,
     Raster,
     bounds,
     cells_of_sites,
@@ -75,13 +75,13 @@ class Filling:
         low, high = (tuple(map(add, self.first, end)) for end in ends)
         return low, high
 
-    def left_out_on(self, lines: Lines | None = None) -> LeftOut:
+    def left_out_on(self, lines: Lines | None = None) -> OmittedCells:
         """Return those cells omitted at narrow voids that have their first corner on the lines."""
         if self.left_out is None:
-            return LeftOut()
+            return OmittedCells()
         line = self.left_out[:, 0]
         low, high = lines or (line.min(initial=0), line.max(initial=0) + 1)
-        return LeftOut.of(self.left_out[(line >= low) & (line < high)])
+        return OmittedCells.of(self.left_out[(line >= low) & (line < high)])
 
     def within(self, low: Index, high: Index) -> Filling:
         """Return the part of the filling from site `low` to `high`, which is excluded."""

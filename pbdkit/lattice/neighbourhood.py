@@ -88,17 +88,17 @@ class Neighbourhood:
         return tuple(np.abs([slot.cell for slot in self.every]).max(axis=0).tolist())
 
     @cached_property
-    def home(self) -> dict[Slot, tuple[int, bool]]:
+    def owner(self) -> dict[Slot, tuple[int, bool]]:
         """Plane in which the bonds along each slot are stored, and whether a bond is stored at the
         particle at which the slot starts."""
         ends = enumerate(self.planes)
         return {slot: (n, slot is p.slot) for n, p in ends for slot in (p.slot, p.opposite)}
 
     @property
-    def home_reach(self) -> tuple[Index, Index]:
+    def owner_reach(self) -> tuple[Index, Index]:
         """Largest differences of repeat cell, backward and forward, between a particle and the
         places that store its bonds."""
-        steps = [slot.cell for slot, (_, at_start) in self.home.items() if not at_start]
+        steps = [slot.cell for slot, (_, at_start) in self.owner.items() if not at_start]
         cells = np.array([(0,) * self.cell.axes, *steps])
         return tuple((-cells.min(axis=0)).tolist()), tuple(cells.max(axis=0).tolist())
 

@@ -34,7 +34,7 @@ def distinct(numbers: NDArray[np.integer[Any]]) -> Indices:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class OmittedCells:
     """Cells omitted because they would connect two sides of a void.
 
     Parameters
@@ -49,14 +49,14 @@ class LeftOut:
     first: Index | None = None
 
     @classmethod
-    def of(cls, sites: Indices) -> LeftOut:
+    def of(cls, sites: Indices) -> OmittedCells:
         """Create from the sites of the first corners, (cell, axis)."""
         return cls(len(sites), min(map(tuple, sites.tolist()), default=None))
 
-    def __add__(self, other: LeftOut) -> LeftOut:
+    def __add__(self, other: OmittedCells) -> OmittedCells:
         """Add the numbers of cells, and take the smaller one of the two first sites."""
         sites = [cells.first for cells in (self, other) if cells.first]
-        return LeftOut(self.count + other.count, min(sites, default=None))
+        return OmittedCells(self.count + other.count, min(sites, default=None))
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class Stretch:
     particle_offset: int
     rows: NDArray[np.int64]
     first: int
-    left_out: LeftOut
+    left_out: OmittedCells
 
 
 @dataclass(frozen=True)

@@ -37,11 +37,11 @@ class CoordinateMatrix:
 
     def without(self, unknowns: Integers) -> CoordinateMatrix:
         """Return the matrix without the rows and columns of some unknowns."""
-        is_kept = np.ones(self.shape[0], bool)
-        is_kept[unknowns] = False
-        number = np.cumsum(is_kept) - 1
-        entries = is_kept[self.rows] & is_kept[self.columns]
-        size = int(np.count_nonzero(is_kept))
+        is_remaining = np.ones(self.shape[0], bool)
+        is_remaining[unknowns] = False
+        number = np.cumsum(is_remaining) - 1
+        entries = is_remaining[self.rows] & is_remaining[self.columns]
+        size = int(np.count_nonzero(is_remaining))
         places = number[self.rows[entries]], number[self.columns[entries]]
         return CoordinateMatrix(*places, self.values[entries], (size, size))
 

@@ -374,11 +374,11 @@ class _Assembly:
         through_frame = is_leader & by_frame
         leaders = self._as_leader[places[through_frame]]
         self._frame_leader.add(rows[through_frame], leaders, blocks[through_frame])
-        lags = by_frame if frame is not None and frame.map.lag else np.zeros_like(by_frame)
+        delayed = by_frame if frame is not None and frame.map.delay else np.zeros_like(by_frame)
         discarded = BlockMatrix((0, 0), 0)
         for couplings, leads, selected in (
-            (self._current, self._leader, is_follower & ~lags),
-            (self._previous, self._leader, is_follower & lags),
+            (self._current, self._leader, is_follower & ~delayed),
+            (self._previous, self._leader, is_follower & delayed),
             (discarded, self._frame_leader, is_follower & by_frame),
         ):
             numbers = self._unknown[places[selected]], self._as_leader[places[selected]]

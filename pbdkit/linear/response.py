@@ -20,7 +20,7 @@ from pbdkit.array_types import Floats, Indices
 from pbdkit.lattice.raster import EMPTY, Places, slot_step
 from pbdkit.linear.stencil import SMALL, array_of, derivative
 from pbdkit.plugin import Here, Slot, Softens, SoftensCells, Vector
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.rule_evaluation import Contributions, Evaluator, Surroundings, summed
@@ -91,7 +91,7 @@ def respond(
     kinds = np.arange(len(place))
     is_uniform = not scene.experiment.rule.uses_reference and not _varies(scene, state)
     at_rest = not state.u.any()
-    with blaming(scene.experiment.rule, "when linearised"):
+    with errors_attributed_to(scene.experiment.rule, "when linearised"):
         if is_uniform and at_rest and len(place) > FEW:
             kinds, place = _group_alike(scene, state, sublattice, place)
         parts = []
@@ -201,9 +201,9 @@ def _is_regular(scene: Scene, state: State, sublattice: int) -> Present:
     for slot in around.slots[sublattice]:
         inside &= block.seen_through(slot).of(occupied)
         if state.broken_step is not None and not scene.tears:
-            plane, at_this_end = around.home[slot]
-            home = block if at_this_end else block.seen_through(slot)
-            inside &= home.within(state.broken_step[plane]) < 0
+            plane, at_this_end = around.owner[slot]
+            owner = block if at_this_end else block.seen_through(slot)
+            inside &= owner.within(state.broken_step[plane]) < 0
         for side in around.tiling.beside[slot] if scene.cells else ():
             first = block.seen_through(side.first) if side.first else block
             inside &= first.of(whole[side.kind])
@@ -211,8 +211,8 @@ def _is_regular(scene: Scene, state: State, sublattice: int) -> Present:
         assert state.broken_step is not None
         for cell in around.cells_around[sublattice].cells:
             for bond in cell:
-                home = block.seen_through(bond.home) if bond.home else block
-                inside &= home.within(state.broken_step[bond.plane]) < 0
+                owner = block.seen_through(bond.owner) if bond.owner else block
+                inside &= owner.within(state.broken_step[bond.plane]) < 0
     return regular
 
 

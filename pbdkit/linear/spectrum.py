@@ -51,7 +51,7 @@ oscillate."""
 
 
 @dataclass(frozen=True)
-class Swing:
+class OscillatingMode:
     """An oscillating mode.
 
     Parameters
@@ -100,17 +100,17 @@ def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | No
     return float((2.0 * (1.0 + memory) * z.real / (z.real**2 + stretched**2)).min())
 
 
-def slowest_swing(mu: Complex) -> Swing | None:
+def slowest_oscillation(mu: Complex) -> OscillatingMode | None:
     """Return the oscillating mode with the longest period, given the eigenvalues μ of a step.
     Return None if all eigenvalues are real."""
-    swinging = mu[np.abs(mu.imag) > STRAIGHT]
-    if not len(swinging):
+    oscillating = mu[np.abs(mu.imag) > STRAIGHT]
+    if not len(oscillating):
         return None
-    slowest = swinging[np.argmin(np.abs(np.angle(swinging)))]
-    return Swing(float(2.0 * np.pi / np.abs(np.angle(slowest))), float(np.abs(slowest)))
+    slowest = oscillating[np.argmin(np.abs(np.angle(oscillating)))]
+    return OscillatingMode(float(2.0 * np.pi / np.abs(np.angle(slowest))), float(np.abs(slowest)))
 
 
-def swings_below(relaxation: float, memory: float) -> float:
+def oscillation_limit(relaxation: float, memory: float) -> float:
     """Return 1 - (1 - √b)² / w, for a momentum 0 < b < 1. Modes with a real λ below it oscillate.
 
     Modes with λ below 1 - (1 + √b)² / w, however, do not oscillate.
@@ -151,7 +151,7 @@ class Spectrum:
     eigenvalues: Complex
 
 
-class TooDearError(RuntimeError):
+class TooExpensiveError(RuntimeError):
     """The eigenvalues are so close together that their computation would exceed the maximum number
     of multiplications."""
 
@@ -162,7 +162,7 @@ def spectrum(matrix: Any) -> Spectrum:
 
     Raises
     ------
-    TooDearError
+    TooExpensiveError
         If more than `MAX_MULTIPLICATIONS` multiplications are needed.
     """
     values, symmetric, budget = [np.empty(0, complex)], True, _Budget()
@@ -191,7 +191,7 @@ def just_below(matrix: Any, edge: float) -> Complex:
 
     Raises
     ------
-    TooDearError
+    TooExpensiveError
         If more than `MAX_MULTIPLICATIONS` multiplications are needed.
     """
     budget = _Budget()
@@ -251,7 +251,7 @@ def _hashable(block: Any) -> tuple[Any, ...]:
 
 class _Budget:
     """Counter of the multiplications in an iteration. If there are too many, it ends the iteration
-    with TooDearError."""
+    with TooExpensiveError."""
 
     def __init__(self) -> None:
         self._remaining = MAX_MULTIPLICATIONS
@@ -264,7 +264,7 @@ class _Budget:
         def counted(x: Any) -> Any:
             self._remaining -= cost + KRYLOV_VECTORS * size
             if self._remaining < 0:
-                raise TooDearError
+                raise TooExpensiveError
             return product(x)
 
         return LinearOperator((size, size), matvec=counted, dtype=float)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Floats
 from pbdkit.linear.spectrum import Complex, modes
 from pbdkit.plugin import Here, Slot
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
@@ -236,10 +236,14 @@ def wave_bound(scene: Scene) -> Bound | None:
     if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MAX_EVALUATIONS:
         return None
     solver = scene.experiment.stepping
-    if scene.lag or scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
+    if (
+        scene.frame_delay
+        or scene.experiment.rule.uses_reference
+        or scene.experiment.neighbours.nearness()
+    ):
         return None
     try:
-        with blaming(scene.experiment.rule, "when evaluated for plane waves"):
+        with errors_attributed_to(scene.experiment.rule, "when evaluated for plane waves"):
             eigenvalues = _eigenvalues(_symbols(scene)).ravel()
     except (
         Exception,

@@ -30,7 +30,7 @@ from pbdkit.plugin import Component, Pair
 from pbdkit.plugin.component import Strict
 from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.operation import Selection
-from pbdkit.plugin.schedule import BodyForce, Course, Force, at
+from pbdkit.plugin.schedule import BodyForce, Force, TimeDependent, at
 from pbdkit.plugin.units import LENGTH, Place
 
 
@@ -175,11 +175,11 @@ class Driven(Strict):
         """Return the last step of a run of `steps` in which the motion is active."""
         return steps if self.until is None else min(self.until, steps)
 
-    def next_change(self, step: int, foreseeable: bool = False) -> float:
+    def next_change(self, step: int, precomputable: bool = False) -> float:
         """Return the first step after `step` in which the motion begins, ends or, unless it is
-        `foreseeable`, continues; infinity if there is none.
+        `precomputable`, continues; infinity if there is none.
 
-        A motion by Newton's law is not foreseeable.
+        A motion by Newton's law is not precomputable.
         """
         last = math.inf if self.until is None else self.until
         if step < self.from_:
@@ -188,7 +188,7 @@ class Driven(Strict):
             return math.inf
         rests = self.motion.rests_after()
         is_moving = rests is None or step - self.from_ + 1 < rests
-        if is_moving and (isinstance(self.motion, Newton) or not foreseeable):
+        if is_moving and (isinstance(self.motion, Newton) or not precomputable):
             return step + 1
         return last + 1
 
@@ -262,10 +262,10 @@ class Load(Strict):
         return 0.0 + self.amplitude(moment) * np.array(forces)
 
     @property
-    def courses(self) -> list[Course[float]]:
+    def time_dependent(self) -> list[TimeDependent[float]]:
         """Time-dependent components of the force."""
         forces = self.force or self.body_force or ()
-        return [component for component in forces if isinstance(component, Course)]
+        return [component for component in forces if isinstance(component, TimeDependent)]
 
     def amplitude(self, moment: float) -> float:
         """Return the fraction of the force at the end of a step, or at a moment within it.

@@ -50,11 +50,11 @@ from pbdkit.plugin import (
     SoftensCells,
 )
 from pbdkit.plugin.component import Strict, as_values
-from pbdkit.plugin.discovery import Retired, blaming, retired_parts, with_successors
+from pbdkit.plugin.discovery import Retired, errors_attributed_to, retired_parts, with_successors
 from pbdkit.plugin.fields import (
     MAX_VALUES,
     RESERVED,
-    OfPlace,
+    PositionFunction,
     RandomField,
     TakesFields,
     Varying,
@@ -62,7 +62,7 @@ from pbdkit.plugin.fields import (
 )
 from pbdkit.plugin.registry import GIVEN, Registry
 from pbdkit.plugin.rule import Calibrated, material_of
-from pbdkit.plugin.schedule import Course
+from pbdkit.plugin.schedule import TimeDependent
 from pbdkit.plugin.units import Scales, Units, given_by_units, of_one_material
 
 Key = str | tuple[str, ...]
@@ -83,7 +83,7 @@ def clashes_of(experiment: Any) -> Iterator[tuple[Key, str]]:
 
 def _drawn_from(field: str, part: Any) -> Iterator[tuple[Key, str]]:
     draws = isinstance(part, Draws) and any(not number.changes for number in part.remembered())
-    for name in part.courses if draws else ():
+    for name in part.time_dependent if draws else ():
         yield (
             (field, name),
             f"'{part.type}' draws random numbers from it before the first step, so that it cannot "
@@ -101,7 +101,7 @@ def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
     """Check parts that require permanent bonds."""
     reevaluates = experiment.neighbours.nearness() is not None
     jumps = not experiment.solver.makes_steps
-    settles = experiment.stepping.settle is not None
+    ends_at_convergence = experiment.stepping.settle is not None
     return [
         ("fracture", reevaluates and experiment.fracture.can_break,
          "bonds cannot break if neighbours are re-evaluated, because bonds are not permanent; "
@@ -112,7 +112,7 @@ def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
         ("solver", reevaluates and jumps,
          "an equilibrium is not defined if neighbours are re-evaluated; "
          "set neighbours.reevaluate: false or solver: {type: stepping}"),
-        ("solver", reevaluates and settles,
+        ("solver", reevaluates and ends_at_convergence,
          "the distance from equilibrium has no bound if neighbours are re-evaluated; "
          "set neighbours.reevaluate: false, or remove solver.settle"),
         ("loads", reevaluates and bool(experiment.loads),
@@ -124,7 +124,10 @@ def _event_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
     """Check events after the last step, and components with limits that depend on the steps."""
     last = max(experiment.record.at or (0,))
     last_cut = max((cut.at for cut in experiment.cuts), default=0)
-    jumps, settles = not experiment.solver.makes_steps, experiment.stepping.settle is not None
+    jumps, ends_at_convergence = (
+        not experiment.solver.makes_steps,
+        experiment.stepping.settle is not None,
+    )
     remembers, softens = (
         isinstance(experiment.rule, RenewsParticles),
         isinstance(experiment.fracture, (Softens, SoftensCells)),
@@ -136,13 +139,13 @@ def _event_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
          "increments of load exist only for an equilibrium; use solver: {type: equilibrium}, or "
          "remove record.increments"),
         ("cuts", last_cut > steps, f"step {last_cut} exceeds the number of steps, {steps}"),
-        ("solver", settles and (remembers or softens),
+        ("solver", ends_at_convergence and (remembers or softens),
          f"'{(rule if remembers else experiment.fracture).type}' depends on the history, so that "
          "the distance from equilibrium has no bound; remove solver.settle"),
         ("solver", jumps and remembers,
          f"the rule '{rule.type}' depends on the history, so that there is no equilibrium that is "
          "independent of the steps; use solver: {type: stepping}"),
-        *(("solver", (jumps or settles) and not operation.rests,
+        *(("solver", (jumps or ends_at_convergence) and not operation.rests,
            f"'{operation.type}' can move particles at rest, so that the equilibrium is not "
            "determined; use solver: {type: stepping} without `settle`")
           for operation in experiment.operations),
@@ -239,7 +242,7 @@ def sampled(part: TakesFields, lattice: Lattice, body: Body, seed: int, field: s
     values: dict[str, Varying] = {}
     for name, varying in part.varying.items():
         try:
-            if isinstance(varying, OfPlace):
+            if isinstance(varying, PositionFunction):
                 values[name] = varying.sampled(*_grid(lattice, body))
             elif isinstance(varying, RandomField):
                 values[name] = varying.drawn_at(*_grid(lattice, body), seed, field)
@@ -328,7 +331,7 @@ def _numbered(fields: Mapping[str, Any]) -> Iterator[tuple[str | int, ...]]:
 
 
 def _declares_variables(part: Diagnostic) -> Diagnostic:
-    with blaming(part, "to declare its variables"):
+    with errors_attributed_to(part, "to declare its variables"):
         as_values(part.variables(), "variables")
     return part
 
@@ -624,17 +627,21 @@ class Experiment(Strict):
         return result or {"": self}
 
     @property
-    def courses(self) -> dict[tuple[str, str], Course[float]]:
+    def time_dependent(self) -> dict[tuple[str, str], TimeDependent[float]]:
         """Time-dependent parameters, by part and parameter, without those of loads.
 
         The fields of the experiment have the values at the end.
         """
         parts = {"rule": self.rule, "fracture": self.fracture, "solver": self.solver}
-        return {(f, n): course for f, part in parts.items() for n, course in part.courses.items()}
+        return {
+            (f, n): number for f, part in parts.items() for n, number in part.time_dependent.items()
+        }
 
     def at(self, moment: float) -> Experiment:
         """Return the experiment with its parameters at the end of a step, or within it."""
-        return self.model_copy(update={f: getattr(self, f).at(moment) for f, _ in self.courses})
+        return self.model_copy(
+            update={f: getattr(self, f).at(moment) for f, _ in self.time_dependent}
+        )
 
     def _repr_html_(self) -> str:
         """Return the scene and its stability analysis for notebooks."""

@@ -32,7 +32,7 @@ MAX_LINE = 2**16
 """Maximum number of characters in a line."""
 
 
-def or_a_file(*names: str) -> Callable[[dict[str, Any]], None]:
+def names_or_file(*names: str) -> Callable[[dict[str, Any]], None]:
     """Return an update of a JSON Schema that requires the fields `names` or `file`."""
 
     def either(schema: dict[str, Any]) -> None:
@@ -220,7 +220,7 @@ class Measured(Motion):
     replaces `points` and `displacements`.
     """
 
-    model_config = ConfigDict(json_schema_extra=or_a_file("points", "displacements"))
+    model_config = ConfigDict(json_schema_extra=names_or_file("points", "displacements"))
 
     type: Literal["measured"] = "measured"
     of_reference: ClassVar[bool] = True
@@ -460,7 +460,7 @@ class Table(Tabulated):
     The content of the file replaces `steps` and `displacements`.
     """
 
-    model_config = ConfigDict(json_schema_extra=or_a_file("steps", "displacements"))
+    model_config = ConfigDict(json_schema_extra=names_or_file("steps", "displacements"))
 
     type: Literal["table"] = "table"
     file: str | None = Field(None, exclude=True)

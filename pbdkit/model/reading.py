@@ -394,7 +394,7 @@ def kind_of(data: Mapping[str, Any]) -> str:
     return EXPERIMENT if data.keys() & (PARTS - COMMON_KEYS) or data.keys() <= PARTS else ""
 
 
-def what_takes(kind: str, name: str) -> str:
+def command_for(kind: str, name: str) -> str:
     """Return the command for a file of a kind."""
     if kind == SWEEP:
         return f"`pbdkit sweep {name}` runs it"
@@ -417,7 +417,7 @@ def of_kind(required: str, source: Source) -> Source:
     if kind:
         hints = {SWEEP: "; a sweep refers to it by `experiment`, and lists parameters in `vary`"}
         hint = hints.get(required, "") if kind == EXPERIMENT else ""
-        command = what_takes(kind, name)
+        command = command_for(kind, name)
         raise ExperimentError(f"{name}: is {kind}, not {required}; {command}{hint}")
     remedy = {
         EXPERIMENT: "it requires `lattice`, `body`, `rule`, `steps`; `pbdkit init` writes one",

@@ -13,7 +13,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.model.validation import closed_part
 from pbdkit.plugin import Component
 from pbdkit.plugin.component import Strict
-from pbdkit.plugin.schedule import COURSE, PLAIN, WORD, Course, form_of, last
+from pbdkit.plugin.schedule import PLAIN, TIME_DEPENDENT, WORD, TimeDependent, form_of, last
 
 Steps = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, min_length=1)]
 """Type of a list of recorded steps."""
@@ -90,30 +90,32 @@ Threads = Annotated[
 _Relaxation = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
-class RelaxationCourse(Course[_Relaxation]):
+class TimeDependentRelaxation(TimeDependent[_Relaxation]):
     """Relaxation that depends on time."""
 
 
 Relaxation = Annotated[
-    Word | Annotated[_Relaxation, Tag(PLAIN)] | Annotated[RelaxationCourse, Tag(COURSE)],
+    Word
+    | Annotated[_Relaxation, Tag(PLAIN)]
+    | Annotated[TimeDependentRelaxation, Tag(TIME_DEPENDENT)],
     Discriminator(_form_of),
 ]
 """Type of the relaxation: a number, time-dependent, or `auto`."""
 _Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class MemoryCourse(Course[_Memory]):
+class TimeDependentMomentum(TimeDependent[_Memory]):
     """Momentum coefficient that depends on time."""
 
 
 Memory = Annotated[
-    Word | Annotated[_Memory, Tag(PLAIN)] | Annotated[MemoryCourse, Tag(COURSE)],
+    Word | Annotated[_Memory, Tag(PLAIN)] | Annotated[TimeDependentMomentum, Tag(TIME_DEPENDENT)],
     Discriminator(_form_of),
 ]
 """Type of the momentum coefficient: a number, time-dependent, or `auto`."""
 
 
-class Settle(Strict):
+class SteadyStateCriterion(Strict):
     """Settings that end a run early, once the distance of every follower from equilibrium is below
     a tolerance.
 
@@ -140,7 +142,7 @@ class Solver(Component):
         return _equilibrium()
 
     @property
-    def courses(self) -> dict[str, Course[float]]:
+    def time_dependent(self) -> dict[str, TimeDependent[float]]:
         """Time-dependent parameters by name."""
         return {}
 
@@ -172,7 +174,7 @@ class Stepping(Solver):
     threads: Threads = "auto"
     relaxation_setting: Relaxation = Field(default=1.0, alias="relaxation")
     memory_setting: Memory = Field(default=0.0, alias="memory")
-    settle: Settle | None = None
+    settle: SteadyStateCriterion | None = None
 
     @property
     def stepping(self) -> Stepping:
@@ -191,14 +193,16 @@ class Stepping(Solver):
         return tuple(name for name, setting in settings.items() if setting == "auto")
 
     @property
-    def courses(self) -> dict[str, Course[float]]:
+    def time_dependent(self) -> dict[str, TimeDependent[float]]:
         """Time-dependent relaxation and momentum, by name."""
         settings = {"relaxation": self.relaxation_setting, "memory": self.memory_setting}
-        return {name: value for name, value in settings.items() if isinstance(value, Course)}
+        return {name: value for name, value in settings.items() if isinstance(value, TimeDependent)}
 
     def at(self, moment: float) -> Stepping:
         """Return the settings with the values of a moment."""
-        values = {f"{name}_setting": course.at(moment) for name, course in self.courses.items()}
+        values = {
+            f"{name}_setting": number.at(moment) for name, number in self.time_dependent.items()
+        }
         return self.model_copy(update=values)
 
     @property
@@ -229,7 +233,7 @@ class Stepping(Solver):
         return self.model_copy(update=values)
 
 
-def _number(setting: Literal["auto"] | float | Course[float], name: str) -> float:
+def _number(setting: Literal["auto"] | float | TimeDependent[float], name: str) -> float:
     if setting == "auto":
         text = "'auto' has no value yet; select it with pbdkit.stability.relaxation.tuned"
         raise ExperimentError(text, ("solver", name))

@@ -29,7 +29,7 @@ from pbdkit.errors import (
 )
 from pbdkit.model.reading import FileResolver, Source, file_resolver
 from pbdkit.plugin import INTERFACES, Component
-from pbdkit.plugin.discovery import blame
+from pbdkit.plugin.discovery import component_error
 from pbdkit.plugin.fields import MAX_VALUES, Gridded, TakesFields
 from pbdkit.plugin.registry import Registry
 from pbdkit.plugin.schedule import FORMS, WORD
@@ -207,7 +207,7 @@ def open_part(interface: type[Component]) -> BeforeValidator:
             part.model_dump_json()
         except (Exception, SystemExit) as error:
             when = "to be written as JSON for datasets"
-            raise _blame(type(part), when, error, info) from error
+            raise _component_error(type(part), when, error, info) from error
         return part
 
     return BeforeValidator(build)
@@ -257,7 +257,7 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
     except (Exception, SystemExit) as error:
         if not issubclass(part, tuple(INTERFACES.values())):
             raise
-        raise _blame(part, "to validate its parameters", error, info) from error
+        raise _component_error(part, "to validate its parameters", error, info) from error
 
 
 def _from_files(
@@ -275,10 +275,10 @@ def _from_files(
     return result
 
 
-def _blame(
+def _component_error(
     part: type[Component], when: str, error: BaseException, info: ValidationInfo
 ) -> PluginError:
-    return PluginError(str(blame(part, when, error)), (info.field_name or "",))
+    return PluginError(str(component_error(part, when, error)), (info.field_name or "",))
 
 
 def fault(text: str, **where: Any) -> PydanticCustomError:

@@ -48,16 +48,16 @@ class MPICommunicator(Communicator):
         flat = np.ascontiguousarray(numbers).ravel()
         minimum, size = np.empty_like(flat), max(1, NUMBERS_AT_ONCE // self.size)
         for at in range(0, len(flat), size):
-            mine = flat[at : at + size]
-            every = np.empty((self.size, len(mine)), mine.dtype)
-            self._comm.Allgather(mine, every)
+            local = flat[at : at + size]
+            every = np.empty((self.size, len(local)), local.dtype)
+            self._comm.Allgather(local, every)
             every.min(axis=0, out=minimum[at : at + size])
         return minimum.reshape(numbers.shape)
 
     def any(self, value: Any) -> bool:
         """Return whether the value is true in any process."""
-        mine, values = np.array([bool(value)], np.uint8), np.empty(self.size, np.uint8)
-        self._comm.Allgather(mine, values)
+        local, values = np.array([bool(value)], np.uint8), np.empty(self.size, np.uint8)
+        self._comm.Allgather(local, values)
         return bool(values.any())
 
     def send(self, block: Bytes, rank: int) -> None:
@@ -114,7 +114,7 @@ class MPICommunicator(Communicator):
         """Raise, in all processes, the error of the lowest rank that has an error."""
         if not self.any(error is not None):
             return
-        errors = self.allgather(error and _carried(error))
+        errors = self.allgather(error and _picklable(error))
         first = next(n for n, error_of_rank in enumerate(errors) if error_of_rank is not None)
         raised: Exception = error if first == self.rank and error else errors[first]
         raise raised
@@ -152,7 +152,7 @@ class MPICommunicator(Communicator):
             raise
 
 
-def _carried(error: Exception) -> Exception:
+def _picklable(error: Exception) -> Exception:
     """Return an error that can be sent to other processes: the same error if possible, otherwise an
     error with the same message."""
     try:

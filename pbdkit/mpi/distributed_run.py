@@ -26,10 +26,10 @@ from pbdkit.model.solver import Equilibrium, Solver, Stepping
 from pbdkit.mpi import driver, partition
 from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.plugin import AppliesTwice, Cell, Diagnostic, FollowerRule
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.progress import Watch
 from pbdkit.scene.memory_estimate import TooLargeError
-from pbdkit.scene.scene import Ground, Scene, build_scene
+from pbdkit.scene.scene import LatticeSetup, Scene, build_scene
 from pbdkit.simulation import Driver, Execution, Simulation
 from pbdkit.stability.forecast import prediction, quick_warnings
 from pbdkit.stability.relaxation import tuned, with_solver
@@ -55,13 +55,13 @@ CUTS: dict[type[Solver], PartitionScheme] = {
 """Partition schemes by solver."""
 
 
-class ElsewhereError(PbdkitError):
+class RemoteError(PbdkitError):
     """An error has occurred in another process."""
 
 
 class BuildCommunicator(Communicator):
     """Communicator during the construction of a scene: if one process fails, all others raise
-    ElsewhereError at their next call."""
+    RemoteError at their next call."""
 
     def __init__(self, communicator: MPICommunicator) -> None:
         self._inner = communicator
@@ -71,7 +71,7 @@ class BuildCommunicator(Communicator):
         """Return the values of all processes, by rank."""
         values = self._inner.allgather((True, value))
         if not all(goes_on for goes_on, _ in values):
-            raise ElsewhereError("another process has failed")
+            raise RemoteError("another process has failed")
         return [each for _, each in values]
 
     def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
@@ -82,10 +82,10 @@ class BuildCommunicator(Communicator):
     @contextmanager
     def raise_together(self) -> Iterator[None]:
         """Run the block. If an exception occurs in a process, all other processes raise
-        ElsewhereError at the end of the block."""
+        RemoteError at the end of the block."""
         try:
             yield
-        except ElsewhereError:
+        except RemoteError:
             raise
         except BaseException:
             self._inner.allgather((False, None))
@@ -107,7 +107,7 @@ def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
             with building.raise_together():
                 return _built(experiment, building)
         except Exception as raised:
-            error = None if isinstance(raised, ElsewhereError) else raised
+            error = None if isinstance(raised, RemoteError) else raised
         bug = error is not None and not isinstance(error, PbdkitError)
         if ranks.any(bug or _is_too_large(experiment)):
             if isinstance(error, ExperimentError):
@@ -120,7 +120,7 @@ def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
 def _is_too_large(experiment: Experiment) -> bool:
     """Return whether the whole scene is too large for one process."""
     try:
-        Ground(experiment)
+        LatticeSetup(experiment)
     except TooLargeError:
         return True
     except PbdkitError:
@@ -129,7 +129,7 @@ def _is_too_large(experiment: Experiment) -> bool:
 
 
 def _built(experiment: Experiment, ranks: Communicator) -> Scene:
-    ground = Ground(experiment, ranks)
+    ground = LatticeSetup(experiment, ranks)
     if not (counts := partition.count_rows(ground, ranks)):
         raise ground.nothing()
     bounds = partition.bounds_of(counts.rows, ranks.size)
@@ -158,12 +158,12 @@ def _levels(rule: FollowerRule) -> int:
     other. The evaluation of the forces on masses is included."""
     levels = 2
     while isinstance(rule, AppliesTwice):
-        with blaming(rule, "to return its inner rule", "rule"):
+        with errors_attributed_to(rule, "to return its inner rule", "rule"):
             levels, rule = levels + 1, rule.inner()
     return levels
 
 
-def _search(ground: Ground) -> int:
+def _search(ground: LatticeSetup) -> int:
     """Return an upper bound of the number of rows between a frame point and the particles that it
     can follow. These are its nearest particles, or particles with site indices that differ by twice
     the depth of the frame."""
@@ -208,7 +208,7 @@ class DistributedRecorder(Recorder):
         if measured & self._gathered:
             self._whole = self._division.gathered(state)
         if measured & self._local:
-            self._division.halo.look_back(state)
+            self._division.halo.renew_previous(state)
         with self._ranks.raise_together(), np.errstate(all="ignore"):
             values = self._record_of(state, last)
         self._put(state, values)
@@ -217,7 +217,7 @@ class DistributedRecorder(Recorder):
         """Finish in the same way as a single process."""
         self._whole = self._division.gathered(state) if When.END in self._gathered else None
         if When.END in self._local:
-            self._division.halo.look_back(state)
+            self._division.halo.renew_previous(state)
         super().finish(state, outcome, prediction)
 
     def _diagnosed(self, when: When, moment: StateMoment) -> Values:
@@ -373,7 +373,7 @@ class DistributedSimulation(Simulation):
             whole = self.division.whole_of(scene)
             return quick_warnings(whole, bound) if whole else ()
 
-    def outlook(self) -> list[str]:
+    def further_warnings(self) -> list[str]:
         """Return no warnings, because `check` evaluates the whole scene."""
         return []
 

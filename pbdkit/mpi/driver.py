@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats
-from pbdkit.equilibrium.error_bound import Certificate, SteadyStateMonitor
-from pbdkit.equilibrium.load_stepping import Way
-from pbdkit.equilibrium.system import Rows, Strip, StuckError
+from pbdkit.equilibrium.error_bound import ErrorBound, SteadyStateMonitor
+from pbdkit.equilibrium.load_stepping import EquilibriumPath
+from pbdkit.equilibrium.system import Rows, StagnationError, Strip
 from pbdkit.errors import NotSharedError
-from pbdkit.model.solver import Settle
+from pbdkit.model.solver import SteadyStateCriterion
 from pbdkit.mpi import partition
 from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.plugin import Draws
@@ -26,7 +26,7 @@ from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.memory_estimate import asks_for_grids
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import SECONDS_A_VALUE, Driver, EquilibriumDriver, SteppingDriver
-from pbdkit.stepping.divergence import EVERY, Guard, most_of, size_of
+from pbdkit.stepping.divergence import EVERY, Guard, largest_displacement, size_of
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.program import hindrance, program_of, reach_of, steady_steps
@@ -34,7 +34,7 @@ from pbdkit.stepping.state import State, initial_state
 from pbdkit.stepping.step import Mode
 
 
-class DividedStepper(Engine):
+class DistributedStepper(Engine):
     """Engine that makes as many steps in a call as the halo permits. A call ends before a motion
     begins, since the motion starts from an updated state."""
 
@@ -51,7 +51,7 @@ class DividedStepper(Engine):
         end = state.step + steps
         while state.step < end:
             limit = min(self._steps, end - state.step)
-            count = steady_steps(self._program, state.step + 1, limit, foreseeable=True)
+            count = steady_steps(self._program, state.step + 1, limit, precomputable=True)
             error: Exception | None = None
             try:
                 state = self._engine.advance(state, count)
@@ -95,7 +95,7 @@ class Division:
         """Return the whole scene in the first process."""
         return self.whole or whole_of(self.ranks, scene)
 
-    def begun(self, scene: Scene) -> tuple[State, bool]:
+    def initial_part(self, scene: Scene) -> tuple[State, bool]:
         """Return this process's part of the state at time 0, and whether it can be computed again
         without data of other processes. Random numbers are drawn by the first process for the whole
         lattice."""
@@ -109,9 +109,9 @@ class Division:
         with self.ranks.raise_together():
             if scene_of_all := self.whole_of(scene):
                 whole = initial_state(scene_of_all)
-        return self.dealt(whole), False
+        return self.local_part(whole), False
 
-    def dealt(self, whole: State | None) -> State:
+    def local_part(self, whole: State | None) -> State:
         """Return this process's part of a whole state, which only the first process has."""
         members = self.ranks.allgather(self.halo.members)
         if whole is None or not self.ranks.is_root:
@@ -140,7 +140,7 @@ class Division:
         """Return the dictionary with the state of the driver of this part, given that of the whole
         lattice, which only the first process has."""
         rest = self.ranks.bcast({key: part for key, part in parts.items() if key != "state"})
-        state = self.dealt(parts.get("state") if self.ranks.is_root else None)
+        state = self.local_part(parts.get("state") if self.ranks.is_root else None)
         return {**rest, "state": state}
 
     def stepper(self, choice: Choice) -> tuple[Engine, Choice]:
@@ -150,7 +150,7 @@ class Division:
         with self.ranks.raise_together():
             engine, choice = make_engine(self.scene, choice)
         steps = self.part.subdomain.steps
-        return DividedStepper(self.ranks, self.scene, engine, self.halo, steps), choice
+        return DistributedStepper(self.ranks, self.scene, engine, self.halo, steps), choice
 
 
 class DistributedWatch(Watch):
@@ -162,53 +162,55 @@ class DistributedWatch(Watch):
 
 
 @dataclass
-class DividedGuard(Guard):
+class DistributedGuard(Guard):
     """Check for divergence over all parts of the lattice."""
 
     ranks: MPICommunicator
 
-    def most(self, state: State) -> float:
+    def largest_displacement(self, state: State) -> float:
         """Return the largest displacement of all parts."""
-        return self.ranks.largest(super().most(state))
+        return self.ranks.largest(super().largest_displacement(state))
 
     def worst(self, scene: Scene, state: State) -> int:
         """Return the number of the particle with the largest displacement. If the displacements of
         several particles are equal, the particle of the lowest rank is chosen."""
-        values = self.ranks.allgather((super().most(state), super().worst(scene, state)))
+        values = self.ranks.allgather(
+            (super().largest_displacement(state), super().worst(scene, state))
+        )
         # NaN counts as largest.
         return int(values[int(np.argmax([largest for largest, _ in values]))][1])
 
 
-class DividedSettling(SteadyStateMonitor):
+class DistributedMonitor(SteadyStateMonitor):
     """Steady-state monitor of the whole scene, which runs in the first process."""
 
-    def __init__(self, division: Division, settle: Settle) -> None:
-        self._division, self._settling = division, None
+    def __init__(self, division: Division, criterion: SteadyStateCriterion) -> None:
+        self._division, self._monitor = division, None
         if whole := division.whole:
-            self._settling = SteadyStateMonitor(whole, settle, initial_state(whole), Watch())
+            self._monitor = SteadyStateMonitor(whole, criterion, initial_state(whole), Watch())
         self._agree(None)
 
-    def _agree(self, found: Certificate | None) -> Certificate | None:
+    def _agree(self, found: ErrorBound | None) -> ErrorBound | None:
         """Send the result of the first process to all processes, and return it."""
-        monitor = self._settling
+        monitor = self._monitor
         values = self._division.ranks.bcast(monitor and (found, monitor.pace, monitor.obstacle))
-        certificate: Certificate | None = values[0]
+        error_bound: ErrorBound | None = values[0]
         self.pace, self.obstacle = values[1:]
-        return certificate
+        return error_bound
 
-    def look(self, state: State) -> Certificate | None:
+    def look(self, state: State) -> ErrorBound | None:
         """Return the error bound of a steady state, as in a run with a single process. Raises
         StoppedError in all processes."""
-        whole, certificate, ranks = self._division.gathered(state), None, self._division.ranks
+        whole, error_bound, ranks = self._division.gathered(state), None, self._division.ranks
         error: Exception | None = None
-        if self._settling and whole is not None:
-            self._settling.pace, self._settling.obstacle = self.pace, self.obstacle
+        if self._monitor and whole is not None:
+            self._monitor.pace, self._monitor.obstacle = self.pace, self.obstacle
             try:
-                certificate = self._settling.look(whole)
+                error_bound = self._monitor.look(whole)
             except StoppedError as stopped:
                 error = stopped
         ranks.raise_first(error)
-        return self._agree(certificate)
+        return self._agree(error_bound)
 
 
 class DistributedSteppingDriver(SteppingDriver):
@@ -217,15 +219,17 @@ class DistributedSteppingDriver(SteppingDriver):
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
         refuse_operations(ranks, scene, Mode.RANKS)
-        start, anew = division.begun(scene)
+        start, can_recompute = division.initial_part(scene)
         Driver.__init__(self, division.scene, start, DistributedWatch(ranks, watch))
         self._engine, self.choice = division.stepper(ranks.bcast(choose(scene)))
         self._steps_per_call = self._steps_in(SECONDS_A_VALUE * scene.raster.total / ranks.size)
-        size = size_of(scene) + ranks.largest(most_of(start))
-        self.guard = DividedGuard(size, 0, EVERY, None if anew else start.copy(), ranks)
+        size = size_of(scene) + ranks.largest(largest_displacement(start))
+        self.guard = DistributedGuard(
+            size, 0, EVERY, None if can_recompute else start.copy(), ranks
+        )
         self.monitor, self.recorded_step = None, -1
-        if settle := scene.experiment.stepping.settle:
-            self.monitor = DividedSettling(division, settle)
+        if criterion := scene.experiment.stepping.settle:
+            self.monitor = DistributedMonitor(division, criterion)
 
     def _steps_in(self, seconds_a_step: float) -> int:
         """Return the number of steps that the first process estimates."""
@@ -307,7 +311,7 @@ def deep_subdomains(scene: Scene, parts: int) -> list[partition.Subdomain]:
     for part in partition.subdomains(scene, parts):
         low = max(0, part.begin - halo) // spread * spread
         high = min(rows, part.end + halo)
-        steps = max(1, min(partition.MOST_STEPS, (halo - edge) // max(1, each)))
+        steps = max(1, min(partition.MAX_STEPS_PER_EXCHANGE, (halo - edge) // max(1, each)))
         deep.append(partition.Subdomain(part.begin, part.end, low, high, edge, steps))
     return deep
 
@@ -351,9 +355,9 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         for mode in (Mode.RANKS, Mode.RANKS_AT_REST):
             refuse_operations(ranks, scene, mode)
         _refuse_solver(scene)
-        start, anew = division.begun(scene)
+        start, can_recompute = division.initial_part(scene)
         super().__init__(division.scene, start, DistributedWatch(ranks, watch))
-        self._start = None if anew else start.copy()
+        self._start = None if can_recompute else start.copy()
         strip = strip_of(scene, division.part.subdomain, ranks.size)
         self._rows = DistributedRows(ranks, division.halo, strip)
 
@@ -367,27 +371,27 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         the first process has."""
         super().load_state_dict(self._division.scattered(parts))
 
-    def _way(self, state: State) -> Way:
+    def _path(self, state: State) -> EquilibriumPath:
         from pbdkit.equilibrium.load_stepping import finder_of, increments
 
         scene, start = self.scene, self._start or initial_state(self.scene)
         try:
             finder = finder_of(scene, start, self.watch, rows=self._rows)
-            way = increments(scene, state, self.watch, self.moment, finder, self._stops)
-            certificate = yield from self._renewed(way)
-        except StuckError:
+            path = increments(scene, state, self.watch, self.moment, finder, self._stops)
+            error_bound = yield from self._renewed(path)
+        except StagnationError:
             raise NotSharedError(STUCK, ("solver",)) from None
         self._division.halo.renew(state)
-        return certificate
+        return error_bound
 
-    def _renewed(self, way: Way) -> Way:
+    def _renewed(self, path: EquilibriumPath) -> EquilibriumPath:
         """Update the frame points at each equilibrium on the path of the load."""
         while True:
             try:
-                reached = next(way)
+                reached = next(path)
             except StopIteration as end:
-                certificate: Certificate = end.value
-                return certificate
+                error_bound: ErrorBound = end.value
+                return error_bound
             if reached.at_rest:
                 self._division.halo.renew(reached.state)
             yield reached

@@ -29,7 +29,7 @@ from pbdkit.lattice.raster import (
     EMPTY,
     FOLLOWER,
     FRAME,
-    LeftOut,
+    OmittedCells,
     Raster,
     Restriction,
     RowLayout,
@@ -39,7 +39,7 @@ from pbdkit.lattice.raster import (
 )
 from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.plugin.lattice import Index
-from pbdkit.scene.scene import Ground, Scene
+from pbdkit.scene.scene import LatticeSetup, Scene
 from pbdkit.stepping.program import program_of, reach_of
 from pbdkit.stepping.state import State
 
@@ -97,7 +97,7 @@ def _blocks(part: Array, axis: int) -> Iterator[Bytes]:
             yield whole[at : at + BLOCK]
 
 
-MOST_STEPS = 16
+MAX_STEPS_PER_EXCHANGE = 16
 """Maximum number of steps between two exchanges. With this number, the halo of a part with 1500
 rows is a hundredth of the part."""
 MAX_OVERLAP = 0.05
@@ -214,21 +214,25 @@ def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
 def _steps(each: int, least: int) -> int:
     """Return the number of steps between two exchanges. `each` is the number of rows that a step
     reaches, and `least` the minimum number of rows of a part."""
-    return min(MOST_STEPS, 1 + int(MAX_OVERLAP * least / each)) if each else MOST_STEPS
+    return (
+        min(MAX_STEPS_PER_EXCHANGE, 1 + int(MAX_OVERLAP * least / each))
+        if each
+        else MAX_STEPS_PER_EXCHANGE
+    )
 
 
 @dataclass(frozen=True)
 class SubdomainScene:
     """Scene of a subdomain and its place in the whole lattice.
 
-    `ours` are the particles of each leader group in the own rows of the subdomain. `early` are the
-    numbers of particles of each group in earlier rows. `rows` are the rows of the table with the
-    subdomain's own particles.
+    `own_leaders` are the particles of each leader group in the own rows of the subdomain. `early`
+    are the numbers of particles of each group in earlier rows. `rows` are the rows of the table
+    with the subdomain's own particles.
     """
 
     subdomain: Subdomain
     scene: Scene
-    ours: tuple[Mask, ...]
+    own_leaders: tuple[Mask, ...]
     early: tuple[int, ...]
     rows: slice
 
@@ -239,9 +243,9 @@ def part_of(scene: Scene, subdomain: Subdomain) -> SubdomainScene:
     to, rows = restriction(scene.raster, subdomain)
     places = [each.place[each.is_in(to)] for each in scene.leading]
     begin = to.low + subdomain.own.start
-    ours = [to.is_between(place, (begin, to.low + subdomain.own.stop)) for place in places]
+    own_leaders = [to.is_between(place, (begin, to.low + subdomain.own.stop)) for place in places]
     early = [int(to.is_between(place, (0, begin)).sum()) for place in places]
-    return SubdomainScene(subdomain, scene.restrict(to), tuple(ours), tuple(early), rows)
+    return SubdomainScene(subdomain, scene.restrict(to), tuple(own_leaders), tuple(early), rows)
 
 
 def restriction(raster: Raster, subdomain: Subdomain) -> tuple[Restriction, slice]:
@@ -298,12 +302,12 @@ class Halo:
     ) -> None:
         self._ranks, self._part, self._axes = ranks, part, part.scene.axes
         self._parts = parts
-        sizes = ranks.allgather([int(ours.sum()) for ours in part.ours])
+        sizes = ranks.allgather([int(own_leaders.sum()) for own_leaders in part.own_leaders])
         self._counts = list(zip(*sizes, strict=True))
         offsets = [sum(counts[: ranks.rank]) for counts in self._counts]
         self.members = tuple(
-            np.arange(len(ours)) + first - early
-            for ours, early, first in zip(part.ours, part.early, offsets, strict=True)
+            np.arange(len(own_leaders)) + first - early
+            for own_leaders, early, first in zip(part.own_leaders, part.early, offsets, strict=True)
         )
         """Indices, within each leader group, of the particles that the part has."""
         own, rank, rows = part.subdomain, ranks.rank, parts[-1].end
@@ -315,10 +319,10 @@ class Halo:
         places = [each.place for each in part.scene.leading]
         self._at = [np.unravel_index(place, part.scene.raster.shape)[1] for place in places]
         moving = {n: self._rows(parts[n].inner(rows)) for n in (*sides, rank)}
-        self._theirs = {n: self._members(self._sent[n], moving[n]) for n in sides}
+        self._outgoing = {n: self._members(self._sent[n], moving[n]) for n in sides}
         self._mine = {n: self._members(self.received[n], moving[rank]) for n in sides}
         solver = part.scene.experiment.stepping
-        self._looks_back = solver.memory != 0.0 or "memory" in solver.courses
+        self._needs_previous = solver.memory != 0.0 or "memory" in solver.time_dependent
         self._pushed = [n for n, each in enumerate(part.scene.leading) if each.share is not None]
 
     def _rows(self, rows: tuple[int, int]) -> slice:
@@ -336,16 +340,16 @@ class Halo:
         """Update the halo of a state in place, including the velocities of masses in the halo.
         Displacements of the previous step are omitted if no step reads them."""
         arrays = [
-            array for array in state.arrays() if self._looks_back or array is not state.previous
+            array for array in state.arrays() if self._needs_previous or array is not state.previous
         ]
         starts = [(n, start) for n in self._pushed if (start := state.starts[n]) is not None]
-        theirs = {r: [s[:, self._theirs[r][n]] for n, s in starts] for r in self._sent}
-        mine = {
+        outgoing = {r: [s[:, self._outgoing[r][n]] for n, s in starts] for r in self._sent}
+        incoming = {
             r: [np.empty((len(s), len(members[n])), s.dtype) for n, s in starts]
             for r, members in self._mine.items()
         }
-        self._exchange(arrays, theirs, mine)
-        for rank, arrays_of in mine.items():
+        self._exchange(arrays, outgoing, incoming)
+        for rank, arrays_of in incoming.items():
             for (n, start), values in zip(starts, arrays_of, strict=True):
                 start[:, self._mine[rank][n]] = values
 
@@ -353,18 +357,22 @@ class Halo:
         """Update the halo of an array with cells along the last axes, in place."""
         self._exchange([field], {}, {})
 
-    def look_back(self, state: State) -> None:
+    def renew_previous(self, state: State) -> None:
         """Update the halo of the displacements of the previous step, in place."""
-        if not self._looks_back:
+        if not self._needs_previous:
             self.meet(state.previous)
 
     def _exchange(
-        self, arrays: list[Array], theirs: dict[int, list[Array]], mine: dict[int, list[Array]]
+        self,
+        arrays: list[Array],
+        outgoing: dict[int, list[Array]],
+        incoming: dict[int, list[Array]],
     ) -> None:
-        """Exchange rows of `arrays`, and the further arrays `theirs` and `mine`, with each rank."""
+        """Exchange rows of `arrays`, and the further arrays `outgoing` and `incoming`, with each
+        rank."""
         sent, received = (
             {r: [*self._blocks(arrays, rows), *map(as_bytes, extra.get(r, []))] for r, rows in each}
-            for each, extra in ((self._sent.items(), theirs), (self.received.items(), mine))
+            for each, extra in ((self._sent.items(), outgoing), (self.received.items(), incoming))
         )
         self._ranks.exchange(sent, received)
 
@@ -387,8 +395,10 @@ class Halo:
             return joined(self._ranks, row_view(array, self._axes, rows_of_part), axis, rows)
 
         starts = tuple(
-            None if start is None else joined(self._ranks, start[:, ours], 1, counts)
-            for start, ours, counts in zip(state.starts, self._part.ours, self._counts, strict=True)
+            None if start is None else joined(self._ranks, start[:, own_leaders], 1, counts)
+            for start, own_leaders, counts in zip(
+                state.starts, self._part.own_leaders, self._counts, strict=True
+            )
         )
         return state.map(whole, starts)
 
@@ -451,7 +461,7 @@ class RowCount:
     period: int
     reach: int
     layers: int
-    left_out: LeftOut
+    left_out: OmittedCells
 
     @property
     def first(self) -> int:
@@ -493,7 +503,7 @@ class RowCount:
         return min(max(line, self._start), self._start + len(self.lines))
 
 
-def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
+def count_rows(ground: LatticeSetup, communicator: Communicator) -> RowCount | None:
     """Count the particles of a body and its frame in each row; return None if there is no body.
     Each process counts the particles of the same number of lines."""
     rank = communicator.rank
@@ -508,7 +518,7 @@ def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
     if not boxes:
         return None
     lines = np.concatenate([counts for _, counts, _ in every])
-    left_out = sum((cells for *_, cells in every), LeftOut())
+    left_out = sum((cells for *_, cells in every), OmittedCells())
     low, high = hull(boxes)
     begin = low[0] - layers - cuts[0]
     lines = lines[begin : high[0] + layers - cuts[0]]
@@ -525,8 +535,8 @@ def _bands(lines: list[int], across: int) -> Iterator[Lines]:
 
 
 def _counted(
-    ground: Ground, lines: Lines
-) -> tuple[tuple[Index, Index] | None, NDArray[np.int64], LeftOut]:
+    ground: LatticeSetup, lines: Lines
+) -> tuple[tuple[Index, Index] | None, NDArray[np.int64], OmittedCells]:
     """Return (box of the body, particles on each line, omitted cells) of some lines."""
     first, last = lines
     counts, layers = np.zeros(last - first, np.int64), ground.layers

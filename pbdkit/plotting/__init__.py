@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pbdkit.errors import refuse_no_matplotlib
 from pbdkit.plotting.movie import animate, animation
-from pbdkit.plotting.style import Look
+from pbdkit.plotting.style import PlotOptions
 
 if TYPE_CHECKING:
     import xarray
@@ -100,7 +100,7 @@ def plot(
     >>> ax = ds.pbd.plot("pe1", time=20, cmap="magma")
     >>> figure = ds.pbd.plot("pe1", time=[0, 20])
     """
-    look = Look(
+    look = PlotOptions(
         filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
     )  # fmt: skip
     refuse_no_matplotlib()
@@ -183,7 +183,7 @@ def compare(
     >>> second = pbdkit.run("paper/a-weighted", settings={"steps": 20}, progress=False)
     >>> left, right = first.pbd.compare(second, "pe1")
     """
-    look = Look(
+    look = PlotOptions(
         filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
     )  # fmt: skip
     refuse_no_matplotlib()
@@ -233,7 +233,7 @@ def plot_experiment(
     refuse_no_matplotlib()
     from pbdkit.plotting.scene_axes import draw_experiment
 
-    return draw_experiment(experiment, Look(figsize=figsize, dpi=dpi), ax)
+    return draw_experiment(experiment, PlotOptions(figsize=figsize, dpi=dpi), ax)
 
 
 def crack(dataset: xarray.Dataset, kind: CrackKind = "map", *, ax: Axes | None = None) -> Axes:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
 from pbdkit.plotting.data import PlottedQuantity, Snapshot
-from pbdkit.plotting.style import Look
+from pbdkit.plotting.style import PlotOptions
 
 KINDS = {
     int(FRAME): ("frame", "#F0E442"),
@@ -91,7 +91,7 @@ class Scale:
 
 
 def scale_of(
-    quantity: PlottedQuantity, values: tuple[float, float], look: Look, filled: bool
+    quantity: PlottedQuantity, values: tuple[float, float], look: PlotOptions, filled: bool
 ) -> Scale:
     """Return the colour scale of a quantity with values in a range.
 

@@ -41,7 +41,7 @@ from pbdkit.plotting.layers import (
     draw_numbers,
     draw_outline,
 )
-from pbdkit.plotting.style import Look, figure_of, label
+from pbdkit.plotting.style import PlotOptions, figure_of, label
 
 if TYPE_CHECKING:
     import xarray
@@ -53,7 +53,7 @@ def draw(
     dataset: xarray.Dataset,
     color: str | None,
     time: float | Iterable[float | None] | None,
-    look: Look,
+    look: PlotOptions,
     ax: Axes | Sequence[Axes] | None = None,
 ) -> Axes | list[Axes]:
     """Draw recorded steps as `plot` does, with the options in `look`."""
@@ -72,7 +72,9 @@ def draw(
         raise ExperimentError(
             f"expected one axes for each of {len(snapshots)} steps, got {len(targets)}"
         )
-    sheet = Sheet([recording] * len(snapshots), titles, recording.title, extent, look, targets)
+    sheet = PanelFigure(
+        [recording] * len(snapshots), titles, recording.title, extent, look, targets
+    )
     for panel, snapshot in zip(sheet.panels, snapshots, strict=True):
         panel.show(snapshot)
         if look.numbers:
@@ -89,7 +91,7 @@ def draw_comparison(
     second: xarray.Dataset,
     color: str | None,
     time: float | None,
-    look: Look,
+    look: PlotOptions,
     *,
     difference: bool,
 ) -> Axes | list[Axes]:
@@ -102,7 +104,7 @@ def draw_comparison(
 
 
 def _side_by_side(
-    datasets: list[xarray.Dataset], color: str | None, time: float | None, look: Look
+    datasets: list[xarray.Dataset], color: str | None, time: float | None, look: PlotOptions
 ) -> list[Axes]:
     recordings = [Trajectory(dataset, color or "kind") for dataset in datasets]
     snapshots = [next(r.snapshots([r.row(time)])) for r in recordings]
@@ -113,7 +115,7 @@ def _side_by_side(
         f"{r.title}, step {snapshot.step}".lstrip(", ")
         for r, snapshot in zip(recordings, snapshots, strict=True)
     ]
-    sheet = Sheet(recordings, titles, "", extent, look)
+    sheet = PanelFigure(recordings, titles, "", extent, look)
     for panel, snapshot in zip(sheet.panels, snapshots, strict=True):
         panel.show(snapshot)
     return sheet.axes
@@ -193,7 +195,7 @@ class RenderStyle:
 
 
 def choose_style(
-    body: ReferenceBody, quantity: PlottedQuantity, look: Look, distance: float
+    body: ReferenceBody, quantity: PlottedQuantity, look: PlotOptions, distance: float
 ) -> RenderStyle:
     """Choose the rendering style by the options that are given, and otherwise by legibility. Raises
     ExperimentError for an option that is impossible or too expensive."""
@@ -210,7 +212,9 @@ def choose_style(
     )
 
 
-def _is_filled(body: ReferenceBody, quantity: PlottedQuantity, look: Look, distance: float) -> bool:
+def _is_filled(
+    body: ReferenceBody, quantity: PlottedQuantity, look: PlotOptions, distance: float
+) -> bool:
     is_large = len(body.reference) > DETAILED
     possible, requested = (
         quantity.owner == "particle" and not quantity.words,
@@ -234,7 +238,7 @@ def _is_filled(body: ReferenceBody, quantity: PlottedQuantity, look: Look, dista
 
 
 def _is_lined(
-    body: ReferenceBody, of_bonds: bool, filled: bool, look: Look, distance: float
+    body: ReferenceBody, of_bonds: bool, filled: bool, look: PlotOptions, distance: float
 ) -> bool:
     requested, is_large = look.bonds or look.broken, len(body.ends) > MANY_BONDS
     if requested and not len(body.ends):
@@ -270,7 +274,7 @@ class Panel:
             layer.show(snapshot)
 
 
-class Sheet:
+class PanelFigure:
     """Axes and panels, each of which shows steps of a recording.
 
     All panels have the limits and the scale of an extent. Fields have `finer` times as many pixels
@@ -286,7 +290,7 @@ class Sheet:
         titles: list[str],
         heading: str,
         extent: Extent,
-        look: Look,
+        look: PlotOptions,
         axes: list[Axes] | None = None,
         finer: float = 2.0,
         *,
@@ -309,7 +313,7 @@ class Sheet:
                 self._larger = min(max(1.0, NUMBERED_PT / self._spacing()), LARGEST)
                 self._page.arrange(larger=self._larger)
         else:
-            self._dress(panels)
+            self._label_axes(panels)
         self._style = choose_style(self._body, self._quantity, look, self._spacing())
         self._scale = self._scale_of_all()
         self._key()
@@ -396,7 +400,7 @@ class Sheet:
         if palette:
             self._add_legend(palette)
 
-    def _dress(self, panels: Panels) -> None:
+    def _label_axes(self, panels: Panels) -> None:
         """Set limits, titles and labels of axes passed by the caller."""
         xmin, xmax, ymin, ymax = panels.box
         for ax, title in zip(self.axes, panels.titles, strict=True):

@@ -150,7 +150,7 @@ HUES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#0000
 """Colours of Okabe and Ito, without yellow, which is invisible on white."""
 MANY = "viridis"
 """Colour map for more lines than there are colours."""
-MOST = 12
+MAX_LEGEND_LINES = 12
 """Maximum number of lines in a legend."""
 WITHIN = 4
 """Maximum number of lines in a legend inside the panel."""
@@ -209,7 +209,7 @@ def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
     ax.set_title(label(title, width=BROAD), fontsize="medium", pad=12)
-    if len(lines) > MOST:
+    if len(lines) > MAX_LEGEND_LINES:
         _scale(ax, lines, order, hues)
     elif any(line.name for line in lines):
         _legend(ax, lines, hues)

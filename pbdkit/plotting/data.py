@@ -23,13 +23,13 @@ from pbdkit.io.layout import (
     OF_BODY,
     as_step,
     broken_by,
+    diagnostics_that_provide,
     json_attribute,
-    makers_of,
     rows_of,
 )
 from pbdkit.lattice.raster import FRAME
 from pbdkit.model.bodies import AnyBody, Body as Shape, Sites
-from pbdkit.plotting.style import Look, in_its_units, is_number, label, plain
+from pbdkit.plotting.style import PlotOptions, in_its_units, is_number, label, plain
 from pbdkit.plugin import Vector
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def _codes(pairs: Array, particles: int) -> Array:
 
 PARTS = 8
 """Parts of each side of a cut cell, in each of which the outline is straight."""
-MOST_POINTS = 400_000
+MAX_POINTS = 400_000
 """Maximum number of points at which the distance to the outline is evaluated. If more cells are
 cut, they are small on the page and have fewer parts."""
 ON_IT = 1e-6
@@ -193,7 +193,7 @@ class CutCells:
         near = np.zeros(len(reference), bool)
         near[cells[outside[cells].any(axis=1)]] = True
         candidates = np.flatnonzero(near[cells].any(axis=1))
-        parts = int(min(PARTS, max(1.0, math.sqrt(MOST_POINTS / max(1, len(candidates))) - 1.0)))
+        parts = int(min(PARTS, max(1.0, math.sqrt(MAX_POINTS / max(1, len(candidates))) - 1.0)))
         at = between(reference[cells[candidates]], np.linspace(0.0, 1.0, parts + 1))
         size = np.ptp(reference[cells[candidates]], axis=1).max(initial=0.0)
         distance = distance_from(shape, at) - ON_IT * size
@@ -393,7 +393,7 @@ def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
     recorded = [*map(str, dataset.variables)]
     if names & {*recorded} or any(other.startswith(f"{name}_") for other in recorded):
         return []
-    return makers_of(names)
+    return diagnostics_that_provide(names)
 
 
 def _is_drawable(variable: xarray.Variable) -> bool:
@@ -668,7 +668,7 @@ class Extent:
     classes: frozenset[int]
 
 
-def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: Look) -> Extent:
+def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: PlotOptions) -> Extent:
     """Compute the extent of steps of a recording, one after another. Raises ExperimentError if no
     particle has a position."""
     body, quantity = recording.body, recording.quantity

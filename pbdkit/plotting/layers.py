@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SAMPLES = 2_000_000
 """Maximum number of samples that are evaluated at a time."""
-MOST = 60_000_000
+MAX_PIXELS = 60_000_000
 """Maximum total number of samples. A body that is folded over itself many times has fewer samples
 than pixels."""
 
@@ -54,7 +54,9 @@ class PixelGrid:
         sums, counts = np.zeros(self.across * self.up), np.zeros(self.across * self.up)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
-            pixels, inside = self._pixels(corners[cells], weights, _kept(cut, cells, middles))
+            pixels, inside = self._pixels(
+                corners[cells], weights, _within_outline(cut, cells, middles)
+            )
             sampled = (values[cells] @ weights.T).ravel()[inside]
             sums += np.bincount(pixels, sampled, len(sums))
             counts += np.bincount(pixels, minlength=len(sums))
@@ -68,7 +70,9 @@ class PixelGrid:
         largest = np.full(self.across * self.up, -np.inf)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
-            pixels, inside = self._pixels(corners[cells], weights, _kept(cut, cells, middles))
+            pixels, inside = self._pixels(
+                corners[cells], weights, _within_outline(cut, cells, middles)
+            )
             nearest = values[cells][:, weights.argmax(axis=1)].ravel()[inside]
             np.maximum.at(largest, pixels, nearest)
         largest[np.isinf(largest)] = np.nan
@@ -92,7 +96,7 @@ class OutlineCut:
     row: Array
 
 
-def _kept(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
+def _within_outline(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
     """Return a mask over the samples of some cells, (cell and sample,), false where the outline
     cuts a sample off; None if all are kept."""
     rows = cut.row[cells] if cut else np.empty(0, int)
@@ -119,7 +123,7 @@ def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
     # The sum of the distances between samples along both sides is at most a pixel, so that no pixel
     # is missed.
     finest = np.maximum(np.ceil(np.maximum(*(along[0] + along[1]).T)), 1.0)
-    finest = np.maximum(finest * min(1.0, math.sqrt(MOST / max(1.0, (finest**2).sum()))), 1.0)
+    finest = np.maximum(finest * min(1.0, math.sqrt(MAX_PIXELS / max(1.0, (finest**2).sum()))), 1.0)
     # The numbers are rounded up to powers of √2, which gives few groups and not many more samples.
     levels = np.ceil(2 * np.log2(finest) - 1e-6).astype(int)
     for level in np.unique(levels):

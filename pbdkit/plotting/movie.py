@@ -23,13 +23,13 @@ from pbdkit.errors import (
 from pbdkit.io.atomic_file import NewFile, open_atomic
 from pbdkit.io.layout import as_step
 from pbdkit.plotting.data import Extent, Snapshot, Trajectory, extent_of
-from pbdkit.plotting.style import Look
+from pbdkit.plotting.style import PlotOptions
 
 if TYPE_CHECKING:
     import xarray
     from matplotlib.animation import FuncAnimation
 
-    from pbdkit.plotting.configuration import Sheet
+    from pbdkit.plotting.configuration import PanelFigure
 
 
 Show = Callable[[str, float], None]
@@ -135,13 +135,13 @@ def animate(
     path = _movie_file(color, file)
     refuse_no_movie(path)
     _refuse_speed(path, fps, every)
-    look = Look(
+    look = PlotOptions(
         filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
     )  # fmt: skip
     recording = Trajectory(dataset, color or "kind")
     rows = [*range(0, len(recording.steps), every)]
     rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
-    moving = MovieSheet(recording, rows, look, show)
+    moving = MovieFigure(recording, rows, look, show)
     frames = moving.frames(rows, show)
     with open_atomic(path, NewFile, replace=replace) as new:
         if path.suffix == ".gif":
@@ -235,13 +235,13 @@ def animation(
     refuse_no_matplotlib()
     from matplotlib.animation import FuncAnimation
 
-    look = Look(
+    look = PlotOptions(
         filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
     )  # fmt: skip
     recording = Trajectory(dataset, color or "kind")
     last = len(recording.steps) - 1
     rows = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int)).tolist()
-    moving = MovieSheet(recording, rows, look, silent, standalone=False)
+    moving = MovieFigure(recording, rows, look, silent, standalone=False)
     snapshots = [*recording.snapshots(rows)]
     return FuncAnimation(
         moving.sheet.figure, lambda n: moving.put(snapshots[n]), frames=len(snapshots), interval=80,
@@ -261,7 +261,7 @@ def refuse_no_movie(path: Path) -> None:
         raise StorageError(f"{path}: there is no folder {path.parent}")
 
 
-class MovieSheet:
+class MovieFigure:
     """A sheet with one panel. Its background is drawn once, and its layers show one step after the
     other."""
 
@@ -269,12 +269,12 @@ class MovieSheet:
         self,
         recording: Trajectory,
         rows: Sequence[int],
-        look: Look,
+        look: PlotOptions,
         show: Show,
         *,
         standalone: bool = True,
     ) -> None:
-        from pbdkit.plotting.configuration import Sheet
+        from pbdkit.plotting.configuration import PanelFigure
 
         self._recording, self._name = recording, recording.title
         looked_at = _with_progress(
@@ -282,7 +282,7 @@ class MovieSheet:
         )
         extent: Extent = extent_of(recording, looked_at, look)
         title = self._title(as_step(recording.steps[-1]))
-        self.sheet: Sheet = Sheet(
+        self.sheet: PanelFigure = PanelFigure(
             [recording], [title], "", extent, look, finer=FINER, standalone=standalone
         )
         (self._panel,) = self.sheet.panels

@@ -14,7 +14,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.model.experiment import Experiment
 from pbdkit.plotting.figure_layout import Page, Panels, handle
 from pbdkit.plotting.scene_figure import MARGIN, WITHIN, SceneLegend, corners, draw_scene
-from pbdkit.plotting.style import Look, figure_of, label, plain
+from pbdkit.plotting.style import PlotOptions, figure_of, label, plain
 from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.scene import build_scene
 
@@ -61,11 +61,11 @@ class AxesCanvas:
         )
         self._ax.add_patch(PathPatch(path, fc=fill, ec=edge, lw=POINTS, zorder=self._next))
 
-    def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
+    def arrow(self, tail: Floats, vector: Floats, colour: str) -> None:
         """Draw an arrow from a place, by a vector in pixels, y up."""
-        if not np.any(way):
+        if not np.any(vector):
             return
-        tip = self._unit * (np.asarray(tail) + np.asarray(way) / self.scale)
+        tip = self._unit * (np.asarray(tail) + np.asarray(vector) / self.scale)
         style = {"arrowstyle": "-|>,head_width=0.2,head_length=0.4", "color": colour}
         lengths: dict[str, Any] = {"shrinkA": 0.0, "shrinkB": 0.0, "lw": 1.6 * POINTS}
         ends = (*tip,), (*(self._unit * np.asarray(tail)),)
@@ -86,7 +86,7 @@ def _closed(outline: Floats) -> Floats:
     return np.concatenate([outline, outline[:1]])
 
 
-def draw_experiment(experiment: Experiment, look: Look, ax: Axes | None) -> Axes:
+def draw_experiment(experiment: Experiment, look: PlotOptions, ax: Axes | None) -> Axes:
     """Draw the set-up of an experiment on axes, by default in a new figure."""
     scene = build_scene(experiment)
     if scene.axes != 2:

@@ -78,9 +78,9 @@ class Svg:
         style = f'fill="{fill}" stroke="{edge}" fill-rule="evenodd"'
         self._add(f'<path d="{"".join(parts)}" {style}/>')
 
-    def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
+    def arrow(self, tail: Floats, vector: Floats, colour: str) -> None:
         """Draw an arrow from a place, by a vector in pixels, y up."""
-        (x, y), (dx, dy) = self.at(tail), (float(way[0]), -float(way[1]))
+        (x, y), (dx, dy) = self.at(tail), (float(vector[0]), -float(vector[1]))
         length = math.hypot(dx, dy)
         if length < 1e-9:
             return
@@ -120,8 +120,8 @@ def extreme(motion: Motion, reference: Floats, steps: int) -> Floats:
     if isinstance(motion, Newton):
         return np.atleast_2d(motion.velocity)
     moments = [n for n in (1, *motion.knots(), steps) if 1 <= n <= steps]
-    ways = [np.atleast_2d(motion.offset(n, reference)) for n in moments]
-    return max(ways, key=lambda way: float(np.hypot(*way.T).max()))
+    vectors = [np.atleast_2d(motion.offset(n, reference)) for n in moments]
+    return max(vectors, key=lambda vector: float(np.hypot(*vector.T).max()))
 
 
 def greatest(force: Any) -> float:
@@ -200,7 +200,7 @@ class Canvas(Protocol):
     def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
         """Fill the area between closed outlines: an inner one is a hole."""
 
-    def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
+    def arrow(self, tail: Floats, vector: Floats, colour: str) -> None:
         """Draw an arrow from a place, by a vector in pixels, y up."""
 
 
@@ -312,16 +312,18 @@ class _Drawing:
     def _longest(self) -> float:
         """Longest displacement of a motion."""
         driven = self.scene.driven
-        ways = [extreme(d.group.motion, d.reference, self.scene.experiment.steps) for d in driven]
-        return max((float(np.hypot(*way.T).max()) for way in ways), default=0.0)
+        vectors = [
+            extreme(d.group.motion, d.reference, self.scene.experiment.steps) for d in driven
+        ]
+        return max((float(np.hypot(*vector.T).max()) for vector in vectors), default=0.0)
 
     def _leaders(self) -> None:
         longest = self._longest
         for barrier in self.scene.barriers:
-            way = extreme(barrier.group.motion, barrier.reference, self.scene.experiment.steps)
+            vector = extreme(barrier.group.motion, barrier.reference, self.scene.experiment.steps)
             ring = np.concatenate(_outlines(barrier.start, self.canvas.low, self.canvas.high))
             nearest = ring[np.argmin(np.hypot(*(ring - self.middle).T))]
-            self._arrows(nearest[None], way.mean(axis=0, keepdims=True), longest, DRIVEN)
+            self._arrows(nearest[None], vector.mean(axis=0, keepdims=True), longest, DRIVEN)
         for leading in self.scene.leading:
             motion, is_fixed = leading.group.motion, isinstance(leading.group.motion, Hold)
             colour = HELD if is_fixed else LEADS
@@ -330,15 +332,17 @@ class _Drawing:
                 text += f" along {' and '.join(leading.group.axes)}"
             self.canvas.dots(leading.reference, max(1.4 * self.dot, 3.0), colour, square=is_fixed)
             self._note(colour, text)
-            ways = np.zeros((len(leading.rows), 2)) + extreme(
+            vectors = np.zeros((len(leading.rows), 2)) + extreme(
                 motion, leading.reference, self.scene.experiment.steps
             )
             free = [axis for axis in range(2) if axis not in leading.axes]
-            ways[:, free] = 0.0
-            self._arrows(leading.reference, ways, longest, colour)
+            vectors[:, free] = 0.0
+            self._arrows(leading.reference, vectors, longest, colour)
             if isinstance(motion, Newton):
                 force = np.array([greatest(f) for f in motion.force])
-                self._arrows(leading.reference, force + 0.0 * ways, float(np.hypot(*force)), ACTS)
+                self._arrows(
+                    leading.reference, force + 0.0 * vectors, float(np.hypot(*force)), ACTS
+                )
 
     def _loads(self) -> None:
         each = self.scene.loads.each if self.scene.loads else ()
@@ -350,26 +354,26 @@ class _Drawing:
             self._arrows(at, np.tile(force, (len(at), 1)), longest, ACTS)
             self._note(ACTS, "body force" if loading.load.body_force else "force")
 
-    def _arrows(self, at: Floats, ways: Floats, longest: float, colour: str) -> None:
+    def _arrows(self, at: Floats, vectors: Floats, longest: float, colour: str) -> None:
         """Draw arrows at some of the places. An arrow starts at its place or, if it would then
         point into the body, ends there."""
         extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
         count = min(max(int(extent / APART), 1), ARROWS)
         ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])
         selection = np.unique(ends.round().astype(int))
-        for place, way in zip(at[selection], ways[selection], strict=True):
-            pixels = _pixels(way, longest)
-            inwards = float((self.middle - place) @ way) > 1e-9 * float(np.hypot(*way))
+        for place, vector in zip(at[selection], vectors[selection], strict=True):
+            pixels = _pixels(vector, longest)
+            inwards = float((self.middle - place) @ vector) > 1e-9 * float(np.hypot(*vector))
             tail = place - pixels / self.canvas.scale if inwards else place
             self.canvas.arrow(tail, pixels, colour)
 
 
-def _pixels(way: Floats, longest: float) -> Floats:
+def _pixels(vector: Floats, longest: float) -> Floats:
     """Return the arrow of a displacement, the longest being ARROW pixels long; zero for none."""
-    length = float(np.hypot(*way))
+    length = float(np.hypot(*vector))
     if length <= 1e-12 * longest or longest == 0.0:
         return np.zeros(2)
-    return np.asarray(way / length * max(ARROW * length / longest, LEAST))
+    return np.asarray(vector / length * max(ARROW * length / longest, LEAST))
 
 
 def edge_of(raster: Raster) -> Rows:

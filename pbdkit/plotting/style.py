@@ -93,7 +93,7 @@ LARGEST_DPI = 2400
 
 
 @dataclass(frozen=True)
-class Look:
+class PlotOptions:
     """Options of `plot`, `compare` and `animate`, with the same names.
 
     Raises ExperimentError for values that are not possible.

@@ -47,12 +47,12 @@ from pbdkit.plugin.fracture_model import (
     BreaksAtStrain,
     CellStress,
     FractureModel,
-    KnowsStiffness,
     RenewsBonds,
     Segment,
     Softens,
     SoftensCells,
     StartsCracked,
+    UsesStiffness,
 )
 from pbdkit.plugin.frame_policy import Anchors, FrameMap, FramePolicy, FrameSites
 from pbdkit.plugin.lattice import (
@@ -121,11 +121,11 @@ __all__ = [
     "BasisSite", "BondHistory", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellPolygon",
     "CellStress", "CellValues", "Command", "Component", "Condition", "Constants", "Diagnostic",
     "Drawn", "Draws", "FollowerRule", "ForceValues", "FractureModel", "FrameMap", "FramePolicy",
-    "FrameSites", "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows", "Loadable",
-    "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair",
-    "Parameters", "ParticleOperation", "Particles", "Quantity", "Remembered", "Remembers",
-    "RenewsBonds", "RenewsParticles", "Segment", "Setting", "SharesParticles", "Slot", "Softens",
-    "SoftensCells", "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells",
-    "Tiling", "Torn", "TouchingRows", "TurnsParticles", "Variable", "Vector", "Weights", "dot",
+    "FrameSites", "Here", "Lattice", "LeaderRows", "LoadRows", "Loadable", "MixesCells", "Moment",
+    "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair", "Parameters",
+    "ParticleOperation", "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds",
+    "RenewsParticles", "Segment", "Setting", "SharesParticles", "Slot", "Softens", "SoftensCells",
+    "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells", "Tiling", "Torn",
+    "TouchingRows", "TurnsParticles", "UsesStiffness", "Variable", "Vector", "Weights", "dot",
     "hookimpl", "length", "squared_length", "where",
 ]  # fmt: skip

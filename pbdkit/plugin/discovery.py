@@ -45,14 +45,14 @@ def full_description(component: type[Component]) -> str:
     return f"{interface_of(component).__name__} '{component.type_name()}'{origin}"
 
 
-def blame(component: type[Component], when: str, error: BaseException) -> PluginError:
+def component_error(component: type[Component], when: str, error: BaseException) -> PluginError:
     """Return the PluginError for an error in the code of a component."""
     message = worded(error, component.__module__.split(".")[0], component)
     return PluginError(f"{full_description(component)} failed {when}: {message}")
 
 
 @contextmanager
-def blaming(component: Component, when: str, *field: str | int) -> Iterator[None]:
+def errors_attributed_to(component: Component, when: str, *field: str | int) -> Iterator[None]:
     """Convert errors in the code of a component.
 
     An exception is converted to a PluginError that names the interface, type and distribution of
@@ -66,7 +66,7 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
         raise KeyboardInterrupt(f"in {full_description(type(component))} {when}") from None
     except ExperimentError as error:
         if not field:
-            raise blame(type(component), when, error) from error
+            raise component_error(type(component), when, error) from error
         has_field = error.where[: len(field)] == field
         raise ExperimentError(
             str(error), error.where if has_field else (*field, *error.where)
@@ -74,7 +74,7 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
     except (PbdkitError, MemoryError, FloatingPointError):
         raise
     except (Exception, SystemExit) as error:
-        raise blame(type(component), when, error) from error
+        raise component_error(type(component), when, error) from error
 
 
 TYPE = r"[A-Za-z0-9][A-Za-z0-9._-]*"

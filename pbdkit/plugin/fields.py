@@ -29,8 +29,8 @@ from pydantic_core import PydanticCustomError, core_schema
 from pbdkit.array_types import Floats
 from pbdkit.errors import did_you_mean
 from pbdkit.plugin.component import Component, Strict
-from pbdkit.plugin.schedule import Course, as_course
-from pbdkit.plugin.units import LENGTH, PATTERN, Quantity, or_text
+from pbdkit.plugin.schedule import TimeDependent, as_time_dependent
+from pbdkit.plugin.units import LENGTH, PATTERN, Quantity, number_or_text
 from pbdkit.seeds import random_field_seed
 
 Held = Mapping[str, NDArray[np.bool_]]
@@ -189,7 +189,7 @@ class Gridded(Varying):
 
 
 @dataclass(frozen=True)
-class OfPlace(Varying):
+class PositionFunction(Varying):
     """Function of arrays x and y.
 
     An experiment replaces the function by its values on a grid, so that the dataset contains the
@@ -231,7 +231,7 @@ def as_varying(value: Any) -> Varying | None:
             raise ValueError(f"an array should have the dimensions x and y, got {value.dims}")
         return Gridded(value["x"], value["y"], value.transpose("x", "y"))
     if callable(value):
-        return OfPlace(value)
+        return PositionFunction(value)
     if not isinstance(value, dict):
         return None
     if "otherwise" in value:
@@ -444,7 +444,7 @@ ALTERNATIVES: dict[str, Any] = {
         {
             "type": "object",
             "required": ["otherwise"],
-            "additionalProperties": or_text({"type": "number"}),
+            "additionalProperties": number_or_text({"type": "number"}),
         },
         {
             "type": "object",
@@ -467,7 +467,7 @@ ALTERNATIVES: dict[str, Any] = {
             "required": ["steps", "values"],
             "properties": {
                 "steps": {"type": "array", "items": {"type": "integer", "minimum": 0}},
-                "values": {"type": "array", "items": or_text({"type": "number"})},
+                "values": {"type": "array", "items": number_or_text({"type": "number"})},
             },
             "additionalProperties": False,
         },
@@ -503,11 +503,11 @@ class TakesFields(Component):
 
     The attribute of such a parameter contains the value that is used where a single number is
     required; for a time-dependent parameter this is the last value. `varying` contains the
-    functions of space, and `courses` the functions of time.
+    functions of space, and `time_dependent` the functions of time.
     """
 
     _varying: dict[str, Varying] = PrivateAttr(default_factory=dict)
-    _courses: dict[str, Course[float]] = PrivateAttr(default_factory=dict)
+    _time_dependent: dict[str, TimeDependent[float]] = PrivateAttr(default_factory=dict)
 
     @property
     def varying(self) -> Mapping[str, Varying]:
@@ -515,13 +515,13 @@ class TakesFields(Component):
         return self._varying
 
     @property
-    def courses(self) -> Mapping[str, Course[float]]:
+    def time_dependent(self) -> Mapping[str, TimeDependent[float]]:
         """Time-dependent parameters, by name."""
-        return self._courses
+        return self._time_dependent
 
     def at(self, moment: float) -> Any:
         """Return the component with the values of its parameters at a time, in steps."""
-        return self.with_more(**{name: c.at(moment) for name, c in self._courses.items()})
+        return self.with_more(**{name: c.at(moment) for name, c in self._time_dependent.items()})
 
     def with_more(self, **values: Any) -> Any:
         """Return the component with some parameters changed.
@@ -533,13 +533,15 @@ class TakesFields(Component):
         ValidationError
             If the parameters are incompatible.
         """
-        return self.with_values(**{**self._varying, **self._courses, **values})
+        return self.with_values(**{**self._varying, **self._time_dependent, **values})
 
     def in_place_of_numbers(self) -> dict[str, Any]:
         """Return the varying parameters as they are written in an experiment file."""
         fields = {name: field.written() for name, field in self._varying.items()}
-        courses = {name: course.model_dump(mode="json") for name, course in self._courses.items()}
-        return fields | courses
+        time_dependent = {
+            name: number.model_dump(mode="json") for name, number in self._time_dependent.items()
+        }
+        return fields | time_dependent
 
     def with_values(self, **values: Any) -> Any:
         """Return the component with some parameters changed.
@@ -562,20 +564,20 @@ class TakesFields(Component):
             return handler(data)
         data = data | {name: cls._number_of(name, data[name], info) for name in data}
         varying: dict[str, Varying] = {**random_fields(data, cls.numbers(), info.context)}
-        courses = dict[str, Course[float]]()
+        time_dependent = dict[str, TimeDependent[float]]()
         for name in (cls.numbers() & data.keys()) - varying.keys():
             try:
-                if course := as_course(data[name]):
-                    courses[name] = course
+                if number := as_time_dependent(data[name]):
+                    time_dependent[name] = number
                 elif field := as_varying(data[name]):
                     varying[name] = field
             except ValueError as error:
                 raise _fault(name, str(error)) from None
-        variations: dict[str, Varying | Course[float]] = {**varying, **courses}
+        variations: dict[str, Varying | TimeDependent[float]] = {**varying, **time_dependent}
         if variations:
             cls._refuse_wrong(data, variations, info.context)
         part = handler(data | {name: _first(field) for name, field in variations.items()})
-        part._varying, part._courses = varying, courses
+        part._varying, part._time_dependent = varying, time_dependent
         return part
 
     @classmethod
@@ -640,7 +642,7 @@ class TakesFields(Component):
                     raise _fault(str(name or min(sample)), f"{where}: {text}{got}") from None
 
 
-def _first(field: Varying | Course[float]) -> float:
+def _first(field: Varying | TimeDependent[float]) -> float:
     return next(iter(field.samples.values()))
 
 

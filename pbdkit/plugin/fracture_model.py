@@ -36,7 +36,7 @@ class FractureModel(TakesFields):
     ``breaks`` is evaluated. The state variables of broken bonds no longer change. Afterwards, for a
     model that derives from `Softens`, the rule receives another difference in place of d at intact
     bonds. Optional capabilities are further base classes: `Remembers`, `Draws`, `RenewsBonds`,
-    `Softens`, `SoftensCells`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
+    `Softens`, `SoftensCells`, `StartsCracked`, `BreaksAtStrain`, `UsesStiffness`.
     """
 
     has_axes: ClassVar[bool] = False
@@ -178,7 +178,7 @@ class RenewsBonds(Remembers):
         """
 
 
-class KnowsStiffness(ABC):
+class UsesStiffness(ABC):
     """A fracture model for calibrated rules.
 
     Some of its constants depend on the material and the cells.

@@ -31,14 +31,14 @@ class FrameMap:
         Row of the body particle of each entry in the table of particles.
     weight : array of float, shape (entry,) or (entry, axis, axis)
         Number or matrix for each entry.
-    lag : int
+    delay : int
         Delay in steps: with 1 the frame is computed from the displacements of the previous step.
     """
 
     point: Indices
     body: Indices
     weight: NDArray[np.float64]
-    lag: int = 0
+    delay: int = 0
 
 
 @dataclass(frozen=True)

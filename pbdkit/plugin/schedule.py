@@ -20,15 +20,15 @@ MAX_KNOTS = 100_000
 """Maximum number of steps of a time-dependent number."""
 PLAIN = "number"
 """Form of a constant number in the messages of pydantic."""
-COURSE = "course"
+TIME_DEPENDENT = "time-dependent"
 """Form of a time-dependent number in the messages of pydantic."""
 WORD = "a number or 'auto'"
 """Form, in messages, of a number that can also be 'auto'."""
-FORMS = (PLAIN, COURSE, WORD)
+FORMS = (PLAIN, TIME_DEPENDENT, WORD)
 """Forms of numbers in messages."""
 
 
-class Course(Strict, Generic[Value]):
+class TimeDependent(Strict, Generic[Value]):
     """Time-dependent number, piecewise linear in time.
 
     It has the `values` at the end of the `steps`, is interpolated linearly between them, and is
@@ -42,7 +42,7 @@ class Course(Strict, Generic[Value]):
     values: Annotated[tuple[Value, ...], Field(strict=False, min_length=1, max_length=MAX_KNOTS)]
 
     @model_validator(mode="after")
-    def _in_order(self) -> Course[Value]:
+    def _in_order(self) -> TimeDependent[Value]:
         if len(self.steps) != len(self.values):
             raise ValueError(f"{len(self.steps)} steps have {len(self.values)} values")
         for first, second in pairwise(self.steps):
@@ -67,7 +67,7 @@ class Course(Strict, Generic[Value]):
         return float(np.interp(moment, self.steps, self._values))
 
     @cached_property
-    def bends(self) -> tuple[int, ...]:
+    def breakpoints(self) -> tuple[int, ...]:
         """Steps after which the slope changes."""
         knots = list(zip(self.steps, self._values, strict=True))
         flat = (0.0, False)  # a change with a slope that rounds to zero is not flat
@@ -75,24 +75,29 @@ class Course(Strict, Generic[Value]):
         pairs = zip(self.steps, pairwise(slopes), strict=True)
         return tuple(step for step, (first, second) in pairs if first != second)
 
-    def bends_within(self, begin: int, end: int) -> list[int]:
-        """Return the bends from step `begin` to step `end`, and `end` if the number changes in it.
+    def breakpoints_within(self, begin: int, end: int) -> list[int]:
+        """Return the breakpoints from step `begin` to step `end`, and `end` if the number changes
+        in it.
 
         The result is empty if `end` precedes `begin`.
         """
         if end < begin:
             return []
-        bends = [bend for bend in self.bends if begin <= bend <= end]
-        return bends if end in bends or self.next_change(end - 1) > end else [*bends, end]
+        breakpoints = [knot for knot in self.breakpoints if begin <= knot <= end]
+        return (
+            breakpoints
+            if end in breakpoints or self.next_change(end - 1) > end
+            else [*breakpoints, end]
+        )
 
     def next_change(self, step: int) -> float:
         """Return the first step after `step` with another value than at `step`, or infinity."""
         k = bisect_right(self.steps, step)
         if 0 < k < len(self.steps) and self.values[k - 1] != self.values[k]:
             return step + 1
-        return min((bend + 1 for bend in self.bends[:-1] if bend > step), default=math.inf)
+        return min((knot + 1 for knot in self.breakpoints[:-1] if knot > step), default=math.inf)
 
-    def way(self, begin: float, end: float) -> float:
+    def relative_change(self, begin: float, end: float) -> float:
         """Return the change between two times, divided by the largest absolute value."""
         largest = max(map(abs, self._values))
         return abs(self.at(end) - self.at(begin)) / largest if largest else 0.0
@@ -104,7 +109,7 @@ class Course(Strict, Generic[Value]):
         return numbers
 
 
-class NumberCourse(Course[float]):
+class TimeDependentNumber(TimeDependent[float]):
     """Time-dependent number without a unit.
 
     Each kind of number is a separate class, so that objects can be pickled.
@@ -112,11 +117,11 @@ class NumberCourse(Course[float]):
 
 
 def form_of(value: Any) -> str:
-    """Return the form of a value, `PLAIN` or `COURSE`."""
-    return COURSE if isinstance(value, (dict, Course)) else PLAIN
+    """Return the form of a value, `PLAIN` or `TIME_DEPENDENT`."""
+    return TIME_DEPENDENT if isinstance(value, (dict, TimeDependent)) else PLAIN
 
 
-def as_course(value: Any) -> Course[float] | None:
+def as_time_dependent(value: Any) -> TimeDependent[float] | None:
     """Return a value as a time-dependent number, or None if it is of another form.
 
     Raises
@@ -124,12 +129,12 @@ def as_course(value: Any) -> Course[float] | None:
     ValueError
         If the value is malformed.
     """
-    if isinstance(value, Course):
+    if isinstance(value, TimeDependent):
         return value
     if not (isinstance(value, dict) and "steps" in value):
         return None
     try:
-        return NumberCourse.model_validate(value)
+        return TimeDependentNumber.model_validate(value)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         place = "".join(f"{word}: " for word in fault["loc"])
@@ -138,33 +143,34 @@ def as_course(value: Any) -> Course[float] | None:
         raise ValueError(f"{place}{'is missing' if missing else text}") from None
 
 
-def at(number: float | Course[float], moment: float) -> float:
+def at(number: float | TimeDependent[float], moment: float) -> float:
     """Return the value of a constant or time-dependent number at a time, in steps."""
-    return number.at(moment) if isinstance(number, Course) else number
+    return number.at(moment) if isinstance(number, TimeDependent) else number
 
 
-def last(number: float | Course[float]) -> float:
+def last(number: float | TimeDependent[float]) -> float:
     """Return the last value of a constant or time-dependent number."""
-    return number.last if isinstance(number, Course) else number
+    return number.last if isinstance(number, TimeDependent) else number
 
 
-class ForceCourse(Course[Annotated[float, FORCE]]):
+class TimeDependentForce(TimeDependent[Annotated[float, FORCE]]):
     """Force that depends on time."""
 
 
-class BodyForceCourse(Course[Annotated[float, BODY_FORCE]]):
+class TimeDependentBodyForce(TimeDependent[Annotated[float, BODY_FORCE]]):
     """Time-dependent force per area."""
 
 
 OneForce = Annotated[
-    Annotated[float, FORCE, Tag(PLAIN)] | Annotated[ForceCourse, Tag(COURSE)],
+    Annotated[float, FORCE, Tag(PLAIN)] | Annotated[TimeDependentForce, Tag(TIME_DEPENDENT)],
     Discriminator(form_of),
 ]
 """Type of a component of a force."""
 Force = Annotated[tuple[OneForce, OneForce], Field(strict=False)]
 """Type of a force; a list of two numbers in an experiment file."""
 OneBodyForce = Annotated[
-    Annotated[float, BODY_FORCE, Tag(PLAIN)] | Annotated[BodyForceCourse, Tag(COURSE)],
+    Annotated[float, BODY_FORCE, Tag(PLAIN)]
+    | Annotated[TimeDependentBodyForce, Tag(TIME_DEPENDENT)],
     Discriminator(form_of),
 ]
 """Type of a component of a force per area."""

@@ -74,7 +74,7 @@ class Quantity:
         return core_schema.with_info_before_validator_function(self.number, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        return or_text(handler(schema))
+        return number_or_text(handler(schema))
 
     def number(self, value: Any, info: ValidationInfo) -> Any:
         """Return a number in lattice units. Values without unit are not changed.
@@ -175,7 +175,7 @@ class Units(Strict):
         """Lattice unit in mm."""
         return magnitude(self.length, LENGTH.unit, LENGTH.meaning)
 
-    def lacks(self, quantity: Quantity) -> list[str]:
+    def missing_entries(self, quantity: Quantity) -> list[str]:
         """Return the entries of `units` that a quantity needs but that are missing."""
         return [n for n in type(self).model_fields if getattr(quantity, n) and not getattr(self, n)]
 
@@ -187,7 +187,7 @@ class Units(Strict):
         PydanticCustomError
             If an entry of `units` is missing.
         """
-        if missing := self.lacks(quantity):
+        if missing := self.missing_entries(quantity):
             raise _fault(f"a {quantity.meaning} requires units.{missing[0]}, which is missing")
         powers = {name: getattr(quantity, name) for name in type(self).model_fields}
         scale: float = math.prod(
@@ -218,7 +218,7 @@ class FromUnits:
         return core_schema.with_info_before_validator_function(self._resolve, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        return or_text(handler(schema))
+        return number_or_text(handler(schema))
 
     def _resolve(self, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, str) and TEXT.fullmatch(value):
@@ -337,7 +337,7 @@ def _units(text: str, info: ValidationInfo) -> Units:
     return units
 
 
-def or_text(number: dict[str, Any]) -> dict[str, Any]:
+def number_or_text(number: dict[str, Any]) -> dict[str, Any]:
     """Return the JSON Schema of a number, or of text with a unit."""
     return {"anyOf": [number, {"type": "string", "pattern": PATTERN}]}
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import AccuracyWarning, WarningText
 from pbdkit.lattice.fill import has_narrow_slot
 from pbdkit.lattice.neighbourhood import Neighbourhood, flatness
-from pbdkit.lattice.raster import FOLLOWER, LeftOut, Raster, cells_of_sites, positions
+from pbdkit.lattice.raster import FOLLOWER, OmittedCells, Raster, cells_of_sites, positions
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Newton, Oscillation, Rotation
 from pbdkit.plugin import Lattice, MixesCells, Vector
@@ -86,7 +86,7 @@ def lattice_warnings(
     return warnings
 
 
-def narrow_voids(lattice: Lattice, left_out: LeftOut) -> Iterator[str]:
+def narrow_voids(lattice: Lattice, left_out: OmittedCells) -> Iterator[str]:
     """Generate a warning if cells are omitted that would connect the two sides of a void."""
     if left_out.first is not None:
         cell = lattice.cell()
@@ -144,11 +144,11 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
             yield f"regions.{name}: not referenced, so that it has no effect"
         elif not raster.communicator.any((signed_distance(region, cell, x, y) <= tolerance).any()):
             yield f"regions.{name}: lies outside the body, so that it has no effect"
-    for place, course in experiment.courses.items():
-        if course.bends and course.bends[-1] > experiment.steps:
+    for place, number in experiment.time_dependent.items():
+        if number.breakpoints and number.breakpoints[-1] > experiment.steps:
             yield (
-                f"{'.'.join(place)}: changes until step {course.bends[-1]}, but the run ends with "
-                f"step {experiment.steps}"
+                f"{'.'.join(place)}: changes until step {number.breakpoints[-1]}, but the run ends "
+                f"with step {experiment.steps}"
             )
     if not experiment.solver.makes_steps and experiment.record_count > MAX_EQUILIBRIA:
         yield (

@@ -37,7 +37,6 @@ from pbdkit.plugin import (
     Draws,
     FollowerRule,
     FractureModel,
-    KnowsStiffness,
     Remembered,
     Remembers,
     Setting,
@@ -45,10 +44,11 @@ from pbdkit.plugin import (
     Softens,
     SoftensCells,
     TearsCells,
+    UsesStiffness,
     Vector,
 )
 from pbdkit.plugin.component import as_values
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.fields import ByRegion, TakesFields
 from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import vector
@@ -70,7 +70,7 @@ def particle_numbers(experiment: Experiment) -> Declared:
 def _declared(part: FollowerRule | FractureModel, field: str) -> Declared:
     if not isinstance(part, Remembers):
         return ()
-    with blaming(part, "to declare its remembered numbers", field):
+    with errors_attributed_to(part, "to declare its remembered numbers", field):
         return as_values(part.remembered(), "remembered")
 
 
@@ -113,7 +113,7 @@ def check_diagnostics(
     """
     owners = remembered_names(experiment)
     for n, diagnostic in enumerate(experiment.diagnostics):
-        with blaming(diagnostic, "to declare its variables", "diagnostics", n):
+        with errors_attributed_to(diagnostic, "to declare its variables", "diagnostics", n):
             diagnostic.check(raster.total, len(experiment.leaders))
             diagnostic.coordinates()
             if "cells" in diagnostic.needs and not raster.communicator.any(
@@ -327,10 +327,10 @@ class SceneConstants:
         """Return the parameters of the rule at particles."""
         return self.rule._replace(**{name: where.of(v) for name, v in self.by_particle.items()})
 
-    def limits_at(self, slot: Slot, plane: int, home: Where) -> Any:
+    def limits_at(self, slot: Slot, plane: int, owner: Where) -> Any:
         """Return the limits of the bonds along a slot. `plane` is the index of the plane in which
-        the bonds are stored, and `home` are the places at which they are stored."""
-        values = {name: home.within(planes[plane]) for name, planes in self.by_bond.items()}
+        the bonds are stored, and `owner` are the places at which they are stored."""
+        values = {name: owner.within(planes[plane]) for name, planes in self.by_bond.items()}
         return self.limits[slot]._replace(**values)
 
 
@@ -346,11 +346,11 @@ def scene_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
     """
     slots = [slot for ends in setting.slots for slot in ends]
     rule, fracture = experiment.rule, experiment.fracture
-    with blaming(rule, "to return its constants", "rule"):
+    with errors_attributed_to(rule, "to return its constants", "rule"):
         of_rule = _named("Parameters", rule.parameters(setting))
         weights = {s: named_weights(rule.weights(s, setting), rule) for s in slots}
         _refuse_other_names(weights, "weights")
-    with blaming(fracture, "to return its constants", "fracture"):
+    with errors_attributed_to(fracture, "to return its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
         material_constants = {s: of_material(fracture, rule, setting, s) for s in slots}
         if isinstance(fracture, SoftensCells) and not experiment.frame.weighs_cells:
@@ -411,7 +411,7 @@ def of_material(
         If the rule is not calibrated to a material, or is not defined on cells although the
         fracture model requires cells.
     """
-    if not isinstance(fracture, KnowsStiffness):
+    if not isinstance(fracture, UsesStiffness):
         return {}
     if not isinstance(rule, TearsCells) or rule.elasticity() is None:
         raise ExperimentError(
@@ -444,7 +444,7 @@ def _refuse_other_names(by_slot: dict[Slot, Any], what: str) -> None:
         raise ValueError(f"`{what}` returned different names for different slots; use the same")
 
 
-class Home(Enum):
+class Owner(Enum):
     """Kind of object to which a number belongs."""
 
     SCENE = "scene"
@@ -471,14 +471,14 @@ class Number:
     ----------
     name
         Name of the constant or state variable.
-    home
+    owner
         Kind of object to which it belongs.
     changes
         Whether it can change during a run.
     """
 
     name: str
-    home: Home
+    owner: Owner
     changes: bool = False
 
 
@@ -519,23 +519,26 @@ def numbers_of(
     weights = next(iter(constants.weights.values()))._fields
     limits = next(iter(constants.limits.values()))._fields
     return VisibleNumbers(
-        _all(constants.rule._fields, Home.SCENE, constants.by_particle, Home.FIXED_PARTICLE),
-        tuple(Number(w, Home.CELL if w in shares else Home.SLOT) for w in weights),
-        _remembered(particle_numbers(experiment), Home.PARTICLE),
-        _all(constants.fracture._fields, Home.SCENE),
-        _all(limits, Home.SLOT, constants.by_bond, Home.FIXED_BOND)
-        + _remembered(bond_numbers(experiment), Home.BOND),
+        _all(constants.rule._fields, Owner.SCENE, constants.by_particle, Owner.FIXED_PARTICLE),
+        tuple(Number(w, Owner.CELL if w in shares else Owner.SLOT) for w in weights),
+        _remembered(particle_numbers(experiment), Owner.PARTICLE),
+        _all(constants.fracture._fields, Owner.SCENE),
+        _all(limits, Owner.SLOT, constants.by_bond, Owner.FIXED_BOND)
+        + _remembered(bond_numbers(experiment), Owner.BOND),
     )
 
 
 def _all(
-    names: Iterable[str], home: Home, varying: Container[str] = (), varying_home: Home = Home.SCENE
+    names: Iterable[str],
+    owner: Owner,
+    varying: Container[str] = (),
+    varying_owner: Owner = Owner.SCENE,
 ) -> Numbers:
-    return tuple(Number(name, varying_home if name in varying else home) for name in names)
+    return tuple(Number(name, varying_owner if name in varying else owner) for name in names)
 
 
-def _remembered(numbers: Iterable[Remembered], home: Home) -> Numbers:
-    return tuple(Number(number.name, home, number.changes) for number in numbers)
+def _remembered(numbers: Iterable[Remembered], owner: Owner) -> Numbers:
+    return tuple(Number(number.name, owner, number.changes) for number in numbers)
 
 
 SAMPLE_COUNT = 3
@@ -564,11 +567,11 @@ def with_fields(
         return constants
     _refuse(experiment)
     if rule.varying and not rule.uses_cells:
-        with blaming(rule, "to return its constants", "rule"):
+        with errors_attributed_to(rule, "to return its constants", "rule"):
             planes = _by_particle(experiment, raster, setting, constants)
         constants = replace(constants, by_particle=planes)
-    if fracture.can_break and (fracture.varying or _knows_varying(fracture, rule)):
-        with blaming(fracture, "to return its constants", "fracture"):
+    if fracture.can_break and (fracture.varying or _uses_varying(fracture, rule)):
+        with errors_attributed_to(fracture, "to return its constants", "fracture"):
             planes = _by_bond(experiment, raster, neighbourhood, constants, setting)
         constants = replace(constants, by_bond=planes)
     return constants
@@ -594,10 +597,10 @@ def _refuse(experiment: Experiment) -> None:
             )
 
 
-def _knows_varying(fracture: FractureModel, rule: FollowerRule) -> bool:
+def _uses_varying(fracture: FractureModel, rule: FollowerRule) -> bool:
     """Return whether the fracture model depends on the stiffness of the rule while this stiffness
     varies in space."""
-    return isinstance(fracture, KnowsStiffness) and bool(rule.varying)
+    return isinstance(fracture, UsesStiffness) and bool(rule.varying)
 
 
 def _draws(part: TakesFields) -> bool:
@@ -689,7 +692,7 @@ def _rules_at(
     """
     rule = experiment.rule
     parts, kind = [rule], np.zeros(x.shape, np.intp)
-    if _knows_varying(experiment.fracture, rule):
+    if _uses_varying(experiment.fracture, rule):
         parts, kind = kinds_of(rule, values_at(experiment, "rule", x, y, needed))
     yield from ((part, kind == n) for n, part in enumerate(parts))
 

@@ -114,8 +114,10 @@ def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
     is_row = (follow.body >= 0) & (follow.body < raster.count)
     if not is_row.all() or (raster.table_kind[follow.body] != FOLLOWER).any():
         raise ExperimentError("its map refers to a row that is not a particle of the body")
-    if not np.isfinite(follow.weight).all() or follow.lag not in (0, 1):
-        raise ExperimentError("its map has weights that are not finite, or a lag other than 0 or 1")
+    if not np.isfinite(follow.weight).all() or follow.delay not in (0, 1):
+        raise ExperimentError(
+            "its map has weights that are not finite, or a delay other than 0 or 1"
+        )
 
 
 @dataclass(frozen=True)

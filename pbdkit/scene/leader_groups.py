@@ -20,7 +20,7 @@ from pbdkit.model.boundary_conditions import LeaderGroup
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Measured, Newton, Rotation
 from pbdkit.plugin import TurnsParticles
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.scene.constants import particle_numbers
 from pbdkit.scene.selection import Selecting, shares_of, spacing
@@ -38,7 +38,7 @@ def rotations_of(experiment: Experiment) -> tuple[tuple[int, int], ...]:
     rule = experiment.rule
     if not isinstance(rule, TurnsParticles):
         return ()
-    with blaming(rule, "to return its rotations", "rule"):
+    with errors_attributed_to(rule, "to return its rotations", "rule"):
         pairs = rule.rotations()
     changing = {n.name: m for m, n in enumerate(particle_numbers(experiment)) if n.changes}
     for name in (name for pair in pairs for name in pair):

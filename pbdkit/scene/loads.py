@@ -16,7 +16,7 @@ from pbdkit.lattice.raster import Raster, Restriction
 from pbdkit.model.boundary_conditions import Load
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin.lattice import Tiling, signed_area
-from pbdkit.plugin.schedule import Course
+from pbdkit.plugin.schedule import TimeDependent
 from pbdkit.scene.selection import Selecting, shares_of
 
 Planes = NDArray[np.floating[Any]]
@@ -97,21 +97,23 @@ class Loads:
         return sorted(step for step in every if step <= steps)
 
     @property
-    def courses(self) -> list[Course[float]]:
+    def time_dependent(self) -> list[TimeDependent[float]]:
         """Time-dependent forces of all loads."""
-        return [course for loading in self.each for course in loading.load.courses]
+        return [number for loading in self.each for number in loading.load.time_dependent]
 
     def next_change(self, step: int) -> float:
         """Return the first step after `step` at which the forces change, or infinity."""
         steps = [change for loading in self.each for change in loading.load.changes()]
         steps = [change for change in steps if change > step]
-        return min([*steps, *(c.next_change(step) for c in self.courses)], default=math.inf)
+        return min([*steps, *(c.next_change(step) for c in self.time_dependent)], default=math.inf)
 
-    def way(self, begin: float, end: float) -> float:
+    def relative_change(self, begin: float, end: float) -> float:
         """Return the largest relative change of a load between two moments."""
         loads = (loading.load for loading in self.each)
         changes = [abs(load.amplitude(end) - load.amplitude(begin)) for load in loads]
-        return max([*changes, *(course.way(begin, end) for course in self.courses)])
+        return max(
+            [*changes, *(number.relative_change(begin, end) for number in self.time_dependent)]
+        )
 
 
 def build_loads(
@@ -138,7 +140,10 @@ def build_loads(
         )
         loads.append(Loading(load, rows, place, share))
         with np.errstate(all="ignore"):
-            moments = [load.from_, *(bend for course in load.courses for bend in course.bends)]
+            moments = [
+                load.from_,
+                *(knot for number in load.time_dependent for knot in number.breakpoints),
+            ]
             forces = [load.force_at(moment) * share.sum() for moment in moments]
             finite = np.isfinite(forces).all()
         if not finite:

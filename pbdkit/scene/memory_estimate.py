@@ -27,7 +27,7 @@ from pbdkit.scene.constants import bond_numbers, particle_numbers
 
 LARGEST_DIRECT = 3_000
 """Number of particles up to which `auto` selects a direct solver if the system is set up once."""
-LARGEST_ANEW = 20_000
+LARGEST_REPEATED = 20_000
 """Number of particles up to which `auto` selects a direct solver if systems are set up repeatedly,
 because the rule is nonlinear or bonds break. Beyond it the moves are compiled."""
 
@@ -68,7 +68,7 @@ def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
     """Return whether multigrid on stencils is requested or, if the method is selected
     automatically, is the fastest method."""
     once = experiment.rule.linear and not experiment.fracture.can_break
-    largest = LARGEST_DIRECT if once else LARGEST_ANEW
+    largest = LARGEST_DIRECT if once else LARGEST_REPEATED
     return method == "multigrid" or (method == "auto" and particles > largest)
 
 

@@ -1,9 +1,9 @@
 """Obstacles on a lattice: their outlines at a moment, and the shortest displacement that moves a
 particle out of them.
 
-`facing`, `way_out` and `clearance` are elementwise: the same source is evaluated on arrays and
-inside kernels. `leave` and `way_between` are evaluated for one particle at a time, by numpy and in
-kernels.
+`facing`, `outline_correction` and `clearance` are elementwise: the same source is evaluated on
+arrays and inside kernels. `contact_correction` and `overlap_correction` are evaluated for one
+particle at a time, by numpy and in kernels.
 """
 
 from __future__ import annotations
@@ -107,11 +107,11 @@ class Walls(NamedTuple):
         """Evaluate `clearance` at places."""
         return clearance(x, y, self.kinds, self.points, self.first, self.radii)
 
-    def way_between(self, at: Floats, C: Floats, code: int) -> tuple[Any, Any]:
-        """Evaluate `way_between` for a particle."""
+    def overlap_correction(self, at: Floats, C: Floats, code: int) -> tuple[Any, Any]:
+        """Evaluate `overlap_correction` for a particle."""
         (x, y), (xx, xy, yy) = at, C
         arrays = self.kinds, self.points, self.first, self.radii
-        wx, wy = way_between(x, y, xx, xy, yy, code, *arrays)
+        wx, wy = overlap_correction(x, y, xx, xy, yy, code, *arrays)
         return wx, wy
 
 
@@ -166,11 +166,12 @@ class Outline:
         gap, nx, ny = (np.broadcast_to(value, x.shape) for value in result)
         return gap, nx, ny
 
-    def way_out(self, at: Floats, C: Floats) -> Floats:
-        """Evaluate `way_out` at places, (axis, place), with the compliance C, (xx xy yy, place)."""
+    def outline_correction(self, at: Floats, C: Floats) -> Floats:
+        """Evaluate `outline_correction` at places, (axis, place), with the compliance C, (xx xy yy,
+        place)."""
         whole = self.points, 0, len(self.points), self.inner, self.outer
-        result = way_out(at[0], at[1], C[0], C[1], C[2], self.kind, *whole)
-        return np.stack([np.broadcast_to(way, at[0].shape) for way in result])
+        result = outline_correction(at[0], at[1], C[0], C[1], C[2], self.kind, *whole)
+        return np.stack([np.broadcast_to(component, at[0].shape) for component in result])
 
     def faces(self, x: Floats, y: Floats) -> Iterator[Face]:
         """Generate the faces of the outline, with the distances and normals at given places.
@@ -254,7 +255,7 @@ def facing(
     return _before_polygon(x, y, points, first, last)
 
 
-def way_out(
+def outline_correction(
     x: Any, y: Any, xx: Any, xy: Any, yy: Any, kind: Any, points: Any, first: Any, last: Any,
     inner: Any, outer: Any,
 ) -> Any:  # fmt: skip
@@ -304,7 +305,7 @@ def clearance(x: Any, y: Any, kinds: Any, points: Any, first: Any, radii: Any) -
     return depth
 
 
-def leave(
+def contact_correction(
     x: Any, y: Any, xx: Any, xy: Any, yy: Any, code: Any,
     kinds: Any, points: Any, first: Any, radii: Any,
 ) -> Any:  # fmt: skip
@@ -324,16 +325,16 @@ def leave(
     if count == 0 or code == 3:
         return 0.0, 0.0
     if count == 1 and code == 0:
-        wx, wy = way_out(
+        wx, wy = outline_correction(
             x, y, xx, xy, yy,
             kinds[n], points, first[n], first[n + 1], radii[n, 0], radii[n, 1],
         )  # fmt: skip
         if clearance(x + wx, y + wy, kinds, points, first, radii) >= 0.0:
             return wx, wy
-    return way_between(x, y, xx, xy, yy, code, kinds, points, first, radii)
+    return overlap_correction(x, y, xx, xy, yy, code, kinds, points, first, radii)
 
 
-def way_between(
+def overlap_correction(
     x: Any, y: Any, xx: Any, xy: Any, yy: Any, code: Any,
     kinds: Any, points: Any, first: Any, radii: Any,
 ) -> Any:  # fmt: skip
@@ -689,11 +690,11 @@ def collisions(
 
 def _can_evade(outline: Outline, places: Floats, axis: int) -> Mask:
     """Return a mask of the places, (axis, place), at which a particle that is led along `axis` can
-    leave the outline along its other axis."""
+    contact_correction the outline along its other axis."""
     walls, result = Walls.of([outline]), np.zeros(places.shape[1], bool)
     with np.errstate(all="ignore"):
         for k, at in enumerate(places.T):
-            x, y = at + walls.way_between(at, np.array([1.0, 0.0, 1.0]), axis + 1)
+            x, y = at + walls.overlap_correction(at, np.array([1.0, 0.0, 1.0]), axis + 1)
             result[k] = walls.clearance(x, y) >= 0.0
     return result
 

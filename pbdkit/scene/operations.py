@@ -10,7 +10,7 @@ from pbdkit.array_types import Indices
 from pbdkit.lattice.raster import Raster, Restriction
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import ParticleOperation
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.scene.selection import Selecting
 
 
@@ -43,7 +43,7 @@ def build_operations(raster: Raster, experiment: Experiment) -> tuple[Operated, 
         rows = raster.body_rows
         if operation.select:
             rows = body.select(operation.select, ("operations", n, "select"))
-        with blaming(operation, "to return its parameters", "operations", n):
+        with errors_attributed_to(operation, "to return its parameters", "operations", n):
             numbers = operation.parameters()
         parameters = namedtuple("Parameters", numbers)(**numbers)
         operations.append(Operated(operation, rows, raster.place_of(rows), parameters))

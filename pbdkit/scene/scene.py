@@ -34,7 +34,7 @@ from pbdkit.lattice.neighbourhood import (
     missing_segments,
     setting_of,
 )
-from pbdkit.lattice.raster import LeftOut, Raster, Restriction, RowLayout, RowRange, distinct
+from pbdkit.lattice.raster import OmittedCells, Raster, Restriction, RowLayout, RowRange, distinct
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
     AppliesTwice,
@@ -45,10 +45,10 @@ from pbdkit.plugin import (
     TearsCells,
     Vector,
 )
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.lattice import Index
-from pbdkit.plugin.schedule import Course
+from pbdkit.plugin.schedule import TimeDependent
 from pbdkit.scene import checks
 from pbdkit.scene.constants import SceneConstants, check_diagnostics, scene_constants, with_fields
 from pbdkit.scene.frame import Frame, build_frame
@@ -60,7 +60,7 @@ from pbdkit.scene.obstacles import Barrier, build_obstacles, collisions
 from pbdkit.scene.operations import Operated, build_operations
 
 
-class Ground:
+class LatticeSetup:
     """Neighbours, frame layers and body of an experiment. They are the first stage in the
     construction of its scene.
 
@@ -96,17 +96,17 @@ class Ground:
         communicator: Communicator = SERIAL,
         row_range: RowRange | None = None,
     ) -> None:
-        self.left_out = LeftOut()
+        self.left_out = OmittedCells()
         self.experiment, self._communicator, self._row_range = experiment, communicator, row_range
         lattice, neighbours = experiment.lattice, experiment.neighbours
         fracture, frame = experiment.fracture, experiment.frame
-        with blaming(lattice, "to return its cell", "lattice"):
+        with errors_attributed_to(lattice, "to return its cell", "lattice"):
             self.cell = checked_cell(lattice)
-        with blaming(neighbours, "to return the neighbours", "neighbours"):
+        with errors_attributed_to(neighbours, "to return the neighbours", "neighbours"):
             self.neighbourhood = build_neighbourhood(self.cell, neighbours)
-        with blaming(fracture, "to check the rest lengths", "fracture"):
+        with errors_attributed_to(fracture, "to check the rest lengths", "fracture"):
             self.warnings = tuple(fracture.check(self.neighbourhood.shells()))
-        with blaming(frame, "to return its depth", "frame"):
+        with errors_attributed_to(frame, "to return its depth", "frame"):
             self.layers = frame.depth(self.neighbourhood.reach)
         low, high = window(experiment.body, lattice)
         extent = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
@@ -245,19 +245,19 @@ class Scene:
 
         `self` has the final values of its time-dependent parameters.
         """
-        courses = self._courses
-        if all(course.at(moment) == course.last for course in courses):
+        time_dependent = self._time_dependent
+        if all(number.at(moment) == number.last for number in time_dependent):
             return self
-        values = tuple(course.at(moment) for course in courses)
+        values = tuple(number.at(moment) for number in time_dependent)
         if values not in self._cache:
             self._cache.clear()
             self._cache[values] = renumbered(self, self.experiment.at(moment))
         return self._cache[values]
 
     @cached_property
-    def _courses(self) -> tuple[Course[float], ...]:
+    def _time_dependent(self) -> tuple[TimeDependent[float], ...]:
         """Time-dependent parameters, by their path in the file."""
-        return tuple(self.experiment.courses.values())
+        return tuple(self.experiment.time_dependent.values())
 
     @cached_property
     def _cache(self) -> dict[tuple[float, ...], Scene]:
@@ -289,24 +289,24 @@ class Scene:
         return self.has_fracture and isinstance(self.experiment.rule, TearsCells)
 
     @cached_property
-    def home_reach(self) -> tuple[Index, Index]:
+    def owner_reach(self) -> tuple[Index, Index]:
         """Largest differences in repeat cells, backward and forward, between a particle and the
         places that store the bonds on which the move of the particle depends.
 
         These are the bonds of the particle or, if cells can be torn, of all cells around it.
         """
         if not self.tears:
-            return self.neighbourhood.home_reach
+            return self.neighbourhood.owner_reach
         cells = (cell for around in self.neighbourhood.cells_around for cell in around.cells)
-        homes = {bond.home for cell in cells for bond in cell}
-        steps = np.array([home.cell if home else (0,) * self.axes for home in homes])
+        owners = {bond.owner for cell in cells for bond in cell}
+        steps = np.array([owner.cell if owner else (0,) * self.axes for owner in owners])
         low, high = np.minimum(steps.min(axis=0), 0), np.maximum(steps.max(axis=0), 0)
         return tuple((-low).tolist()), tuple(high.tolist())
 
     @property
-    def lag(self) -> int:
+    def frame_delay(self) -> int:
         """Delay of the frame in steps."""
-        return self.frame.map.lag if self.frame else 0
+        return self.frame.map.delay if self.frame else 0
 
     @property
     def axes(self) -> int:
@@ -316,7 +316,7 @@ class Scene:
     @property
     def frame_changes(self) -> bool:
         """True if the map of the frame depends on time-dependent parameters of the rule."""
-        is_variable = bool(self.experiment.rule.courses)
+        is_variable = bool(self.experiment.rule.time_dependent)
         return is_variable and self.frame is not None and self.frame.depends_on_rule
 
     @cached_property
@@ -364,12 +364,12 @@ def build_scene(
         If no scene can be built, with file and line if they are known.
     """
     try:
-        return _build(experiment, Ground(experiment, communicator, row_range))
+        return _build(experiment, LatticeSetup(experiment, communicator, row_range))
     except ExperimentError as error:
         raise experiment.located(error) from None
 
 
-def _build(experiment: Experiment, ground: Ground) -> Scene:
+def _build(experiment: Experiment, ground: LatticeSetup) -> Scene:
     neighbours = experiment.neighbours
     neighbourhood, layers = ground.neighbourhood, ground.layers
     raster, cells = ground.raster()
@@ -417,7 +417,7 @@ def _segments(experiment: Experiment) -> dict[str, Segment]:
     experiment."""
     segments = {f"cuts.{n}": cut.segment for n, cut in enumerate(experiment.cuts)}
     if isinstance(model := experiment.fracture, StartsCracked):
-        with blaming(model, "to return its cracks", "fracture"):
+        with errors_attributed_to(model, "to return its cracks", "fracture"):
             segments |= {f"fracture.cracks.{n}": s for n, s in enumerate(model.segments())}
     return segments
 
@@ -435,7 +435,7 @@ def renumbered(scene: Scene, experiment: Experiment) -> Scene:
 
 
 def _frame_of(raster: Raster, experiment: Experiment) -> Frame | None:
-    with blaming(experiment.frame, "to map the frame points", "frame"):
+    with errors_attributed_to(experiment.frame, "to map the frame points", "frame"):
         return build_frame(raster, experiment.frame, experiment.rule)
 
 
@@ -451,11 +451,11 @@ def with_inner(scene: Scene) -> Scene:
     experiment, rule = scene.experiment, scene.experiment.rule
     if not isinstance(rule, AppliesTwice):
         return scene
-    with blaming(rule, "to return its inner rule", "rule"):
+    with errors_attributed_to(rule, "to return its inner rule", "rule"):
         inner = rule.inner()
     remembers = isinstance(rule, Remembers) or isinstance(inner, Remembers)
     for clash, part, remedy in (
-        (scene.lag, "frame", "lag: 0"),
+        (scene.frame_delay, "frame", "lag: 0"),
         (experiment.cuts, "cuts", "[]"),
         (experiment.fracture.can_break, "fracture", "{type: none}"),
         (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),

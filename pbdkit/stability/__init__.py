@@ -1,7 +1,7 @@
 """Predictions about a run before its first step.
 
 `analysis` computes the spectrum of a step and the rate of convergence, `relaxation` the optimal
-relaxation and momentum, and `lag` the distance from equilibrium while leaders move. `forecast`
+relaxation and momentum, and `distance` the distance from equilibrium while leaders move. `forecast`
 combines these results with warnings and with estimates of memory and time, for `pbdkit check`.
 """
 

@@ -20,30 +20,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.equilibrium.lattice_system import SlowMode
-from pbdkit.equilibrium.system import StuckError, System, one_thread
+from pbdkit.equilibrium.system import StagnationError, System, one_thread
 from pbdkit.lattice.raster import distinct
 from pbdkit.linear.block_matrix import CoordinateMatrix, connected
 from pbdkit.linear.operator import StepOperator, step_operator
 from pbdkit.linear.spectrum import (
     NEUTRAL,
+    OscillatingMode,
     Spectrum,
-    Swing,
     excess,
     just_below,
     largest_stable_relaxation,
     modes,
-    slowest_swing,
+    oscillation_limit,
+    slowest_oscillation,
     spectrum,
     spectrum_of,
-    swings_below,
 )
 from pbdkit.linear.stencil import NO_REMEDY, bounds_the_body, wave_bound
 from pbdkit.memory import machine_memory
 from pbdkit.plugin import Anchors
 from pbdkit.progress import Watch
-from pbdkit.scene.memory_estimate import LARGEST_ANEW
+from pbdkit.scene.memory_estimate import LARGEST_REPEATED
 from pbdkit.scene.scene import Scene
-from pbdkit.stability.lag import Lag, fastest, lag_of
+from pbdkit.stability.distance import LeaderDistance, distance_from_equilibrium, fastest
 from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
@@ -82,7 +82,9 @@ class Spectra:
         """
         rule_spectrum, solver = self.of_rule, self.scene.experiment.stepping
         if rule_spectrum is None:
-            return self._spectrum_of(lambda: self.operator.augmented().matrix(), self.scene.lag > 0)
+            return self._spectrum_of(
+                lambda: self.operator.augmented().matrix(), self.scene.frame_delay > 0
+            )
         if solver.relaxation == 1.0 and solver.memory == 0.0:
             return rule_spectrum
         # The map from λ to μ maps the ends of a real spectrum to the extreme values of μ.
@@ -131,10 +133,10 @@ class Spectra:
 
         For large bodies an estimate by multigrid is tried first.
         """
-        is_large = self.scene.raster.count > LARGEST_ANEW
+        is_large = self.scene.raster.count > LARGEST_REPEATED
         if is_large and (result := self.estimate.spectrum):
             return result, True
-        if result := self._spectrum_of(self.rule_matrix, self.scene.lag == 0):
+        if result := self._spectrum_of(self.rule_matrix, self.scene.frame_delay == 0):
             return result, False
         result = None if is_large else self.estimate.spectrum
         return result, result is not None
@@ -202,7 +204,8 @@ class Analysis:
         return f"<pbdkit.Analysis of {self.scene.experiment.name}>"
 
     def __str__(self) -> str:
-        """A summary: stability, steps to a tolerance, eigenvalues, lag and warnings."""
+        """A summary: stability, steps to a tolerance, eigenvalues, distance from equilibrium and
+        warnings."""
         rows = [*self.rows(), *(("warning", text) for text in self.warnings())]
         width = max(len(name) for name, _ in rows)
         title = f"analysis of {self.scene.experiment.name}"
@@ -219,8 +222,8 @@ class Analysis:
             which = "estimated" if self.estimated else "known"
             kinds = f", {turning} of them complex" if turning else ", all real"
             rows.append((f"eigenvalues {which}", f"{len(values)}{kinds}"))
-        if self.lag is not None:
-            rows.append(("distance", f"{self.lag:.4g} lattice units from equilibrium"))
+        if self.distance is not None:
+            rows.append(("distance", f"{self.distance:.4g} lattice units from equilibrium"))
         return rows
 
     def _repr_html_(self) -> str:
@@ -236,7 +239,9 @@ class Analysis:
         """
         experiment = self.scene.experiment
         scene = self.scene
-        changes = scene.has_fracture or scene.barriers or scene.operations or experiment.courses
+        changes = (
+            scene.has_fracture or scene.barriers or scene.operations or experiment.time_dependent
+        )
         return experiment.rule.linear and not changes and not experiment.neighbours.nearness()
 
     @cached_property
@@ -271,13 +276,13 @@ class Analysis:
             )
         if not self.estimated:
             return messages
-        if solver.memory > 0.0 and self.swing(solver.relaxation, solver.memory) is None:
+        if solver.memory > 0.0 and self.oscillation(solver.relaxation, solver.memory) is None:
             messages.append(
                 "analysis: the period is omitted, because a body of this size has many modes "
                 "between those that decay without oscillating and those that oscillate"
             )
         moves = self.scene.experiment.solver.makes_steps and fastest(self.scene).speed > 0.0
-        if moves and self.stable and self.trailing is None:
+        if moves and self.stable and self.leader_distance is None:
             messages.append(
                 "analysis: the distance from equilibrium is omitted, because the leaders do not "
                 "constrain the body in their fastest steps"
@@ -345,7 +350,7 @@ class Analysis:
         mu = modes(rule_spectrum.eigenvalues, relaxation, memory)
         return bool(np.abs(mu).max(initial=0.0) <= 1.0 + NEUTRAL)
 
-    def swing(self, relaxation: float, memory: float) -> Swing | None:
+    def oscillation(self, relaxation: float, memory: float) -> OscillatingMode | None:
         """Return the oscillating mode with the longest period for a given relaxation and momentum.
 
         Parameters
@@ -357,7 +362,7 @@ class Analysis:
 
         Returns
         -------
-        `Swing` or None
+        `OscillatingMode` or None
             Period 2π / arg μ in steps, and decay per step |μ|, which is √memory if the eigenvalues
             of the rule are real. None if no mode oscillates, or if the eigenvalues of the rule are
             unknown.
@@ -366,10 +371,10 @@ class Analysis:
         if rule_spectrum is None:
             return None
         eigenvalues = rule_spectrum.eigenvalues
-        if self.estimated and rule_spectrum.largest > swings_below(relaxation, memory):
+        if self.estimated and rule_spectrum.largest > oscillation_limit(relaxation, memory):
             return None
         if 0.0 < memory < 1.0 and rule_spectrum.largest > (
-            edge := swings_below(relaxation, memory)
+            edge := oscillation_limit(relaxation, memory)
         ):
             # The slowest modes do not oscillate, and the modes near the limit of oscillation may
             # not have been computed yet.
@@ -377,7 +382,7 @@ class Analysis:
                 eigenvalues = np.append(eigenvalues, just_below(self.spectra.rule_matrix(), edge))
             except RuntimeError:  # Too expensive, or ARPACK did not converge.
                 return None
-        return slowest_swing(modes(eigenvalues, relaxation, memory))
+        return slowest_oscillation(modes(eigenvalues, relaxation, memory))
 
     @property
     def steps_to(self) -> dict[str, int | None]:
@@ -392,7 +397,7 @@ class Analysis:
         }
 
     @cached_property
-    def trailing(self) -> Lag | None:
+    def leader_distance(self) -> LeaderDistance | None:
         """Return the distance of the body from its equilibrium in the steps in which its leaders
         move fastest.
 
@@ -403,7 +408,9 @@ class Analysis:
             return None
         if self.estimated:
             estimate = self.spectra.estimate
-            return lag_of(self.scene, estimate.at_rest, estimate.system, self._slowness)
+            return distance_from_equilibrium(
+                self.scene, estimate.at_rest, estimate.system, self._slowness
+            )
         state = initial_state(self.scene)
 
         def system_at(step: int) -> System:
@@ -411,7 +418,7 @@ class Analysis:
 
             return linearised(self.scene.bare, state, step, "auto", Watch())
 
-        return lag_of(self.scene, state, system_at, self._slowness)
+        return distance_from_equilibrium(self.scene, state, system_at, self._slowness)
 
     @property
     def _slowness(self) -> float:
@@ -423,13 +430,13 @@ class Analysis:
         return float(1.0 / (relaxation * decays[decays > NEUTRAL].min(initial=1.0)))
 
     @property
-    def lag(self) -> float | None:
+    def distance(self) -> float | None:
         """Return the largest distance of a follower from its equilibrium, in lattice units.
 
         It is the constant distance that is reached after long motion at the largest speed of the
         leaders.
         """
-        return self.trailing.steady if self.trailing else None
+        return self.leader_distance.steady if self.leader_distance else None
 
     @cached_property
     def parts_without_leader(self) -> list[Any]:
@@ -469,10 +476,12 @@ class Analysis:
         if len(parts) > 3:
             warnings = [f"leaders: {len(parts)} parts of the body are not constrained by any"]
         bond = min(min(lengths) for lengths in self.scene.neighbourhood.shells())
-        lag_warnings = (
-            self.trailing.late(bond, self.scene.experiment.units) if self.trailing else []
+        distance_warnings = (
+            self.leader_distance.late(bond, self.scene.experiment.units)
+            if self.leader_distance
+            else []
         )
-        return [*warnings, *self._growth(), *self._edges_near_the_bound(), *lag_warnings]
+        return [*warnings, *self._growth(), *self._edges_near_the_bound(), *distance_warnings]
 
     def _growth(self) -> list[str]:
         """Warn of modes that grow, or never decay."""
@@ -524,7 +533,7 @@ class StabilityEstimate:
 
     NEEDS = (
         "multigrid requires leaders that constrain the whole body, bonds to adjacent cells only "
-        "and a frame without lag"
+        "and a frame without delay"
     )
     """Conditions of the estimate."""
 
@@ -579,7 +588,7 @@ class StabilityEstimate:
             slowness = mode.slowness
             try:
                 mode = mode.improved(system, ACCURACY)
-            except StuckError:
+            except StagnationError:
                 return None
             if abs(mode.slowness - slowness) <= CLOSE * slowness:
                 break
@@ -588,7 +597,7 @@ class StabilityEstimate:
     @cached_property
     def spectrum(self) -> Spectrum | None:
         """Estimate both ends of the spectrum of the rule's own step, if it is real."""
-        if self._scene.lag:
+        if self._scene.frame_delay:
             return None
         waves = wave_bound(self._scene)
         if waves is None or waves.imaginary > 1e-9:

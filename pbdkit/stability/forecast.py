@@ -35,7 +35,7 @@ from pbdkit.model.motions import Newton
 from pbdkit.plugin import Anchors, Calibrated
 from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.leader_groups import kinds_at, kinds_of_places
-from pbdkit.scene.memory_estimate import LARGEST_ANEW, MIB, Sizes, sizes_of
+from pbdkit.scene.memory_estimate import LARGEST_REPEATED, MIB, Sizes, sizes_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.engine_choice import choose, seconds_of
 from pbdkit.stepping.leaders import NewtonForces
@@ -140,7 +140,7 @@ MAX_CHANGES = 16
 """Maximum number of analyses with different values of time-dependent parameters."""
 ANALYSIS_FIELDS = (
     *("spectral_radius", "smallest_eigenvalue", "largest_stable_relaxation", "stable", "steps_to"),
-    *("exact", "estimated", "lag"),
+    *("exact", "estimated"),
 )
 """Fields of a forecast that have the same names in the analysis."""
 
@@ -158,7 +158,7 @@ def forecast(scene: Scene) -> Forecast:
     kinds = kinds_at(scene.raster, scene.leading, 1)
     analysis, solver = Analysis(scene), scene.experiment.stepping
     sizes = _sizes(analysis)
-    swing = analysis.swing(solver.relaxation, solver.memory) if solver.memory else None
+    mode = analysis.oscillation(solver.relaxation, solver.memory) if solver.memory else None
     waves = [] if analysis.spectrum else _growing_waves(scene, wave_bound(scene))
     return Forecast(
         particles=scene.raster.count,
@@ -169,9 +169,10 @@ def forecast(scene: Scene) -> Forecast:
         seconds=_seconds(scene),
         relaxation=solver.relaxation,
         memory=solver.memory,
-        period=swing.period if swing else None,
-        decay=swing.decay if swing else None,
-        lag_reached=analysis.trailing.reached if analysis.trailing else None,
+        period=mode.period if mode else None,
+        decay=mode.decay if mode else None,
+        lag=analysis.distance,
+        lag_reached=analysis.leader_distance.reached if analysis.leader_distance else None,
         size_mm=_size_mm(scene),
         warnings=[
             *_scene_warnings(scene),
@@ -204,7 +205,7 @@ def _sizes(analysis: Analysis) -> Sizes:
     solver."""
     scene = analysis.scene
     count, grids = scene.raster.count, not scene.barriers
-    if grids and count > LARGEST_ANEW and not scene.experiment.solver.makes_steps:
+    if grids and count > LARGEST_REPEATED and not scene.experiment.solver.makes_steps:
         grids = analysis.spectra.estimate.system(scene.experiment.steps) is not None
     return sizes_of(scene.experiment, scene.neighbourhood, count, grids=grids)
 
@@ -249,15 +250,20 @@ def _divergence_in_time(scene: Scene) -> list[str]:
     the run."""
     from pbdkit.stability.analysis import Analysis
 
-    courses, steps = scene.experiment.courses, scene.experiment.steps
-    bends = sorted({min(bend, steps) for course in courses.values() for bend in course.bends})
-    moments = [n for n in bends if any(c.at(n) != c.last for c in courses.values())]
+    time_dependent, steps = scene.experiment.time_dependent, scene.experiment.steps
+    breakpoints = sorted(
+        {min(knot, steps) for number in time_dependent.values() for knot in number.breakpoints}
+    )
+    moments = [n for n in breakpoints if any(c.at(n) != c.last for c in time_dependent.values())]
     warnings = list[str]()
     for moment in moments[:MAX_CHANGES] if scene.experiment.solver.makes_steps else ():
         if Analysis(scene.at(moment)).stable is False:
-            values = (f"{'.'.join(at)} {course.at(moment):g}" for at, course in courses.items())
+            values = (
+                f"{'.'.join(at)} {number.at(moment):g}" for at, number in time_dependent.items()
+            )
             warnings.append(
-                f"{min(courses)[0]}: at step {moment} steps diverge, with {', '.join(values)}"
+                f"{min(time_dependent)[0]}: at step {moment} steps diverge, with "
+                f"{', '.join(values)}"
             )
     if len(moments) > MAX_CHANGES:
         warnings.append(
@@ -339,7 +345,7 @@ def _missing_supports(scene: Scene) -> list[str]:
     ]
 
 
-def outlook(scene: Scene) -> list[str]:
+def further_warnings(scene: Scene) -> list[str]:
     """Return warnings that are computed within a second, in addition to `quick_warnings`.
 
     The warnings concern missing supports and, for small bodies, the reasons why steps do not

@@ -67,7 +67,7 @@ class StepWeights(NamedTuple):
         return float(np.abs(modes(moving, *self)).max(initial=0.0))
 
 
-class HopelessError(ValueError):
+class NoStableWeightsError(ValueError):
     """No relaxation and momentum exist with which all modes decay. The message contains the
     reason."""
 
@@ -86,21 +86,23 @@ def best_weights(
 
     Raises
     ------
-    HopelessError
+    NoStableWeightsError
         If there are no values with which all modes decay.
     """
     z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
     if not len(z):
         return StepWeights(relaxation or 1.0, memory or 0.0)
     if z.real.min() <= 0.0:
-        raise HopelessError(f"the rule has a mode with the eigenvalue {1 - z.real.min():.6g}")
+        raise NoStableWeightsError(
+            f"the rule has a mode with the eigenvalue {1 - z.real.min():.6g}"
+        )
     if memory is not None and abs(memory) >= 1.0:
-        raise HopelessError(f"with memory {memory:g} no mode decays")
+        raise NoStableWeightsError(f"with memory {memory:g} no mode decays")
     weights = _best_for_real(float(z.real.min()), float(z.real.max()), relaxation, memory)
     if np.abs(z.imag).max() > STRAIGHT:
         weights = _best_for_complex(eigenvalues, relaxation, memory)
     if not weights.rate(eigenvalues) < 1.0:
-        raise HopelessError(
+        raise NoStableWeightsError(
             f"no value of memory makes all modes decay with relaxation {weights[0]:g}"
         )
     return weights
@@ -204,23 +206,23 @@ def chosen_weights(scene: Scene) -> StepWeights:
         weights = best_weights(eigenvalues, *prescribed)
         if prescribed[1] is None and not is_sure and weights.memory > LITTLE_MEMORY:
             weights = best_weights(eigenvalues, prescribed[0], LITTLE_MEMORY)
-    except HopelessError as error:
+    except NoStableWeightsError as error:
         raise _refusal(f"{error}; {REMEDY}") from None
     return weights
 
 
 def _refuse(scene: Scene) -> None:
-    if scene.experiment.courses:
+    if scene.experiment.time_dependent:
         raise _refusal(f"'auto' requires constant parameters, but some depend on time; {REMEDY}")
     if scene.experiment.neighbours.nearness():
         raise _refusal(
             "'auto' requires a spectrum, which does not exist if neighbours are re-evaluated; "
             f"set neighbours.reevaluate: false, or {REMEDY}"
         )
-    if scene.lag:
+    if scene.frame_delay:
         raise _refusal(
-            "'auto' requires steps that depend on the last one only, but a frame with lag depends "
-            f"on earlier ones; set frame.lag: 0, or {REMEDY}"
+            "'auto' requires steps that depend on the last one only, but a frame with delay "
+            f"depends on earlier ones; set frame.lag: 0, or {REMEDY}"
         )
 
 

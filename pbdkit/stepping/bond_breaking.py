@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pbdkit.lattice.neighbourhood import bonds_in, plane_block
 from pbdkit.plugin import CellStress, FractureModel, RenewsBonds, SoftensCells, Vector, length
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers
 from pbdkit.scene.scene import Scene
@@ -22,7 +22,7 @@ from pbdkit.stepping.rule_evaluation import BLOCK_CELLS, Evaluator
 from pbdkit.stepping.state import State, cut_bonds
 from pbdkit.stepping.step import Call, Hindrance, Mode, Operation, Reach, Step
 
-Home = tuple[Any, ...]
+Owner = tuple[Any, ...]
 """Type of the index of bonds in the arrays of bonds: the plane, and a slice of cells along each
 axis."""
 DIRECTIONS = 8
@@ -69,7 +69,7 @@ class Fracturing:
         assert state.broken_step is not None
         assert state.broken_length is not None
         when = f"at step {step}"
-        renewed: Iterable[_Renewed] = self._renewed(m, state, when)
+        renewed: Iterable[UpdatedBonds] = self._renewed(m, state, when)
         if in_turn and self._cells:
             old = [value.copy() for value in state.bond_values]
             renewed = list(renewed)
@@ -77,9 +77,9 @@ class Fracturing:
         for part in renewed:
             breaks = self._breaks(part, when)
             if breaks.any():
-                state.broken_step[part.home][breaks] = step
+                state.broken_step[part.owner][breaks] = step
                 current = part.r + part.d.each(lambda values, where=breaks: values[where])
-                state.broken_length[part.home][breaks] = length(current)
+                state.broken_length[part.owner][breaks] = length(current)
 
     def may_break(self, u: NDArray[Any], state: State, within: float) -> bool:
         """Return whether any bond breaks at u, or would break if the relative displacement of its
@@ -99,7 +99,7 @@ class Fracturing:
 
     def _renewed(
         self, m: NDArray[Any], state: State, when: str, nudge: Vector | None = None
-    ) -> Iterator[_Renewed]:
+    ) -> Iterator[UpdatedBonds]:
         """Generate the bonds of each slot, block by block, with updated state variables. They are
         updated in place, or in copies if the relative displacements of the ends of all bonds are
         changed by a `nudge`."""
@@ -111,20 +111,20 @@ class Fracturing:
             numbers = [block.within(value[n]) for value in state.bond_values]
             if nudge:
                 d, numbers = d + nudge, [value.copy() for value in numbers]
-            with np.errstate(all="ignore"), blaming(self._model, when):
+            with np.errstate(all="ignore"), errors_attributed_to(self._model, when):
                 limits = self._constants.limits_at(slot, n, block)
                 cells = self._cells.of(m, slot, block) if self._cells else ()
                 self._evaluator.renew_bonds(d, r, limits, numbers, intact, cells)
-            yield _Renewed((n, *block.slices()[1:]), d, r, limits, numbers, intact, cells)
+            yield UpdatedBonds((n, *block.slices()[1:]), d, r, limits, numbers, intact, cells)
 
-    def _breaks(self, part: _Renewed, when: str) -> NDArray[np.bool_]:
+    def _breaks(self, part: UpdatedBonds, when: str) -> NDArray[np.bool_]:
         """Return which bonds break."""
-        with np.errstate(all="ignore"), blaming(self._model, when):
+        with np.errstate(all="ignore"), errors_attributed_to(self._model, when):
             return np.asarray(
                 part.intact & self._evaluator.breaks(part.d, part.r, part.limits, part.numbers)
             )
 
-    def _hold_back(self, previous: list[NDArray[Any]], parts: Sequence[_Renewed]) -> None:
+    def _hold_back(self, previous: list[NDArray[Any]], parts: Sequence[UpdatedBonds]) -> None:
         """Restore the state variables of cells that would begin to soften, except the cells with
         the largest load. As long as the damage of cells that already soften still changes, restore
         the state variables of all cells that would begin."""
@@ -134,12 +134,14 @@ class Fracturing:
         for part in parts:
             for n, numbers in enumerate(sides):
                 old = [
-                    value[part.home] for value, its in zip(previous, numbers, strict=True) if its
+                    value[part.owner] for value, its in zip(previous, numbers, strict=True) if its
                 ]
                 new = [value for value, its in zip(part.numbers, numbers, strict=True) if its]
                 begins = np.all([value == 0.0 for value in old], axis=0)
-                ways = (abs(b - a) / np.maximum(1.0, abs(a)) for a, b in zip(old, new, strict=True))
-                change = max(change, *(float(way[~begins].max(initial=0.0)) for way in ways))
+                ratios = (
+                    abs(b - a) / np.maximum(1.0, abs(a)) for a, b in zip(old, new, strict=True)
+                )
+                change = max(change, *(float(ratio[~begins].max(initial=0.0)) for ratio in ratios))
                 begins &= np.any([value != 0.0 for value in new], axis=0)
                 if begins.any():
                     load = self._load(part, n)
@@ -150,7 +152,7 @@ class Fracturing:
             for a, b in zip(old, new, strict=True):
                 np.copyto(b, a, where=begins & (load < threshold))
 
-    def _load(self, part: _Renewed, side: int) -> NDArray[Any]:
+    def _load(self, part: UpdatedBonds, side: int) -> NDArray[Any]:
         """Return the load of the cells on one side of bonds. If there is no cell on that side, at
         the edge of the body, return the load of the cell on the other side."""
         loads = [self._evaluator.load(cell, part.limits, part.numbers) for cell in part.cells]
@@ -158,10 +160,10 @@ class Fracturing:
         return np.broadcast_to(load, part.intact.shape)
 
 
-class _Renewed(NamedTuple):
+class UpdatedBonds(NamedTuple):
     """Bonds along a slot with updated state variables."""
 
-    home: Home
+    owner: Owner
     d: Vector
     r: Vector
     limits: Any
@@ -198,7 +200,7 @@ class CutBonds(Operation):
         """Cut the bonds of the first step of a call."""
         call.has_cuts = cut_bonds(self.scene, call.state.broken_step, call.step)
 
-    def next_change(self, step: int, foreseeable: bool = False) -> float:
+    def next_change(self, step: int, precomputable: bool = False) -> float:
         """Return the next step that begins with a cut."""
         return min((at for at in self._steps if at > step), default=math.inf)
 
@@ -242,8 +244,8 @@ class BreakBonds(Operation):
         scene, fracture = self.scene, self.scene.experiment.fracture
         if not (isinstance(fracture, RenewsBonds) or scene.tears):
             return Reach()
-        backward, forward = (home[axis] for home in scene.neighbourhood.home_reach)
-        back, ahead = (home[axis] for home in scene.home_reach)
+        backward, forward = (owner[axis] for owner in scene.neighbourhood.owner_reach)
+        back, ahead = (owner[axis] for owner in scene.owner_reach)
         return Reach(back=back, ahead=ahead, below=forward, above=backward)
 
     def hindrance(self, mode: Mode) -> Hindrance | None:

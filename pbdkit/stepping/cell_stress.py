@@ -32,11 +32,11 @@ class CellBeside:
     rates: tuple[Vector, ...]
     side: Side
 
-    def gradient(self, u: NDArray[Any], home: Block) -> list[Any]:
+    def gradient(self, u: NDArray[Any], owner: Block) -> list[Any]:
         """Return the gradient at bonds that start at places of a block, as the components xx, xy,
         yx, yy. The first letter is the component of the displacement, the second letter the axis of
         the derivative."""
-        first, *corners = (Vector(*shown(self._at(corner, home).of(u))) for corner in self.corners)
+        first, *corners = (Vector(*shown(self._at(corner, owner).of(u))) for corner in self.corners)
         d = [other - first for other in corners]
         return [
             sum_in_order(
@@ -49,7 +49,7 @@ class CellBeside:
             for b in "xy"
         ]
 
-    def way(self, corner: tuple[int, Index], slot: Slot, shape: tuple[int, ...]) -> int:
+    def flat_offset(self, corner: tuple[int, Index], slot: Slot, shape: tuple[int, ...]) -> int:
         """Return the difference of flat places between the start of a bond along a slot and a
         corner."""
         step = corner[0] - slot.source
@@ -58,8 +58,8 @@ class CellBeside:
         return step
 
     @staticmethod
-    def _at(corner: tuple[int, Index], home: Block) -> Block:
-        start, stop = (tuple(map(add, end, corner[1])) for end in (home.start, home.stop))
+    def _at(corner: tuple[int, Index], owner: Block) -> Block:
+        start, stop = (tuple(map(add, end, corner[1])) for end in (owner.start, owner.stop))
         return Block(corner[0], start, stop)
 
 
@@ -130,17 +130,17 @@ class CellStresses:
         """Cells of the lattice."""
         return self._scene.neighbourhood.tiling
 
-    def of(self, u: NDArray[Any], slot: Slot, home: Block) -> tuple[CellStress, CellStress]:
+    def of(self, u: NDArray[Any], slot: Slot, owner: Block) -> tuple[CellStress, CellStress]:
         """Return the cells to the left and right of the bonds along a slot that start in a
         block."""
         precision = self._scene.experiment.stepping.precision
-        shares = self._cells.beside(slot, home, precision, self._cells.share)
+        shares = self._cells.beside(slot, owner, precision, self._cells.share)
         ratios = [self.ratios] * 2
         if self._cells.mixed:
-            parts = (self._cells.beside(slot, home, precision, p) for p in self.ratios_by_cell)
+            parts = (self._cells.beside(slot, owner, precision, p) for p in self.ratios_by_cell)
             ratios = [Stiffness(*side) for side in zip(*parts, strict=True)]
         first, second = (
-            self._stressed(cell.gradient(u, home), c, share)
+            self._stressed(cell.gradient(u, owner), c, share)
             for cell, c, share in zip(self.beside(slot), ratios, shares, strict=True)
         )
         return first, second

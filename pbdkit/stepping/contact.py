@@ -26,12 +26,20 @@ from pbdkit.lattice.raster import FOLLOWER, Block, Places, distinct
 from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import length, vector
 from pbdkit.scene.leader_groups import guided_at, has_guides, kinds_at
-from pbdkit.scene.obstacles import SLACK, Outline, Walls, leave, outlines_at
+from pbdkit.scene.obstacles import SLACK, Outline, Walls, contact_correction, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
 from pbdkit.stepping.state import State, unmoved_state
-from pbdkit.stepping.step import PUSHED_BY_COURSES, Call, Cells, Hindrance, Mode, Operation, Step
+from pbdkit.stepping.step import (
+    PUSHED_BY_TIME_DEPENDENCE,
+    Call,
+    Cells,
+    Hindrance,
+    Mode,
+    Operation,
+    Step,
+)
 
 NUDGE = 0.01
 """Displacement of a particle, in lattice constants, for which its restoring move is evaluated."""
@@ -161,25 +169,27 @@ class Contact:
         place = distinct(np.concatenate(places))
         if len(place):
             flat = u.reshape(len(u), -1)
-            flat[:, place] = flat[:, place] + self.ways(u, place, moment)
+            flat[:, place] = flat[:, place] + self.corrections(u, place, moment)
 
-    def ways(self, u: Floats, place: Indices, moment: float) -> Floats:
+    def corrections(self, u: Floats, place: Indices, moment: float) -> Floats:
         """Return the displacements, (axis, place), that push particles at flat places out of the
         obstacles."""
         codes = self.led(math.ceil(moment))
         codes_at = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
-        return self._ways(self.positions(u, place), self.compliance_at(place), codes_at, moment)
+        return self._corrections(
+            self.positions(u, place), self.compliance_at(place), codes_at, moment
+        )
 
-    def ways_of_masses(self, u: Floats, place: Indices, moment: float) -> Floats:
+    def corrections_of_masses(self, u: Floats, place: Indices, moment: float) -> Floats:
         """Return the displacements, (axis, place), that push particles with isotropic response out
         of the obstacles. The particles have the displacements u."""
         X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
         at = np.stack([a + b for a, b in zip(X, u, strict=True)])
-        return self._ways(at, _alike(len(place)), np.zeros(len(place), np.int8), moment)
+        return self._corrections(at, _alike(len(place)), np.zeros(len(place), np.int8), moment)
 
-    def _ways(self, at: Floats, C: Floats, led: NDArray[np.int8], moment: float) -> Floats:
+    def _corrections(self, at: Floats, C: Floats, led: NDArray[np.int8], moment: float) -> Floats:
         outlines = self._outlines(moment)
-        walls, way, size = Walls.of(outlines), np.zeros(at.shape), at.shape[1]
+        walls, correction, size = Walls.of(outlines), np.zeros(at.shape), at.shape[1]
         count, obstacle = np.zeros(size, np.intp), np.zeros(size, np.intp)
         with np.errstate(all="ignore"):
             for n, outline in enumerate(outlines):
@@ -187,12 +197,12 @@ class Contact:
                 count, obstacle = count + inside, np.where(inside, n, obstacle)
             for n, outline in enumerate(outlines):
                 single = np.flatnonzero((count == 1) & (led == FREE) & (obstacle == n))
-                way[:, single] = outline.way_out(at[:, single], C[:, single])
-            x, y = at + way
+                correction[:, single] = outline.outline_correction(at[:, single], C[:, single])
+            x, y = at + correction
             alone = (count == 1) & (led == FREE) & (walls.clearance(x, y) >= 0.0)
             for k in np.flatnonzero((count > 0) & (led != ALL_LED) & ~alone).tolist():
-                way[:, k] = walls.way_between(at[:, k], C[:, k], int(led[k]))
-        return way
+                correction[:, k] = walls.overlap_correction(at[:, k], C[:, k], int(led[k]))
+        return correction
 
     def positions(self, u: Floats, place: Indices) -> Floats:
         """Return the positions of particles at flat places, relative to the lattice's site (0, 0),
@@ -324,7 +334,7 @@ class PushOut(Operation):
 
     def functions(self) -> dict[str, Callable[..., Any]]:
         """Return the displacement of a particle out of all obstacles."""
-        return {"leave": leave}
+        return {"contact_correction": contact_correction}
 
     def arrays(self, call: Call) -> dict[str, Any]:
         """Return the outlines of the obstacles with their points and bounding boxes in each step,
@@ -349,9 +359,9 @@ class PushOut(Operation):
         for step in call.moments:
             yield from self.contact.touched_at_rest(step)
 
-    def next_change(self, step: int, foreseeable: bool = False) -> float:
+    def next_change(self, step: int, precomputable: bool = False) -> float:
         """Return the next change of any obstacle."""
-        return min(each.group.next_change(step, foreseeable) for each in self.scene.barriers)
+        return min(each.group.next_change(step, precomputable) for each in self.scene.barriers)
 
     def events(self, steps: int) -> list[int]:
         """Return the events of all obstacles."""
@@ -362,7 +372,7 @@ class PushOut(Operation):
         from the initial values of the state variables."""
         reasons = {
             Mode.GPU: "obstacles push",
-            Mode.COURSES: PUSHED_BY_COURSES,
+            Mode.TIME_DEPENDENT: PUSHED_BY_TIME_DEPENDENCE,
             Mode.RANKS_AT_REST: "an equilibrium before obstacles",
         }
         return Hindrance(reasons[mode], "obstacles") if mode in reasons else None
@@ -392,7 +402,9 @@ class PushOut(Operation):
         axes = "led_axes[s, i, j0 + j]" if has_guides(self.scene.leading) else "0"
         particle = ", ".join([*compliance, axes])
         walls = "wall_kind, points, wall_first, radii"
-        out.add(3, f"{', '.join(kernel.each('w@'))} = leave(px, py, {particle}, {walls})")
+        out.add(
+            3, f"{', '.join(kernel.each('w@'))} = contact_correction(px, py, {particle}, {walls})"
+        )
         out.add(3, *kernel.each("o@[j] = o@[j] + w@"))
 
 

@@ -32,7 +32,7 @@ from pbdkit.errors import PbdkitError
 from pbdkit.lattice.neighbourhood import bonds_in, plane_block
 from pbdkit.lattice.raster import slot_step
 from pbdkit.plugin import Slot
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, Lines
 from pbdkit.stepping.numba_engine import sweeps
@@ -53,12 +53,12 @@ from pbdkit.stepping.numba_engine.plan import (
     Passes,
     Plan,
     PlanWriter,
-    blamed,
+    attributing_errors,
     functions_of,
     levels_of,
 )
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.program import foresee, prepare, program_of
+from pbdkit.stepping.program import precompute_steps, prepare, program_of
 from pbdkit.stepping.state import State, unmoved_state
 from pbdkit.stepping.step import Call
 
@@ -131,13 +131,13 @@ def write_bonds(plan: Plan) -> Function:
     out.add(0, sweeps.parameters(plan, plan.levels[-1])[-1])
     out.add(0, "cells = flat_broken.size // len(ends)", "for n in range(len(ends)):")
     out.add(1, f"r = {plan.vector('end_rests[n, #]')}")
-    rows = {"since": "broken", "ways": "lengths", "may": "breakable"}
+    rows = {"since": "broken", "broken_lengths": "lengths", "may": "breakable"}
     rows |= {f"b{m}": f"bond{m}" for m in range(plan.bonds)}
     rows |= {f"x{m}": f"limit{m}" for m in range(plan.limits)}
     out.add(1, *(f"{name} = flat_{of}[n * cells:(n + 1) * cells]" for name, of in rows.items()))
     out.add(1, f"for j in {plan.over('cells')}:", "    if may[j] and since[j] < 0:")
     out.add(3, "here = ends[n, 0] * cells + j", "there = here + end_steps[n]")
-    out.add(3, *sweeps.judging(plan, "flat_u_@[there] - flat_u_@[here]", "here").write)
+    out.add(3, *sweeps.bond_update(plan, "flat_u_@[there] - flat_u_@[here]", "here").write)
     out.add(3, *sweeps.marking_lines(plan, "n * cells + j", "here"))
     return out
 
@@ -177,7 +177,7 @@ def _steps(plan: Plan, kind: int, s: int, k: int, slot: Slot) -> list[str]:
 
 
 def _words(plan: Plan, level: Level, kind: int, s: int, k: int) -> sweeps.Words:
-    place, home = f"j + w{s}_{k}", f"j + v{s}_{k}"
+    place, owner = f"j + w{s}_{k}", f"j + v{s}_{k}"
     shares = (
         [f"flat_share[j + q{s}_{k}_{side}]" for side in (0, 1)] if kind == sweeps.WITH_CELLS else []
     )
@@ -185,9 +185,9 @@ def _words(plan: Plan, level: Level, kind: int, s: int, k: int) -> sweeps.Words:
         f"flat_{level.source}_@[{place}]",
         [f"flat_{array}[{place}]" for array in plan.shown],
         shares,
-        f"flat_bond{{n}}[{home}]",
-        f"flat_limit{{n}}[{home}]",
-        f"flat_broken[{home}]",
+        f"flat_bond{{n}}[{owner}]",
+        f"flat_limit{{n}}[{owner}]",
+        f"flat_broken[{owner}]",
     )
 
 
@@ -235,7 +235,7 @@ class ThreadWriter(PlanWriter):
         """Write the first lines of operations, and lines that copy state variables before the step
         changes them."""
         self.out.add(1, *self.plan.opening("moment"))
-        for m in self.plan.kept:
+        for m in self.plan.copied_values:
             self.out.add(1, f"for e in {self.plan.over(f'flat_own{m}.size')}:")
             self.out.add(2, f"flat_was{m}[e] = flat_own{m}[e]")
 
@@ -268,11 +268,11 @@ class ThreadWriter(PlanWriter):
         """Write the call of the sweep over the particles of the thread."""
         self._call(self.passes.sweeps[level])
 
-    def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
+    def follow(self, mapped: Callable[[str], Lines], planes: str, delay: int = 0) -> None:
         """Write a loop over the frame points of the thread."""
         self.wait()
         self.out.add(1, f"for f in {self.plan.over('points.size')}:")
-        self.out.add(2, *mapped("flat_u" if lag else planes))
+        self.out.add(2, *mapped("flat_u" if delay else planes))
         self.out.add(2, *self.each(f"{planes}_@[points[f]] = t_@"))
         self.wait()
 
@@ -335,7 +335,7 @@ def kernel_of(scene: Scene) -> GpuKernel:
     start = unmoved_state(scene, scene.raster.shape[1:])
     inner = [name for n in range(len(plan.levels) - 1) for name in plan.each(f"z{n}_@")]
     arrays = {name: np.zeros(scene.raster.shape, start.u.dtype) for name in inner}
-    arrays |= {f"was{m}": np.zeros_like(start.particle_values[m]) for m in plan.kept}
+    arrays |= {f"was{m}": np.zeros_like(start.particle_values[m]) for m in plan.copied_values}
     if plan.judged:
         arrays["lost"] = np.zeros(scene.raster.shape, bits_for(scene))
     if plan.tears:
@@ -501,7 +501,7 @@ class GpuStepper(Engine):
         self._plan, self._names = kernel.plan, kernel.names
         self._device: Arrays = {}
         self._send(kernel.arrays)
-        with blamed(self._plan.levels):
+        with attributing_errors(self._plan.levels):
             threads = MAX_THREADS if kernel.alone else THREADS
             functions = functions_of(self._plan.levels)
             self._run = make_kernel(kernel.source, functions, threads)
@@ -556,9 +556,9 @@ class GpuStepper(Engine):
         if call.has_cuts:
             self._begin(state)
         self._renumber(self._scene.at(step))
-        count = foresee(self._program, call, end)
+        count = precompute_steps(self._program, call, end)
         self._send_call(call)
-        with blaming(self._scene.experiment.rule, f"at step {step}"):
+        with errors_attributed_to(self._scene.experiment.rule, f"at step {step}"):
             self._launch(*self._given(state.step, count))
         if count % 2:
             for u, v in zip(*(self._plan.each(f"flat_{side}_@") for side in "uv"), strict=True):

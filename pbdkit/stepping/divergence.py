@@ -16,7 +16,7 @@ from pbdkit.stepping.state import State, initial_state
 
 EVERY = 100
 """Number of steps between two checks; recorded steps are checked, too."""
-KEPT_EVERY = 5000
+COPY_INTERVAL = 5000
 """Minimum number of steps between two copies of the state. Steps after a copy are repeated to find
 the last good state."""
 MAX_RELATIVE_SIZE = 1e6
@@ -45,14 +45,19 @@ class Guard:
     def of(cls, scene: Scene, start: State) -> Guard:
         """Create the guard of a run from a state."""
         copy = start.copy() if start.step else None
-        return cls(size_of(scene) + most_of(start), start.step, next_multiple(start.step), copy)
+        return cls(
+            size_of(scene) + largest_displacement(start),
+            start.step,
+            next_multiple(start.step),
+            copy,
+        )
 
     def look(self, scene: Scene, state: State, *, note: bool = True) -> None:
         """Raise FloatingPointError, with particle and step, if a displacement is not finite or
         exceeds the limit. With `note` false the result is not stored. This is necessary for checks
         at steps that depend on the length of the run, because stored results must not depend on
         it."""
-        largest = self.most(state)
+        largest = self.largest_displacement(state)
         if note:
             self.next_look = next_multiple(state.step)
             self._note(state, largest)
@@ -64,12 +69,12 @@ class Guard:
     def _note(self, state: State, largest: float) -> None:
         if largest <= self.size:
             self.good_step = state.step
-            if state.step >= KEPT_EVERY + (self.good_copy.step if self.good_copy else 0):
+            if state.step >= COPY_INTERVAL + (self.good_copy.step if self.good_copy else 0):
                 self.good_copy = state.copy(self.good_copy)
 
-    def most(self, state: State) -> float:
+    def largest_displacement(self, state: State) -> float:
         """Return the largest displacement along an axis."""
-        return most_of(state)
+        return largest_displacement(state)
 
     def worst(self, scene: Scene, state: State) -> int:
         """Return the number of the particle with the largest displacement."""
@@ -90,7 +95,7 @@ class Guard:
         good = state.copy()
         while state.step + 1 < before and not stopping():
             state = engine.advance(state)
-            if not self.most(state) <= self.size:
+            if not self.largest_displacement(state) <= self.size:
                 break
             good = state.copy(good)
         return None if stopping() else good
@@ -105,18 +110,18 @@ def size_of(scene: Scene) -> float:
     """Return the size of the body plus the largest distances of its leaders' motions."""
     ends = scene.raster.body_ends()
     spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
-    local = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
-    ways: list[float] = np.max(scene.raster.communicator.allgather(local), axis=0).tolist()
+    local = [largest_offset(leading, scene.experiment.steps) for leading in scene.driven]
+    offsets: list[float] = np.max(scene.raster.communicator.allgather(local), axis=0).tolist()
     width = float(np.abs(ends[1] - ends[0]).max())
-    return width + float(spacing) + sum(ways)
+    return width + float(spacing) + sum(offsets)
 
 
-def most_of(state: State) -> float:
+def largest_displacement(state: State) -> float:
     """Return the largest displacement along an axis."""
     return max(float(state.u.max()), -float(state.u.min()))
 
 
-def way_of(leading: Leading | Barrier, steps: int) -> float:
+def largest_offset(leading: Leading | Barrier, steps: int) -> float:
     """Return the largest distance of a group from its start, at `SAMPLES` moments of its motion."""
     group = leading.group
     last, rests = group.last(steps) - group.from_ + 1, group.motion.rests_after()

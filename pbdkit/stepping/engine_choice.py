@@ -16,7 +16,7 @@ from pbdkit.stepping.program import last_event, reason_against
 from pbdkit.stepping.step import Mode
 
 
-def what_is_missing() -> str:
+def missing_for_gpu() -> str:
     """Return the package, compiler or device that a GPU engine lacks; empty if it lacks none."""
     install = "pip install 'pbdkit[gpu]'"
     if not (find_spec("numba") and find_spec("numba_cuda")):
@@ -30,7 +30,7 @@ def what_is_missing() -> str:
     return "" if cuda.cudadrv.nvvm.is_available() else f"the CUDA compiler is missing: {install}"
 
 
-def what_gpus_lack(scene: Scene) -> str:
+def gpu_obstacle(scene: Scene) -> str:
     """Return the reason why a scene cannot be stepped on a GPU; empty if it can."""
     return reason_against(scene, Mode.GPU)
 
@@ -68,10 +68,12 @@ def choose(scene: Scene) -> Choice:
     """
     solver = scene.experiment.stepping
     if solver.engine == "gpu":
-        lacks = what_is_missing() or what_gpus_lack(scene) or what_kernels_lack(scene)
-        _refuse(scene, lacks and f"the GPU engine is not available: {lacks}; use `engine: auto`")
+        missing = missing_for_gpu() or gpu_obstacle(scene) or kernel_obstacle(scene)
+        _refuse(
+            scene, missing and f"the GPU engine is not available: {missing}; use `engine: auto`"
+        )
         return Choice("gpu", 1, "requested")
-    hindrance = obstacle() or what_kernels_lack(scene)
+    hindrance = obstacle() or kernel_obstacle(scene)
     if solver.engine == "compiled":
         _refuse(
             scene,
@@ -101,7 +103,7 @@ def seconds_of(scene: Scene, choice: Choice) -> float:
     recording."""
     if choice.engine == "numpy":
         return _numpy_seconds(scene)
-    return KERNEL_S * scene.raster.total * _most_steps(scene) / choice.threads
+    return KERNEL_S * scene.raster.total * _max_steps(scene) / choice.threads
 
 
 def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
@@ -134,11 +136,11 @@ def obstacle() -> str:
     return "" if find_spec("numba") else "numba is not installed: pip install 'pbdkit[fast]'"
 
 
-def what_kernels_lack(scene: Scene) -> str:
+def kernel_obstacle(scene: Scene) -> str:
     """Return the reason why kernels do not support the time-dependent parameters of a scene; empty
     if they do, or if there are none."""
-    fields = {field for field, _ in scene.experiment.courses}
-    mode = Mode.SOLVER_COURSES if fields == {"solver"} else Mode.COURSES
+    fields = {field for field, _ in scene.experiment.time_dependent}
+    mode = Mode.TIME_DEPENDENT_SOLVER if fields == {"solver"} else Mode.TIME_DEPENDENT
     return reason_against(scene, mode) if fields else ""
 
 
@@ -153,18 +155,20 @@ def _numpy_seconds(scene: Scene) -> float:
     """Return an upper estimate of the time of the numpy engine in seconds."""
     slots = sum(map(len, scene.neighbourhood.slots)) * (2 if scene.has_fracture else 1)
     a_step = slots * (CALL_S + VALUE_S * scene.raster.total / len(scene.neighbourhood.slots))
-    return a_step * _most_steps(scene)
+    return a_step * _max_steps(scene)
 
 
-def _most_steps(scene: Scene) -> float:
+def _max_steps(scene: Scene) -> float:
     """Return the largest number of steps: that of the run or, for a run until convergence, the
     estimate (2n)² (2/π)² ln(1 / tolerance) for the barycentre rule on a body of n cells with one
     fixed end."""
-    steps, settle = float(scene.experiment.steps), scene.experiment.stepping.settle
-    if settle is None:
+    steps, criterion = float(scene.experiment.steps), scene.experiment.stepping.settle
+    if criterion is None:
         return steps
-    settled = (4 * max(scene.raster.whole_shape[1:]) / math.pi) ** 2 * -math.log(settle.tolerance)
-    return min(steps, last_event(scene) + settled)
+    steps_to_convergence = (4 * max(scene.raster.whole_shape[1:]) / math.pi) ** 2 * -math.log(
+        criterion.tolerance
+    )
+    return min(steps, last_event(scene) + steps_to_convergence)
 
 
 def _about(seconds: float) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from pbdkit.array_types import Floats, Indices, Mask
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import FollowerRule, Here, StoresEnergy, Vector
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
@@ -239,7 +239,7 @@ class MoveFollowers(Operation):
         """Move the particles from the intermediate configuration. Values that are not finite are
         not reported here, but when they are recorded."""
         quiet = np.errstate(all="ignore", invalid=step.invalid)
-        with quiet, blaming(self.scene.experiment.rule, f"at step {step.number}"):
+        with quiet, errors_attributed_to(self.scene.experiment.rule, f"at step {step.number}"):
             self._followers.move(step.u, step.new, step.state)
 
     def emit(self, kernel: KernelWriter) -> None:
@@ -294,10 +294,10 @@ class MoveFollowers(Operation):
         loads = self.scene.loads
         return loads.at(call.step, call.state.u.dtype) if loads else None
 
-    def next_change(self, step: int, foreseeable: bool = False) -> float:
+    def next_change(self, step: int, precomputable: bool = False) -> float:
         """Return the next step in which a load or a parameter changes."""
-        courses = self.scene.experiment.courses.values()
-        changes = [course.next_change(step) for course in courses]
+        time_dependent = self.scene.experiment.time_dependent.values()
+        changes = [number.next_change(step) for number in time_dependent]
         changes += [self.scene.loads.next_change(step)] if self.scene.loads else []
         return min(changes, default=math.inf)
 
@@ -305,15 +305,15 @@ class MoveFollowers(Operation):
         """Return the steps in which loads begin and cease to act."""
         return self.scene.loads.changes(steps) if self.scene.loads else []
 
-    def bends(self, steps: int) -> list[int]:
+    def breakpoints(self, steps: int) -> list[int]:
         """Return the moments at which the slope of a time-dependent parameter, or of a load that
         acts, changes."""
-        courses = self.scene.experiment.courses.values()
-        spans = [(course, 0, steps) for course in courses]
+        time_dependent = self.scene.experiment.time_dependent.values()
+        spans = [(number, 0, steps) for number in time_dependent]
         for loading in self.scene.loads.each if self.scene.loads else ():
             load = loading.load
-            spans += [(course, load.from_, load.last(steps)) for course in load.courses]
-        return [bend for course, *span in spans for bend in course.bends_within(*span)]
+            spans += [(number, load.from_, load.last(steps)) for number in load.time_dependent]
+        return [knot for number, *span in spans for knot in number.breakpoints_within(*span)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
         """Return a reason if neighbours are re-evaluated, because their lists are computed on the
@@ -322,8 +322,8 @@ class MoveFollowers(Operation):
             changing = "parameters are time-dependent, and neighbours are re-evaluated"
             reasons = {
                 Mode.RANKS: "neighbours that are re-evaluated",
-                Mode.COURSES: changing,
-                Mode.SOLVER_COURSES: changing,
+                Mode.TIME_DEPENDENT: changing,
+                Mode.TIME_DEPENDENT_SOLVER: changing,
             }
             return Hindrance(reasons.get(mode, "neighbours are re-evaluated"), "neighbours")
         if mode is Mode.PASSES and self.sweeps() > 2:
@@ -332,20 +332,22 @@ class MoveFollowers(Operation):
             reason = "applies twice" if self._rule.linear else "is not linear"
             text = f"the equilibrium of rule '{self._rule.type}', which {reason}"
             return Hindrance(text, "rule")
-        return self._hindrance_of_courses() if mode is Mode.COURSES else None
+        return self._hindrance_of_time_dependence() if mode is Mode.TIME_DEPENDENT else None
 
-    def _hindrance_of_courses(self) -> Hindrance | None:
+    def _hindrance_of_time_dependence(self) -> Hindrance | None:
         """Return a reason if time-dependent parameters are not the same for all particles, because
         kernels read them from arrays that have one value for all particles."""
         scene = self.scene
-        courses = scene.experiment.courses
-        fields = [field for field, _ in courses if field != "solver"]
+        time_dependent = scene.experiment.time_dependent
+        fields = [field for field, _ in time_dependent if field != "solver"]
         if not fields:
             return None
         if scene.constants.by_particle or scene.constants.by_bond or _is_mixed(scene):
             reason = "some parameters vary in space and others in time"
             return Hindrance(reason, str(fields[0]))
-        for moment in sorted({bend for course in courses.values() for bend in course.bends}):
+        for moment in sorted(
+            {knot for number in time_dependent.values() for knot in number.breakpoints}
+        ):
             if _differ_in_kernels(scene, scene.at(moment)):
                 reason = "constants of kernels are time-dependent"
                 return Hindrance(reason, str(fields[0]))

@@ -28,12 +28,12 @@ class FollowFrame(Operation):
         """Move the frame points after all particles have been placed."""
         frame = self.scene.frame
         assert frame
-        body, axes = step.u if frame.map.lag else step.new, len(step.u)
+        body, axes = step.u if frame.map.delay else step.new, len(step.u)
         frame.follow(body.reshape(axes, -1), step.new.reshape(axes, -1))
 
     def emit(self, kernel: KernelWriter) -> None:
         """Write the lines that move the frame points."""
-        kernel.follow(self.mapped(kernel), "flat_v", self.scene.lag)
+        kernel.follow(self.mapped(kernel), "flat_v", self.scene.frame_delay)
 
     def reach(self, axis: int) -> Reach:
         """Return the distance of the frame points from the particles that they follow."""
@@ -93,7 +93,7 @@ class FollowFrame(Operation):
         """Return a reason if the map changes with time, because it is then stored on the host and
         for the whole lattice."""
         reasons = {
-            Mode.COURSES: "the weights of the frame are time-dependent",
+            Mode.TIME_DEPENDENT: "the weights of the frame are time-dependent",
             Mode.RANKS: "a frame that depends on time-dependent parameters of the rule",
         }
         changes = mode in reasons and self.scene.frame_changes

@@ -113,7 +113,7 @@ class KernelWriter(ABC):
         `moment`, the index of the step in the call."""
 
     @abstractmethod
-    def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
+    def follow(self, mapped: Callable[[str], Lines], planes: str, delay: int = 0) -> None:
         """Write a loop over the frame points f that writes their values in the arrays `planes`.
-        `mapped` gives the lines that compute the values t_@. With `lag` they are computed from the
-        displacements before the step."""
+        `mapped` gives the lines that compute the values t_@. With `delay` they are computed from
+        the displacements before the step."""

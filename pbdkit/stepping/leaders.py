@@ -37,7 +37,7 @@ from pbdkit.stepping.kernel import KernelWriter, Lines
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
 from pbdkit.stepping.state import State
 from pbdkit.stepping.step import (
-    PUSHED_BY_COURSES,
+    PUSHED_BY_TIME_DEPENDENCE,
     Call,
     Cells,
     Entries,
@@ -233,7 +233,7 @@ class NewtonForces:
         leading = self._scene.leading[n]
         if self._contact is None or len(leading.axes) < self._scene.axes:
             return velocity, u
-        push = self._contact.ways_of_masses(u, leading.place, step)
+        push = self._contact.corrections_of_masses(u, leading.place, step)
         if not any(barrier.group.from_ == step for barrier in self._scene.barriers):
             velocity = velocity + push
         return velocity, u + push
@@ -424,12 +424,12 @@ class PlaceLeaders(LeaderOperation):
         leaders, call.starts = prescribe(self.scene, call.state, call.step, self._forces)
         call.leaders, call.state = [leaders], replace(call.state, starts=call.starts)
 
-    def is_foreseeable(self, step: int) -> bool:
+    def can_precompute(self, step: int) -> bool:
         """Return whether no particle belongs to two groups. Otherwise displacements are not
         computed in advance, so that a contradiction is reported in the step in which it occurs."""
         return not self.scene.leaders_overlap
 
-    def foresee(self, call: Call, step: int) -> None:
+    def precompute(self, call: Call, step: int) -> None:
         """Compute the prescribed displacements in a later step."""
         call.leaders.append(prescribe(self.scene, call.state, step)[0])
 
@@ -464,9 +464,9 @@ class PlaceLeaders(LeaderOperation):
         particles move."""
         return int(any(leading.share is not None for leading in self.scene.leading))
 
-    def next_change(self, step: int, foreseeable: bool = False) -> float:
+    def next_change(self, step: int, precomputable: bool = False) -> float:
         """Return the next step in which any group changes."""
-        return min(each.group.next_change(step, foreseeable) for each in self.scene.leading)
+        return min(each.group.next_change(step, precomputable) for each in self.scene.leading)
 
     def events(self, steps: int) -> list[int]:
         """Return the events of all groups."""
@@ -477,7 +477,10 @@ class PlaceLeaders(LeaderOperation):
         on the host and from state variables that are on the host."""
         if not any(isinstance(leading.group.motion, Newton) for leading in self.scene.leading):
             return None
-        reasons = {Mode.GPU: "leaders move by Newton's law", Mode.COURSES: PUSHED_BY_COURSES}
+        reasons = {
+            Mode.GPU: "leaders move by Newton's law",
+            Mode.TIME_DEPENDENT: PUSHED_BY_TIME_DEPENDENCE,
+        }
         return Hindrance(reasons[mode], "leaders") if mode in reasons else None
 
 
@@ -516,7 +519,10 @@ class GuideLeaders(LeaderOperation):
     def hindrance(self, mode: Mode) -> Hindrance | None:
         """Return a reason if state variables change, because the response of particles is computed
         from the initial values of the state variables."""
-        reasons = {Mode.GPU: "leaders lead along an axis", Mode.COURSES: PUSHED_BY_COURSES}
+        reasons = {
+            Mode.GPU: "leaders lead along an axis",
+            Mode.TIME_DEPENDENT: PUSHED_BY_TIME_DEPENDENCE,
+        }
         return Hindrance(reasons[mode], "leaders") if mode in reasons else None
 
 
@@ -559,7 +565,7 @@ class TurnDirections(DirectionOperation):
         """Rotate the directions in the first step of a call."""
         call.clamps = self._clamps.turn(call.state, call.step)
 
-    def is_foreseeable(self, step: int) -> bool:
+    def can_precompute(self, step: int) -> bool:
         """Return whether no direction rotates in the step."""
         return not self._clamps.turning(step)
 

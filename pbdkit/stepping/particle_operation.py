@@ -11,7 +11,7 @@ import numpy as np
 from pbdkit.array_types import Floats, Indices
 from pbdkit.plugin import Component
 from pbdkit.plugin.component import as_vector
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter
@@ -88,7 +88,7 @@ class OperateOnParticles(Operation):
     def _displaced(self, u: Floats, new: Floats, when: str) -> Floats:
         """Return the displacements after the operation, (axis, particle)."""
         operation, current = self._operated.operation, vector(shown(new))
-        with blaming(operation, when):
+        with errors_attributed_to(operation, when):
             displacement = operation.displacement(
                 vector(shown(u)), current, self._operated.parameters
             )

@@ -41,7 +41,7 @@ ORDER: tuple[type[Operation], ...] = (
     FollowFrame,
 )
 """Types of operations in the order of a step. The order is defined only here."""
-MAX_FORESEEN = 64
+MAX_PRECOMPUTED = 64
 """Maximum number of steps for which the displacements of leaders are computed in advance."""
 MAX_VALUES = 2**20
 """Maximum number of values of displacements that are computed in advance."""
@@ -68,7 +68,7 @@ def prepare(program: Program, state: State) -> Call:
     return call
 
 
-def foresee(program: Program, call: Call, end: int) -> int:
+def precompute_steps(program: Program, call: Call, end: int) -> int:
     """Prepare a call for further steps, up to `end`, as long as they need no other work on the
     host. Return the number of steps of the call."""
     step, limit = call.step, end - call.state.step
@@ -76,12 +76,12 @@ def foresee(program: Program, call: Call, end: int) -> int:
     if steady > 1:
         return steady
     values = sum(leaders.u.size for leaders in call.leaders[0])
-    limit = min(steady_steps(program, step, limit, foreseeable=True), MAX_FORESEEN)
+    limit = min(steady_steps(program, step, limit, precomputable=True), MAX_PRECOMPUTED)
     for later in range(step + 1, step + min(limit, max(1, MAX_VALUES // max(1, values)))):
-        if not all(operation.is_foreseeable(later) for operation in program):
+        if not all(operation.can_precompute(later) for operation in program):
             break
         for operation in program:
-            operation.foresee(call, later)
+            operation.precompute(call, later)
     return len(call.leaders)
 
 
@@ -92,31 +92,31 @@ def reach_of(scene: Scene, axis: int) -> Reach:
     return Reach(*map(max, zip(Reach(), *distances, strict=True)))
 
 
-def steady_steps(program: Program, step: int, most: int, foreseeable: bool = False) -> int:
-    """Return the number of equal steps from `step` on, from 1 to `most`. Steps are equal if leaders
-    and obstacles do not move, loads and parameters are constant, and no bonds are cut except at the
-    beginning of the first step.
+def steady_steps(program: Program, step: int, max_steps: int, precomputable: bool = False) -> int:
+    """Return the number of equal steps from `step` on, from 1 to `max_steps`. Steps are equal if
+    leaders and obstacles do not move, loads and parameters are constant, and no bonds are cut
+    except at the beginning of the first step.
 
-    With `foreseeable`, steps also count as equal if leaders have motions that can be computed in
+    With `precomputable`, steps also count as equal if leaders have motions that can be computed in
     advance.
     """
-    change = min(operation.next_change(step, foreseeable) for operation in program)
-    return int(min(most, change - step))
+    change = min(operation.next_change(step, precomputable) for operation in program)
+    return int(min(max_steps, change - step))
 
 
 def last_event(scene: Scene) -> int:
     """Return the last step of the run, at least 1, in which something changes: leaders or obstacles
     move, roles, loads or parameters change, or bonds are cut."""
     events = (operation.events(scene.experiment.steps) for operation in program_of(scene))
-    return max([1, *chain(*events), *bends_of(scene)])
+    return max([1, *chain(*events), *breakpoints_of(scene)])
 
 
-def bends_of(scene: Scene) -> list[int]:
+def breakpoints_of(scene: Scene) -> list[int]:
     """Return the steps between which parameters and forces are linear functions of the step. The
     last step of the run is included if parameters or forces still change at it. The steps at which
     the slope of a load changes are included only while the load acts."""
-    bends = (operation.bends(scene.experiment.steps) for operation in program_of(scene))
-    return [*chain(*bends)]
+    breakpoints = (operation.breakpoints(scene.experiment.steps) for operation in program_of(scene))
+    return [*chain(*breakpoints)]
 
 
 def moves_of(scene: Scene, sweep: MoveFollowers) -> Program:

@@ -36,7 +36,7 @@ from pbdkit.plugin import (
     where,
 )
 from pbdkit.plugin.component import as_values, as_vector, as_verdict
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers, particle_numbers
@@ -126,10 +126,10 @@ class Evaluator:
         model = self._model
         if to.broken is None and to.c is None:
             return d
-        with blaming(model, "to place a fictitious point"):
+        with errors_attributed_to(model, "to place a fictitious point"):
             lost = as_vector(model.fictitious(u, to.r, self._q), "fictitious", u)
         if isinstance(model, Softens) and to.c is not None:
-            with blaming(model, "to soften a bond"):
+            with errors_attributed_to(model, "to soften a bond"):
                 d = as_vector(model.seen(d, lost, to.r, to.c, self._q), "seen", u)
         return d if to.broken is None else where(to.broken, lost, d)
 
@@ -140,7 +140,7 @@ class Evaluator:
         if isinstance(model, SoftensCells):
             return c.damage_left, c.damage_right
         ahead, nothing = (vector([x, *[0.0] * (len(r) - 1)]) for x in (1.0, 0.0))
-        with blaming(model, "to soften a bond"):
+        with errors_attributed_to(model, "to soften a bond"):
             difference = as_vector(model.seen(ahead, nothing, r, c, self._q), "seen", ahead)
         return (1.0 - difference[0],) * 2
 
@@ -360,19 +360,19 @@ class Surroundings:
         """Return the damage beside each slot; None if nothing is damaged."""
         around = self._scene.neighbourhood.cells_around[self._sublattice]
         damage = {
-            (bond.plane, bond.home): self._damage(bond, state)
+            (bond.plane, bond.owner): self._damage(bond, state)
             for cell in around.cells
             for bond in cell
         }
         if not any(np.any(values) for both in damage.values() for values in both):
             return None
         largest = [
-            reduce(np.maximum, (damage[bond.plane, bond.home][bond.side] for bond in cell))
+            reduce(np.maximum, (damage[bond.plane, bond.owner][bond.side] for bond in cell))
             for cell in around.cells
         ]
         torn = {}
         for slot in self.slots:
-            plane, at_this_end = self._scene.neighbourhood.home[slot]
+            plane, at_this_end = self._scene.neighbourhood.owner[slot]
             bond_damage = damage[plane, None if at_this_end else slot]
             left_damage, right_damage = (largest[n] for n in around.beside[slot])
             torn[slot] = Torn(
@@ -383,15 +383,15 @@ class Surroundings:
     def _damage(self, bond: CellBond, state: State) -> tuple[NDArray[np.floating[Any]], ...]:
         """Return the fractions of the force of bonds that are lost in the cells to their left and
         right; 1 for broken bonds."""
-        scene, home = self._scene, self.where
-        if bond.home:
-            home = home.seen_through(bond.home)
+        scene, owner = self._scene, self.where
+        if bond.owner:
+            owner = owner.seen_through(bond.owner)
         assert state.broken_step is not None
-        broken = home.within(state.broken_step[bond.plane]) >= 0
+        broken = owner.within(state.broken_step[bond.plane]) >= 0
         softened: tuple[Any, Any] = 0.0, 0.0
         if isinstance(scene.experiment.fracture, (Softens, SoftensCells)):
-            numbers = shown([home.within(value[bond.plane]) for value in state.bond_values])
-            limits = scene.constants.limits_at(bond.slot, bond.plane, home)
+            numbers = shown([owner.within(value[bond.plane]) for value in state.bond_values])
+            limits = scene.constants.limits_at(bond.slot, bond.plane, owner)
             softened = self._evaluator.damage(
                 bond.slot.rest, scene.constants.of_bond(*limits, *numbers)
             )
@@ -404,13 +404,13 @@ class Surroundings:
         if state.broken_step is None:
             return None, None
         scene = self._scene
-        plane, at_this_end = scene.neighbourhood.home[slot]
-        home = self.where if at_this_end else self.where.seen_through(slot)
-        broken = home.within(state.broken_step[plane]) >= 0
+        plane, at_this_end = scene.neighbourhood.owner[slot]
+        owner = self.where if at_this_end else self.where.seen_through(slot)
+        broken = owner.within(state.broken_step[plane]) >= 0
         c = None
         if isinstance(scene.experiment.fracture, Softens):
-            numbers = shown([home.within(value[plane]) for value in state.bond_values])
-            c = scene.constants.of_bond(*scene.constants.limits_at(slot, plane, home), *numbers)
+            numbers = shown([owner.within(value[plane]) for value in state.bond_values])
+            c = scene.constants.of_bond(*scene.constants.limits_at(slot, plane, owner), *numbers)
         return (broken if broken.any() else None), c
 
 

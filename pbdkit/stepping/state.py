@@ -24,7 +24,7 @@ from pbdkit.plugin import (
     Remembered,
     StartsCracked,
 )
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.fracture_model import Segment
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.leader_groups import kinds_at
@@ -90,8 +90,8 @@ class State:
         copying."""
         if over is None:
             return replace(self, **{name: _copied(part) for name, part in vars(self).items()})
-        for mine, target in zip(self.arrays(), over.arrays(), strict=True):
-            np.copyto(target, mine)
+        for source, target in zip(self.arrays(), over.arrays(), strict=True):
+            np.copyto(target, source)
         return replace(over, step=self.step, starts=self.starts)
 
     def fits(self, other: State) -> bool:
@@ -110,8 +110,8 @@ class State:
     def arrays(self) -> list[Array]:
         """Return the arrays that steps write."""
         bonds = (self.broken_step, self.broken_length, *self.bond_values)
-        carried = (self.u, self.previous, *bonds, *self.particle_values)
-        return [array for array in carried if array is not None]
+        arrays_of_state = (self.u, self.previous, *bonds, *self.particle_values)
+        return [array for array in arrays_of_state if array is not None]
 
 
 def _mapped(function: Callable[[Any], Any], part: Any) -> Any:
@@ -186,7 +186,7 @@ def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Value
         owners, bonds = describe_bonds(scene), scene.bonds
         place = bonds.plane * math.prod(scene.raster.shape[1:]) + bonds.place
     generator = component_generator(scene.experiment.seed, field)
-    with blaming(part, "to draw its initial values", field):
+    with errors_attributed_to(part, "to draw its initial values", field):
         array_of = {number.name: value for number, value in zip(numbers, values, strict=True)}
         for name, value in part.draw(owners, generator).items():
             if name not in array_of:

@@ -54,11 +54,11 @@ class Mode(Enum):
     PASSES = "several steps in a pass over the memory"
     RANKS = "rows of the lattice in several processes"
     RANKS_AT_REST = "an equilibrium in several processes"
-    COURSES = "in kernels, while numbers of rule or fracture model change in time"
-    SOLVER_COURSES = "in kernels, while numbers of the solver change in time"
+    TIME_DEPENDENT = "in kernels, while numbers of rule or fracture model change in time"
+    TIME_DEPENDENT_SOLVER = "in kernels, while numbers of the solver change in time"
 
 
-PUSHED_BY_COURSES = (
+PUSHED_BY_TIME_DEPENDENCE = (
     "the motion of masses, obstacles or leaders along an axis depends on time-dependent parameters"
 )
 """Reason why kernels do not support the time-dependent parameters of some scenes."""
@@ -297,11 +297,11 @@ class Operation(ABC):
         """Compute on the host what the lines of the operation need in the first step of a call."""
         return
 
-    def is_foreseeable(self, step: int) -> bool:
-        """Return whether `foresee` can prepare a later step."""
+    def can_precompute(self, step: int) -> bool:
+        """Return whether `precompute` can prepare a later step."""
         return True
 
-    def foresee(self, call: Call, step: int) -> None:
+    def precompute(self, call: Call, step: int) -> None:
         """Compute on the host what the lines of the operation need in a later step of a call."""
         return
 
@@ -329,16 +329,16 @@ class Operation(ABC):
         particle propagates in one step."""
         return np.zeros((0, self.scene.axes), np.intp)
 
-    def next_change(self, step: int, foreseeable: bool = False) -> float:
+    def next_change(self, step: int, precomputable: bool = False) -> float:
         """Return the first step after `step` in which the operation changes; infinity if there is
-        none. With `foreseeable`, motions that `foresee` can prepare are not included."""
+        none. With `precomputable`, motions that `precompute` can prepare are not included."""
         return math.inf
 
     def events(self, steps: int) -> list[int]:
         """Return the steps of a run in which the operation begins or ceases to act."""
         return []
 
-    def bends(self, steps: int) -> list[int]:
+    def breakpoints(self, steps: int) -> list[int]:
         """Return the steps of a run between which the parameters of the operation are linear
         functions of the step."""
         return []

@@ -16,7 +16,7 @@ from pbdkit.io.layout import in_this_layout, json_attribute, reserved_names
 from pbdkit.io.members import STATUS
 from pbdkit.memory import machine_memory
 from pbdkit.sweeps.specification import MESSAGE, Dimension, Member, names_of, values_along
-from pbdkit.sweeps.worker import KEPT, MemberReport, MemberVariable, unpacked
+from pbdkit.sweeps.worker import STORED_STATUSES, MemberReport, MemberVariable, unpacked
 
 if TYPE_CHECKING:
     import xarray
@@ -145,7 +145,7 @@ def combine_members(
     for member in members:
         report = report_of(member.job.key)
         status[member.place], message[member.place] = report.status, report.message
-        if report.status in KEPT:
+        if report.status in STORED_STATUSES:
             frame.look(unpacked(report.content))
             complete.append(member)
     arrays = frame.arrays(shape, dims)

@@ -56,8 +56,8 @@ from pbdkit.sweeps.specification import Dimension, Job, Keep, Member, SweepPlan,
 from pbdkit.sweeps.store import Store
 from pbdkit.sweeps.worker import (
     INTERRUPTED,
-    KEPT,
     LOST,
+    STORED_STATUSES,
     MemberReport,
     begin_worker,
     report_of,
@@ -69,7 +69,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-HANDED_OUT_S = 0.25
+CHUNK_S = 0.25
 """Duration of a chunk of members in seconds."""
 MAX_AT_ONCE = 16
 """Maximum number of members in a chunk. A chunk must fit into the pipe to a worker that has been
@@ -115,7 +115,7 @@ class Queue:
         """
         if not self._count or self.jobs[0].key in self._losses:
             return [self.jobs.popleft()]
-        size = int(HANDED_OUT_S * self._count / max(self._seconds, 1e-9))
+        size = int(CHUNK_S * self._count / max(self._seconds, 1e-9))
         size = min(size, MAX_AT_ONCE, len(self.jobs) // (2 * self.workers))
         chunk = [self.jobs.popleft()]
         while len(chunk) < size and self.jobs and self.jobs[0].key not in self._losses:
@@ -171,7 +171,7 @@ class ClusterExecutor(Executor):
         out: dict[Any, list[Job]] = {}
         try:
             yield from self._with_workers(stopping)
-            yield from self._handed_out(jobs, out, stopping)
+            yield from self._distributed(jobs, out, stopping)
         except (Exception, CancelledError) as error:
             if self._is_there():
                 raise
@@ -199,7 +199,7 @@ class ClusterExecutor(Executor):
             time.sleep(HEARTBEAT_S)
             yield None
 
-    def _handed_out(
+    def _distributed(
         self, jobs: list[Job], out: dict[Any, list[Job]], stopping: Callable[[], bool]
     ) -> Iterator[MemberReport | None]:
         from distributed import wait as wait_for
@@ -334,11 +334,11 @@ class Summary:
         """The members that ended without values, with status and message."""
         ended = [member for member in self.members if member.job.key in self.ends]
         every = [(member, *self.ends[member.job.key]) for member in ended]
-        return [entry for entry in every if entry[1] not in KEPT]
+        return [entry for entry in every if entry[1] not in STORED_STATUSES]
 
 
 def carry_out(
-    plan: SweepPlan, folder: Path, crew: Executor, stopping: Callable[[], bool], show: Show
+    plan: SweepPlan, folder: Path, executor: Executor, stopping: Callable[[], bool], show: Show
 ) -> Summary:
     """Validate all members, run those that the folder does not hold, and write the dataset.
 
@@ -361,7 +361,7 @@ def carry_out(
         todo = [job for key, job in jobs.items() if key not in ends]
         passing: dict[str, MemberReport] = {}
         run = 0
-        for report in _heard(crew.work(todo, stopping), len(jobs), len(todo), show):
+        for report in _reported(executor.work(todo, stopping), len(jobs), len(todo), show):
             store.commit_if_due()
             if report is None:
                 continue
@@ -371,7 +371,7 @@ def carry_out(
                 passing[report.key] = report
             ends[report.key], run = (report.status, report.message), run + 1
         store.commit()
-        store.look_around()
+        store.check_existence()
         if run < len(todo):
             return Summary(members, ends, run, store.faults, None)
         dataset = combine_members(grid, members, lambda key: passing.get(key) or store.report(key))
@@ -384,7 +384,7 @@ class _StoppedError(Exception):
     """The sweep was stopped while its members were validated."""
 
 
-def _heard(
+def _reported(
     reports: Iterator[MemberReport | None], members: int, todo: int, show: Show
 ) -> Iterator[MemberReport | None]:
     """Yield the reports of all but interrupted members, and show progress meanwhile."""
@@ -392,7 +392,10 @@ def _heard(
     for report in reports:
         if report is not None and report.status == INTERRUPTED:
             continue
-        run, failed = run + bool(report), failed + bool(report and report.status not in KEPT)
+        run, failed = (
+            run + bool(report),
+            failed + bool(report and report.status not in STORED_STATUSES),
+        )
         progress = f"{members - todo + run} of {members} members"
         show(progress + (f", {failed} failed" if failed else ""), run / todo)
         yield report
@@ -610,13 +613,13 @@ def called(
             "classes from Python do not have; omit it, or put the classes into a plugin "
             "(`pbdkit plugins new`)"
         )
-    crew = crew_of(workers, client, classes)
+    executor = executor_of(workers, client, classes)
     sweep = checked(parts | {"experiment": base.data}, Source())
     plan = SweepPlan(sweep, base, Source(), classes)
     with ExitStack() as ending:
         path = Path(folder or ending.enter_context(tempfile.TemporaryDirectory(prefix="pbdkit-")))
         with progress_bar(progress) as show:
-            summary = carry_out(plan, path, crew, lambda: False, show)
+            summary = carry_out(plan, path, executor, lambda: False, show)
         for text in summary.faults:
             warn_caller(text, StorageWarning)
         if failures := summary.failures:
@@ -634,7 +637,7 @@ def called(
         return dataset
 
 
-def crew_of(
+def executor_of(
     workers: int | None, client: Any, components: tuple[type[Component], ...] = ()
 ) -> Executor:
     """Return the executor of a sweep; raise ExperimentError if it is not available."""

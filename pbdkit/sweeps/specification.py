@@ -536,9 +536,9 @@ def job_of(experiment: Experiment, keep: Keep, versions: dict[str, str]) -> Job:
     steps = experiment.steps
     if keep.times != "all":
         wanted = (steps,) if keep.times == "last" else keep.times
-        steps_kept = sorted({step for step in wanted if step <= steps}) or [0]
+        recorded_steps = sorted({step for step in wanted if step <= steps}) or [0]
         record = {key: value for key, value in data["record"].items() if key != "every"}
-        data["record"] = record | {"at": steps_kept}
+        data["record"] = record | {"at": recorded_steps}
     if keep.variables is not None:
         names = {*keep.variables, *(name.removesuffix(IN_MM) for name in keep.variables)}
         measured = zip(experiment.diagnostics, data["diagnostics"], strict=True)

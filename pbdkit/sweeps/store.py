@@ -31,7 +31,7 @@ from pbdkit.io.sqlite_file import (
     files_of,
     is_database,
     journal_mode,
-    look,
+    open_read_only,
     size_of,
 )
 from pbdkit.sweeps.worker import MemberReport, digest_of
@@ -198,7 +198,7 @@ class Store:
             )
         return report
 
-    def look_around(self) -> None:
+    def check_existence(self) -> None:
         """Check after the last commit that folder and database still exist.
 
         A missing database is reported in `faults`.
@@ -322,7 +322,7 @@ class Store:
             return ""
         try:
             with ExitStack() as stack:
-                return self._fault_within(look(self._path, stack), count, logs)
+                return self._fault_within(open_read_only(self._path, stack), count, logs)
         except sqlite3.DatabaseError as error:
             if error.sqlite_errorcode & 0xFF in LOCKED:
                 raise
@@ -357,7 +357,7 @@ class Store:
             with suppress(sqlite3.Error), ExitStack() as stack:
                 if not is_database(self._path):
                     return
-                database = look(self._path, stack)
+                database = open_read_only(self._path, stack)
                 database.text_factory = partial(str, encoding="utf-8", errors="replace")
                 for row in database.execute(f"SELECT {COLUMNS} FROM member {order}"):
                     if not isinstance(self._verified(row), str):

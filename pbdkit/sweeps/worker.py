@@ -73,7 +73,7 @@ def unpacked(content: bytes) -> dict[str, MemberVariable]:
     return variables
 
 
-KEPT = (*WHOLE, "separated")
+STORED_STATUSES = (*WHOLE, "separated")
 """Status of members with values in the dataset. A run that ended because its body came apart under
 an equilibrium solver ("separated") has the values recorded before that."""
 FAILED = "failed"
@@ -116,7 +116,7 @@ def digest_of(key: str, status: str, message: str, content: bytes) -> bytes:
     return digest.digest()
 
 
-class KeptSink(MemorySink):
+class SelectiveSink(MemorySink):
     """Sink that keeps some variables of a run, at all recorded steps, the last one or selected
     ones."""
 
@@ -126,7 +126,7 @@ class KeptSink(MemorySink):
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
         """Begin with the columns that are kept, and the coordinates of their dimensions."""
-        super().begin(kept_columns(columns, self._variables), sizes, planned)
+        super().begin(selected_columns(columns, self._variables), sizes, planned)
 
     def put(self, values: Values) -> None:
         """Keep the values of those columns."""
@@ -145,7 +145,7 @@ class KeptSink(MemorySink):
         return MemberVariable(column.dims, values, column.attributes, column.coordinate, fixed)
 
 
-def kept_columns(columns: list[Column], variables: set[str] | None) -> list[Column]:
+def selected_columns(columns: list[Column], variables: set[str] | None) -> list[Column]:
     """Return the columns of these variables and the coordinates of their dimensions; for variables
     of particles the reference positions, too."""
     chosen = [c for c in columns if variables is None or c.name in variables]
@@ -180,7 +180,7 @@ def run_member(
     stopping: Callable[[], bool] = lambda: False,
 ) -> MemberReport:
     """Run a member on one thread; an exception becomes a report with the status `failed`."""
-    start, sink = time.perf_counter(), KeptSink(job.variables, job.times)
+    start, sink = time.perf_counter(), SelectiveSink(job.variables, job.times)
     content, lasting = b"", False
     with _one_at_a_time, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Warnings of a run are in its message.
@@ -192,7 +192,7 @@ def run_member(
             with threadpool_limits(1):
                 status, message = _ran(experiment, sink, stopping)
             lasting = status != INTERRUPTED
-            content = sink.content() if status in KEPT else b""
+            content = sink.content() if status in STORED_STATUSES else b""
         except ExperimentError as error:
             status, message, lasting = FAILED, str(error), True
         except PbdkitError as error:
@@ -203,7 +203,9 @@ def run_member(
     return report_of(job.key, status, message, content, lasting, seconds=seconds)
 
 
-def _ran(experiment: Experiment, sink: KeptSink, stopping: Callable[[], bool]) -> tuple[str, str]:
+def _ran(
+    experiment: Experiment, sink: SelectiveSink, stopping: Callable[[], bool]
+) -> tuple[str, str]:
     """Return status and message of the run."""
     run = Simulation.of_scene(build_scene(experiment), watch=Watch(stopping))
     messages = run.warnings

@@ -834,14 +834,14 @@ def follows_nearby_particles(subject: Subject) -> None:
         if frame is None:
             continue
         follow, layers = policy.follow(frame), policy.depth(scene.neighbourhood.reach)
-        way = np.abs(raster.site_of(follow.body) - frame.site[follow.point]).max(axis=1)
+        distance = np.abs(raster.site_of(follow.body) - frame.site[follow.point]).max(axis=1)
         nearest = {*zip(*(each.tolist() for each in frame.nearest()), strict=True)}
-        for entry in np.flatnonzero(way > 2 * layers).tolist():
+        for entry in np.flatnonzero(distance > 2 * layers).tolist():
             point, body = int(follow.point[entry]), int(follow.body[entry])
             if (point, body) not in nearest:
                 raise PropertyError(
-                    f"frame point {point} follows a particle {way[entry]} sites away, in a frame "
-                    f"of {layers} layers ({place_of(scene.experiment)}); remove `local`"
+                    f"frame point {point} follows a particle {distance[entry]} sites away, in a "
+                    f"frame of {layers} layers ({place_of(scene.experiment)}); remove `local`"
                 )
 
 

@@ -85,10 +85,10 @@ def stiffness(scene: Scene, state: State) -> Floats:
     u = np.zeros_like(state.u, dtype=float)
     flat = u.reshape(len(u), -1)
 
-    def pulled(particle: int, axis: int, way: float) -> Floats:
+    def pulled(particle: int, axis: int, displacement: float) -> Floats:
         flat[...] = 0.0
         if particle >= 0:
-            flat[axis, place[particle]] = way
+            flat[axis, place[particle]] = displacement
         if scene.frame:
             scene.frame.follow(flat, flat)
         forces = followers.forces(u, state).reshape(len(u), -1)[:, place]
@@ -185,7 +185,7 @@ TEARS = {"type": "strain", "failure": 0.1}
 """Fracture model of the solids."""
 SPRINGS = {"type": "springs"}
 """Rule of the solids."""
-MOST = 2
+MAX_SOLIDS = 2
 """Maximum number of lattices."""
 
 
@@ -241,7 +241,7 @@ def solids_of(component: Component, around: Mapping[str, Any]) -> list[Solid]:
     solids: dict[str, Solid] = {}
     for experiment in _experiments(component, around):
         name = experiment.lattice.type
-        if name not in solids and len(solids) < MOST:
+        if name not in solids and len(solids) < MAX_SOLIDS:
             with suppress(ExperimentError):
                 solid = Solid(build_scene(experiment))
                 if not (_is_tied(solid.scene) or pulls_at_rest(solid.scene, solid._softened)):

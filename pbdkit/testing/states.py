@@ -136,10 +136,10 @@ def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ..
 
 def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
     """Return the move that follows from the sums of contributions."""
-    return Evaluator(scene).move(summed((c, None) for c in contributions), standing(scene, **at))
+    return Evaluator(scene).move(summed((c, None) for c in contributions), here_of(scene, **at))
 
 
-def standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
+def here_of(scene: Scene, u: Any, X: Any, own: Any) -> Here:
     """Return the values at particles that the rule uses."""
     place: Any = X if scene.experiment.rule.uses_reference else None
     return Here(u, place, place, scene.constants.of_particle(*own))

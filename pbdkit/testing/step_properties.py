@@ -40,9 +40,9 @@ from pbdkit.testing.states import (
     displacements,
     gathered,
     here,
+    here_of,
     measured_by,
     spacing,
-    standing,
     state_with,
 )
 from pbdkit.testing.subject import (
@@ -71,7 +71,7 @@ def bears_loads_as_forces(subject: Subject) -> None:
     load, added = here(scene, 1)["u"], []
     for seed in (0, 1):
         total = summed((c, None) for c in gathered(scene, differences(scene, seed)))
-        at, under = standing(scene, **here(scene, seed)), rule.loaded(total, load, p)
+        at, under = here_of(scene, **here(scene, seed)), rule.loaded(total, load, p)
         _compare(
             evaluator.force(under, at),
             evaluator.force(total, at) + load,

@@ -31,7 +31,6 @@ from pbdkit.plugin import (
     FractureModel,
     FramePolicy,
     Here,
-    KnowsStiffness,
     Lattice,
     Loadable,
     NeighbourMetric,
@@ -40,6 +39,7 @@ from pbdkit.plugin import (
     RenewsParticles,
     Softens,
     SoftensCells,
+    UsesStiffness,
     Vector,
 )
 from pbdkit.plugin.component import as_vector
@@ -60,12 +60,12 @@ from pbdkit.testing.states import (
     frame_showing,
     gathered,
     here,
+    here_of,
     measured_by,
     moment_of,
     owners,
     remembers,
     shared,
-    standing,
     stressed,
 )
 
@@ -156,7 +156,7 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[FunctionCall]:
 
     def call(function: str) -> FunctionCall:
         def compute(total: Any, **to: Any) -> Any:
-            return functions[function](total, standing(scene, **to))
+            return functions[function](total, here_of(scene, **to))
 
         return FunctionCall(function, {"total": total} | at, compute, elementwise=True)
 
@@ -380,7 +380,7 @@ def _rules(component: Component) -> list[dict[str, Any]]:
         return [ELASTIC]
     if isinstance(component, FramePolicy) and component.edges_are_free:
         return [ELASTIC]
-    if isinstance(component, KnowsStiffness):
+    if isinstance(component, UsesStiffness):
         return [ELASTIC]
     return list(PARTNERS if isinstance(component, (Lattice, NeighbourMetric)) else PARTNERS[:1])
 

@@ -101,7 +101,7 @@ async function show(lattice, charts, { run: content }) {
 }
 
 /** Append the section first: the width of a chart is that of its parent. */
-function settling({ rows, notes, moves, certificate }) {
+function convergence({ rows, notes, moves, certificate }) {
   const parts = notes.map((line) => make("p", { className: "note" }, line));
   const words = (value) => (typeof value === "number" ? short(value, 6) : value ?? "not known");
   const happened = (value) => (value === null ? "" : words(value));
@@ -146,7 +146,7 @@ async function runPage(content) {
   page.append(origin(content), lattice, section("Curves", charts));
   const panel = await show(lattice, charts, whole);
   listenToKeys(() => panel);
-  settling(whole.settling);
+  convergence(whole.convergence);
   if (whole.ledger) page.append(ledger(whole.ledger));
 }
 

@@ -43,7 +43,7 @@ from pbdkit.stability.relaxation import tuned
 from pbdkit.stepping.state import describe_bonds
 from pbdkit.sweeps.combine import FILL
 from pbdkit.sweeps.specification import CASE, MESSAGE
-from pbdkit.sweeps.worker import KEPT
+from pbdkit.sweeps.worker import STORED_STATUSES
 from pbdkit.web.page import packed, page
 
 
@@ -63,7 +63,7 @@ def factor_of(variable: xarray.DataArray) -> float:
     return in_its_units(variable.attrs)[0]
 
 
-MOST_POINTS = 1200
+MAX_POINTS = 1200
 """Maximum number of points of a curve."""
 MAX_SERIES = 12
 """Maximum number of curves of a variable."""
@@ -83,7 +83,7 @@ class Curve:
     series: list[dict[str, Any]]
 
 
-def curves(dataset: xarray.Dataset, points: int = MOST_POINTS) -> list[dict[str, Any]]:
+def curves(dataset: xarray.Dataset, points: int = MAX_POINTS) -> list[dict[str, Any]]:
     """Return the curves of all variables over time, or over every step, with at most a few small
     dimensions, and of the pairs AGAINST, with at most `points` points."""
     names = _names(dataset)
@@ -95,7 +95,7 @@ def curves(dataset: xarray.Dataset, points: int = MOST_POINTS) -> list[dict[str,
 def fewer_points(dataset: xarray.Dataset) -> list[str]:
     """Return a note where curves show fewer points than were recorded."""
     longest = max((dataset.sizes.get(dim, 0) for dim in ("time", "step")), default=0)
-    every = _every(longest, MOST_POINTS)
+    every = _every(longest, MAX_POINTS)
     return [] if every == 1 else [f"Curves show one of {every} points, of up to {longest}."]
 
 
@@ -597,7 +597,7 @@ def facts(dataset: xarray.Dataset) -> list[list[str]]:
     entries = {
         "ended": outcome,
         "created": str(attributes.get("created", "")),
-        "by": made_by(dataset),
+        "by": version_text(dataset),
         **{name: kind for name, kind in kinds.items() if kind not in ("", "none")},
         "particles": f"{sizes.get('particle', 0)}",
         "bonds": f"{sizes['bond']}" if sizes.get("bond") else "",
@@ -607,7 +607,7 @@ def facts(dataset: xarray.Dataset) -> list[list[str]]:
     return [[name, value] for name, value in entries.items() if value]
 
 
-def made_by(dataset: xarray.Dataset) -> str:
+def version_text(dataset: xarray.Dataset) -> str:
     """Return the versions of pbdkit and of plugins."""
     versions = {"pbdkit": dataset.attrs.get("pbdkit_version", "")} | json_attribute(
         dataset, "plugins"
@@ -680,14 +680,14 @@ LARGEST = 20_000
 longer for larger bodies."""
 FEWEST = 8
 """Minimum number of moves from which a decay is measured."""
-MOST = 800
+MAX_MOVES = 800
 """Maximum number of moves from which a decay is measured."""
 ROUNDING_RTOL = 1e-11
 """Ratio to the largest move below which moves are rounding errors."""
 
 
 @dataclass(frozen=True)
-class SettlingMoves:
+class MoveHistory:
     """The largest move per step of any follower, `move`, up to each of the `steps`; `free` is the
     first row after the last event: a leader that moves, begins or ends, or a bond that breaks."""
 
@@ -719,11 +719,11 @@ class SettlingMoves:
         return int(self.steps[self.free + below[0]] - self.steps[self.free]) if len(below) else None
 
 
-def moves_of(dataset: xarray.Dataset) -> SettlingMoves | None:
-    """Return the moves between equidistant recorded steps, at most MOST; None if there are too few
-    steps, or if the kinds of particles were not recorded."""
+def moves_of(dataset: xarray.Dataset) -> MoveHistory | None:
+    """Return the moves between equidistant recorded steps, at most MAX_MOVES; None if there are too
+    few steps, or if the kinds of particles were not recorded."""
     recorded = dataset.sizes["time"]
-    steps = np.arange(0, recorded, -(-recorded // MOST))
+    steps = np.arange(0, recorded, -(-recorded // MAX_MOVES))
     times = dataset["time"].values[steps]
     intervals = np.diff(times)
     if len(intervals) and intervals[-1] != intervals[0]:
@@ -742,10 +742,10 @@ def moves_of(dataset: xarray.Dataset) -> SettlingMoves | None:
     if "broken_step" in dataset and dataset["broken_step"].size:
         last = int(dataset["broken_step"].max())
         event = max(event, int(np.searchsorted(times, last)))
-    return SettlingMoves(times[1:], np.array(move), min(event, len(move) - 1))
+    return MoveHistory(times[1:], np.array(move), min(event, len(move) - 1))
 
 
-def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
+def convergence(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
     """Return the predicted and measured values, notes, and the curve of the moves; or the reason
     why there is none."""
     if scene is None:
@@ -753,7 +753,7 @@ def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
             "notes": [("There is no prediction: the experiment cannot be built on this machine.")]
         }
     if not scene.experiment.solver.makes_steps:
-        return _certificate(dataset)
+        return _error_bound_table(dataset)
     if scene.raster.count > LARGEST:
         return {
             "notes": [
@@ -779,16 +779,16 @@ def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
     return content | ({"moves": _curve(analysis, moves)} if moves else {})
 
 
-def _certificate(dataset: xarray.Dataset) -> dict[str, Any]:
+def _error_bound_table(dataset: xarray.Dataset) -> dict[str, Any]:
     """Return the error bound of an equilibrium."""
-    certificate = json_attribute(dataset, "certificate")
-    entries = [[name.replace("_", " "), value] for name, value in certificate.items()]
+    error_bound = json_attribute(dataset, "certificate")
+    entries = [[name.replace("_", " "), value] for name, value in error_bound.items()]
     note = "The solver makes no steps: it computes the equilibrium, with a bound on the error."
     return {"certificate": entries, "notes": [note]}
 
 
 def _rows(
-    dataset: xarray.Dataset, analysis: Analysis, moves: SettlingMoves | None
+    dataset: xarray.Dataset, analysis: Analysis, moves: MoveHistory | None
 ) -> list[list[Any]]:
     to = analysis.steps_to["1e-3"]
     measured: Any = moves.steps_to(1e-3) if moves else None
@@ -810,7 +810,7 @@ def _yes(stable: bool | None) -> str:
     return "not known" if stable is None else "yes" if stable else "no"
 
 
-def _ended(dataset: xarray.Dataset, moves: SettlingMoves | None) -> str:
+def _ended(dataset: xarray.Dataset, moves: MoveHistory | None) -> str:
     status = str(dataset.attrs.get("status", ""))
     if status not in ("complete", "settled") or moves is None:
         return status
@@ -830,7 +830,7 @@ def _notes(analysis: Analysis) -> list[str]:
     return [*notes, *analysis.warnings()]
 
 
-def _curve(analysis: Analysis, moves: SettlingMoves) -> dict[str, Any]:
+def _curve(analysis: Analysis, moves: MoveHistory) -> dict[str, Any]:
     """Return the logarithm of the moves and a line with the predicted slope. The line passes
     through the middle one of the moves from which the decay is measured."""
     with np.errstate(divide="ignore"):
@@ -887,7 +887,7 @@ class RunContent:
             "file": file_name(title),
             "facts": facts(dataset),
             "experiment": experiment_text(parts) if parts else "",
-            "settling": settling(dataset, origin.scene),
+            "convergence": convergence(dataset, origin.scene),
             "ledger": self._bonds.ledger() if self._bonds and self._bonds.can_break else None,
         }
 
@@ -1058,7 +1058,7 @@ class SweepContent:
         packing."""
         each = self._members
         points = max(MIN_POINTS, POINTS // len(each))
-        successful = [str(member[STATUS].item()) in KEPT for member in each]
+        successful = [str(member[STATUS].item()) in STORED_STATUSES for member in each]
         if "position" not in each[0] or not any(successful):
             note = "No lattices are shown: no member is complete, or `position` was not kept."
             plain = [{"curves": curves(member, points)} for member in each]
@@ -1147,7 +1147,7 @@ def _facts(dataset: xarray.Dataset) -> list[list[str]]:
         ["members", members],
         ["ended", outcome],
         ["created", created],
-        ["by", made_by(dataset)],
+        ["by", version_text(dataset)],
     ]
 
 
@@ -1226,7 +1226,7 @@ BUDGET = 4_900_000
 FIRST = 20_000_000
 """Number of bytes of the lattice before compression in the first attempt. The compression ratio
 depends on the motion and is known afterwards."""
-MOST_BYTES = 80_000_000
+MAX_PAGE_BYTES = 80_000_000
 """Maximum number of bytes before compression that a browser moves smoothly."""
 ATTEMPTS = 4
 """Maximum number of attempts."""
@@ -1294,10 +1294,10 @@ def report_text(dataset: xarray.Dataset, measured: dict[str, Any] | None = None)
         fits = len(text) <= BUDGET
         if not best or (fits and len(text) > len(best)) or len(best) > BUDGET:
             best = text
-        enough = not data["thinned"] or len(text) > SMALL * BUDGET or budget == MOST_BYTES
+        enough = not data["thinned"] or len(text) > SMALL * BUDGET or budget == MAX_PAGE_BYTES
         if fits and enough:
             break
-        budget = min(int(0.9 * budget * BUDGET / len(text)), MOST_BYTES)
+        budget = min(int(0.9 * budget * BUDGET / len(text)), MAX_PAGE_BYTES)
     return best
 
 

@@ -143,9 +143,9 @@ def execute(session: Session, command: Command) -> None:
     impossible."""
     match command:
         case Play():
-            session.running, session.owed = command.on, 0
+            session.running, session.due_steps = command.on, 0
         case Advance():
-            session.running, session.owed = False, session.owed + command.count
+            session.running, session.due_steps = False, session.due_steps + command.count
         case Rewind():
             session.rewind(command.step)
         case Speed():

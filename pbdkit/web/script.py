@@ -28,12 +28,12 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Motion, Path
 from pbdkit.model.reading import MAX_BYTES, MAX_NODES, yaml_text
 from pbdkit.plugin.fracture_model import Segment
-from pbdkit.plugin.schedule import NumberCourse
+from pbdkit.plugin.schedule import TimeDependentNumber
 
-Way = tuple[float, float]
+Displacement = tuple[float, float]
 
 
-class Hand(Motion):
+class ManualMotion(Motion):
     """Motion of a leader group that is moved by the mouse, given by knots. Between knots and after
     the last one it is the same as `path`.
 
@@ -43,7 +43,7 @@ class Hand(Motion):
 
     type: Literal["hand"] = "hand"
     _steps: list[int] = PrivateAttr(default_factory=list)
-    _ways: list[Way] = PrivateAttr(default_factory=list)
+    _displacements: list[Displacement] = PrivateAttr(default_factory=list)
 
     def offset(self, n: float, start: Floats) -> Floats:
         """Return the offset of the path with these knots."""
@@ -51,48 +51,48 @@ class Hand(Motion):
             return np.zeros(2)
         # The lists are shared, since copying the path at each call would cost as much as its
         # length.
-        knots: dict[str, Any] = {"steps": self._steps, "displacements": self._ways}
+        knots: dict[str, Any] = {"steps": self._steps, "displacements": self._displacements}
         return Path.model_construct(**knots).offset(n, start)
 
     def knots(self) -> tuple[int, ...]:
         """Return the last knot; earlier knots have no effect on later steps."""
         return tuple(self._steps[-1:])
 
-    def at(self, n: int) -> Way:
+    def at(self, n: int) -> Displacement:
         """Return the offset at the end of its n-th step, n ≥ 0."""
         x, y = self.offset(n, np.zeros((1, 2))) if n else (0.0, 0.0)
         return float(x), float(y)
 
-    def lead(self, begin: int, end: int, way: Way) -> None:
-        """Move linearly, after its step `begin`, to `way` at its step `end`."""
+    def lead(self, begin: int, end: int, displacement: Displacement) -> None:
+        """Move linearly, after its step `begin`, to `displacement` at its step `end`."""
         if begin and (not self._steps or self._steps[-1] < begin):
             self._add(begin, self.at(begin))
-        self._add(end, way)
+        self._add(end, displacement)
 
     def cut_back(self, n: int) -> None:
         """Remove the motion after step n; all steps until then remain the same to the last bit."""
-        knots = [(step, way) for step, way in self.path if step <= n]
+        knots = [(step, displacement) for step, displacement in self.path if step <= n]
         if len(knots) < len(self._steps):
             begin = knots[-1][0] if knots else 0
             knots += [(step, self.at(step)) for step in range(begin + 1, n + 1)]
         self._steps[:] = [step for step, _ in knots]
-        self._ways[:] = [way for _, way in knots]
+        self._displacements[:] = [displacement for _, displacement in knots]
 
     @property
-    def path(self) -> list[tuple[int, Way]]:
+    def path(self) -> list[tuple[int, Displacement]]:
         """Return the knots of the path."""
-        return list(zip(self._steps, self._ways, strict=True))
+        return list(zip(self._steps, self._displacements, strict=True))
 
     def motion(self) -> dict[str, Any]:
         """Return the motion as in an experiment file."""
         if not self._steps:
             return {"type": "hold"}
-        ways = [list(way) for way in self._ways]
-        return {"type": "path", "steps": list(self._steps), "displacements": ways}
+        displacements = [list(displacement) for displacement in self._displacements]
+        return {"type": "path", "steps": list(self._steps), "displacements": displacements}
 
-    def _add(self, step: int, way: Way) -> None:
+    def _add(self, step: int, displacement: Displacement) -> None:
         self._steps.append(step)
-        self._ways.append(way)
+        self._displacements.append(displacement)
 
 
 ADJUSTABLE = ("rule", "fracture", "solver")
@@ -146,7 +146,9 @@ class AdjustableNumber:
     def at(self, step: int) -> float:
         """Return the value at the end of a step."""
         value = self.after(step - 1)
-        return NumberCourse.model_validate(value).at(step) if isinstance(value, dict) else value
+        return (
+            TimeDependentNumber.model_validate(value).at(step) if isinstance(value, dict) else value
+        )
 
     def turn(self, step: int, value: float) -> None:
         """Change the value after a step."""
@@ -183,13 +185,13 @@ class AdjustableNumber:
         the last digits."""
         if not isinstance(self.initial, dict):
             return [(until, self.initial)]
-        course = NumberCourse.model_validate(self.initial)
-        pairs = zip(course.steps, course.values, strict=True)
+        number = TimeDependentNumber.model_validate(self.initial)
+        pairs = zip(number.steps, number.values, strict=True)
         knots = [(step, float(value)) for step, value in pairs if step <= until]
         begin = knots[-1][0] + 1 if knots else until
-        if begin > course.steps[-1]:
+        if begin > number.steps[-1]:
             return knots
-        return knots + [(step, course.at(step)) for step in range(begin, until + 1)]
+        return knots + [(step, number.at(step)) for step in range(begin, until + 1)]
 
 
 def numbers_of(experiment: Experiment, parts: dict[str, Any]) -> dict[str, AdjustableNumber]:
@@ -255,7 +257,7 @@ class LeaderScript:
     """
 
     of_file: Parts
-    hand: Hand | None = None
+    manual: ManualMotion | None = None
     ended: int | None = None
     instead_of: LeaderScript | None = None
 
@@ -273,8 +275,8 @@ class LeaderScript:
         """Return the group as in an experiment file. A group moved by the mouse is at rest if its
         `motion` is omitted."""
         end = {} if self.ended is None else {"until": self.ended}
-        motion_part = self.hand.motion() if self.hand and motion else {"type": "hold"}
-        return self.of_file | ({"motion": motion_part} if self.hand else {}) | end
+        motion_part = self.manual.motion() if self.manual and motion else {"type": "hold"}
+        return self.of_file | ({"motion": motion_part} if self.manual else {}) | end
 
 
 @dataclass
@@ -309,12 +311,12 @@ class Script:
         """Let the mouse move a leader group after a step; return the index of the group that it
         moves."""
         original = self.groups[group]
-        if original.hand is not None:
+        if original.manual is not None:
             return group
         selection = {
             key: of for key, of in original.of_file.items() if key not in ("motion", "until")
         }
-        led_group = LeaderScript(selection | {"from": step + 1}, Hand())
+        led_group = LeaderScript(selection | {"from": step + 1}, ManualMotion())
         if original.begins == step + 1:
             led_group.instead_of, self.groups[group] = original, led_group
             return group
@@ -325,7 +327,7 @@ class Script:
     def pick(self, particle: int, step: int) -> int:
         """Let the mouse move a particle, given by its number, after a step."""
         self.groups.append(
-            LeaderScript({"select": {"numbers": [particle]}, "from": step + 1}, Hand())
+            LeaderScript({"select": {"numbers": [particle]}, "from": step + 1}, ManualMotion())
         )
         return len(self.groups) - 1
 
@@ -366,8 +368,8 @@ class Script:
         for led_group in self.groups:
             if led_group.ended is not None and led_group.ended >= step:
                 led_group.ended = None
-            if led_group.hand:
-                led_group.hand.cut_back(step - led_group.begins + 1)
+            if led_group.manual:
+                led_group.manual.cut_back(step - led_group.begins + 1)
 
     def next_turn(self, step: int) -> int:
         """Return the first step after which a parameter changes again."""
@@ -436,7 +438,7 @@ def _without_defaults(group: Parts) -> Parts:
 
 
 def _begins_after(group: LeaderScript, step: int) -> bool:
-    return group.hand is not None and group.begins > step
+    return group.manual is not None and group.begins > step
 
 
 def _with_key(parts: Parts, key: str, values: list[Any]) -> Parts:

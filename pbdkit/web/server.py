@@ -32,7 +32,7 @@ from websockets.http11 import Request, Response
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.web.page import script, source
 from pbdkit.web.requests import LONGEST, Command, PictureReceived, Rewind, command_of, execute
-from pbdkit.web.session import Judge, Judgement, Message, Session, scenery, standing
+from pbdkit.web.session import Judge, Judgement, Message, Session, static_message, status_message
 from pbdkit.web.view_frames import ViewFrame
 
 HOST = "127.0.0.1"
@@ -101,7 +101,7 @@ class Viewer(ABC):
         return self.is_ready and (self.last_frame is None or self.last_frame.picture != picture)
 
     @abstractmethod
-    def tell(self, message: Message) -> None:
+    def post(self, message: Message) -> None:
         """Send a message other than a picture."""
 
     @abstractmethod
@@ -110,7 +110,7 @@ class Viewer(ABC):
 
 
 What = Command | Judgement | Literal["join", "leave", "close"]
-Asked = tuple[Viewer | None, What]
+ViewerRequest = tuple[Viewer | None, What]
 
 
 class Conductor:
@@ -119,10 +119,10 @@ class Conductor:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        session.notify = self._tell
+        session.notify = self._broadcast
         self._viewers: list[Viewer] = []
-        self._queue: queue.SimpleQueue[Asked] = queue.SimpleQueue()
-        self._standing: Message = {}
+        self._queue: queue.SimpleQueue[ViewerRequest] = queue.SimpleQueue()
+        self._status: Message = {}
         self._judge = Judge(lambda judgement: self._queue.put((None, judgement)))
         self._judged: Any = None
         self._judgement: Message | None = None
@@ -141,7 +141,7 @@ class Conductor:
         """Remove a viewer from the session."""
         self._queue.put((viewer, "leave"))
 
-    def ask(self, viewer: Viewer, command: Command) -> None:
+    def submit(self, viewer: Viewer, command: Command) -> None:
         """Queue a command of a page, to be executed between two steps."""
         self._queue.put((viewer, command))
 
@@ -165,10 +165,10 @@ class Conductor:
                 self._try(None, lambda steps=steps: self._session.advance(steps))
             self._try(None, self._publish)
 
-    def _requests(self, seconds: float | None) -> Iterator[Asked]:
+    def _requests(self, seconds: float | None) -> Iterator[ViewerRequest]:
         """Generate the queued requests, waiting for some time for the first. Of consecutive rewinds
         only the last counts."""
-        requests: list[Asked] = []
+        requests: list[ViewerRequest] = []
         try:
             requests.append(self._queue.get(timeout=seconds))
             while True:
@@ -185,12 +185,12 @@ class Conductor:
             self._closed = True
         elif isinstance(what, Judgement):
             self._judgement = {"is": "judgement", "word": what.word, "why": what.why}
-            self._tell(self._judgement)
+            self._broadcast(self._judgement)
         elif what == "join" and viewer:
             self._viewers.append(viewer)
-            for message in (scenery(self._session), self._standing, self._judgement):
+            for message in (static_message(self._session), self._status, self._judgement):
                 if message:
-                    viewer.tell(message)
+                    viewer.post(message)
         elif what == "leave" and viewer in self._viewers:
             self._viewers.remove(viewer)
             if not self._viewers:  # No viewer is connected.
@@ -208,29 +208,29 @@ class Conductor:
         except PbdkitError as error:
             text = str(error)
         except Exception as error:
-            self._session.running, self._session.owed = False, 0
+            self._session.running, self._session.due_steps = False, 0
             text = f"a bug in pbdkit, please report it: {type(error).__name__}: {error}"
         else:
             return
         message = {"is": "error", "text": text}
         if viewer:
-            viewer.tell(message)
+            viewer.post(message)
         else:
-            self._tell(message)
+            self._broadcast(message)
 
-    def _tell(self, message: Message) -> None:
+    def _broadcast(self, message: Message) -> None:
         for viewer in self._viewers:
-            viewer.tell(message)
+            viewer.post(message)
 
     def _publish(self) -> None:
         session = self._session
-        if (status := standing(session)) != self._standing:
-            self._standing = status
-            self._tell(status)
+        if (status := status_message(session)) != self._status:
+            self._status = status
+            self._broadcast(status)
         values = [number.after(session.step) for number in session.script.numbers.values()]
         if values != self._judged:
             self._judged = values
-            self._judge.ask(session.plain())
+            self._judge.submit(session.plain())
         viewers = [viewer for viewer in self._viewers if viewer.awaits(session.pictures)]
         frame = session.frame() if viewers else None
         for viewer in viewers:
@@ -240,7 +240,7 @@ class Conductor:
             viewer.show(picture)
 
 
-MOST_WAITING = 1000
+MAX_WAITING = 1000
 """Maximum number of messages that wait for a page; if it does not read them, it is disconnected."""
 MAX_PAGES = 8
 """Maximum number of connected pages."""
@@ -265,9 +265,9 @@ class SocketViewer(Viewer):
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self._waiting: asyncio.Queue[str | bytes | None] = asyncio.Queue(MOST_WAITING)
+        self._waiting: asyncio.Queue[str | bytes | None] = asyncio.Queue(MAX_WAITING)
 
-    def tell(self, message: Message) -> None:
+    def post(self, message: Message) -> None:
         """Queue a message to the page."""
         self._put(as_json(message))
 
@@ -378,9 +378,9 @@ class SessionServer:
         try:
             async for message in socket:
                 try:
-                    self._conductor.ask(viewer, command_of(message))
+                    self._conductor.submit(viewer, command_of(message))
                 except ExperimentError as error:
-                    viewer.tell({"is": "error", "text": str(error)})
+                    viewer.post({"is": "error", "text": str(error)})
         except ConnectionClosed:
             pass
         finally:

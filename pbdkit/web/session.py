@@ -37,7 +37,7 @@ from pbdkit.stepping.divergence import Guard
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state, unmoved_state
-from pbdkit.web.script import NEVER, LeaderScript, Saved, Script, Way, save_script
+from pbdkit.web.script import NEVER, Displacement, LeaderScript, Saved, Script, save_script
 from pbdkit.web.view_frames import COLOURS, Camera, ViewFrame
 
 LARGEST = 4000
@@ -100,34 +100,34 @@ def _worded(analysis: Analysis) -> Judgement:
 class Judge:
     """Stability analysis of the newest experiment in a separate thread."""
 
-    def __init__(self, tell: Callable[[Judgement], None]) -> None:
-        self._tell, self._asked = tell, threading.Condition()
+    def __init__(self, report: Callable[[Judgement], None]) -> None:
+        self._report, self._requested = report, threading.Condition()
         self._newest: Experiment | None = None
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="judge", daemon=True)
         self._thread.start()
 
-    def ask(self, experiment: Experiment) -> None:
+    def submit(self, experiment: Experiment) -> None:
         """Queue an experiment, which replaces one that is still waiting."""
-        with self._asked:
+        with self._requested:
             self._newest = experiment
-            self._asked.notify()
+            self._requested.notify()
 
     def close(self) -> None:
         """End the thread after the present analysis."""
-        with self._asked:
+        with self._requested:
             self._closed = True
-            self._asked.notify()
+            self._requested.notify()
 
     def _work(self) -> None:
         while True:
-            with self._asked:
-                self._asked.wait_for(lambda: self._closed or self._newest is not None)
+            with self._requested:
+                self._requested.wait_for(lambda: self._closed or self._newest is not None)
                 if self._closed:
                     return
                 experiment, self._newest = self._newest, None
             assert experiment
-            self._tell(judged(experiment))
+            self._report(judged(experiment))
 
 
 SMALL = 20_000
@@ -197,7 +197,7 @@ def _led(scene: Scene, groups: Sequence[LeaderScript]) -> tuple[Leading, ...]:
     for leading, group_of_script in zip(
         build_leading(scene.raster, scene.experiment), groups, strict=True
     ):
-        motion = group_of_script.hand or leading.group.motion
+        motion = group_of_script.manual or leading.group.motion
         group = leading.group.model_copy(update={"motion": motion})
         groups_of_scene.append(replace(leading, group=group))
     return tuple(groups_of_scene)
@@ -227,7 +227,7 @@ ROOM = 256 * 2**20
 """Maximum memory of kept states in bytes."""
 FEWEST = 4
 """Minimum number of kept states."""
-MOST = 200
+MAX_STATES = 200
 """Maximum number of kept states."""
 
 
@@ -269,7 +269,7 @@ class History:
 
     def _fits(self) -> bool:
         count = len(self._states)
-        return count <= FEWEST or (count <= MOST and sum(map(_size, self._states)) <= ROOM)
+        return count <= FEWEST or (count <= MAX_STATES and sum(map(_size, self._states)) <= ROOM)
 
     def _thin(self) -> None:
         states = self._states[:1]
@@ -316,9 +316,9 @@ def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float)
 def across(ends: Floats) -> Segment:
     """Return a short segment at rest that crosses a bond and none of the bonds that cross this
     bond."""
-    (x, y), way = ends[0], ends[1] - ends[0]
-    middle = np.array([x, y]) + ALONG * way
-    aside = WIDTH * np.array([-way[1], way[0]])
+    (x, y), direction = ends[0], ends[1] - ends[0]
+    middle = np.array([x, y]) + ALONG * direction
+    aside = WIDTH * np.array([-direction[1], direction[0]])
     (ax, ay), (bx, by) = middle - aside, middle + aside
     return (float(ax), float(ay)), (float(bx), float(by))
 
@@ -327,13 +327,13 @@ def _straightened(places: Floats, tolerance: float) -> list[int]:
     """Return the indices of the places that are corners of a polyline; all others are within the
     tolerance of it."""
     first, last = places[0], places[-1]
-    way, offsets = last - first, places - first
-    length = math.hypot(*way)
+    direction, offsets = last - first, places - first
+    length = math.hypot(*direction)
     if length == 0.0:
         distance = np.hypot(*offsets.T)
     else:
-        share = np.clip(offsets @ way / length**2, 0.0, 1.0)
-        distance = np.hypot(*(offsets - share[:, None] * way).T)
+        share = np.clip(offsets @ direction / length**2, 0.0, 1.0)
+        distance = np.hypot(*(offsets - share[:, None] * direction).T)
     worst = int(np.argmax(distance))
     if len(places) < 3 or distance[worst] <= tolerance:
         return [0, len(places) - 1]
@@ -358,8 +358,8 @@ class GrabbedParticle:
 
     row: int
     group: int | None = None
-    start: Way = (0.0, 0.0)
-    by: Way = (0.0, 0.0)
+    start: Displacement = (0.0, 0.0)
+    by: Displacement = (0.0, 0.0)
     frees: bool = False
 
 
@@ -376,7 +376,7 @@ class Session:
     output: Path | None = None
     notify: Callable[[dict[str, Any]], None] = field(default=lambda message: None)
     running: bool = False
-    owed: int = 0
+    due_steps: int = 0
     speed: int = 1
     grabbed: GrabbedParticle | None = None
     step_s: float = 0.0
@@ -410,26 +410,26 @@ class Session:
         self.step_s = (perf_counter() - clock) / steps
         self.pictures += 1
         self.end = max(self.end, self.step)
-        self.owed = max(0, self.owed - steps)
+        self.due_steps = max(0, self.due_steps - steps)
         try:
             self.guard.look(self.stage.scene, self.state)
             self.history.keep(self.state)
         except FloatingPointError as error:
-            self.running, self.owed = False, 0
+            self.running, self.due_steps = False, 0
             text = f"{error} diverged; go back, and choose other parameters"
             self.notify({"is": "error", "text": text})
 
     @property
     def next_steps(self) -> int:
         """Return the number of steps to the next picture; 0 while stepping is stopped."""
-        if not (self.running or self.owed):
+        if not (self.running or self.due_steps):
             return 0
         limit = max(1, int(LONGEST_S / self.step_s)) if self.step_s else 1
-        return min(limit, self.speed if self.running else self.owed)
+        return min(limit, self.speed if self.running else self.due_steps)
 
     def rewind(self, step: int) -> None:
         """Go to a step, or to a kept state before it if replaying would take long, and stop."""
-        self.running, self.owed, self.grabbed = False, 0, None
+        self.running, self.due_steps, self.grabbed = False, 0, None
         step = min(step, self.end)
         snapshot = self.history.before(step)
         if (step - snapshot.step) * self.step_s > REPLAY_S:
@@ -446,7 +446,7 @@ class Session:
             raise ExperimentError("frame points follow the body, and cannot be moved")
         self.grabbed = GrabbedParticle(row_in_table)
 
-    def drag(self, by: Way) -> None:
+    def drag(self, by: Displacement) -> None:
         """Set the displacement of the mouse since the particle was grabbed."""
         if self.grabbed is None:
             return
@@ -463,7 +463,7 @@ class Session:
 
     def rest(self) -> None:
         """Stop stepping, and release the grabbed particle."""
-        self.running, self.owed = False, 0
+        self.running, self.due_steps = False, 0
         self.release()
 
     def turn(self, name: str, value: float) -> None:
@@ -471,7 +471,7 @@ class Session:
         with self._editing():
             self.script.turn(name, self.step, value)
 
-    def cut(self, line: tuple[Way, Way]) -> None:
+    def cut(self, line: tuple[Displacement, Displacement]) -> None:
         """Cut along a line across the deformed body, before the next step."""
         camera = self.camera
         positions = camera.positions(self.state)
@@ -526,9 +526,9 @@ class Session:
             else:
                 grabbed.group, grabbed.frees = self.script.pick(grabbed.row + 1, step), True
         self.grabbed = grabbed
-        hand = self.script.groups[grabbed.group].hand
-        assert hand
-        grabbed.start = hand.at(step - self.script.groups[grabbed.group].begins + 1)
+        manual = self.script.groups[grabbed.group].manual
+        assert manual
+        grabbed.start = manual.at(step - self.script.groups[grabbed.group].begins + 1)
 
     def _lead(self, begin: int, end: int) -> None:
         if self.grabbed is None or self.grabbed.group is None:
@@ -539,9 +539,9 @@ class Session:
             self.grabbed.start[1] + self.grabbed.by[1],
         )
         first = begin - group.begins + 1
-        if group.hand and group.hand.at(first) != target:
+        if group.manual and group.manual.at(first) != target:
             self._forget_later()
-            group.hand.lead(first, end - group.begins + 1, target)
+            group.manual.lead(first, end - group.begins + 1, target)
 
     @contextmanager
     def _editing(self) -> Iterator[None]:
@@ -573,7 +573,7 @@ class Session:
         self.state = self.stage.set(self.state)
 
     def _undo(self, step: int, text: str) -> None:
-        self.running, self.owed, self.grabbed = False, 0, None
+        self.running, self.due_steps, self.grabbed = False, 0, None
         self.end = step
         self.script.cut_back(step)
         self.history.cut_back(step)
@@ -589,7 +589,7 @@ class Session:
 Message = dict[str, Any]
 
 
-def scenery(session: Session) -> Message:
+def static_message(session: Session) -> Message:
     """Return the static content of a session: the body, its bonds (pairs of rows, 32 bits each),
     its numbers."""
     camera, scene = session.camera, session.stage.scene
@@ -608,7 +608,7 @@ def scenery(session: Session) -> Message:
     }
 
 
-def standing(session: Session) -> Message:
+def status_message(session: Session) -> Message:
     """Return the content of a session that may change at any step, except for pictures."""
     choice, grabbed = session.stage.choice, session.grabbed
     threads = f" on {choice.threads} threads" if choice.threads > 1 else ""

@@ -18,11 +18,11 @@ from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-MOST_POINTS = 50_000
+MAX_POINTS = 50_000
 """Maximum number of particles that are shown."""
 MAX_LEADERS = 2000
 """Maximum number of leaders of a group that are shown."""
-MOST_BONDS = 500_000
+MAX_BONDS = 500_000
 """Maximum number of bonds that are shown."""
 COLOURS = {"kind": "kind", "displacement": "displacement", "last-step": "move in the last step"}
 """Variables that can colour particles, with their names."""
@@ -81,7 +81,7 @@ class Camera:
 
     def __init__(self, scene: Scene) -> None:
         raster = scene.raster
-        self.every = max(1, math.ceil(math.sqrt(raster.count / MOST_POINTS)))
+        self.every = max(1, math.ceil(math.sqrt(raster.count / MAX_POINTS)))
         self.rows = np.arange(raster.count)
         if self.every > 1:
             self.rows = _thinned(scene, self.every)
@@ -96,7 +96,7 @@ class Camera:
     def bonds(self) -> NDArray[np.uint32]:
         """Rows of the ends of bonds, (bond, end); none if particles or bonds are omitted."""
         table = self._scene.bonds.ends if self._shows_bonds else np.zeros((0, 2))
-        return table.astype(np.uint32) if len(table) <= MOST_BONDS else np.zeros((0, 2), np.uint32)
+        return table.astype(np.uint32) if len(table) <= MAX_BONDS else np.zeros((0, 2), np.uint32)
 
     @property
     def _shows_bonds(self) -> bool:

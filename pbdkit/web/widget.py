@@ -19,7 +19,7 @@ class _Cells(Viewer):
     def __init__(self, widget: anywidget.AnyWidget) -> None:
         self._widget = widget
 
-    def tell(self, message: Message) -> None:
+    def post(self, message: Message) -> None:
         self._widget.send(message)
 
     def show(self, picture: bytes) -> None:
@@ -45,7 +45,7 @@ class LiveWidget(anywidget.AnyWidget):
         self.session = session
         self._conductor = Conductor(session)
         self._cells = _Cells(self)
-        self.on_msg(self._hear)
+        self.on_msg(self._receive)
         self._conductor.start()
 
     def close(self) -> None:
@@ -53,7 +53,7 @@ class LiveWidget(anywidget.AnyWidget):
         self._conductor.close()
         super().close()
 
-    def _hear(self, widget: Any, message: Any, buffers: Any) -> None:
+    def _receive(self, widget: Any, message: Any, buffers: Any) -> None:
         """Execute the message of a cell; a new cell joins as a new viewer."""
         if message == {"do": "join"}:
             self._conductor.leave(self._cells)
@@ -61,6 +61,6 @@ class LiveWidget(anywidget.AnyWidget):
             self._conductor.join(self._cells)
             return
         try:
-            self._conductor.ask(self._cells, command_of(message))
+            self._conductor.submit(self._cells, command_of(message))
         except ExperimentError as error:
-            self._cells.tell({"is": "error", "text": str(error)})
+            self._cells.post({"is": "error", "text": str(error)})

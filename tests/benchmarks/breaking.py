@@ -70,7 +70,7 @@ def found(scene: Scene, by_numpy: bool) -> tuple[float, State]:
     """Seconds of the processor, and the equilibrium."""
     begun = time.process_time()
     if by_numpy:
-        with patch.object(breaking_kernel, "settler_of", return_value=None):
+        with patch.object(breaking_kernel, "breaking_kernel_of", return_value=None):
             state, _ = equilibrium_state(scene)
     else:
         state, _ = equilibrium_state(scene)

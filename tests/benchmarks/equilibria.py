@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 
 import pbdkit
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.load_stepping import settle
+from pbdkit.equilibrium.load_stepping import equilibrate
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
@@ -62,7 +62,7 @@ def sheet(rule: str, n: int) -> pbdkit.Experiment:
 def whole(experiment: pbdkit.Experiment) -> Any:
     """From the experiment to the certified state."""
     scene = build_scene(experiment)
-    return settle(scene, initial_state(scene))
+    return equilibrate(scene, initial_state(scene))
 
 
 def prepared(experiment: pbdkit.Experiment) -> Callable[[], object]:

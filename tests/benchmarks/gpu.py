@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from sheets import FRACTURE, Running, moving
 
-from pbdkit.stepping.engine_choice import what_is_missing
+from pbdkit.stepping.engine_choice import missing_for_gpu
 
 SIZE, FEW, MANY, TURNS = 3000, 100, 1100, 5
 
 
 def gpu() -> list[dict[str, Any]] | None:
     """Return None, after a message, if there is no device to measure."""
-    if missing := what_is_missing():
+    if missing := missing_for_gpu():
         print(f"gpu: not measured: {missing}")
         return None
     from numba import cuda

@@ -17,8 +17,8 @@ from sheets import Running, moving, scene_of
 
 from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.mpi.distributed_run import DistributedExecution
-from pbdkit.mpi.driver import DividedStepper, Division
-from pbdkit.mpi.partition import MOST_STEPS, subdomains
+from pbdkit.mpi.driver import DistributedStepper, Division
+from pbdkit.mpi.partition import MAX_STEPS_PER_EXCHANGE, subdomains
 from pbdkit.simulation import peak_memory
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 
@@ -69,8 +69,8 @@ class Sharing:
         self.steps, self.sent = steps, 0
         for rows in self.halo.received.values():
             self.sent += (rows.stop - rows.start) * part.raster.shape[2] * 16
-        self._stepper = DividedStepper(ranks, part, engine, self.halo, steps)
-        self.state, _ = self.division.begun(scene)
+        self._stepper = DistributedStepper(ranks, part, engine, self.halo, steps)
+        self.state, _ = self.division.initial_part(scene)
 
     def __call__(self) -> None:
         self.state = self._stepper.advance(self.state, STEPS)
@@ -131,13 +131,13 @@ def _weak(ranks: DistributedExecution, rows: int, places: int) -> dict[str, floa
     works = {
         "part": Running(sheet(rows + 2 * halo), shared.steps),
         "exchange": lambda: shared.halo.renew(shared.state),
-        "alone": Running(sheet(rows), MOST_STEPS),
+        "alone": Running(sheet(rows), MAX_STEPS_PER_EXCHANGE),
     }
     seconds: dict[str, list[float]] = {name: [] for name in works}
     for turn in range(TURNS + 1):
         _timed(ranks, works, seconds, turn)
     best = {name: min(taken) for name, taken in seconds.items()}
-    best["alone"] *= shared.steps / MOST_STEPS
+    best["alone"] *= shared.steps / MAX_STEPS_PER_EXCHANGE
     return best | {"rows": rows, "places": places, "steps": shared.steps}
 
 

@@ -336,14 +336,17 @@ def test_startup_imports_no_heavy_package(start: str) -> None:
 
 LIBRARIES = {"dask", "h5py", "matplotlib", "numba", "pandas", "rich", "scipy", "shapely", "xarray"}
 NEEDED = {
-    "import pbdkit.api": ({"numpy", "pydantic"}, {"pbdkit.equilibrium", "pbdkit.stability.lag"}),
+    "import pbdkit.api": (
+        {"numpy", "pydantic"},
+        {"pbdkit.equilibrium", "pbdkit.stability.distance"},
+    ),
     "run paper/aa": (set(), {"pbdkit.plugin", "pbdkit.components", "pbdkit.model.experiment"}),
     "run e.json --set rul=1": ({"numpy", "pydantic"}, {"pbdkit.scene.scene", "pbdkit.stepping"}),
     "check e.json": ({"numpy", "pydantic"}, {"pbdkit.io.netcdf", "pbdkit.restart"}),
     "run e.json": ({"h5py", "numpy", "pydantic"}, {"pbdkit.equilibrium.load_stepping"}),
     "run e.json --quiet": (
         {"h5py", "numpy", "pydantic"},
-        {"pbdkit.equilibrium", "pbdkit.stability.lag"},
+        {"pbdkit.equilibrium", "pbdkit.stability.distance"},
     ),
     "status e.nc": ({"numpy"}, {"pbdkit.plugin", "pbdkit.components"}),
     "verify e.nc": ({"numpy", "pydantic"}, {"pbdkit.stepping", "pbdkit.equilibrium"}),

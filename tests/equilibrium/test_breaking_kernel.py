@@ -11,7 +11,7 @@ from interpreted_kernels import interpreting
 
 import pbdkit
 from pbdkit.equilibrium import breaking_kernel as choice, load_stepping as increments
-from pbdkit.equilibrium.breaking_kernel import Settler
+from pbdkit.equilibrium.breaking_kernel import BreakingKernel
 from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
@@ -58,9 +58,11 @@ def _mostly_interpreted(request):
 def by_kernel(monkeypatch):
     """Count the increments that the kernel solves, each time."""
     monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
-    settled, settle = [], Settler.settle
+    settled, equilibrate = [], BreakingKernel.equilibrate
     monkeypatch.setattr(
-        Settler, "settle", lambda *given: settled.append(settle(*given)) or settled[-1]
+        BreakingKernel,
+        "equilibrate",
+        lambda *given: settled.append(equilibrate(*given)) or settled[-1],
     )
     return settled
 
@@ -68,7 +70,7 @@ def by_kernel(monkeypatch):
 @pytest.mark.parametrize("parts", SCENES.values(), ids=SCENES)
 def test_kernel_breaks_and_softens_like_numpy(parts, monkeypatch):
     scene = scene_of(**parts)
-    expected, certificate = equilibrium_state(scene)
+    expected, error_bound = equilibrium_state(scene)
     settled = by_kernel(monkeypatch)
     found, own = equilibrium_state(scene)
     assert len(settled) == 3
@@ -78,7 +80,7 @@ def test_kernel_breaks_and_softens_like_numpy(parts, monkeypatch):
     np.testing.assert_allclose(found.u, expected.u, rtol=0, atol=1e-10)
     for mine, others in zip(found.bond_values, expected.bond_values, strict=True):
         np.testing.assert_allclose(mine, others, rtol=0, atol=1e-10)
-    assert own.method == certificate.method
+    assert own.method == error_bound.method
     assert own.distance <= scene.experiment.solver.tolerance * 2.0
 
 
@@ -108,7 +110,7 @@ def test_repeated_increment_is_bitwise_identical(monkeypatch):
 
 def test_short_computations_are_not_compiled():
     scene = scene_of(fracture=DAMAGE)
-    assert choice.settler_of(scene, 1e-8, Watch()) is None
+    assert choice.breaking_kernel_of(scene, 1e-8, Watch()) is None
 
 
 def test_cache_key_is_independent_of_set_order():

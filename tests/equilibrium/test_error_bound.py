@@ -34,7 +34,7 @@ def sheet(columns=7, rows=5, tolerance=1e-4, solver=None, **parts):
     return experiment(columns, rows, **(base | parts)) | {"solver": asked}
 
 
-def certificate(ds):
+def error_bound(ds):
     return json.loads(ds.attrs["certificate"])
 
 
@@ -78,7 +78,7 @@ def test_no_random_scene_exceeds_its_error_bound(drawn, tolerance):
     assume(ds.attrs["status"] == "settled")
     rest, broken = stepped_on(given_, ds, 3000)
     assume(rest is not None)
-    known = certificate(ds)
+    known = error_bound(ds)
     assert error_of(ds, rest) <= known["distance"] + 1e-11 * max(1.0, np.abs(rest).max())
     assert known["share"] <= tolerance
     if broken is not None:
@@ -106,12 +106,12 @@ def test_run_ends_soon_after_the_first_step_within_tolerance(lattice, rule, tole
                          "steps": steps_of(ds)})  # fmt: skip
     u = (full.position - full.reference).values
     within = np.hypot(*(u - rest).transpose(2, 0, 1))
-    within = np.where(full.kind == 1, within, 0.0).max(axis=1) <= certificate(ds)["distance"]
+    within = np.where(full.kind == 1, within, 0.0).max(axis=1) <= error_bound(ds)["distance"]
     # Symmetric or nearly, without memory: the distance falls in every step, so there is one first.
     first = int(np.argmax(within))
     assert 0 < first <= steps_of(ds) <= first + 2 + first / 64
-    assert error_of(ds, rest) <= certificate(ds)["distance"]
-    assert certificate(ds)["distance"] <= 1.001 * error_of(ds, rest)
+    assert error_of(ds, rest) <= error_bound(ds)["distance"]
+    assert error_bound(ds)["distance"] <= 1.001 * error_of(ds, rest)
 
 
 LATE = [
@@ -175,7 +175,7 @@ def test_finished_load_does_not_delay_the_end():
 
 def test_body_at_rest_converges_in_the_first_step():
     ds = run(sheet(leaders=BOTH_ENDS_HELD))
-    assert (ds.attrs["status"], steps_of(ds), certificate(ds)["distance"]) == ("settled", 1, 0.0)
+    assert (ds.attrs["status"], steps_of(ds), error_bound(ds)["distance"]) == ("settled", 1, 0.0)
 
 
 @pytest.mark.parametrize("memory", [0.5, 0.97, -0.5])
@@ -191,7 +191,7 @@ def test_oscillation_through_equilibrium_has_not_converged(memory, frame):
                             "steps": steps_of(ds) + 400})  # fmt: skip
     u = (onwards.position - onwards.reference).values[steps_of(ds) :]
     farthest = np.hypot(*(u - rest).transpose(2, 0, 1))[:, ds.kind[-1].values == 1].max()
-    assert farthest <= certificate(ds)["distance"] <= 1e-3 * 0.5
+    assert farthest <= error_bound(ds)["distance"] <= 1e-3 * 0.5
 
 
 NECK = {
@@ -248,7 +248,7 @@ def test_run_does_not_end_while_bonds_may_break_beyond_equilibrium():
     neck = float(rest.position[-1, 1, 0] - rest.position[-1, 0, 0])
     last = torn(9.0, record={"at": [steps_of(whole) - 1]}).position.diff("time")[-1]
     carried = float(np.abs(last).max()) * 0.8 / (1.0 - 0.8)
-    distance = certificate(whole)["distance"]
+    distance = error_bound(whole)["distance"]
     assert 0.2 * distance < carried < 0.3 * distance
     # The octagon around a circle reaches 1.09 times as far.
     for beyond, waits in ((1.5, True), (1.9, True), (2.3, False)):
@@ -272,7 +272,7 @@ def test_momentum_and_delay_contribute_to_the_distance(memory, lag):
     before = run(given_ | {"record": {"at": [steps_of(ds) - 1]}}).position.diff("time")[-1]
     carried = (abs(memory) / (1.0 - abs(memory)) + lag) * float(np.abs(before).max())
     assert carried > 0.005 * error_of(ds, rest)
-    assert certificate(ds)["distance"] == pytest.approx(error_of(ds, rest) + carried, rel=1e-6)
+    assert error_bound(ds)["distance"] == pytest.approx(error_of(ds, rest) + carried, rel=1e-6)
 
 
 def test_nonlinear_rules_converge_between_leaders():
@@ -281,8 +281,8 @@ def test_nonlinear_rules_converge_between_leaders():
     ds = run(given_)
     rest, _ = stepped_on(given_, ds)
     assert ds.attrs["status"] == "settled"
-    assert certificate(ds)["linearised"]
-    assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.1 * error_of(ds, rest)
+    assert error_bound(ds)["linearised"]
+    assert error_of(ds, rest) <= error_bound(ds)["distance"] <= 1.1 * error_of(ds, rest)
 
 
 def test_no_first_order_bound_for_a_rule_with_a_kink():
@@ -306,7 +306,7 @@ def test_no_first_order_bound_for_a_rule_with_a_kink():
     rest, _ = stepped_on(given_, ds)
     assert np.ptp((ds.reference.values + rest), axis=0).max() < 1e-9
     assert ds.attrs["status"] == "settled"
-    assert error_of(ds, rest) <= certificate(ds)["distance"]
+    assert error_of(ds, rest) <= error_bound(ds)["distance"]
     early = run(given_ | {"steps": 320})
     assert "not converged: at step" in early.attrs["stop_reason"]
     assert "the rule is too nonlinear" in early.attrs["stop_reason"]
@@ -343,7 +343,7 @@ def test_unsymmetric_rules_converge_within_the_error_bound(columns):
     ds = run(given_)
     assert ds.attrs["status"] == "settled"
     rest, _ = stepped_on(given_, ds)
-    assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.01 * error_of(ds, rest)
+    assert error_of(ds, rest) <= error_bound(ds)["distance"] <= 1.01 * error_of(ds, rest)
 
 
 @pytest.mark.parametrize("record", [{"every": 1}, {"every": 37}, {"at": [0, 3]}])
@@ -374,7 +374,7 @@ def test_single_precision_converges_to_its_limit():
     ds = run(given_)
     assert ds.attrs["status"] == "settled"
     rest, _ = stepped_on(given_ | {"solver": {"type": "stepping"}}, ds)
-    assert error_of(ds, rest) <= certificate(ds)["distance"]
+    assert error_of(ds, rest) <= error_bound(ds)["distance"]
     fine = run(sheet(solver={"precision": "float32"}, tolerance=1e-12, steps=3000))
     assert fine.attrs["status"] == "complete"
     assert "not converged: at step" in fine.attrs["stop_reason"]
@@ -441,7 +441,7 @@ def test_large_released_body_converges_within_the_error_bound(rule, memory, fram
     assert ds.attrs["status"] == "settled"
     rest, _ = stepped_on(given_, ds, 40_000)
     assert np.abs(rest).max() > 0.01
-    assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.01 * error_of(ds, rest)
+    assert error_of(ds, rest) <= error_bound(ds)["distance"] <= 1.01 * error_of(ds, rest)
 
 
 def test_undamped_oscillation_never_converges():
@@ -471,4 +471,4 @@ def test_momentum_displacement_counts_as_distance(memory):
     ds = run(sheet(solver=solver, tolerance=1e-3, record={"every": 1}))
     last = np.abs((ds.position[-1] - ds.position[-2]).values).max()
     assert ds.attrs["status"] == "settled"
-    assert certificate(ds)["distance"] >= memory / (1.0 - memory) * last
+    assert error_bound(ds)["distance"] >= memory / (1.0 - memory) * last

@@ -42,7 +42,7 @@ def run(given):
     return pbdkit.run(given, progress=False)
 
 
-def certificate(ds):
+def error_bound(ds):
     return json.loads(ds.attrs["certificate"])
 
 
@@ -53,7 +53,7 @@ def test_every_method_solves_the_affine_sheet_within_its_error_bound(method, siz
     exact = ds.reference.isel(axis=0) / (size - 1)
     body = ds.kind.isel(time=-1) < 2
     error = abs(ds.u.isel(time=-1, axis=0) - exact).where(body).max()
-    known = certificate(ds)
+    known = error_bound(ds)
     assert error <= known["distance"] <= 1e-10
     assert ds.attrs["status"] == "complete"
     assert ds.time.values.tolist() == list(range(61))
@@ -90,7 +90,7 @@ def test_stepping_random_scenes_leads_to_their_equilibrium(experiment):
     u = scene.raster.table(state.u)
     scale = max(1.0, np.abs(u).max())
     found = (straight.position[-1] - straight.reference).values
-    reached = certificate(straight)["distance"] + 1e-9 * scale
+    reached = error_bound(straight)["distance"] + 1e-9 * scale
     assert np.abs(found - u).max() <= reached
 
 
@@ -170,7 +170,7 @@ def test_nonlinear_rule_is_relinearised_and_rests_at_the_solution():
     solver = STRAIGHT | {"tolerance": 1e-10}
     ds = run(sheet(9, 7, rule={"type": "distance-weighted"}, leaders=[LEFT, pulled(3.0, 1.0)],
                    solver=solver))  # fmt: skip
-    known = certificate(ds)
+    known = error_bound(ds)
     assert known["linearised"]
     assert known["iterations"] > 1
     assert known["residual"] < 1e-10
@@ -213,7 +213,7 @@ def test_part_under_unbalanced_load_is_refused_by_name():
     with pytest.raises(pbdkit.ExperimentError, match=r"a part of 12 particles \(with number"):
         run(sheet(4, 3, rule=Pushed(type="pushed"), leaders=[]))
     held = run(sheet(4, 3, rule=Pushed(type="pushed")))
-    assert certificate(held)["distance"] < 1e-8
+    assert error_bound(held)["distance"] < 1e-8
 
 
 class Limited(Pushed):

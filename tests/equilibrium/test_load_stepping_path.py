@@ -9,9 +9,9 @@ from hypothesis import given, strategies as st
 from scene_strategies import samples
 
 import pbdkit
-from pbdkit.equilibrium.error_bound import ErrorBound
+from pbdkit.equilibrium.error_bound import EquilibriumPredictor
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.load_stepping import events, moments, settle
+from pbdkit.equilibrium.load_stepping import equilibrate, events, moments
 from pbdkit.equilibrium.system import Moves
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
@@ -152,7 +152,7 @@ def test_bond_changes_are_within_tolerance_at_the_end_of_the_path(tolerance):
         )
     )
     state = initial_state(scene)
-    settle(scene, state)
+    equilibrate(scene, state)
     before = [value.copy() for value in state.bond_values]
     assert max(float(value.max()) for value in before) > 0.1
     Fracturing.of(scene).break_bonds(state.u, state, 1)
@@ -164,19 +164,19 @@ def test_first_order_bounds_are_doubled():
     """Test springs, by the search and by a state on the path."""
     scene = build_scene(pbdkit.Experiment(**springs([0.5, 1.0])))
     state = initial_state(scene)
-    certificate = settle(scene, state)
+    error_bound = equilibrate(scene, state)
     moves = Moves(scene)
     system = linearised(scene, state, 1, "auto", Watch(), moves)
     rounding = system.amplification * moves.rounding(state.u)
     once = system.distance(moves.at(state, 1), rounding)
-    assert certificate.linearised
-    assert certificate.distance == pytest.approx(2.0 * once, rel=0.1)
+    assert error_bound.linearised
+    assert error_bound.distance == pytest.approx(2.0 * once, rel=0.1)
     state.u[...] += moves.at(state, 1) + 1e-4 * np.sin(state.u)  # off by a little
-    found = ErrorBound(scene, 1.0, Watch()).from_(state)
+    found = EquilibriumPredictor(scene, 1.0, Watch()).predict(state)
     system = linearised(scene, state, 1, "auto", Watch())
     correction = found.u - state.u
     left = system.distance(moves.at(type(state)(**vars(state) | {"u": found.u}), 1),
                            moves.rounding(found.u))  # fmt: skip
     way = float(np.hypot(*correction).max())
-    assert found.certificate.distance == pytest.approx(way + 2.0 * left, rel=1e-9)
+    assert found.error_bound.distance == pytest.approx(way + 2.0 * left, rel=1e-9)
     assert 2.0 * left > 1e-6 * way

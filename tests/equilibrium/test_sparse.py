@@ -188,13 +188,15 @@ def test_iteration_reports_progress_and_can_be_stopped():
 
 
 def test_progress_is_reported_as_phase_and_fraction(monkeypatch):
-    from pbdkit.equilibrium.load_stepping import settle
+    from pbdkit.equilibrium.load_stepping import equilibrate
     from pbdkit.scene.scene import build_scene
     from pbdkit.stepping.state import initial_state
 
     told = []
     scene = build_scene(pbdkit.Experiment(**sheet()))
-    settle(scene, initial_state(scene), Watch(show=lambda what, share: told.append((what, share))))
+    equilibrate(
+        scene, initial_state(scene), Watch(show=lambda what, share: told.append((what, share)))
+    )
     phases = list(dict.fromkeys(what for what, _ in told))
     assert phases == ["assembling", "bounding the error", "solving"]
     shares = [share for what, share in told if what == "solving"]

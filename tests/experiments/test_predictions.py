@@ -15,7 +15,7 @@ from scene_strategies import in_turn
 import pbdkit
 from pbdkit.equilibrium.load_stepping import equilibrium_state
 from pbdkit.linear.operator import step_operator
-from pbdkit.linear.spectrum import modes, slowest_swing, spectrum
+from pbdkit.linear.spectrum import modes, slowest_oscillation, spectrum
 from pbdkit.model.shipped import read_experiment, shipped_names
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
@@ -142,10 +142,10 @@ def test_broken_bodies_stay_stable_and_converge_more_slowly(call, name):
     state = stepper.advance(initial_state(scene), at_rest(scene) + 400)
     assert (state.broken_step > 0).any()
     found = torn_modes(name, state)
-    torn, swing = abs(found).max(), slowest_swing(found)
+    torn, mode = abs(found).max(), slowest_oscillation(found)
     hangs = scene.experiment.rule.type == "springs" and torn > 1.0 - HANGING
     assert said["spectral_radius"] - 1e-9 < torn < (1.0 + HANGING if hangs else 1.0)
-    window = math.ceil(swing.period) if swing else 1
+    window = math.ceil(mode.period) if mode else 1
     moves = []
     for _ in range(200 + window):
         before = body_of(scene, state)

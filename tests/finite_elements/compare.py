@@ -85,12 +85,12 @@ def _memory(rate: float, cells: int) -> float:
 def _equilibrium(problem: Problem, cells: int) -> Point:
     asked = pbdkit.Experiment(**experiment(problem, cells))
     setup, scene = best(REPEATS, lambda: build_scene(asked))
-    solving, (state, certificate) = best(REPEATS, lambda: equilibrium_state(scene))
+    solving, (state, error_bound) = best(REPEATS, lambda: equilibrium_state(scene))
     rows = scene.raster.body_rows
     u = state.u.reshape(2, -1)[:, scene.raster.place_of(rows)].T
     u = on_grid(problem, cells, scene.raster.reference(rows), u)
     error = Solved(problem, cells, u, np.nan).throughout
-    return Point(cells, error, setup, solving, certificate.method)
+    return Point(cells, error, setup, solving, error_bound.method)
 
 
 def _stepping(problem: Problem, cells: int, error: float, memory: float) -> Point:

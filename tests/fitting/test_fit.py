@@ -12,7 +12,7 @@ import pytest
 
 import pbdkit
 from pbdkit.fitting.observations import Interpolation
-from pbdkit.fitting.sensitivity import Resting
+from pbdkit.fitting.sensitivity import RestingScene
 from pbdkit.scene.scene import build_scene
 
 NOISE = 4e-4
@@ -58,7 +58,7 @@ def plate(rule=None, *, noise=0.0, generator=None, **more):
 def measured(experiment, path, *, noise=0.0, count=400, generator=None):
     """Writes what the equilibrium of an experiment shows at random points."""
     generator = generator or np.random.default_rng(0)
-    resting = Resting.of(pbdkit.Experiment(**experiment))
+    resting = RestingScene.of(pbdkit.Experiment(**experiment))
     points = generator.uniform([0.0, 0.0], [WIDTH, HEIGHT], (count, 2))
     found = Interpolation.at(resting.scene, points)
     u = found.of(resting.state.u, resting.scene)
@@ -152,7 +152,7 @@ def test_errors_match_repeated_experiments():
     from pbdkit.fitting.problem import Problem, Unknown, solved
 
     coarse = {"lattice": {"type": "square", "a": 2.0}}
-    resting = Resting.of(pbdkit.Experiment(**plate(**coarse)))
+    resting = RestingScene.of(pbdkit.Experiment(**plate(**coarse)))
     points = generator.uniform([0.0, 0.0], [WIDTH, HEIGHT], (600, 2))
     inside = Interpolation.at(resting.scene, points)
     points, true = points[inside.inside], inside.of(resting.state.u, resting.scene)

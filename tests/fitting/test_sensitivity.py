@@ -15,7 +15,7 @@ from scene_strategies import AT_LENGTH
 import pbdkit
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.sensitivity import Resting
+from pbdkit.fitting.sensitivity import RestingScene
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.plugin import BUILTIN, FollowerRule, FramePolicy
 from pbdkit.plugin.registry import Registry
@@ -97,7 +97,7 @@ def by_complex_step(experiment, path, monkeypatch):
     """∂u/∂θ from the functions of the rule alone, at θ + ih, and a dense matrix of their moves."""
     scene = build_scene(experiment)
     _, name = path.split(".")
-    resting = Resting.of(experiment)
+    resting = RestingScene.of(experiment)
     state, frame = resting.state, scene.frame
     place = np.flatnonzero(
         kinds_of_places(scene.raster, scene.leading, experiment.steps) == FOLLOWER
@@ -138,7 +138,7 @@ def test_derivatives_match_complex_steps(name, frame, monkeypatch):
     experiment = pbdkit.Experiment(**given)
     with one_thread():
         expected, place = by_complex_step(experiment, path, monkeypatch)
-    found = Resting.of(experiment).change(Parameter(path)).reshape(2, -1)[:, place].ravel()
+    found = RestingScene.of(experiment).change(Parameter(path)).reshape(2, -1)[:, place].ravel()
     assert np.abs(expected).max() > 1e-6
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9 * np.abs(expected).max())
 
@@ -163,8 +163,8 @@ def test_derivative_of_linear_parameters_equals_differences(name):
     parts, path = LINEAR[name]
     experiment = pbdkit.Experiment(**SHEET | parts)
     parameter = Parameter(path)
-    here = Resting.of(experiment)
-    there = Resting.of(parameter.put(experiment, parameter.value_in(experiment) + 0.5))
+    here = RestingScene.of(experiment)
+    there = RestingScene.of(parameter.put(experiment, parameter.value_in(experiment) + 0.5))
     difference = (there.state.u - here.state.u) / 0.5
     np.testing.assert_allclose(here.change(parameter), difference, atol=1e-9)
 
@@ -190,8 +190,8 @@ SMOOTH = {
 def test_derivatives_match_differences_of_equilibria(name):
     parts, path = SMOOTH[name]
     experiment, parameter = pbdkit.Experiment(**SHEET | parts), Parameter(path)
-    found = Resting.of(experiment).change(parameter)
-    expected = parameter.derivative(experiment, lambda e: Resting.of(e).state.u)
+    found = RestingScene.of(experiment).change(parameter)
+    expected = parameter.derivative(experiment, lambda e: RestingScene.of(e).state.u)
     size = np.abs(expected).max()
     assert size > 1e-5
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7 * size)
@@ -203,7 +203,7 @@ def test_load_response_decreases_with_stiffness_beside_another_field():
     rule = ELASTIC | {"stiffness": 4.0, "poisson_ratio": {"otherwise": 0.3, "core": 0.1}}
     load = {"select": {"edge": "right"}, "force": [0.1, -0.2]}
     parts = {"rule": rule, "regions": core, "leaders": SHEET["leaders"][:1], "loads": [load]}
-    resting = Resting.of(pbdkit.Experiment(**SHEET | parts | {"frame": {"type": "natural"}}))
+    resting = RestingScene.of(pbdkit.Experiment(**SHEET | parts | {"frame": {"type": "natural"}}))
     found, u = resting.change(Parameter("rule.stiffness")), resting.state.u
     np.testing.assert_allclose(found, -u / 4.0, rtol=0.0, atol=1e-8 * np.abs(u).max())
 
@@ -280,7 +280,7 @@ def test_transposed_solve_solves_the_transpose(method, frame):
             "body": {"type": "grid", "columns": columns, "rows": rows},
             "solver": {"type": "equilibrium", "method": asked},
         }  # fmt: skip
-        resting = Resting.of(pbdkit.Experiment(**given))
+        resting = RestingScene.of(pbdkit.Experiment(**given))
         kinds = kinds_of_places(resting.scene.raster, resting.scene.leading, 1)
         a, b = np.random.default_rng(0).normal(size=(2, *resting.state.u.shape))
         for planes in (a, b):
@@ -302,14 +302,14 @@ WIDE = SHEET | {
 @by_grids
 def test_solutions_started_from_another_equilibrium_are_the_same():
     parameter, accuracy = Parameter("rule.poisson_ratio"), 1e-9
-    there = Resting.of(pbdkit.Experiment(**WIDE), accuracy=accuracy)
+    there = RestingScene.of(pbdkit.Experiment(**WIDE), accuracy=accuracy)
     led = np.zeros_like(there.state.u)
     led.reshape(2, -1)[0, there.scene.leading[1].place] = 1.0
     nearby = parameter.put(there.scene.experiment, 0.31)
     found, counts = [], []
     for start in (None, there):
         there.answer(led), there.change(parameter)
-        here = Resting.of(nearby, start, accuracy)
+        here = RestingScene.of(nearby, start, accuracy)
         before = here.system.iterations
         found.append((here.answer(led), here.change(parameter)))
         counts.append(here.system.iterations - before)
@@ -320,7 +320,7 @@ def test_solutions_started_from_another_equilibrium_are_the_same():
 
 @by_grids
 def test_leader_columns_are_part_of_the_stencils():
-    resting = Resting.of(pbdkit.Experiment(**WIDE))
+    resting = RestingScene.of(pbdkit.Experiment(**WIDE))
     led = np.zeros_like(resting.state.u)
     place = resting.scene.leading[1].place
     led.reshape(2, -1)[:, place] = np.random.default_rng(0).normal(size=(2, len(place)))
@@ -329,7 +329,7 @@ def test_leader_columns_are_part_of_the_stencils():
 
 
 def test_loose_derivative_meets_its_tolerance():
-    exact, rough = (Resting.of(pbdkit.Experiment(**WIDE), None, a) for a in (1e-12, 1e-7))
+    exact, rough = (RestingScene.of(pbdkit.Experiment(**WIDE), None, a) for a in (1e-12, 1e-7))
     one, other = (resting.change(Parameter("rule.poisson_ratio")) for resting in (exact, rough))
     assert 0.0 < np.abs(one - other).max() < 1e-6 * np.abs(one).max()
 
@@ -338,9 +338,9 @@ def test_sensitivities_compile_no_new_kernel():
     pytest.importorskip("numba")
     from pbdkit.equilibrium.stencil_matrix import kernels
 
-    resting = Resting.of(pbdkit.Experiment(**WIDE))
+    resting = RestingScene.of(pbdkit.Experiment(**WIDE))
     resting.gradient(np.ones_like(resting.state.u), [Parameter("rule.poisson_ratio")])
-    again = Resting.of(resting.scene.experiment, resting)
+    again = RestingScene.of(resting.scene.experiment, resting)
     again.answer(np.ones_like(resting.state.u))
     for name, ways in (("product", 1), ("scaled", 1), ("dot", 2)):
         assert len(getattr(kernels(), name).signatures) == ways, name
@@ -352,7 +352,7 @@ def test_unsupported_displaced_part_is_refused():
         for edge, sign in (("left", -1.0), ("right", 1.0))
     ]
     free = SHEET | {"leaders": [], "rule": ELASTIC, "frame": {"type": "natural"}}
-    resting = Resting.of(pbdkit.Experiment(**free | {"loads": pulled}))
+    resting = RestingScene.of(pbdkit.Experiment(**free | {"loads": pulled}))
     with pytest.raises(pbdkit.ExperimentError, match="a part of the body is not constrained"):
         resting.change(Parameter("rule.poisson_ratio"))
     with pytest.raises(pbdkit.ExperimentError, match="a part of the body is not constrained"):
@@ -363,10 +363,10 @@ def test_changing_bonds_and_obstacles_are_refused():
     torn = {"rule": ELASTIC, "frame": {"type": "natural"},
             "fracture": {"type": "strain", "failure": 0.01}}  # fmt: skip
     with pytest.raises(pbdkit.ExperimentError, match="bonds break or soften on the load path"):
-        Resting.of(pbdkit.Experiment(**SHEET | torn))
+        RestingScene.of(pbdkit.Experiment(**SHEET | torn))
     indented = pbdkit.load("modelling/indentation", settings=["solver={type: equilibrium}"])
     with pytest.raises(pbdkit.ExperimentError, match="remove the obstacles"):
-        Resting.of(indented)
+        RestingScene.of(indented)
 
 
 @pytest.mark.parametrize(
@@ -387,7 +387,7 @@ def test_parameter_that_is_not_a_number_is_refused(path, told):
 def test_parameter_on_its_bound_has_no_derivative():
     experiment = pbdkit.Experiment(**SHEET | {"rule": ELASTIC | {"poisson_ratio": 0.5}})
     with pytest.raises(pbdkit.ExperimentError, match="is at its bound"):
-        Resting.of(experiment).change(Parameter("rule.poisson_ratio"))
+        RestingScene.of(experiment).change(Parameter("rule.poisson_ratio"))
 
 
 def test_parameter_that_changes_the_particles_has_no_derivative():
@@ -395,4 +395,4 @@ def test_parameter_that_changes_the_particles_has_no_derivative():
         **SHEET | {"rule": ELASTIC, "body": {"type": "rectangle", "width": 5.1, "height": 4.1}}
     )
     with pytest.raises(pbdkit.ExperimentError, match="changes the set of particles"):
-        Resting.of(experiment).change(Parameter("body.width"))
+        RestingScene.of(experiment).change(Parameter("body.width"))

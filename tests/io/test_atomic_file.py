@@ -152,7 +152,7 @@ def test_write_errors_are_hidden_from_hdf5(tmp_path: Path) -> None:
         for n in range(50):
             content[f"variable{n}"] = np.arange(1000.0)
     with pytest.raises(OSError, match="No space left"):
-        file.settle()
+        file.finalize()
     disk.close()
 
 

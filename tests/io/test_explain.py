@@ -193,10 +193,10 @@ def test_model_without_a_limit():
     given = BAR | SHEET | {"fracture": Weakest(spread=0.3)}
     ds, found = explained(given, components=[Weakest])
     row = int(found.order[0])
-    (standing,) = found.statuses(np.array([row]))
-    assert standing.breaks_above is None
+    (status,) = found.statuses(np.array([row]))
+    assert status.breaks_above is None
     assert found.nearest() is None
-    assert standing.strain_at_break == float(ds.broken_strain[row]) > 0.5
+    assert status.strain_at_break == float(ds.broken_strain[row]) > 0.5
     remembered = found.remembered(row)
     assert remembered["onset"] == float(ds.onset[row])
     assert remembered["damage"] >= 1.0

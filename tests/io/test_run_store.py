@@ -154,7 +154,7 @@ def test_full_disk_is_named_and_the_run_can_be_resumed(
 
         def fill() -> None:
             if FAILING[what] == "disk":
-                patch.setattr(netcdf_sink.PagedFile, "settle", full)
+                patch.setattr(netcdf_sink.PagedFile, "finalize", full)
             elif FAILING[what] == "commit":
                 patch.setattr(RunStore, "commit", full)
             elif FAILING[what] == "link":

@@ -9,7 +9,7 @@ import pytest
 import pbdkit
 from pbdkit.io.atomic_file import Destination
 from pbdkit.io.netcdf import NetcdfSink
-from pbdkit.io.sinks import LARGE_BYTES, MOST_WAITING, KeepingSink, OverlappingSink
+from pbdkit.io.sinks import LARGE_BYTES, MAX_WAITING, KeepingSink, OverlappingSink
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation, record
@@ -100,7 +100,7 @@ def test_memory_stays_bounded_if_the_disk_is_slow():
     producer = threading.Thread(target=produce)
     producer.start()
     producer.join(0.3)
-    assert len(done) <= MOST_WAITING
+    assert len(done) <= MAX_WAITING
     inner.gate.set()
     producer.join(10)
     sink.finish({})

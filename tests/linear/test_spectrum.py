@@ -23,8 +23,8 @@ from pbdkit.linear.spectrum import (
     NEUTRAL,
     largest_stable_relaxation,
     modes,
-    slowest_swing,
-    swings_below,
+    oscillation_limit,
+    slowest_oscillation,
 )
 from pbdkit.linear.stencil import wave_bound
 
@@ -83,14 +83,14 @@ def test_slowest_oscillation_is_that_of_the_largest_oscillating_eigenvalue(some,
     eigenvalues = np.array(some, complex)
     s = 1.0 + b - w * (1.0 - eigenvalues.real)
     assume((np.abs(s * s - 4.0 * b) > 1e-9).all())
-    swings = s * s < 4.0 * b
-    assert (eigenvalues.real[swings] < swings_below(w, b)).all()
-    found = slowest_swing(modes(eigenvalues, w, b))
-    if not swings.any():
+    is_oscillating = s * s < 4.0 * b
+    assert (eigenvalues.real[is_oscillating] < oscillation_limit(w, b)).all()
+    found = slowest_oscillation(modes(eigenvalues, w, b))
+    if not is_oscillating.any():
         assert found is None
         return
     assert found.period == pytest.approx(
-        2.0 * math.pi / math.acos(s[swings].max() / (2.0 * math.sqrt(b))), rel=1e-6
+        2.0 * math.pi / math.acos(s[is_oscillating].max() / (2.0 * math.sqrt(b))), rel=1e-6
     )
     assert found.decay == pytest.approx(math.sqrt(b), rel=1e-9)
 
@@ -168,17 +168,17 @@ def period_of(x):
 
 @pytest.mark.parametrize(("memory", "period"), [(1.0, 76.07), (0.99, None), (0.95, None)])
 def test_slowest_mode_of_a_sheet_has_the_predicted_period_and_decay(memory, period):
-    swing = pbdkit.analyse(sheet(20, 20)).swing(1.0, memory)
-    assert period is None or swing.period == pytest.approx(period, abs=0.01)
-    assert swing.decay == pytest.approx(math.sqrt(memory))
+    mode = pbdkit.analyse(sheet(20, 20)).oscillation(1.0, memory)
+    assert period is None or mode.period == pytest.approx(period, abs=0.01)
+    assert mode.decay == pytest.approx(math.sqrt(memory))
     scene = scene_of(20, 20, leaders=BOTH_ENDS_HELD, solver=stepping(1.0, memory))
     column = body_sites(scene)[:, 0]
     start = np.stack([np.zeros(len(column)), np.sin(np.pi * column / 19)], axis=1)
     y = advanced(scene, start, 500)[:, 8 * 20 + 9, 1]
-    assert period_of(y) == pytest.approx(swing.period, rel=0.005)
+    assert period_of(y) == pytest.approx(mode.period, rel=0.005)
     # The remainder u(t+1) - 2 √b cos ω u(t) + b u(t-1) is rounding.
-    s = 2 * swing.decay * math.cos(2 * math.pi / swing.period)
-    np.testing.assert_allclose(y[2:] - s * y[1:-1] + swing.decay**2 * y[:-2], 0, atol=1e-9)
+    s = 2 * mode.decay * math.cos(2 * math.pi / mode.period)
+    np.testing.assert_allclose(y[2:] - s * y[1:-1] + mode.decay**2 * y[:-2], 0, atol=1e-9)
 
 
 def test_shipped_experiment_has_the_period_of_the_closed_form():
@@ -225,8 +225,8 @@ def test_slowest_oscillation_of_large_sheets_matches_the_closed_form(memory):
     a = np.cos(np.pi * np.arange(1, n - 1) / (n - 1))[:, None]
     b = np.cos(np.pi * np.arange(n) / n)[None, :]
     every = modes((a + b).ravel() / 2 + 0j, 1.0, memory)
-    exact = slowest_swing(every)
-    found = analysis.swing(1.0, memory)
+    exact = slowest_oscillation(every)
+    found = analysis.oscillation(1.0, memory)
     assert found.period == pytest.approx(exact.period, rel=1e-9)
     assert found.decay == pytest.approx(exact.decay, rel=1e-9)
     assert analysis.spectral_radius == pytest.approx(np.abs(every).max(), abs=1e-11)
@@ -239,13 +239,13 @@ def test_without_momentum_nothing_oscillates_at_any_relaxation(rule, lattice):
     """Behind copying frames; overshooting makes short waves alternate, or diverge."""
     analysis = pbdkit.analyse(sheet(rule=rule, lattice=lattice))
     for relaxation in (0.5, 1.0, 1.3, 2.0):
-        assert analysis.swing(relaxation, 0.0) is None
+        assert analysis.oscillation(relaxation, 0.0) is None
 
 
 def test_delayed_frames_have_no_prediction():
     analysis = pbdkit.analyse(sheet(frame="lag"))
     assert analysis.stable_at(1.0, 0.5) is None
-    assert analysis.swing(1.0, 0.5) is None
+    assert analysis.oscillation(1.0, 0.5) is None
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_with_momentum_every_mode_satisfies_its_quadratic():
         np.testing.assert_allclose(u[t + 1], expected, rtol=0, atol=1e-13)
 
 
-def test_lag_behind_moving_leaders_matches_the_formula():
+def test_distance_behind_moving_leaders_matches_the_formula():
     columns, v = 20, 0.0035
     steps = 1500  # ten relaxation times of 147 steps
     u = displacements(columns, 3, leaders=[HOLD_LEFT, pull_right(v, 0.0, steps)], steps=steps)

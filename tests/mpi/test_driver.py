@@ -16,7 +16,7 @@ from turning_frame import Turning
 import pbdkit
 from pbdkit.equilibrium import multigrid as parted_grids
 from pbdkit.equilibrium.lattice_system import LatticeSystem
-from pbdkit.equilibrium.system import StuckError
+from pbdkit.equilibrium.system import StagnationError
 from pbdkit.mpi.driver import deep_subdomains, strip_of
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption
@@ -172,10 +172,10 @@ def test_error_bound_holds(tmp_path):
     grids = {"type": "equilibrium", "method": "multigrid"}
     sought, path = given_ | {"solver": grids}, tmp_path / "several.nc"
     outcomes = on_ranks(2, lambda ranks: written(sought, path, ranks))
-    (right, _), (u, certificate) = certified(tmp_path / "exact.nc"), certified(path)
+    (right, _), (u, error_bound) = certified(tmp_path / "exact.nc"), certified(path)
     assert {one.status for one in outcomes} == {"complete"}
-    assert certificate["method"] == "multigrid, conjugate-gradients"
-    assert np.hypot(*(u - right).T).max() <= certificate["distance"] <= 1e-8
+    assert error_bound["method"] == "multigrid, conjugate-gradients"
+    assert np.hypot(*(u - right).T).max() <= error_bound["distance"] <= 1e-8
 
 
 BREAKING = {"type": "threshold", "thresholds": [1.9]}
@@ -216,7 +216,7 @@ def test_undistributed_features_are_refused_in_one_message(text, tmp_path):
 
 def test_stalled_iteration_recommends_one_process(tmp_path, monkeypatch):
     def stuck(*given):
-        raise StuckError
+        raise StagnationError
 
     monkeypatch.setattr(LatticeSystem, "solve", stuck)
     refused = on_ranks(2, lambda ranks: ended(strip(), tmp_path / "out.nc", ranks))

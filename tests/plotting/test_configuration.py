@@ -23,7 +23,7 @@ from matplotlib.text import Text
 from pbdkit.plotting import animate, animation, compare, plot
 from pbdkit.plotting.data import cells_of, distance_from, outline, whole
 from pbdkit.plotting.layers import PixelGrid
-from pbdkit.plotting.style import Look
+from pbdkit.plotting.style import PlotOptions
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 SIDEWAYS = {"type": "velocity", "velocity": [0.3, 0.1], "steps": 10}
@@ -590,7 +590,7 @@ def test_figures_belong_to_pyplot_if_it_is_in_use(tmp_path):
 @pytest.mark.parametrize("verb", [plot, compare, animate, animation], ids=lambda v: v.__name__)
 def test_plots_share_documented_keyword_options(verb):
     """An editor completes them, with types; `numbers` is not legible in movies."""
-    options = {part.name: part.type for part in fields(Look)}
+    options = {part.name: part.type for part in fields(PlotOptions)}
     if verb in (animate, animation):
         del options["numbers"]
     parameters = signature(verb).parameters

@@ -16,8 +16,8 @@ import imageio_ffmpeg
 from PIL import Image
 
 from pbdkit.plotting.data import Trajectory
-from pbdkit.plotting.movie import MovieSheet
-from pbdkit.plotting.style import Look
+from pbdkit.plotting.movie import MovieFigure
+from pbdkit.plotting.style import PlotOptions
 
 SMALL = {"figsize": (3.01, 2.47), "dpi": 61}
 """A picture with an odd number of pixels either way is written in its own size."""
@@ -63,7 +63,7 @@ def test_every_recorded_step_has_a_frame(torn, tmp_path, suffix):
 
 def test_frame_equals_the_plot_of_its_step(torn):
     recording = Trajectory(torn, "pe1_intact")
-    moving = MovieSheet(recording, range(25), Look(**SMALL), lambda what, share: None)
+    moving = MovieFigure(recording, range(25), PlotOptions(**SMALL), lambda what, share: None)
     frames = [*moving.frames(range(25))]
     assert moving.sheet.axes[0].get_title().endswith("step 24")
     again = next(iter(moving.frames([7])))

@@ -53,7 +53,7 @@ CAPABILITIES = {
         pbdkit.plugin.SoftensCells,
         pbdkit.plugin.StartsCracked,
         pbdkit.plugin.BreaksAtStrain,
-        pbdkit.plugin.KnowsStiffness,
+        pbdkit.plugin.UsesStiffness,
     ),
     "FramePolicy": (pbdkit.plugin.Anchors,),
 }

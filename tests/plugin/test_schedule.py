@@ -16,20 +16,20 @@ from pbdkit.components.elasticity import Elastic, StrainGradient
 from pbdkit.equilibrium.load_stepping import moments
 from pbdkit.errors import NotSharedError
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.sensitivity import Resting, scene_like
+from pbdkit.fitting.sensitivity import RestingScene, scene_like
 from pbdkit.io.explain import BondRecords
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source
 from pbdkit.plugin import FollowerRule, FractureModel
 from pbdkit.plugin.registry import Registry
-from pbdkit.plugin.schedule import Course
+from pbdkit.plugin.schedule import TimeDependent
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation
 from pbdkit.stability.analysis import Analysis
 from pbdkit.stability.forecast import forecast
-from pbdkit.stepping.engine_choice import choose, what_kernels_lack
+from pbdkit.stepping.engine_choice import choose, kernel_obstacle
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.program import last_event
 from pbdkit.stepping.state import initial_state
@@ -127,7 +127,7 @@ knots = st.lists(
 @given(knots)
 def test_schedule_is_linear_between_steps_and_constant_beyond(known):
     steps, values = zip(*known, strict=True)
-    course = Course[float](steps=steps, values=values)
+    course = TimeDependent[float](steps=steps, values=values)
     assert [course.at(step) for step in steps] == list(values)
     assert course.at(0) == values[0] or steps[0] == 0
     assert course.at(1000) == course.last == values[-1]
@@ -139,13 +139,13 @@ def test_schedule_is_linear_between_steps_and_constant_beyond(known):
 @given(knots, st.integers(0, 70))
 def test_the_next_change_is_the_next_step_with_another_value(known, step):
     steps, values = zip(*known, strict=True)
-    course = Course[float](steps=steps, values=values)
+    course = TimeDependent[float](steps=steps, values=values)
     later = [n for n in range(step + 1, 100) if course.at(n) != course.at(step)]
     assert course.next_change(step) <= (later[0] if later else math.inf)
     if course.next_change(step) < math.inf and later:
         stays = [course.at(n) for n in range(step, int(course.next_change(step)))]
         assert set(stays) == {course.at(step)}
-    assert max(course.bends, default=0) >= max(
+    assert max(course.breakpoints, default=0) >= max(
         (n for n in range(1, 100) if course.at(n) != course.at(n - 1)), default=0
     )
 
@@ -468,7 +468,7 @@ def test_independent_frame_is_built_once(monkeypatch):
 
 def test_kernels_leave_scheduled_frames_to_numpy():
     scene = build_scene(leaning(engine="auto", **FOLLOWING["parameter"]))
-    assert "the weights of the frame are time-dependent" in what_kernels_lack(scene)
+    assert "the weights of the frame are time-dependent" in kernel_obstacle(scene)
 
 
 class Behind(StrainGradient):
@@ -483,7 +483,7 @@ class Behind(StrainGradient):
 def test_kernels_leave_inner_rules_with_scheduled_weights_to_numpy():
     rule = Behind(poisson_ratio=0.2, length=course([2, 15], [0.1, 0.4]))
     scene = build_scene(pbdkit.Experiment(**sheet(rule=rule)))
-    assert what_kernels_lack(scene) == "constants of kernels are time-dependent"
+    assert kernel_obstacle(scene) == "constants of kernels are time-dependent"
 
 
 def test_spectrum_during_the_run_uses_the_current_frame():
@@ -549,7 +549,7 @@ def test_sensitivities_use_the_values_of_the_last_step(frame):
         "steps": 4,
         "solver": {"type": "equilibrium", "tolerance": 1e-12},
     }
-    resting = Resting.of(pbdkit.Experiment(**sheet_))
+    resting = RestingScene.of(pbdkit.Experiment(**sheet_))
     led = np.zeros_like(resting.state.u)
     led.reshape(2, -1)[0, resting.scene.leading[1].place] = 1.0
     expected = resting.change(Parameter("leaders.1.motion.displacement.0"))

@@ -311,7 +311,7 @@ def test_check_prints_forces_as_in_the_file(call: Any) -> None:
         assert told in call("check", "modelling/composite-plate", "--set", f"loads.0={load}").out
 
 
-def test_lag_behind_leaders_is_printed_in_mm(call: Any) -> None:
+def test_distance_from_equilibrium_is_printed_in_mm(call: Any) -> None:
     given = ["paper/a", "--set", "units={length: 2 mm}"]
     told = call("check", *given, "--verbose").out
     assert "moves by 0.7 mm per step, which brings the body 4.09 mm from equilibrium" in told
@@ -393,7 +393,7 @@ def test_fields_and_schedules_take_units_like_numbers() -> None:
     (varying,) = dogbone(steel, field).fracture.varying.values()
     assert varying.samples == {"otherwise": pytest.approx(0.02), "neck": 0.01}
     course = "fracture={type: strain, failure: {steps: [0, 9], values: [66 MPa, 33 MPa]}}"
-    assert dogbone(course).courses["fracture", "failure"].at(9) == pytest.approx(0.01)
+    assert dogbone(course).time_dependent["fracture", "failure"].at(9) == pytest.approx(0.01)
     chance = (
         "fracture={type: strain, failure: {mean: 66 MPa, scatter: 0.1, correlation_length: 4 mm}}"
     )

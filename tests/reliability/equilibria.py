@@ -139,14 +139,14 @@ def bounds(rng: np.random.Generator, _: int, found: Counts) -> None:
     if exact is None or near is None:
         found["unconverged"] += 1
         return
-    certificate = json.loads(near.attrs["certificate"])
+    error_bound = json.loads(near.attrs["certificate"])
     error = np.hypot(*(near.u.values[-1] - exact.u.values[-1]).T).max()
-    ratio = certificate["distance"] / error if error > 1e-11 else 1.0
+    ratio = error_bound["distance"] / error if error > 1e-11 else 1.0
     bins = (1.0, 3.0, 10.0, 30.0, np.inf)
     name = next(f"up to {b:g} times" for b in bins[1:] if ratio <= b)
-    found[f"{certificate['bound']}: {name}" if ratio >= 1.0 else "differs"] += 1
+    found[f"{error_bound['bound']}: {name}" if ratio >= 1.0 else "differs"] += 1
     if ratio < 1.0:
-        print("below the true error:", of, columns, rows, motion, certificate, error, flush=True)
+        print("below the true error:", of, columns, rows, motion, error_bound, error, flush=True)
 
 
 TRIALS: dict[str, Callable[[np.random.Generator, int, Counts], None]] = {

@@ -205,7 +205,7 @@ def trial(experiment: dict[str, Any], known: dict[str, Any]) -> str:
         if supports == "clamped":
             return f"{supports}: too soft" if not drifts else f"differs: refused, {error}"
         return f"{supports}: pushed on for ever" if drifts else f"{supports}: refused"
-    certificate = json.loads(ds.attrs["certificate"])
+    error_bound = json.loads(ds.attrs["certificate"])
     u, X = ds.u.values[-1], ds.reference.values
     if supports == "free" and experiment["loads"]:
         loads = [np.array(load["force"]) for load in experiment["loads"]]
@@ -214,10 +214,10 @@ def trial(experiment: dict[str, Any], known: dict[str, Any]) -> str:
     off = error_of(experiment, known, X, u)
     if off is None:
         return f"{supports}: no reference"
-    ratio = off / certificate["distance"] if off else 0.0
+    ratio = off / error_bound["distance"] if off else 0.0
     ok = ratio <= 1.0 or off <= 1e-10 * np.abs(u).max()
-    return f"{supports}, {certificate['method']}: within" if ok else (
-        f"differs: {certificate['method']}, {certificate['bound']}, {ratio:.3g} times beyond"
+    return f"{supports}, {error_bound['method']}: within" if ok else (
+        f"differs: {error_bound['method']}, {error_bound['bound']}, {ratio:.3g} times beyond"
     )  # fmt: skip
 
 

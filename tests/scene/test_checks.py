@@ -15,7 +15,7 @@ import pbdkit
 from pbdkit.model.shipped import shipped_names
 from pbdkit.scene.checks import round_in_radians
 from pbdkit.scene.scene import build_scene
-from pbdkit.stability.forecast import outlook, refuse_unheld_loads
+from pbdkit.stability.forecast import further_warnings, refuse_unheld_loads
 
 HOLD = {"type": "hold"}
 
@@ -302,6 +302,6 @@ def test_large_bodies_run_without_spectrum(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scene = build_scene(pbdkit.load("paper/a"))
-    assert outlook(scene)
+    assert further_warnings(scene)
     monkeypatch.setattr("pbdkit.stability.forecast.QUICK_PARTICLES", 100)
-    assert outlook(scene) == []
+    assert further_warnings(scene) == []

@@ -268,7 +268,7 @@ def test_bonds_that_keep_changing_are_no_equilibrium(monkeypatch, interpreted):
         def update(d, r, c, p):
             return c.damage, c.visits + 1
 
-    monkeypatch.setattr("pbdkit.equilibrium.load_stepping.MOST_SETTLINGS", 5)
+    monkeypatch.setattr("pbdkit.equilibrium.load_stepping.MAX_BOND_CHANGES", 5)
     given = SHEET | {"fracture": Restless(), "solver": {"type": "equilibrium"}}
     with pytest.raises(pbdkit.DivergedError, match="bonds still change after 5 equilibria"):
         pbdkit.run(given, progress=False)

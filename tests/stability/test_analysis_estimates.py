@@ -8,7 +8,7 @@ from property_cases import HOLD_LEFT, experiment, pull_right, scene_of
 
 import pbdkit
 from pbdkit.stability.analysis import Analysis, StabilityEstimate
-from pbdkit.stability.lag import lag_of
+from pbdkit.stability.distance import distance_from_equilibrium
 
 pytest.importorskip("numba")
 
@@ -47,8 +47,8 @@ def test_estimates_are_close_to_exact_values(parts):
     assert 1 - found.largest == pytest.approx(1 - own.largest, rel=0.01)
     assert 1 - found.smallest == pytest.approx(1 - own.smallest, rel=0.02)
     slowness = 1 / (scene.experiment.stepping.relaxation * (1 - found.largest))
-    lag = lag_of(scene, estimate.at_rest, estimate.system, slowness)
-    assert lag.steady == pytest.approx(exact.trailing.steady, rel=0.02)
+    distance = distance_from_equilibrium(scene, estimate.at_rest, estimate.system, slowness)
+    assert distance.steady == pytest.approx(exact.leader_distance.steady, rel=0.02)
 
 
 def test_coarse_grids_suffice_for_large_bodies(monkeypatch):
@@ -68,7 +68,7 @@ def test_sign_changing_waves_decay_before_the_slowest_mode():
 
 def estimated(monkeypatch, **parts):
     """The analysis of a body that counts as large."""
-    monkeypatch.setattr("pbdkit.stability.analysis.LARGEST_ANEW", 0)
+    monkeypatch.setattr("pbdkit.stability.analysis.LARGEST_REPEATED", 0)
     return Analysis(body(**{"columns": 16, "rows": 12} | parts))
 
 
@@ -100,15 +100,15 @@ def test_limits_of_an_estimate_are_reported(parts, said, monkeypatch):
     assert found
 
 
-def test_lag_of_an_unsupported_body_is_omitted_with_a_message(monkeypatch):
+def test_distance_of_an_unsupported_body_is_omitted_with_a_message(monkeypatch):
     """At first one particle moves, around which an elastic body turns freely."""
     pull = {"type": "velocity", "velocity": [0.01, 0.0], "steps": 9}
     first = {"select": {"numbers": [30]}, "motion": pull, "until": 9}
-    monkeypatch.setattr("pbdkit.stability.analysis.LARGEST_ANEW", 0)
+    monkeypatch.setattr("pbdkit.stability.analysis.LARGEST_REPEATED", 0)
     parts = BODIES["elastic"] | {"leaders": [first, HOLD_LEFT | {"from": 10}], "steps": 40}
     analysis = Analysis(scene_of(16, 12, **parts))
     assert analysis.spectrum
-    assert analysis.trailing is None
+    assert analysis.leader_distance is None
     assert any(
         "the distance from equilibrium is omitted, because the leaders do not " in w
         for w in analysis.warnings()

@@ -94,7 +94,7 @@ class Pair:
         now[:, self.followers], before[:, self.followers] = noise
         if scene.frame:
             scene.frame.follow(before, before)
-            scene.frame.follow(before if scene.frame.map.lag else now, now)
+            scene.frame.follow(before if scene.frame.map.delay else now, now)
         self.restart(np.array([start.u, start.previous]))
 
     def restart(self, apart):

@@ -15,7 +15,13 @@ import pbdkit
 from pbdkit.linear.spectrum import has_symmetric_rows
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stability.analysis import Analysis
-from pbdkit.stability.relaxation import MARGIN, HopelessError, StepWeights, best_weights, tuned
+from pbdkit.stability.relaxation import (
+    MARGIN,
+    NoStableWeightsError,
+    StepWeights,
+    best_weights,
+    tuned,
+)
 
 AUTO = {"type": "stepping", "engine": "numpy", "relaxation": "auto", "memory": "auto"}
 OTHERS = {"none": {"type": "none"}, "mean": FRAMES["mean"], "first": FRAMES["first"],
@@ -88,7 +94,7 @@ def test_given_number_is_kept():
     assert best_weights(modes, memory=0.0).relaxation == pytest.approx(2 / 1.91)
     assert best_weights(modes, relaxation=1.0).memory == pytest.approx(0.81)
     for given in ({"relaxation": 2.5}, {"memory": 1.0}):
-        with pytest.raises(HopelessError):
+        with pytest.raises(NoStableWeightsError):
             best_weights(modes, **given)
 
 
@@ -118,7 +124,7 @@ def test_result_contains_the_weights_and_reruns_with_them():
 @pytest.mark.parametrize(
     ("parts", "text"),
     [
-        ({"frame": {"type": "mean", "lag": 1}}, "a frame with lag depends on earlier ones; set "
+        ({"frame": {"type": "mean", "lag": 1}}, "a frame with delay depends on earlier ones; set "
          "frame.lag: 0, or give numbers"),
         ({"neighbours": {"type": "euclidean", "radius": 1.1, "reevaluate": True}},
          "which does not exist if neighbours are re-evaluated; set "

@@ -29,7 +29,7 @@ TRIANGLES = {
 ELASTIC, SPRINGS = {"type": "elastic", "poisson_ratio": 0.3}, {"type": "springs"}
 THIRD = {"type": "elastic", "poisson_ratio": 1.0 / 3.0}
 EQUILIBRIUM = {"type": "equilibrium"}
-WAYS = ["equilibrium", "stepping"]
+BOUND_KINDS = ["equilibrium", "stepping"]
 FORCES = [{"type": name, "youngs_modulus": 1.0} for name in ("contact", "reaction")]
 
 
@@ -121,7 +121,9 @@ def mirrored(given: Any) -> Any:
 
 
 @pytest.mark.parametrize("rule", [SPRINGS, ELASTIC], ids=["springs", "elastic"])
-@pytest.mark.parametrize("solver", [{"solver": EQUILIBRIUM}, stepping(0.9, 0.0, 60)], ids=WAYS)
+@pytest.mark.parametrize(
+    "solver", [{"solver": EQUILIBRIUM}, stepping(0.9, 0.0, 60)], ids=BOUND_KINDS
+)
 def test_mirrored_scenes_agree(rule: Any, solver: Any) -> None:
     given = {
         "rule": rule,
@@ -311,7 +313,7 @@ def test_projection_is_linearised_exactly(shape: str) -> None:
     def there(axis: int, by: float) -> Any:
         put = u.copy()
         put[axis] += by
-        return contact.positions(put, place) + contact.ways(put, place, 1)
+        return contact.positions(put, place) + contact.corrections(put, place, 1)
 
     size = 1e-5
     columns = [(there(axis, size) - there(axis, -size)) / (2.0 * size) for axis in range(2)]
@@ -336,7 +338,7 @@ def test_a_body_that_loses_contact_is_not_pulled_back() -> None:
 
 def test_body_pressed_by_obstacles_may_buckle(monkeypatch: pytest.MonkeyPatch) -> None:
     """A strip before a plate has a straight equilibrium, which is not stable."""
-    monkeypatch.setattr(increments, "MOST_ROUNDS", 2)
+    monkeypatch.setattr(increments, "MAX_ROUNDS", 2)
     ends = [{"select": {"edge": "left"}, "motion": {"type": "hold"}}]
     given = {
         "body": {"type": "grid", "columns": 17, "rows": 3}, "rule": SPRINGS, "leaders": ends,

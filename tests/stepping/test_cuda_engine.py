@@ -17,7 +17,7 @@ import pbdkit
 from pbdkit.components import pbdkit_components
 from pbdkit.plugin import FollowerRule, FractureModel, FramePolicy
 from pbdkit.stepping import cuda_engine as program, engine_choice as choice, engine_choice as limits
-from pbdkit.stepping.engine_choice import choose, make_engine, what_gpus_lack, what_is_missing
+from pbdkit.stepping.engine_choice import choose, gpu_obstacle, make_engine, missing_for_gpu
 from pbdkit.stepping.numba_engine.plan import functions_of
 from tests.scene.test_leader_groups_directions import CASES, vanes
 from tests.stepping.numba_engine.test_engine import ANEW, sheet
@@ -145,9 +145,9 @@ REFUSED = {
 
 @pytest.mark.parametrize("why", REFUSED)
 def test_unsupported_features_are_refused_with_a_reason(why, monkeypatch):
-    monkeypatch.setattr(choice, "what_is_missing", str)
+    monkeypatch.setattr(choice, "missing_for_gpu", str)
     scene = gpu_cases.scene_of(REFUSED[why] | ASKED)
-    assert what_gpus_lack(scene) == why
+    assert gpu_obstacle(scene) == why
     with pytest.raises(pbdkit.ExperimentError) as refused:
         choose(scene)
     remedy = f"solver.engine: the GPU engine is not available: {why}; use `engine: auto`"
@@ -162,12 +162,12 @@ def test_missing_requirement_is_reported(monkeypatch):
     with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[gpu\]'; use `eng"):
         make_engine(scene, choose(scene))
     monkeypatch.setattr(limits, "find_spec", find_spec)
-    if find_spec("numba_cuda") and what_is_missing():
-        assert re.search("no GPU|compiler is missing", what_is_missing())
+    if find_spec("numba_cuda") and missing_for_gpu():
+        assert re.search("no GPU|compiler is missing", missing_for_gpu())
 
 
 def test_auto_never_selects_it(monkeypatch):
-    monkeypatch.setattr(choice, "what_is_missing", str)
+    monkeypatch.setattr(choice, "missing_for_gpu", str)
     body = {"type": "grid", "columns": 400, "rows": 400}
     assert choose(gpu_cases.scene_of(sheet(body=body, steps=5000))).engine == "compiled"
     assert choose(gpu_cases.scene_of(sheet(**ASKED))).engine == "gpu"

@@ -113,7 +113,7 @@ def test_last_good_state_of_a_diverging_run_is_kept(
 ):
     """From the start again where the guard has copied no state yet."""
     begun = []
-    monkeypatch.setattr(guard, "KEPT_EVERY", kept_every)
+    monkeypatch.setattr(guard, "COPY_INTERVAL", kept_every)
     monkeypatch.setattr(guard, "initial_state", lambda s: begun.append(s) or initial_state(s))
     crack = [[2.5, -1.0], [2.5, 1.5]]
     parts = {

@@ -17,7 +17,7 @@ import pbdkit
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation, record
-from pbdkit.stepping.engine_choice import what_gpus_lack
+from pbdkit.stepping.engine_choice import gpu_obstacle
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numba_engine.time_skewing import single_steps
 from pbdkit.stepping.numpy_engine import Stepper
@@ -83,7 +83,7 @@ def test_several_steps_per_pass_are_possible(parts):
 def test_operation_compiles():
     scene = scene_of(**CASES["drag"])
     assert_bitwise_equal(scene, CompiledStepper(scene))
-    assert what_gpus_lack(scene) == ""
+    assert gpu_obstacle(scene) == ""
 
 
 def test_operation_is_distributed_over_ranks(tmp_path):

@@ -41,15 +41,15 @@ def small(tensile):
 def run_only(monkeypatch):
     """The keys of the members that are run, in this process or by workers."""
     seen = []
-    for crew in (SerialExecutor, ProcessExecutor):
-        original = crew.work
+    for executor in (SerialExecutor, ProcessExecutor):
+        original = executor.work
 
         def work(self, jobs, stopping, original=original):
             for report in original(self, jobs, stopping):
                 seen.extend([report.key] if report else [])
                 yield report
 
-        monkeypatch.setattr(crew, "work", work)
+        monkeypatch.setattr(executor, "work", work)
     return seen
 
 

@@ -180,14 +180,14 @@ def test_click_on_a_bond_shows_its_events(page, torn):
     click_at(page, dataset, known.bonds.midpoint[first])
     assert page.locator("aside h3").inner_text() == f"Bond {a}-{b}"
     story = page.locator("aside ul").inner_text()
-    (standing,) = known.statuses(known.order[:1])
+    (status,) = known.statuses(known.order[:1])
     assert (
-        f"It broke in step {standing.step} at strain {standing.strain_at_break:.6g}, "
+        f"It broke in step {status.step} at strain {status.strain_at_break:.6g}, "
         f"bond 1 of {len(known.order)} in the order of breaking." in story
     )
-    assert f"it breaks above the strain {standing.breaks_above:.6g}" in story
+    assert f"it breaks above the strain {status.breaks_above:.6g}" in story
     around = known.statuses(known.around(first))
-    together = [s for s in around if s.step == standing.step]
+    together = [s for s in around if s.step == status.step]
     assert all("-".join(map(str, s.bond)) in story for s in together)
     step, strain = known.most_strained(first)
     assert f"in the steps shown: {strain:.6g}, in step {step}." in story
@@ -253,7 +253,7 @@ def test_pages_are_small(sheet, torn):
 
 def test_large_body_is_thinned_with_a_note(page, tmp_path, monkeypatch):
     monkeypatch.setattr(report, "FIRST", 200_000)
-    monkeypatch.setattr(report, "MOST_BYTES", 200_000)
+    monkeypatch.setattr(report, "MAX_PAGE_BYTES", 200_000)
     settings = ["body.columns=60", "body.rows=60", "steps=80"]
     dataset = pbdkit.run(pbdkit.load("paper/a", settings=settings), progress=False)
     opened(page, written(dataset, tmp_path))

@@ -30,7 +30,7 @@ from pbdkit.web import script as saving, session as history, session as stage
 from pbdkit.web.command_line import live
 from pbdkit.web.requests import FARTHEST, LONGEST, command_of, execute
 from pbdkit.web.server import Access, Conductor, SessionServer, SocketViewer
-from pbdkit.web.session import Session, judged, scenery, standing
+from pbdkit.web.session import Session, judged, static_message, status_message
 from pbdkit.web.widget import LiveWidget
 
 CHANGED = {
@@ -109,7 +109,7 @@ def something(session, dice):
 def test_saved_session_is_reproduced_bit_for_bit(name, tmp_path):
     session, said = session_of(name, tmp_path, CHANGED.get(name, ()))
     at_random(session, name, 40 if session.camera.rows.size < 300 else 8)
-    assert session.script.groups[-1].hand
+    assert session.script.groups[-1].manual
     do(session, do="save")
     assert said[-1]["is"] == "saved"
     assert_same(session.state, run_of(tmp_path / "made.yaml"))
@@ -390,7 +390,7 @@ def test_cuts_are_refused_for_rules_without_cuts(tmp_path):
 
 def test_number_of_stored_states_is_bounded(tmp_path, monkeypatch):
     session, _ = session_of("paper/a", tmp_path)
-    monkeypatch.setattr(history, "MOST", 16)
+    monkeypatch.setattr(history, "MAX_STATES", 16)
     kept = history.History(session.state)
     for step in range(1, 1000):
         session.state.step = step
@@ -616,12 +616,12 @@ class Gone:
 def test_messages_to_closed_pages_are_ignored():
     async def told():
         page = SocketViewer(asyncio.get_running_loop())
-        page.tell({"is": "note"})
+        page.post({"is": "note"})
         await page.send(Gone())
         return page
 
     page = asyncio.run(told())
-    page.tell({"is": "note"})  # the loop is closed by now
+    page.post({"is": "note"})  # the loop is closed by now
     assert page._waiting.empty()
 
 
@@ -739,7 +739,7 @@ CELL = """async ([esm, messages, picture]) => {
 def test_notebook_module_shows_a_body_and_is_removed(page, tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     session.advance(7)
-    messages = json.loads(json.dumps([scenery(session), standing(session)]))
+    messages = json.loads(json.dumps([static_message(session), status_message(session)]))
     picture = list(session.frame().encoded(None))
     found = page.evaluate(CELL, [LiveWidget._esm, messages, picture])
     assert found == [["join", "seen"], "step 7", 0]

@@ -165,21 +165,21 @@ def _stacked(rows: Sequence[dict[str, Any]], real: np.dtype[Any]) -> Arrays:
 
 def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
     """Return the data of a slot by name: its rest offset and weights, the sign by which d is
-    multiplied at the home of a bond, which is the end at which the bond is stored, and index
+    multiplied at the owner of a bond, which is the end at which the bond is stored, and index
     offsets in flat arrays. There is an offset from a particle to its neighbour (`away`), to the
     entry of their bond (`bonds_away`), and to the area fractions of the cells beside the slot
     (`cells_away`)."""
     scene, shape = plan.scene, plan.scene.raster.shape
-    away, (plane, is_home) = slot_step(shape, slot), scene.neighbourhood.home[slot]
-    home = plane - (slot.source if is_home else slot.target)
+    away, (plane, is_owner) = slot_step(shape, slot), scene.neighbourhood.owner[slot]
+    owner = plane - (slot.source if is_owner else slot.target)
     sides = scene.cells.tiling.beside[slot] if scene.cells else ()
     extra = scene.cells.weights if scene.cells else ()
     cells = [(side.kind, slot_step(shape, side.first) if side.first else 0) for side in sides]
     return {
         "rests": slot.rest,
-        "signs": 1.0 if is_home else -1.0,
+        "signs": 1.0 if is_owner else -1.0,
         "away": away,
-        "bonds_away": home * math.prod(shape[1:]) + (0 if is_home else away),
+        "bonds_away": owner * math.prod(shape[1:]) + (0 if is_owner else away),
         "cells_away": [kind * math.prod(shape) + step for kind, step in cells],
         **{f"more{m}": by_slot[slot] for m, by_slot in enumerate(extra)},
         **{
@@ -226,9 +226,9 @@ def renew_lost_bits(lost: Bits, scene: Scene, state: State, rows: slice) -> None
         block = Block(s, (first, *margins), (max(first, last), *stop))
         bits = np.zeros_like(block.of(lost))
         for bit, slot in enumerate(slots):
-            plane, at_this_end = around.home[slot]
-            home = block if at_this_end else block.seen_through(slot)
-            broken = home.within(state.broken_step[plane]) >= 0
+            plane, at_this_end = around.owner[slot]
+            owner = block if at_this_end else block.seen_through(slot)
+            broken = owner.within(state.broken_step[plane]) >= 0
             bits |= broken.astype(lost.dtype) << lost.dtype.type(bit)
         block.of(lost)[...] = bits
 

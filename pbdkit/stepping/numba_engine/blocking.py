@@ -87,14 +87,14 @@ class TileWriter(PlanWriter):
         self.out.add(0, "if r0 < r1 and box[2] < box[3]:")
         self.out.add(1, self.rows(name, write).call("r0", "r1", "moment + s"))
 
-    def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
+    def follow(self, mapped: Callable[[str], Lines], planes: str, delay: int = 0) -> None:
         """Write a loop over the frame points for which the last of the particles that they follow
         lies in the range. Points that follow particles on both sides of the end of a piece are
         computed with the gap between the pieces."""
         lines = self.each(f"{planes}_@[points[f]] = t_@")
-        if lag:  # The point gets the displacement that was computed for it in the previous step.
-            lines = self.each(f"{planes}_@[points[f]] = lag_@[f]")
-        lines = [*lines, *lag_lines(self, mapped, planes)] if lag else [*mapped(planes), *lines]
+        if delay:  # The point gets the displacement that was computed for it in the previous step.
+            lines = self.each(f"{planes}_@[points[f]] = delayed_@[f]")
+        lines = [*lines, *delay_lines(self, mapped, planes)] if delay else [*mapped(planes), *lines]
         self.out.add(0, f"i1 = min(high, top + {self._skew[0].apart} * (up > 0))")
         inside = "(down <= 0 or frame_begun[f] >= bottom) and (up <= 0 or frame_begun[f] < top)"
         self._loop("frame", "f", lines, f" and {inside}")
@@ -126,10 +126,10 @@ class TileWriter(PlanWriter):
         self._is_ahead = True
 
 
-def lag_lines(kernel: KernelWriter, mapped: Callable[[str], Lines], planes: str) -> Lines:
+def delay_lines(kernel: KernelWriter, mapped: Callable[[str], Lines], planes: str) -> Lines:
     """Return lines that compute the displacement of frame point f and store it for the next
     step."""
-    return [*mapped(planes), *kernel.each("lag_@[f] = t_@")]
+    return [*mapped(planes), *kernel.each("delayed_@[f] = t_@")]
 
 
 def write_piece(plan: Plan, program: Program, passes: Passes) -> list[Function]:
@@ -159,7 +159,7 @@ def write_piece(plan: Plan, program: Program, passes: Passes) -> list[Function]:
 def _exchanged(plan: Plan, call: str) -> str:
     """Return a call in which the arrays before and after a step are swapped."""
     pairs = [*zip(plan.each("u_@"), plan.each("v_@"), strict=True)]
-    pairs += [(f"own{m}", f"was{m}") for m in plan.kept if plan.shares]
+    pairs += [(f"own{m}", f"was{m}") for m in plan.copied_values if plan.shares]
     other = dict(pairs) | {v_name: u_name for u_name, v_name in pairs}
     return re.sub(rf"\b({'|'.join(other)})\b", lambda found: other[found[0]], call)
 
@@ -180,13 +180,13 @@ def write_deep_passes(writer: PlanWriter, program: Program, piece: Function) -> 
     out.add(1, "if deep > 1 and area > sizes[3]:")
     out.depth += 2
     _write_extent(out, plan)
-    out.add(0, *(f"was{m}[:] = own{m}" for m in plan.kept))
-    if plan.scene.frame and plan.scene.frame.map.lag:
+    out.add(0, *(f"was{m}[:] = own{m}" for m in plan.copied_values))
+    if plan.scene.frame and plan.scene.frame.map.delay:
         out.add(0, *plan.each("flat_u_@ = u_@.reshape(-1)"), "for f in range(points.size):")
-        out.add(1, *lag_lines(writer, FollowFrame(plan.scene).mapped(writer), "flat_u"))
+        out.add(1, *delay_lines(writer, FollowFrame(plan.scene).mapped(writer), "flat_u"))
     _write_pieces(out, plan, piece)
     if plan.shares:
-        out.add(0, "if deep % 2 == 0:", *(f"    own{m}[:] = was{m}" for m in plan.kept))
+        out.add(0, "if deep % 2 == 0:", *(f"    own{m}[:] = was{m}" for m in plan.copied_values))
     u, v = (", ".join(plan.each(f"{side}_@")) for side in "uv")
     out.add(0, "if deep % 2:", f"    {u}, {v} = {v}, {u}", "moment += deep", "step += deep")
     # In the displacements before the last step, the leaders are placed as in the last step. They

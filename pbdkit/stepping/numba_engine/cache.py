@@ -204,9 +204,9 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
     parts = [source, source_key(*functions.values(), length), vars(numba)["typeof"](arguments)]
     parts += [numba.__version__, np.__version__, sys.version, processor, interpreted]
     key = hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:32]
-    if (index := (_asked_folder(), key)) not in _loaded:
+    if (index := (_cache_folder(), key)) not in _loaded:
         names = {name: compiled(function) for name, function in functions.items()}
-        kernel = None if interpreted else _kept(source, key, names, arguments)
+        kernel = None if interpreted else _cached_kernel(source, key, names, arguments)
         _loaded[index] = kernel or _prepared(source, names, arguments)
     return _loaded[index]
 
@@ -215,7 +215,7 @@ def cache_folder() -> Path | None:
     """Return PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; None if it is not writable.
     Also None if other users can write to it, because code that they place there would be
     executed."""
-    folder = _asked_folder()
+    folder = _cache_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
@@ -227,12 +227,12 @@ def cache_folder() -> Path | None:
         return None
 
 
-def _asked_folder() -> Path:
+def _cache_folder() -> Path:
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(os.environ.get("PBDKIT_CACHE_DIR") or Path(home) / "pbdkit")
 
 
-def _kept(source: str, key: str, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
+def _cached_kernel(source: str, key: str, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
     """Return the kernel from the cache, or compile and store it; None if neither is possible."""
     if (cache := cache_folder()) is None:
         return None
@@ -312,7 +312,7 @@ def _prepared(
     scope = vars(module)
     scope |= words(compiled) | names
     scope.update(njit=numba.njit, part=numba.njit(error_model="numpy"), prange=numba.prange)
-    scope["KEPT"] = bool(folder)
+    scope["CACHED"] = bool(folder)
     if folder:
         module.__file__ = file
         sys.modules[module.__name__] = module  # numba looks up its stored files by this name.

@@ -49,7 +49,7 @@ def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, lis
 def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tuple[str, list[str]]:
     """Return the source of a module with these functions and the entry `run`, and the names of the
     arrays that it reads."""
-    jit = f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=KEPT)'
+    jit = f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=CACHED)'
     head = [jit, f"def run({', '.join(run.own)}):", f"    {', '.join(run.used)}, = arrays"]
     return module_text(plan, functions, head, run), run.used
 
@@ -112,7 +112,7 @@ class LatticeWriter(PlanWriter):
         for name in planes:
             out.add(1, *plan.each(f"flat_{name} = {name}.reshape(-1)"))
         out.add(1, *plan.opening("moment"))
-        out.add(1, *(f"was{m}[:] = own{m}" for m in plan.kept))
+        out.add(1, *(f"was{m}[:] = own{m}" for m in plan.copied_values))
         for name in (f"{name}{m}" for m in plan.prescribed_numbers for name in ("own", "was")):
             out.add(1, f"flat_{name} = {name}.reshape(-1)")
         out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
@@ -134,16 +134,16 @@ class LatticeWriter(PlanWriter):
     def sweep(self, level: int) -> None:
         """Write a call for all rows. If there is a pass over bonds, pass and sweep alternate band
         by band, so that the data of a band stay in the cache."""
-        sweep, judging, self._judging = self.passes.sweeps[level], self._judging, None
-        if judging is None:
+        sweep, bond_update, self._judging = self.passes.sweeps[level], self._judging, None
+        if bond_update is None:
             write_pass(self.out, self.plan, 1, sweep, "i0", "i1")
             return
         out, plan = self.out, self.plan
-        back, ahead = (along[0] for along in plan.scene.home_reach)
+        back, ahead = (along[0] for along in plan.scene.owner_reach)
         out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
         out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
         out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
-        write_pass(out, plan, 2, judging, "judged", "ready", "0", "kind.shape[-1]")
+        write_pass(out, plan, 2, bond_update, "judged", "ready", "0", "kind.shape[-1]")
         out.add(2, "judged = ready")
         write_pass(out, plan, 2, sweep, "low", "high")
 
@@ -151,9 +151,9 @@ class LatticeWriter(PlanWriter):
         """Write a call for all rows."""
         write_pass(self.out, self.plan, 1, self.rows(name, write), "i0", "i1", "moment")
 
-    def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
+    def follow(self, mapped: Callable[[str], Lines], planes: str, delay: int = 0) -> None:
         """Write a loop over all frame points."""
-        source = "flat_u" if lag else planes
+        source = "flat_u" if delay else planes
         self.out.add(1, "for f in range(points.size):")
         self.out.add(2, *mapped(source), *self.plan.each(f"{planes}_@[points[f]] = t_@"))
 

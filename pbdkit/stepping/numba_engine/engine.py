@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats
 from pbdkit.plugin import RenewsBonds, RenewsParticles, StartsCracked
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
@@ -50,11 +50,11 @@ from pbdkit.stepping.numba_engine.plan import (
     Plan,
     goes_deep,
     levels_of,
-    load_blamed,
+    load_plugin_kernel,
     pass_arrays,
 )
 from pbdkit.stepping.numpy_engine import Engine, Stepper
-from pbdkit.stepping.program import Program, foresee, prepare, program_of
+from pbdkit.stepping.program import Program, precompute_steps, prepare, program_of
 from pbdkit.stepping.rule_evaluation import Evaluator, presence
 from pbdkit.stepping.state import State, unmoved_state
 from pbdkit.stepping.step import Call, Cells
@@ -77,7 +77,7 @@ class PairFollowers(Followers):
         arrays = self._named(start.u, start.previous, start, **pairs)
         source, self._names = _write_kernel(replace(self._plan, shared=tuple(arrays)))
         arguments = tuple(arrays[name] for name in self._names), 0, 0, self._chunks
-        self._run = load_blamed(self._plan.levels, source, arguments)
+        self._run = load_plugin_kernel(self._plan.levels, source, arguments)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Move the particles. Neighbours are summed in the same order as by the numpy engine."""
@@ -92,7 +92,7 @@ class PairFollowers(Followers):
         """Return the arrays of the kernel by name. `first_pair` has an entry for each particle of
         the body, `partner` and `rests` for each pair of neighbours, and `place` and `local` for
         each row of the table of particles."""
-        was = {f"was{n}": state.particle_values[n].copy() for n in self._plan.kept}
+        was = {f"was{n}": state.particle_values[n].copy() for n in self._plan.copied_values}
         return self._arrays | state_arrays(self._plan, m, new, state) | was | pairs
 
 
@@ -145,7 +145,7 @@ class MotionExtent:
             scene.has_fracture and isinstance(experiment.fracture, RenewsBonds)
         )
         # A body that is at rest with the current parameters may move when they change.
-        self._renews |= any(field != "solver" for field, _ in experiment.courses)
+        self._renews |= any(field != "solver" for field, _ in experiment.time_dependent)
         self._rests = not self._renews and _rests_by_construction(levels)
         self._bond = len(levels) * _growth(program)
         fixed = np.concatenate([operation.fixed_places() for operation in program])
@@ -226,12 +226,12 @@ def _stays(scene: Scene) -> bool:
     breaks."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     still, slots = vector(np.zeros(scene.axes)), scene.neighbourhood.slots
-    with blaming(experiment.rule, "to move at rest"):
+    with errors_attributed_to(experiment.rule, "to move at rest"):
         if any(component != 0.0 for each in slots for component in evaluator.at_rest(each)):
             return False
     if not scene.has_fracture:
         return True
-    with blaming(experiment.fracture, "to test bonds at rest"):
+    with errors_attributed_to(experiment.fracture, "to test bonds at rest"):
         limits = scene.constants.limits
         return not any(evaluator.breaks(still, k.rest, limits[k], ()) for k in chain(*slots))
 
@@ -287,7 +287,7 @@ class CompiledStepper(Engine):
         self._arrays |= dict(zip(inner, self._moves, strict=True))
         remembered = start.particle_values
         self._arrays |= {
-            f"was{m}": np.zeros(scene.raster.shape, remembered[m].dtype) for m in plan.kept
+            f"was{m}": np.zeros(scene.raster.shape, remembered[m].dtype) for m in plan.copied_values
         }
         if plan.judged:
             self._arrays["lost"] = np.zeros(start.u.shape[1:], bits_for(scene))
@@ -297,7 +297,7 @@ class CompiledStepper(Engine):
         plan = replace(plan, shared=shared)
         source, self._names = write_kernel(plan, self._program, groups)
         # A call without steps compiles the kernel, so that errors of the compiler occur here.
-        self._run = load_blamed(levels, source, self._arguments(Call(start), 0))
+        self._run = load_plugin_kernel(levels, source, self._arguments(Call(start), 0))
 
     def advance(self, state: State, steps: int = 1) -> State:
         """Return the state after `steps` steps, in as few calls as the operations permit."""
@@ -333,9 +333,9 @@ class CompiledStepper(Engine):
         call = prepare(self._program, state)
         if call.has_cuts:
             self._begin(state)
-        count = foresee(self._program, call, end)
+        count = precompute_steps(self._program, call, end)
         count = self._extent.take_in_call(call, count)
-        with blaming(self._scene.experiment.rule, f"at step {call.step}"):
+        with errors_attributed_to(self._scene.experiment.rule, f"at step {call.step}"):
             self._run(*self._arguments(call, count))
         u, new = state.u, state.previous
         final, previous = (new, u) if count % 2 else (u, new)

@@ -29,12 +29,12 @@ from pbdkit.plugin import (
     TearsCells,
     Vector,
 )
-from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import (
-    Home,
     Number,
+    Owner,
     VisibleNumbers,
     bond_numbers,
     numbers_of,
@@ -149,7 +149,7 @@ class Plan:
     @property
     def bonds(self) -> int:
         """Number of state variables of each bond."""
-        return sum(number.home is Home.BOND for number in self.levels[-1].seen.bond)
+        return sum(number.owner is Owner.BOND for number in self.levels[-1].seen.bond)
 
     @cached_property
     def prescribed_numbers(self) -> tuple[int, ...]:
@@ -157,7 +157,7 @@ class Plan:
         return tuple(chain(*(operation.prescribed_numbers() for operation in self.program)))
 
     @cached_property
-    def kept(self) -> tuple[int, ...]:
+    def copied_values(self) -> tuple[int, ...]:
         """State variables of particles of which a copy from before the step is needed.
 
         If the rule reads state variables of neighbours, these are all variables that change;
@@ -177,7 +177,7 @@ class Plan:
     def read(self) -> tuple[str, ...]:
         """Names of the arrays from which state variables of particles are read. If rules read state
         variables of neighbours, these arrays contain the values from before the step."""
-        copies, count = self.kept if self.shares else (), len(self.levels[-1].seen.own)
+        copies, count = self.copied_values if self.shares else (), len(self.levels[-1].seen.own)
         return tuple(f"was{m}" if m in copies else f"own{m}" for m in range(count))
 
     @property
@@ -295,11 +295,11 @@ def listed(texts: Iterable[str]) -> str:
     return "".join(f"{text}, " for text in texts)
 
 
-def values(numbers: Sequence[Number], where: dict[Home, str]) -> str:
+def values(numbers: Sequence[Number], where: dict[Owner, str]) -> str:
     """Return the arguments of a named tuple as text. `where` contains, for each kind of place in
     which numbers are stored, the pattern of the expression for the n-th number stored there."""
-    counts = defaultdict[Home, Iterator[int]](count)
-    return listed(where[number.home].format(n=next(counts[number.home])) for number in numbers)
+    counts = defaultdict[Owner, Iterator[int]](count)
+    return listed(where[number.owner].format(n=next(counts[number.owner])) for number in numbers)
 
 
 @dataclass(frozen=True)
@@ -380,9 +380,9 @@ def pass_arrays(plan: Plan, pieces: int) -> dict[str, Any]:
         order = frame_order(following)
         arrays |= _listed(plan, "frame", *following.last_moved[:, order])
         arrays["frame_begun"] = following.first_moved[0, order]
-        if scene.lag:
+        if scene.frame_delay:
             real = scene.experiment.stepping.precision
-            arrays |= {name: np.zeros(len(order), real) for name in plan.each("lag_@")}
+            arrays |= {name: np.zeros(len(order), real) for name in plan.each("delayed_@")}
     return arrays
 
 
@@ -445,7 +445,7 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
     return functions
 
 
-def load_blamed(
+def load_plugin_kernel(
     levels: Sequence[Level],
     source: str,
     arguments: tuple[Any, ...],
@@ -453,18 +453,18 @@ def load_blamed(
 ) -> Any:
     """Return the kernel. `more` are functions in addition to those of the components. The message
     of a compiler error contains the name of the component that causes it."""
-    with blamed(levels):
+    with attributing_errors(levels):
         return load_kernel(source, functions_of(levels) | dict(more or {}), arguments)
 
 
 @contextmanager
-def blamed(levels: Sequence[Level]) -> Iterator[None]:
+def attributing_errors(levels: Sequence[Level]) -> Iterator[None]:
     """Add the name of the component to the messages of compiler errors that are raised in this
     context."""
     try:
         yield
     except Exception as error:
-        with blaming(_culprit(levels, error), "to compile"):
+        with errors_attributed_to(_culprit(levels, error), "to compile"):
             raise
 
 
@@ -493,13 +493,13 @@ def _parts(scene: Scene) -> tuple[int, ...]:
     slot = scene.neighbourhood.slots[0][0]
     with np.errstate(all="ignore"):
         if scene.has_fracture:
-            with blaming(experiment.fracture, "to compile"):
+            with errors_attributed_to(experiment.fracture, "to compile"):
                 limits = scene.constants.limits[slot]
                 bond = started(scene, bond_numbers(experiment), (1,))
                 cells = tried(experiment.fracture, ones)
                 evaluator.renew_bonds(ones_vector, slot.rest, limits, bond, np.ones(1, bool), cells)
                 evaluator.breaks(ones_vector, slot.rest, limits, bond)
-        with blaming(experiment.rule, "to compile"):
+        with errors_attributed_to(experiment.rule, "to compile"):
             total = evaluator.contribution(
                 ones_vector, ones_vector, evaluator.everywhere([slot])[0]
             )

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pbdkit.lattice.cells import CellBond
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, Block, slot_step
 from pbdkit.plugin import RenewsBonds, RenewsParticles, Slot, Softens, SoftensCells, Stiffness
-from pbdkit.scene.constants import Home, bond_numbers
+from pbdkit.scene.constants import Owner, bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses
 from pbdkit.stepping.kernel import Function
@@ -50,8 +50,8 @@ def damage_word(plan: Plan, broken: str, n: str, bond: str, limit: str, side: in
     if plan.softens_cells:
         softened = bond.format(n=_numbers_of_damage(plan)[side])
     if isinstance(plan.model, Softens):
-        homes = {Home.SLOT: f"end_limits[{n}, {{n}}]", Home.BOND: bond, Home.FIXED_BOND: limit}
-        c = f"Constants({values(plan.levels[-1].seen.bond, homes)})"
+        owners = {Owner.SLOT: f"end_limits[{n}, {{n}}]", Owner.BOND: bond, Owner.FIXED_BOND: limit}
+        c = f"Constants({values(plan.levels[-1].seen.bond, owners)})"
         ahead, nothing = (plan.literal([x, *[0.0] * (len(plan.axes) - 1)]) for x in (1.0, 0.0))
         r = plan.vector(f"end_rests[{n}, #]")
         softened = f"{plan.number(1.0)} - seen({ahead}, {nothing}, {r}, {c}, q).x"
@@ -71,15 +71,15 @@ def _raised(name: str, other: str) -> str:
     return f"{name} = {name} if {name} > {other} else {other}"
 
 
-def _damage_at(plan: Plan, home: str, n: str, side: int = 0) -> str:
+def _damage_at(plan: Plan, owner: str, n: str, side: int = 0) -> str:
     """Return an expression for the damage of the bond at a flat place."""
-    words = f"flat_bond{{n}}[{home}]", f"flat_limit{{n}}[{home}]"
-    return damage_word(plan, f"flat_broken[{home}]", n, *words, side)
+    words = f"flat_bond{{n}}[{owner}]", f"flat_limit{{n}}[{owner}]"
+    return damage_word(plan, f"flat_broken[{owner}]", n, *words, side)
 
 
-def _chosen(plan: Plan, home: str, n: str, on_right: str) -> str:
+def _chosen(plan: Plan, owner: str, n: str, on_right: str) -> str:
     """Return an expression for the damage of a bond on the side that a variable selects."""
-    left_damage, right_damage = (_damage_at(plan, home, n, side) for side in (0, 1))
+    left_damage, right_damage = (_damage_at(plan, owner, n, side) for side in (0, 1))
     return (
         f"({right_damage} if {on_right} else {left_damage})" if plan.softens_cells else left_damage
     )
@@ -92,9 +92,9 @@ def damage_lines(plan: Plan) -> list[str]:
     lines = []
     for cell in range(cells):
         for b in range(bonds):
-            lines.append(f"home = at_j + cell_bonds[s, {cell}, {b}]")
+            lines.append(f"owner = at_j + cell_bonds[s, {cell}, {b}]")
             at = f"[s, {cell}, {b}]"
-            damage = _chosen(plan, "home", f"cell_planes{at}", f"cell_sides{at}")
+            damage = _chosen(plan, "owner", f"cell_planes{at}", f"cell_sides{at}")
             lines += (
                 [f"own = {damage}", _raised(f"m{cell}", "own")] if b else [f"m{cell} = {damage}"]
             )
@@ -106,15 +106,15 @@ def torn_at_slot(plan: Plan) -> list[str]:
     of the cells beside this bond."""
     sides = (f"around[slot_cells[s, k, {side}]]" for side in (0, 1))
     plane = "slot_planes[s, k]"
-    lines = [f"own = {_damage_at(plan, 'home', plane)}", "other = own"]
+    lines = [f"own = {_damage_at(plan, 'owner', plane)}", "other = own"]
     if plan.softens_cells:
-        left_damage, right_damage = (_damage_at(plan, "home", plane, side) for side in (0, 1))
+        left_damage, right_damage = (_damage_at(plan, "owner", plane, side) for side in (0, 1))
         lines = [
             f"own, other = {left_damage}, {right_damage}",
             "if signs[s, k] < 0:",
             "    own, other = other, own",
         ]
-    return ["home = at_j + bonds_away[s, k]", *lines, f"t = Torn({', '.join(sides)}, own, other)"]
+    return ["owner = at_j + bonds_away[s, k]", *lines, f"t = Torn({', '.join(sides)}, own, other)"]
 
 
 class RowDamage:
@@ -124,7 +124,7 @@ class RowDamage:
 
     def __init__(self, plan: Plan, s: int) -> None:
         self._around = plan.scene.neighbourhood.cells_around[s]
-        self._home = plan.scene.neighbourhood.home
+        self._owner = plan.scene.neighbourhood.owner
         self._number: dict[tuple[int, Slot | None, int], int] = {}
         self._sides = (0, 1) if plan.softens_cells else (0,)
         rows, loops = list[str](), list[str]()
@@ -135,7 +135,7 @@ class RowDamage:
         loops.append("for j in range(j1 - j0):")
         for n, cell in enumerate(cells):
             first, *rest = (
-                self._number[bond.plane, bond.home, self._side(bond.side)] for bond in cell
+                self._number[bond.plane, bond.owner, self._side(bond.side)] for bond in cell
             )
             loops.append(f"    m = damage[{first}, j]")
             loops += [f"    {_raised('m', f'damage[{other}, j]')}" for other in rest]
@@ -149,10 +149,10 @@ class RowDamage:
         return side if len(self._sides) == 2 else 0
 
     def _add(self, plan: Plan, bond: CellBond, rows: list[str], loops: list[str]) -> None:
-        if (bond.plane, bond.home, 0) in self._number:
+        if (bond.plane, bond.owner, 0) in self._number:
             return
         n = len(self._number)
-        step = bond.home.cell if bond.home else None
+        step = bond.owner.cell if bond.owner else None
         arrays = {f"y{n}": "broken"}
         if isinstance(plan.model, (Softens, SoftensCells)):
             arrays |= {f"y{n}_b{m}": f"bond{m}" for m in range(plan.bonds)}
@@ -160,28 +160,28 @@ class RowDamage:
         rows += [f"{name} = {plan.row(of, bond.plane, step)}" for name, of in arrays.items()]
         words = f"y{n}[j]", str(bond.plane), f"y{n}_b{{n}}[j]", f"y{n}_x{{n}}[j]"
         for side in self._sides:
-            m = self._number[bond.plane, bond.home, side] = len(self._number)
+            m = self._number[bond.plane, bond.owner, side] = len(self._number)
             loops.append("for j in range(j1 - j0):")
             loops.append(f"    damage[{m}, j] = {damage_word(plan, *words, side)}")
 
     def beside(self, slot: Slot) -> str:
         """Return a line that computes t, the damage of the bond along a slot of particle j of the
         row and of the cells beside this bond."""
-        plane, at_this_end = self._home[slot]
+        plane, at_this_end = self._owner[slot]
         ends = (0, 1) if at_this_end else (1, 0)
-        home = None if at_this_end else slot
-        damage = (self._number[plane, home, self._side(side)] for side in ends)
+        owner = None if at_this_end else slot
+        damage = (self._number[plane, owner, self._side(side)] for side in ends)
         sides = (len(self._number) + cell for cell in self._around.beside[slot])
         return f"t = Torn({', '.join(f'damage[{n}, j]' for n in (*sides, *damage))})"
 
 
-def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
-    """Return lines that mark the particles around a damaged bond of plane n. `home` is the index of
-    the bond in flat arrays of bonds. `there` is the index in flat arrays of particles of the end of
-    the bond at which the bond is stored."""
+def marking_lines(plan: Plan, owner: str, there: str) -> list[str]:
+    """Return lines that mark the particles around a damaged bond of plane n. `owner` is the index
+    of the bond in flat arrays of bonds. `there` is the index in flat arrays of particles of the end
+    of the bond at which the bond is stored."""
     if not plan.tears:
         return []
-    words = (_damage_at(plan, home, "n", side) for side in range(1 + plan.softens_cells))
+    words = (_damage_at(plan, owner, "n", side) for side in range(1 + plan.softens_cells))
     return [
         f"if {' or '.join(f'{word} > {plan.number(0.0)}' for word in words)}:",
         "    for e in range(mark_steps.shape[1]):",
@@ -189,20 +189,20 @@ def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
     ]
 
 
-def stress_lines(plan: Plan, home: str) -> list[str]:
+def stress_lines(plan: Plan, owner: str) -> list[str]:
     """Return lines that compute the stress of the cells to the `left` and `right` of a bond of
-    plane n. `home` is the flat place of the end at which the bond is stored."""
+    plane n. `owner` is the flat place of the end at which the bond is stored."""
     corners = len(plan.scene.neighbourhood.tiling.polygons[0].corners)
     count = len(Stiffness._fields)
     ratio_names = [f"cell_ratios[{m}]" for m in range(count)]
     lines = list[str]()
     for side, name in enumerate(("left", "right")):
-        lines.append(f"cell = {home} + body_steps[n, {side}]")
+        lines.append(f"cell = {owner} + body_steps[n, {side}]")
         if plan.mixed:
             ratio_names = [f"flat_ratios[{count} * cell + {m}]" for m in range(count)]
-        lines.append(f"origin = {home} + corner_steps[n, {side}, 0]")
+        lines.append(f"origin = {owner} + corner_steps[n, {side}, 0]")
         for k in range(1, corners):
-            lines.append(f"corner = {home} + corner_steps[n, {side}, {k}]")
+            lines.append(f"corner = {owner} + corner_steps[n, {side}, {k}]")
             lines += plan.each(f"e{k}_@ = flat_u_@[corner] - flat_u_@[origin]")
         for a in plan.axes:
             for b, axis in enumerate(plan.axes):
@@ -227,7 +227,10 @@ def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
     for plane in scene.neighbourhood.planes:
         cells = stresses.beside(plane.slot)
         steps.append(
-            [[cell.way(corner, plane.slot, shape) for corner in cell.corners] for cell in cells]
+            [
+                [cell.flat_offset(corner, plane.slot, shape) for corner in cell.corners]
+                for cell in cells
+            ]
         )
         rates.append([cell.rates for cell in cells])
         shares.append(
@@ -255,7 +258,7 @@ def tearing_arrays(scene: Scene) -> dict[str, Any]:
     around = scene.neighbourhood
     cells, bonds = _table_shape(scene)
     width, sublattices = max(map(len, around.slots)), len(around.slots)
-    ways, planes, side = np.zeros((3, sublattices, cells, bonds), np.int64)
+    offsets, planes, side = np.zeros((3, sublattices, cells, bonds), np.int64)
     slot_planes = np.zeros((sublattices, width), np.int64)
     slot_cells = np.zeros((sublattices, width, 2), np.int64)
     for s, of in enumerate(around.cells_around):
@@ -263,12 +266,12 @@ def tearing_arrays(scene: Scene) -> dict[str, Any]:
             bonds_of = of.cells[min(n, len(of.cells) - 1)]
             for b in range(bonds):
                 bond = bonds_of[min(b, len(bonds_of) - 1)]
-                ways[s, n, b], planes[s, n, b] = _way(scene, s, bond), bond.plane
+                offsets[s, n, b], planes[s, n, b] = _flat_offset(scene, s, bond), bond.plane
                 side[s, n, b] = bond.side
         for k, slot in enumerate(around.slots[s]):
-            slot_planes[s, k], slot_cells[s, k] = around.home[slot][0], of.beside[slot]
+            slot_planes[s, k], slot_cells[s, k] = around.owner[slot][0], of.beside[slot]
     return {
-        "cell_bonds": ways,
+        "cell_bonds": offsets,
         "cell_planes": planes,
         "cell_sides": side,
         "slot_planes": slot_planes,
@@ -287,10 +290,10 @@ def _table_shape(scene: Scene) -> tuple[int, int]:
     )
 
 
-def _way(scene: Scene, s: int, bond: CellBond) -> int:
+def _flat_offset(scene: Scene, s: int, bond: CellBond) -> int:
     """Return the index offset in flat arrays from a particle of sublattice s to a bond."""
-    shape, home = scene.raster.shape, bond.home
-    step, sublattice = (slot_step(shape, home), home.target) if home else (0, s)
+    shape, owner = scene.raster.shape, bond.owner
+    step, sublattice = (slot_step(shape, owner), owner.target) if owner else (0, s)
     return step + (bond.plane - sublattice) * math.prod(shape[1:])
 
 
@@ -301,10 +304,10 @@ def _mark_steps(scene: Scene) -> NDArray[np.int64]:
     around, shape = scene.neighbourhood, scene.raster.shape
     rows = []
     for plane in around.planes:
-        home = around.cells_around[plane.slot.source]
+        owner = around.cells_around[plane.slot.source]
         ends: set[Slot | None] = {None}
-        for cell in {*home.beside[plane.slot]}:
-            ends |= {slot for slot, cells in home.beside.items() if cell in cells}
+        for cell in {*owner.beside[plane.slot]}:
+            ends |= {slot for slot, cells in owner.beside.items() if cell in cells}
         rows.append(sorted(slot_step(shape, slot) if slot else 0 for slot in ends))
     width = max(map(len, rows))
     return np.array([steps + steps[:1] * (width - len(steps)) for steps in rows], np.int64)
@@ -329,11 +332,11 @@ def renew_torn_marks(marks: Marks, scene: Scene, state: State, rows: slice) -> N
         block = Block(s, (first, *margins), (max(first, last), *stop))
         damaged = np.zeros(block.of(marks).shape, bool)
         for bond in {bond for cell in of.cells for bond in cell}:
-            home = block.seen_through(bond.home) if bond.home else block
-            damaged |= home.within(state.broken_step[bond.plane]) >= 0
+            owner = block.seen_through(bond.owner) if bond.owner else block
+            damaged |= owner.within(state.broken_step[bond.plane]) >= 0
             if softened:
                 for value, initial in _changed(scene, state):
-                    damaged |= home.within(value[bond.plane]) != initial
+                    damaged |= owner.within(value[bond.plane]) != initial
         block.of(marks)[...] = damaged
 
 
@@ -359,8 +362,8 @@ def parameters(plan: Plan, level: Level) -> list[str]:
 def _rule(level: Level) -> str:
     """Return a line that assigns p, the parameters of the rule at a particle."""
     n = level.number
-    homes = {Home.SCENE: f"rule{n}[{{n}}]", Home.FIXED_PARTICLE: "g{n}[j]"}
-    return f"p = Rule{n}({values(level.seen.rule, homes)})"
+    owners = {Owner.SCENE: f"rule{n}[{{n}}]", Owner.FIXED_PARTICLE: "g{n}[j]"}
+    return f"p = Rule{n}({values(level.seen.rule, owners)})"
 
 
 def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
@@ -462,7 +465,7 @@ def _gathered(
 
 def _own(level: Level) -> str:
     """Return an expression for the state variables of the particle."""
-    return values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
+    return values(level.seen.own, {Owner.PARTICLE: "a{n}[j]"})
 
 
 def target_lines(
@@ -497,14 +500,14 @@ def target_lines(
     if level is not plan.levels[-1]:
         lines += plan.each(f"o@[j] = {_chosen_target('move.@', movable, plan.number(0.0))}")
     else:
-        plain = solver.relaxation == 1.0 and "relaxation" not in solver.courses
+        plain = solver.relaxation == 1.0 and "relaxation" not in solver.time_dependent
         relaxed = "move.@" if plain else "solver[0] * move.@"
-        swung = "new_@ = new_@ + solver[1] * (u.@ - o@[j])"
-        swing = [swung] if solver.memory != 0.0 else []
-        if "memory" in solver.courses:
-            swing = [f"{swung} if solver[1] != 0.0 else new_@"]
+        with_momentum = "new_@ = new_@ + solver[1] * (u.@ - o@[j])"
+        momentum = [with_momentum] if solver.memory != 0.0 else []
+        if "memory" in solver.time_dependent:
+            momentum = [f"{with_momentum} if solver[1] != 0.0 else new_@"]
         out = f"o@[j] = {_chosen_target('new_@', movable, otherwise)}"
-        for pattern in (f"new_@ = u.@ + {relaxed}", *swing, out):
+        for pattern in (f"new_@ = u.@ + {relaxed}", *momentum, out):
             lines += plan.each(pattern)
     return lines + [
         f"w{n}[j] = {_chosen_target(f'new[{m}]', movable, f'a{n}[j]')}"
@@ -549,7 +552,7 @@ def write_bond_pass(plan: Plan) -> Function:
     out.add(0, *plan.each(f"n@ = {plan.row('u_@', 'ends[n, 1]', step)}"))
     out.add(0, f"one = {plan.row('kind', 'ends[n, 0]')}")
     out.add(0, f"other = {plan.row('kind', 'ends[n, 1]', step)}")
-    out.add(0, f"since = {plan.row('broken', 'n')}", f"ways = {plan.row('lengths', 'n')}")
+    out.add(0, f"since = {plan.row('broken', 'n')}", f"broken_lengths = {plan.row('lengths', 'n')}")
     out.add(0, *(f"b{m} = {plan.row(f'bond{m}', 'n')}" for m in range(plan.bonds)))
     out.add(0, *(f"x{m} = {plan.row(f'limit{m}', 'n')}" for m in range(plan.limits)))
     if plan.tears:
@@ -558,7 +561,7 @@ def write_bond_pass(plan: Plan) -> Function:
     return out
 
 
-class Judging(NamedTuple):
+class BondUpdate(NamedTuple):
     """Code for bond j of plane n. `look` are lines that evaluate the bond. `breaks` is an
     expression that is true if the bond breaks, and `differ` an expression that is added to it and
     is true if a state variable changes. `write` are lines that store the result."""
@@ -569,20 +572,20 @@ class Judging(NamedTuple):
     write: list[str]
 
 
-def judging(plan: Plan, d: str, home: str) -> Judging:
+def bond_update(plan: Plan, d: str, owner: str) -> BondUpdate:
     """Return the code for a bond. `d` is the pattern of the components of the difference, and
-    `home` the flat place of the end at which the bond is stored."""
+    `owner` the flat place of the end at which the bond is stored."""
     numbers = plan.levels[-1].seen.bond
-    homes = {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]", Home.FIXED_BOND: "x{n}[j]"}
-    c = values(numbers, homes)
+    owners = {Owner.SLOT: "end_limits[n, {n}]", Owner.BOND: "b{n}[j]", Owner.FIXED_BOND: "x{n}[j]"}
+    c = values(numbers, owners)
     look = [f"d = {plan.vector(d)}"]
-    changes_of = [number.changes for number in numbers if number.home is Home.BOND]
+    changes_of = [number.changes for number in numbers if number.owner is Owner.BOND]
     renews = isinstance(plan.model, RenewsBonds)
     changing = [m for m, changes in enumerate(changes_of) if changes and renews]
     if changing:
         cells = ""
         if plan.softens_cells:
-            look += stress_lines(plan, home)
+            look += stress_lines(plan, owner)
             cells = ", left, right"
         look.append(f"new = update(d, r, Constants({c}), q{cells})")
     for position, m in enumerate(changing):
@@ -591,8 +594,8 @@ def judging(plan: Plan, d: str, home: str) -> Judging:
     breaks = f"breaks(d, r, Constants({c}), q)"
     differ = "".join(f" | (new{m} != b{m}[j])" for m in changing)
     renewed = [f"b{m}[j] = new{m}" for m in changing]
-    broken = [f"if {breaks}:", "    since[j] = step", "    ways[j] = length(r + d)"]
-    return Judging(look, breaks, differ, [*look, *renewed, *broken])
+    broken = [f"if {breaks}:", "    since[j] = step", "    broken_lengths[j] = length(r + d)"]
+    return BondUpdate(look, breaks, differ, [*look, *renewed, *broken])
 
 
 def _write_judging(out: Function, plan: Plan) -> None:
@@ -603,7 +606,7 @@ def _write_judging(out: Function, plan: Plan) -> None:
             f"((one[j] == {FOLLOWER}) & (other[j] != {EMPTY}) | "
             f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
-    lines = judging(plan, "n@[j] - h@[j]", "base + j")
+    lines = bond_update(plan, "n@[j] - h@[j]", "base + j")
     # Loops that only read are vectorised. The first loop does not test whether bonds can break, and
     # takes half the time of the second; mostly it finds nothing, and the second is skipped. The
     # last loop writes, and runs only if there is anything to write.
@@ -624,14 +627,14 @@ def write_events(plan: Plan) -> Function:
     out = Function(plan.shared, "note_broken", "s", "base", "width")
     out.add(0, "for here in range(base, base + width):")
     out.add(1, "bits = int64(flat_lost[here])", "for k in range(counts[s]):")
-    out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
+    out.add(2, "there, owner = here + away[s, k], here + bonds_away[s, k]")
     # A bond is recorded by the particle at which it is stored, or by the particle at the other end
     # if the first is not a particle of the body.
     out.add(2, f"ours = signs[s, k] > 0 or flat_kind[there] != {FOLLOWER}")
-    out.add(2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:")
-    out.add(3, "flat_broken[home] = step")
+    out.add(2, "if (bits >> k) & 1 and ours and flat_broken[owner] < 0:")
+    out.add(3, "flat_broken[owner] = step")
     d, r = plan.vector("flat_u_@[there] - flat_u_@[here]"), plan.vector("rests[s, k, #]")
-    out.add(3, f"flat_lengths[home] = length(signs[s, k] * {r} + signs[s, k] * {d})")
+    out.add(3, f"flat_lengths[owner] = length(signs[s, k] * {r} + signs[s, k] * {d})")
     return out
 
 
@@ -764,15 +767,15 @@ def _slot_lines(
 ) -> list[str]:
     """Return lines that compute the contributions of one neighbour and add them."""
     bond = {
-        Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]",
-        Home.BOND: words.bond,
-        Home.FIXED_BOND: words.limit,
+        Owner.SLOT: f"limits[{slot.source}, {k}, {{n}}]",
+        Owner.BOND: words.bond,
+        Owner.FIXED_BOND: words.limit,
     }
     c = f"Constants({values(level.seen.bond, bond)})"
     # At both ends the bond is evaluated with the signs that d and r have at the end at which it is
     # stored, so that the results at both ends agree to the last bit.
-    _, at_home = plan.scene.neighbourhood.home[slot]
-    arguments = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
+    _, is_owner = plan.scene.neighbourhood.owner[slot]
+    arguments = f"d, {plan.literal(slot.rest)}" if is_owner else f"-d, {plan.literal(-slot.rest)}"
     literal = level.scene.constants.weights[slot]._asdict()
     weights = {name: plan.number(value) for name, value in literal.items()}
     if words.shares:
@@ -794,12 +797,12 @@ def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
     """Return lines that define the arrays of the bonds along a slot."""
     if plan.model is None or plan.tears:
         return []
-    plane, at_home = plan.scene.neighbourhood.home[slot]
+    plane, is_owner = plan.scene.neighbourhood.owner[slot]
     rows = {f"b{k}_{n}": f"bond{n}" for n in range(plan.bonds)}
     rows |= {f"x{k}_{n}": f"limit{n}" for n in range(plan.limits)}
     if not plan.judged:
         rows[f"f{k}"] = "broken"
-    step = None if at_home else slot.cell
+    step = None if is_owner else slot.cell
     return [f"{name} = {plan.row(array, plane, step)}" for name, array in rows.items()]
 
 
@@ -875,9 +878,9 @@ def _seen(out: Function, plan: Plan, array: str, away: str) -> str:
 def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], near: str) -> None:
     pattern = _seen(out, plan, f"{level.source}_@", "away[s, k]")
     kind = _seen(out, plan, "kind", "away[s, k]")
-    named = {Home.SLOT: f"weights{level.number}[s, k, {{n}}]", Home.CELL: "share_{n}"}
+    named = {Owner.SLOT: f"weights{level.number}[s, k, {{n}}]", Owner.CELL: "share_{n}"}
     depth = 1 if _is_slot_after_slot(plan) else 2
-    if any(number.home is Home.CELL for number in level.seen.weights):
+    if any(number.owner is Owner.CELL for number in level.seen.weights):
         for side in (0, 1):  # No row is computed slot after slot.
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
     numbers = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
@@ -893,7 +896,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     out.add(2, f"is_there = {kind} != {EMPTY}", difference(plan, level, pattern))
     out.add(2, *(f"b{n} = {value}" for n, value in enumerate(bond)))
     out.add(2, *(f"x{n} = {value}" for n, value in enumerate(fixed)))
-    limits = {Home.SLOT: "limits[s, k, {n}]", Home.BOND: "b{n}", Home.FIXED_BOND: "x{n}"}
+    limits = {Owner.SLOT: "limits[s, k, {n}]", Owner.BOND: "b{n}", Owner.FIXED_BOND: "x{n}"}
     c = f"Constants({values(level.seen.bond, limits)})"
     spares = plan.model and not plan.model.breaks_frame_bonds()
     can = f"({kind} == {FOLLOWER})" if spares else "is_there"
@@ -919,6 +922,6 @@ def _write_mixed(out: Function, plan: Plan, level: Level, shown: Sequence[str]) 
     for side in (0, 1):
         out.add(3, f"cell_{side} = {plan.mixed} * (at_j + cells_away[s, k, {side}])")
     for m in range(plan.mixed):
-        homes = {Home.SLOT: f"more{m}[s, k, {{n}}]", Home.CELL: f"flat_mixed[cell_{{n}} + {m}]"}
-        weights.append(values(level.seen.weights, homes))
+        owners = {Owner.SLOT: f"more{m}[s, k, {{n}}]", Owner.CELL: f"flat_mixed[cell_{{n}} + {m}]"}
+        weights.append(values(level.seen.weights, owners))
     out.add(3, *more_contributions(plan, level, "r", weights, shown))

@@ -56,7 +56,7 @@ def cache(tmp_path, monkeypatch):
 
 
 SOURCE = """
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def run(out):
     out[0] = apply(Vector(3.0, 4.0)).x
 """
@@ -202,7 +202,9 @@ def test_concurrent_requests_compile_a_kernel_once(cache, monkeypatch):
     monkeypatch.setattr(kernel_cache, "_made", make)
     monkeypatch.setattr(kernel_cache, "_prepared", lambda *given: "kernel")
     with ThreadPoolExecutor(4) as several:  # each opens the lock by itself, as processes do
-        found = [several.submit(kernel_cache._kept, "x = 1", "key", {}, ()) for _ in range(4)]
+        found = [
+            several.submit(kernel_cache._cached_kernel, "x = 1", "key", {}, ()) for _ in range(4)
+        ]
     assert [future.result() for future in found] == ["kernel"] * 4
     assert len(made) == 1
     assert [path.name for path in cache.iterdir()] == ["kernel_key"]

@@ -324,7 +324,7 @@ SHARE = 0.5
 
 
 APPLIED = """
-@njit(cache=KEPT)
+@njit(cache=CACHED)
 def run(out):
     out[0] = apply((2.0, 3.0), 0, 0)
 """

@@ -5,12 +5,12 @@ displacements from the end of the step before. Frame points that follow leaders 
 displacements that the leaders had at that time or, with frame delay, one step earlier. Let L be the
 influence of leaders on followers, and S the part of L that acts by means of frame points. Then
 
-    u(t+1) = P u(t) + Q u(t-1) + (L - S) u_L(t+1) + S u_L(t - lag) + s,
+    u(t+1) = P u(t) + Q u(t-1) + (L - S) u_L(t+1) + S u_L(t - d) + s,
 
 If leaders move by v in a step, the equilibrium u* moves by δ, where A δ = L v and A = 1 - P - Q.
 The distance e = u* - u from equilibrium satisfies
 
-    e(t+1) = P e(t) + Q e(t-1) + δ + Q δ - (L - S) v + lag · S v,
+    e(t+1) = P e(t) + Q e(t-1) + δ + Q δ - (L - S) v + d S v,
 
 and converges to a constant value. If S = 0 and Q = 0, the constant value satisfies A e = P δ. For
 the barycentre rule on a sheet of length l, on a square lattice with spacing h, it is at most 4 v l²
@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pbdkit.array_types import Floats, Indices
-from pbdkit.equilibrium.system import ACCURACY, StuckError, System, solved
+from pbdkit.equilibrium.system import ACCURACY, StagnationError, System, solved
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, distinct, slot_step
 from pbdkit.linear.block_matrix import BlockMatrix
@@ -110,7 +110,7 @@ MIN_ACCURACY = 1e-12
 
 
 @dataclass(frozen=True)
-class Lag:
+class LeaderDistance:
     """Distance of the body from its equilibrium in the steps in which a leader moves fastest.
 
     Lengths are in lattice units. The results are valid for linear rules as long as no bond breaks.
@@ -162,7 +162,7 @@ class Lag:
 
 
 @dataclass(frozen=True)
-class Trail:
+class DistanceIncrements:
     """Increments of the distance e = u* - u, as arrays (axis, sublattice, cell, cell).
 
     Parameters
@@ -182,7 +182,7 @@ class Trail:
     @classmethod
     def of(
         cls, scene: Scene, system: System, state: State, step: int, slowness: float
-    ) -> Trail | None:
+    ) -> DistanceIncrements | None:
         """Compute the increments for the velocities that the leaders have in a step. Return None if
         the leaders influence no follower.
 
@@ -190,7 +190,7 @@ class Trail:
         ------
         ExperimentError
             If there is no equilibrium.
-        StuckError
+        StagnationError
             If the linear solver does not converge.
         """
         coupling, v = (
@@ -212,8 +212,10 @@ class Trail:
             accuracy *= ACCURACY
             delta = system.solve(direct + through_frame, accuracy * size)
             first = delta - direct
-            push = first + scene.lag * through_frame - scene.experiment.stepping.memory * delta
-            if scene.lag:
+            push = (
+                first + scene.frame_delay * through_frame - scene.experiment.stepping.memory * delta
+            )
+            if scene.frame_delay:
                 push += coupling.moves(coupling.frame_displacements(delta))
             steady = solved(system, push, slowness * float(np.abs(push).max()))
             error = slowness * accuracy * size
@@ -221,9 +223,9 @@ class Trail:
                 return cls(first, push, steady)
 
 
-def lag_of(
+def distance_from_equilibrium(
     scene: Scene, state: State, system_at: Callable[[int], System | None], slowness: float
-) -> Lag | None:
+) -> LeaderDistance | None:
     """Compute the distance from equilibrium in the interval of at least two steps in which a leader
     moves fastest.
 
@@ -238,7 +240,7 @@ def lag_of(
 
     Returns
     -------
-    Lag or None
+    LeaderDistance or None
         None if no leader moves at constant speed, or if the body has no equilibrium.
     """
     first, last, speed = fastest(scene)
@@ -246,19 +248,21 @@ def lag_of(
     if system is None:
         return None
     try:
-        trail = Trail.of(scene, system, state, first, slowness)
-    except (ExperimentError, StuckError):
+        increments = DistanceIncrements.of(scene, system, state, first, slowness)
+    except (ExperimentError, StagnationError):
         return None
-    if trail is None:
+    if increments is None:
         return None
     steps = last - first + 1
-    reached = _reached_exactly(scene, trail, first, steps)
+    reached = _reached_exactly(scene, increments, first, steps)
     if reached is None:
-        reached = _reached_about(scene, trail, system, slowness, steps)
-    return Lag(first, last, speed, _largest(trail.steady), reached)
+        reached = _reached_about(scene, increments, system, slowness, steps)
+    return LeaderDistance(first, last, speed, _largest(increments.steady), reached)
 
 
-def _reached_exactly(scene: Scene, trail: Trail, first: int, steps: int) -> float | None:
+def _reached_exactly(
+    scene: Scene, increments: DistanceIncrements, first: int, steps: int
+) -> float | None:
     """Compute max |e| after some steps, by computing each step. Return None if this would take too
     long."""
     if excess(scene) or steps * scene.raster.count > MAX_PRODUCTS:
@@ -269,7 +273,9 @@ def _reached_exactly(scene: Scene, trail: Trail, first: int, steps: int) -> floa
     if steps * (current.size if isinstance(current, np.ndarray) else current.nnz) > MAX_PRODUCTS:
         return None
     place = scene.raster.place_of(operator.followers)
-    push, error = (e.reshape(len(e), -1)[:, place].T.ravel() for e in (trail.push, trail.first))
+    push, error = (
+        e.reshape(len(e), -1)[:, place].T.ravel() for e in (increments.push, increments.first)
+    )
     last_error = np.zeros_like(push)
     for _ in range(steps - 1):
         last_error, error = error, current @ error + previous @ last_error + push
@@ -277,7 +283,7 @@ def _reached_exactly(scene: Scene, trail: Trail, first: int, steps: int) -> floa
 
 
 def _reached_about(
-    scene: Scene, trail: Trail, system: System, slowness: float, steps: int
+    scene: Scene, increments: DistanceIncrements, system: System, slowness: float, steps: int
 ) -> float | None:
     """Compute max |e| after some steps without momentum, with an accuracy of 10 %. The formula is e
     = (1 - Pⁿ) A⁻¹ push.
@@ -285,17 +291,19 @@ def _reached_about(
     For few steps the increments are added without decay. For more steps, P is projected onto the
     span of A⁻¹ push and A⁻² push.
     """
-    if scene.lag or scene.experiment.stepping.memory:
+    if scene.frame_delay or scene.experiment.stepping.memory:
         return None
-    e = trail.steady
-    bound = min(_largest(e), steps * _largest(trail.push))
+    e = increments.steady
+    bound = min(_largest(e), steps * _largest(increments.push))
     if steps <= EARLY_FRACTION * slowness:
         return bound
     try:
         second = solved(system, e, slowness * float(np.abs(e).max()))
-    except StuckError:
+    except StagnationError:
         return None
-    basis, images = (np.stack([a.ravel(), b.ravel()]) for a, b in ((e, second), (trail.push, e)))
+    basis, images = (
+        np.stack([a.ravel(), b.ravel()]) for a, b in ((e, second), (increments.push, e))
+    )
     A = np.linalg.solve(basis @ basis.T, basis @ images.T)
     remainder = np.linalg.matrix_power(np.eye(2) - A, steps)[:, 0]
     return min(bound, _largest((1.0 - remainder[0]) * e - remainder[1] * second))
