@@ -2,8 +2,10 @@
 
 import ast
 import re
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -59,48 +61,54 @@ MODULES = {
 }
 
 
-def imported(path):
-    """The modules of pbdkit that a file imports, in functions and for types too."""
+class Facts(NamedTuple):
+    """The modules of pbdkit that a file imports, in functions and for types too; the number of its
+    calls of a method `gather`, without text that it writes for kernels; and its long functions."""
+
+    imported: set[str]
+    gathers: int
+    long_functions: list[str]
+
+
+@cache
+def facts(path):
+    modules, gathers, long_functions = set(), 0, []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pbdkit."):
             names = {f"{node.module}.{name.name}" for name in node.names}
-            yield from (names & {*MODULES}) or {node.module}
+            modules |= (names & {*MODULES}) or {node.module}
+        elif isinstance(node, ast.Call):
+            gathers += isinstance(node.func, ast.Attribute) and node.func.attr == "gather"
+        elif isinstance(node, ast.FunctionDef):
+            # A docstring with its sections is not counted.
+            first = node.body[ast.get_docstring(node) is not None :][:1] or [node]
+            long_functions += [node.name] * (node.end_lineno - first[0].lineno >= 60)
+    return Facts(modules, gathers, long_functions)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_follow_the_layer_order(path):
     own = room(".".join(("pbdkit", *path.relative_to(PACKAGE).with_suffix("").parts)))
-    downstream = [module for module in imported(path) if room(module) > own]
+    downstream = [module for module in facts(path).imported if room(module) > own]
     assert downstream == []
 
 
 def test_no_circular_imports():
     """Not for their types either, within a room as little as between rooms."""
-    needs = {name: {*imported(path)} & {*MODULES} - {name} for name, path in MODULES.items()}
+    needs = {name: facts(path).imported & {*MODULES} - {name} for name, path in MODULES.items()}
     assert len(list(TopologicalSorter(needs).static_order())) == len(MODULES)
-
-
-def calls_of(method, path):
-    """Return the number of calls of the method in a file; text that it writes for kernels does not
-    count."""
-    called = (n.func for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call))
-    return sum(isinstance(f, ast.Attribute) and f.attr == method for f in called)
 
 
 def test_rules_are_evaluated_in_one_place():
     """The evaluator alone implements further features, such as values by bond or a third axis."""
     outside = [path for path in FILES if "components" not in path.relative_to(PACKAGE).parts]
-    found = {str(p.relative_to(PACKAGE)): calls_of("gather", p) for p in outside}
+    found = {str(p.relative_to(PACKAGE)): facts(p).gathers for p in outside}
     assert {path: n for path, n in found.items() if n} == {"stepping/rule_evaluation.py": 1}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_functions_are_short(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.FunctionDef):
-            # A docstring with its sections is not counted.
-            first = node.body[ast.get_docstring(node) is not None :][:1] or [node]
-            assert node.end_lineno - first[0].lineno < 60, node.name
+    assert facts(path).long_functions == []
 
 
 def test_every_package_has_a_place_in_the_order():

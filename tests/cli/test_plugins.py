@@ -152,7 +152,7 @@ def tear(file: Path, content: Any) -> None:
 def test_corrupt_metadata_stops_no_first_command(
     install: Install, call: Call, tmp_path: Path
 ) -> None:
-    """Where a process builds its first model, pydantic would go through all distributions."""
+    """Pydantic would go through all distributions when a process builds its first model."""
     for n, (file, content, _) in enumerate(METADATA.values()):
         install(f"pbdkit-torn-{n}", rule(f"torn-{n}"))
         tear(tmp_path / "site" / f"pbdkit_torn_{n}-1.0.dist-info" / file, content)
