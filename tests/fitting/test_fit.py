@@ -321,7 +321,7 @@ def test_robust_loss_downweights_outliers(tmp_path):
 
 
 def test_without_given_noise_it_is_estimated_from_residuals(tmp_path):
-    made = plate()
+    made = plate(lattice={"type": "square", "a": 2.0})
     measured(made, tmp_path / "field.csv", noise=NOISE)
     found = pbdkit.fit(
         {
@@ -431,7 +431,7 @@ def test_plot_has_one_row_per_axis_without_overlapping_text(tmp_path):
     pytest.importorskip("matplotlib")
     from pbdkit.plotting.fit_figures import draw_fit
 
-    made = plate()
+    made = plate(lattice={"type": "square", "a": 2.0})
     measured(made, tmp_path / "field.csv", noise=NOISE)
     found = pbdkit.fit(
         {

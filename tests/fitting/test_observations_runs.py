@@ -212,7 +212,7 @@ def test_excluded_normalised_residuals_are_independent_of_the_weight(measured):
 def small(**more):
     """A bar that converges soon, and the solver that finds its equilibrium."""
     body = {"type": "rectangle", "width": 4.0, "height": 2.0}
-    return bar(body=body, steps=400, **more)
+    return bar(body=body, steps=160, **more)
 
 
 SETTLING = {"type": "stepping", "relaxation": 0.8, "engine": "numpy", "settle": {"tolerance": 1e-5}}
@@ -227,7 +227,7 @@ def posed(experiment, given):
 @pytest.mark.parametrize("kind", ["tracks", "curve"])
 def test_converged_run_stays_at_rest(kind, tmp_path):
     """At its last steps, and at steps between; derivatives as well."""
-    times = [3.0, 12.5, 250.0, 321.25, 400.0]
+    times = [3.0, 12.5, 100.0, 121.25, 160.0]
     at = [[1.0, 1.0], [2.0, 0.5], [3.0, 2.0]]
     if kind == "tracks":
         rows = [[time, *place, 0.0, 0.0] for time in times for place in at]
@@ -238,7 +238,7 @@ def test_converged_run_stays_at_rest(kind, tmp_path):
         given = {"type": "curve", "group": 1, "youngs_modulus": 1.0, "against": "time"}
         given |= {"columns": ["time", "force"]}
     given |= {"file": str(tmp_path / "rows.csv"), "noise": 1.0}
-    every = {"record": {"every": 25}}  # that of a curve
+    every = {"record": {"every": 10}}  # that of a curve
     stays, goes_on = (posed(small(**more, **every), given) for more in ({"solver": SETTLING}, {}))
     z = stays.start()
     short, whole = stays.at(z), goes_on.at(z)
@@ -357,8 +357,8 @@ def test_derivatives_match_finite_differences(measured):
     at = problem.at(z)
     for n in range(problem.size):
         step = 1e-4 * max(abs(z[n]), 0.1)
-        ends = [problem.at(z + sign * step * np.eye(problem.size)[n]) for sign in (1, -1)]
-        slope = -(ends[0].residuals - ends[1].residuals) / (2 * step)
+        ends = [problem.residuals(z + sign * step * np.eye(problem.size)[n]) for sign in (1, -1)]
+        slope = -(ends[0] - ends[1]) / (2 * step)
         np.testing.assert_allclose(
             at.jacobian[:, n], slope, rtol=1e-5, atol=1e-6 * abs(slope).max()
         )

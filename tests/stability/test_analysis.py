@@ -226,7 +226,7 @@ def test_undamped_mode_is_found():
 
 
 @pytest.mark.parametrize(
-    "name", in_turn([n for n in shipped_names() if "to-failure" not in n], 3, first=1)
+    "name", in_turn([n for n in shipped_names() if "to-failure" not in n], 3)
 )
 def test_predictions_for_shipped_experiments_hold(name):
     """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are that
