@@ -150,7 +150,7 @@ def test_sampler_draws_from_the_posterior(fit):
     assert abs(sample.mean[0] - estimate.value) < estimate.error
     assert 0.0 < sample.error[0] < estimate.error
     assert sample.deviation[0] == pytest.approx(estimate.error, rel=0.5)
-    short = fit | {"modes": 1, "sampler": {"walkers": 8, "steps": 8}}
+    short = fit | {"modes": 1, "sampler": {"walkers": 4, "steps": 10}}
     once, again = (pbdkit.fit(short).sample.draws.tobytes() for _ in range(2))
     assert once == again
 

@@ -225,9 +225,7 @@ def test_undamped_mode_is_found():
     assert any("use a relaxation below 1" in w for w in pbdkit.analyse(given).warnings())
 
 
-@pytest.mark.parametrize(
-    "name", in_turn([n for n in shipped_names() if "to-failure" not in n], 3)
-)
+@pytest.mark.parametrize("name", in_turn([n for n in shipped_names() if "to-failure" not in n], 3))
 def test_predictions_for_shipped_experiments_hold(name):
     """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are that
     are made of steps, and those that go straight to equilibrium stay there too. Bodies that are
