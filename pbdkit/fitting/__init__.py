@@ -1,7 +1,9 @@
 """Fit parameters of an experiment to measurements.
 
-`fit_file` reads what is fitted to which data; `observations` predicts measured fields, tracks and
-curves with derivatives (`sensitivity`, `parameter`); `problem` solves the least-squares problem,
-`uncertainty` evaluates intervals and compares models, and `strength` fits strengths of bonds to
-repeated tests.
+- `fit_file` reads the description of a fit: its parameters and its measurements.
+- `observations` predicts measured fields, tracks and curves.
+- `sensitivity` and `parameter` compute the derivatives of these predictions.
+- `problem` solves the least-squares problem.
+- `uncertainty` computes confidence intervals and compares models.
+- `strength` fits the strengths of bonds to repeated tests.
 """

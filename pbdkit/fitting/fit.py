@@ -31,12 +31,18 @@ from pbdkit.plugin.component import Component
 
 ComponentClasses = Iterable[type[Component]]
 BASE_MODEL = "as given"
-"""Name of the fit's own experiment among the candidates."""
+"""Name of the experiment of the fit in the comparison with candidates."""
 INSET = 1e-6
-"""Distance from a bound, as a fraction of the interval, at which a parameter must be valid."""
+"""Distance from a bound at which the experiment must be valid.
+
+It is a fraction of the interval between the bounds.
+"""
 TINY = 1e-6
-"""Initial noise as a fraction of the measured values, before it is estimated from the residuals.
-Residuals smaller than this fraction of the values are rounding errors."""
+"""Initial noise, as a fraction of the measured values.
+
+It is used before the noise is estimated from the residuals. Residuals smaller than this fraction of
+the values are rounding errors.
+"""
 
 
 def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasses = ()) -> Fitted:
@@ -49,7 +55,7 @@ def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasse
     experiment
         Experiment with the unknown parameters.
     components
-        Component classes that `settings` of the fit may name.
+        Component classes that the `settings` in the fit file may use.
 
     Returns
     -------
@@ -131,12 +137,12 @@ def problem_of(
     Parameters
     ----------
     unknown_bounds
-        Bounds of unknown parameters by path; default: those of the fit.
+        Bounds of the unknown parameters by path; by default those of the fit.
 
     Raises
     ------
     ExperimentError
-        If parameters or measurements do not suit the experiment.
+        If the experiment has no such parameters, or cannot predict the measurements.
     """
     pairs = (unknown_bounds or fit.unknown).items()
     unknowns = tuple(Unknown(Parameter(path), *bounds) for path, bounds in pairs)
@@ -213,7 +219,7 @@ def _refuse_underdetermined(problem: Problem) -> None:
 
 
 def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
-    """Solve the problem; the noise is estimated from the residuals if it is not given."""
+    """Solve the problem. If the noise is not given, estimate it from the residuals."""
     if fit.measured[0].noise is not None:
         return problem, solved(problem, problem.start(), fit.loss)
     (observation,) = problem.observations
@@ -221,7 +227,8 @@ def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
         problem, observations=(observation.with_noise(TINY * _size(observation.measured)),)
     )
     solution = solved(problem, problem.start())
-    # A robust loss identifies outliers by the noise, so that both are computed twice.
+    # A robust loss identifies outliers by means of the noise, so that the fit and the noise are
+    # computed twice.
     for _ in range(1 if fit.loss == "linear" else 2):
         (observation,) = problem.observations
         ratio = max(solution.ratio / np.sqrt(observation.weight), TINY)

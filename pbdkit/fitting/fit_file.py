@@ -1,5 +1,8 @@
-"""Fit files: an experiment, its unknown parameters, and measurements (fields of displacements,
-tracks in time, curves) or, for a fit of strength, the peaks of repeated tests."""
+"""Fit files: an experiment, its unknown parameters, and measurements.
+
+Measurements are fields of displacements, tracks in time and curves. For a fit of strength they are
+the peak loads of repeated tests.
+"""
 
 from __future__ import annotations
 
@@ -57,10 +60,10 @@ if TYPE_CHECKING:
 GUESS = 1.0
 """Standard deviation of the noise until it is estimated from the residuals."""
 MIN_POINTS = 4
-"""Number of points up to which their extent is not checked."""
+"""Largest number of points for which their extent is not compared with that of the body."""
 
 MIN_EXTENT = 2e-3
-"""Extent of the points, relative to the body, below which their unit must be wrong."""
+"""Extent of the points divided by that of the body, below which the unit must be wrong."""
 Positive = Annotated[float, Field(gt=0.0)]
 Term = Annotated[
     tuple[Annotated[int, Field(ge=0, le=4)], Annotated[int, Field(ge=0, le=4)]],
@@ -82,11 +85,13 @@ DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
 
 
 class MeasuredColumns(Component):
-    """A measurement: the columns of a CSV `file` beside the fit file. `noise` is the standard
-    deviation of the measured numbers; by default it is estimated from the residuals. With a
-    `weight` of 4 each number counts as if its noise were halved. `settings` are changes of the
-    experiment, by path, for this measurement alone, for instance another load or another number of
-    steps."""
+    """A measurement: columns of a CSV `file` in the folder of the fit file.
+
+    `noise` is the standard deviation of the measured values; by default it is estimated from the
+    residuals. A `weight` of 4 has the same effect as half the noise. `settings` are changes of the
+    experiment, by path, for this measurement only, for instance another load or another number of
+    steps.
+    """
 
     file: str
     noise: Positive | None = None
@@ -108,12 +113,12 @@ class MeasuredColumns(Component):
 
     @property
     def rows(self) -> Floats:
-        """Return the numbers of the file, (row, column)."""
+        """Return the values in the file, (row, column)."""
         return np.asarray(self._rows)
 
     @property
     def assumed_noise(self) -> float:
-        """Return the noise, or a guess until it is estimated from the residuals."""
+        """Return the noise or, before it is estimated from the residuals, a guess."""
         return self.noise or GUESS
 
     @abstractmethod
@@ -130,7 +135,7 @@ class MeasuredColumns(Component):
         Raises
         ------
         ExperimentError
-            If the measurement does not suit the experiment.
+            If the experiment cannot predict the measurement.
         """
 
 
@@ -139,7 +144,10 @@ DATASET = "(dataset)"
 
 
 def _rows_of(table: xarray.Dataset, columns: Sequence[str]) -> Floats:
-    """Return the rows of a dataset with these variables. Raises ValueError."""
+    """Return the values of variables of a dataset as rows, with a column for each variable.
+
+    Raises ValueError.
+    """
     for name in columns:
         if name not in table:
             hint = did_you_mean(name, map(str, table))
@@ -157,22 +165,25 @@ def _rows_of(table: xarray.Dataset, columns: Sequence[str]) -> Floats:
 
 
 class Distortion(Strict):
-    """Apparent displacements in the plane that are not displacements of the body: polynomials of x
-    and y, by their exponents, with fitted amplitudes. They describe a rotated camera, a lens, and
-    bending out of the plane, for instance `ux: [[2, 0]]`, a strain that grows linearly along x."""
+    """Apparent displacements in the plane that are not displacements of the body, for instance
+    those due to a rotated camera, a lens, or bending out of the plane. They are polynomials of x
+    and y with fitted amplitudes, given by exponents. For example, `ux: [[2, 0]]` is a displacement
+    proportional to x², or a strain that increases linearly along x."""
 
     ux: Terms = ()
     uy: Terms = ()
 
 
 def _without_type(schema: dict[str, Any]) -> None:
-    # The type of a measurement is by default a field.
+    # A measurement without a type is a field.
     schema["required"] = [key for key in schema["required"] if key != "type"]
 
 
 class MeasuredField(MeasuredColumns):
-    """Displacements at scattered points in equilibrium, in lattice units. Points closer to the
-    outline of the body than `margin` are left out."""
+    """Displacements of a body in equilibrium at scattered points, in lattice units.
+
+    Points that are closer to the outline of the body than `margin` are not used.
+    """
 
     model_config = ConfigDict(json_schema_extra=_without_type)
 
@@ -182,7 +193,7 @@ class MeasuredField(MeasuredColumns):
     distortion: Distortion = Field(default_factory=Distortion)
 
     def observation(self, experiment: Experiment, modes: int) -> FieldObservation:
-        """Return the observation in equilibrium, for any solver of the experiment."""
+        """Return the observation of an equilibrium. The solver of the experiment is not used."""
         if experiment.solver.makes_steps:
             experiment = experiment.model_copy(update={"solver": Equilibrium()})
         scene = build_scene(experiment)
@@ -211,15 +222,15 @@ class MeasuredTracks(MeasuredColumns):
     )
 
     def observation(self, experiment: Experiment, modes: int) -> TracksObservation:
-        """Return the observation in a run."""
+        """Return the observation of a run."""
         times, points, u = self.rows[:, 0], self.rows[:, 1:3], self.rows[:, 3:]
         return TracksObservation.of(experiment, times, points, u, self.assumed_noise)
 
 
 class MeasuredCurve(MeasuredColumns):
-    """The force that leader group `group` exerts along `axis`, over its displacement along that
-    axis, or over time in steps with `against: time`. Forces are those of a body of this
-    `thickness`. `youngs_modulus` is fitted, too, by default. Units are N, mm and MPa if the
+    """The force that the leader group `group` exerts along `axis` as a function of its displacement
+    along this axis or, with `against: time`, of the time in steps. `thickness` is the thickness of
+    the tested body. By default `youngs_modulus` is fitted too. Units are N, mm and MPa if the
     experiment has units."""
 
     type: Literal["curve"] = "curve"
@@ -231,7 +242,10 @@ class MeasuredCurve(MeasuredColumns):
     columns: Annotated[tuple[str, str], Field(strict=False)] = ("displacement", "force")
 
     def observation(self, experiment: Experiment, modes: int) -> CurveObservation:
-        """Return the observation in a run, divided by thickness and modulus if they are known."""
+        """Return the observation of a run.
+
+        Forces are divided by the thickness and by a known modulus.
+        """
         scale = self.thickness * (self.youngs_modulus or 1.0)
         scale *= experiment.units.length_mm if experiment.units else 1.0
         curve = CurveObservation.of(
@@ -286,7 +300,7 @@ Measurements = Annotated[
     tuple[SerializeAsAny[MeasuredColumns], ...],
     BeforeValidator(_one_or_some, json_schema_input_type=_Any | tuple[_Any, ...]),
 ]
-"""One measurement, by default of a field, or a list of measurements."""
+"""One measurement, or a list of measurements. A measurement without a type is a field."""
 
 
 FOLDER = Path(__file__).parent.parent / "fits"
@@ -303,9 +317,9 @@ Bounds = Annotated[Pair, AfterValidator(_two)]
 
 
 class Force(Strict):
-    """The force of a leader group and the thickness of the body, from which Young's modulus
-    follows. Its unit is that of the force, divided by those of the thickness and of the lattice.
-    Units are N, mm and MPa if the experiment has units."""
+    """The force of a leader group and the thickness of the body, from which Young's modulus is
+    computed. Units are N, mm and MPa if the experiment has units. Otherwise the unit of the modulus
+    is that of the force divided by the unit of the thickness and by the lattice unit."""
 
     group: Annotated[int, Field(ge=0)]
     value: Pair
@@ -314,16 +328,21 @@ class Force(Strict):
 
 
 class AlternativeModel(Strict):
-    """Another model for the same data: changes of the experiment, by path, and its unknown
-    parameters if they differ."""
+    """Another model for the same data.
+
+    It is given by changes of the experiment, by path, and by its unknown parameters if they are not
+    those of the fit.
+    """
 
     settings: Annotated[dict[str, Any], Field(min_length=1)]
     unknown: Annotated[dict[str, Bounds], Field(min_length=1)] | None = None
 
 
 class Sampler(Strict):
-    """Number of walkers of emcee, and of their steps; the first quarter of the steps is
-    discarded."""
+    """Number of walkers of emcee, and number of steps of each walker.
+
+    The first quarter of the steps is discarded.
+    """
 
     walkers: Annotated[int, Field(ge=4, le=1000)] = 16
     steps: Annotated[int, Field(ge=10)] = 200
@@ -331,16 +350,18 @@ class Sampler(Strict):
 
 
 class Fit(Strict):
-    """Fits the `unknown` parameters of an experiment, within bounds, to measurements: a field in
-    equilibrium, tracks, a curve, or several of these.
+    """Fits the `unknown` parameters of an experiment, within bounds, to one or several
+    measurements, which are fields in equilibrium, tracks or curves.
 
-    For leader groups with the motion `measured`, the amplitudes of `modes` smooth displacements
-    along each axis are estimated, too; if `modes` is 0, the measured displacements are prescribed.
-    `loss` is the loss function of the residuals: all but `linear` reduce the weight of outliers.
+    If a leader group has the motion `measured`, its displacement along each axis is a sum of
+    `modes` smooth functions with amplitudes that are also fitted. If `modes` is 0, the measured
+    displacements are prescribed. `loss` is the loss function of the residuals. All functions except
+    `linear` reduce the weight of outliers.
 
-    Optional and expensive: `profile` lists parameters for a profile likelihood, computed by
-    fitting all others again; `sampler` draws from the posterior; `candidates` are other models by
-    name, which are compared with this one by cross-validation over a number of `folds`.
+    Three computations are optional and expensive. `profile` lists the parameters of which the
+    profile likelihood is computed, by fitting all other parameters again. `sampler` generates
+    samples of the posterior distribution. `candidates` are other models by name, which are compared
+    with this one by cross-validation over a number of `folds`.
     """
 
     version: Version = 1
@@ -359,7 +380,7 @@ class Fit(Strict):
 
     @property
     def files(self) -> FileResolver:
-        """Return the folder of files that the fit may name."""
+        """Return the folder to which the file names in the fit refer."""
         return self._files
 
     @model_validator(mode="after")
@@ -401,20 +422,22 @@ class Fit(Strict):
 
 
 KIND = "strength"
-"""Value of `kind` in strength fits."""
+"""Value of `kind` in fits of strength."""
 MIN_BROKEN = 3
 """Smallest number of broken specimens from which scatter can be estimated."""
 
 
 class Peaks(Strict):
-    """The peak load of each specimen: a list of `peaks`, or the `column` of a CSV `file` beside
-    this one. `of` names the measured quantity: the `force` or the `displacement` of the leader
-    group `group` at the peak, or `factor`, the peak load as a fraction of the experiment's load.
+    """The peak load of each specimen, given as a list of `peaks` or as a `column` of a CSV `file`
+    in the folder of the fit file. `of` is the measured quantity. It is the `force` or the
+    `displacement` of the leader group `group` at the peak, or `factor`, the peak load as a fraction
+    of the load in the experiment.
 
-    Instead of `column`, `curve` names the columns specimen, displacement and force of whole curves;
-    their peaks are used. `broke` is 1 if a specimen broke and 0 if its test ended before, as a list
-    or the name of a column; by default all broke. Forces are those of a body of `youngs_modulus`
-    and `thickness`. `group` is by default the one with the largest displacement.
+    In place of `column`, `curve` can name the columns specimen, displacement and force of whole
+    curves, the peaks of which are used. `broke` is a list or the name of a column with a 1 for each
+    specimen that broke and a 0 for each one that did not break before the end of its test. By
+    default all specimens broke. `youngs_modulus` and `thickness` are those of the tested body. By
+    default `group` is the one with the largest displacement.
     """
 
     file: str | None = None
@@ -484,8 +507,10 @@ class Peaks(Strict):
 
 
 def _peaks_of_curves(rows: Floats, quantity: str) -> Floats:
-    """Return the largest force of each specimen, or the displacement there, and the rest of the
-    row."""
+    """Return the largest force of each specimen, or the displacement at this force.
+
+    The other values of the row of the file are returned too.
+    """
     peaks = []
     for specimen in np.unique(rows[:, 0]):
         curve = rows[rows[:, 0] == specimen]
@@ -495,14 +520,16 @@ def _peaks_of_curves(rows: Floats, quantity: str) -> Floats:
 
 
 class StrengthFit(Strict):
-    """Fits the strength of bonds and its scatter, the `unknown` parameters within bounds, to
-    repeats of one experiment.
+    """Fits the strength of bonds and its scatter to repeated tests of one experiment.
 
-    `law` is the distribution of strengths, by default that of the experiment's fracture. `method`:
-    `likelihood` assumes that a specimen fails with its first bond, `simulation` compares with
-    simulated specimens, `auto` uses `simulation` if that assumption does not hold. `check` is the
-    number of specimens that are simulated to test the assumption, `simulations` the number for the
-    method `simulation`, and `seed` the seed of the random numbers of both methods.
+    They are the `unknown` parameters, with bounds.
+
+    `law` is the distribution of strengths, by default that of the fracture model of the experiment.
+    The `method` `likelihood` assumes that a specimen fails when its first bond breaks. `simulation`
+    compares the measurements with simulated specimens. `auto` uses `likelihood`, and `simulation`
+    if the assumption does not hold. `check` is the number of specimens that are simulated to test
+    the assumption, and `simulations` the number of specimens for the method `simulation`. `seed` is
+    the seed of the random numbers of both methods.
     """
 
     version: Version = 1
@@ -525,10 +552,9 @@ class StrengthFit(Strict):
 
 
 def is_strength_fit(description: Mapping[str, Any] | str | Path) -> bool:
-    """Return whether a fit file, a shipped fit or a mapping describes a strength fit, by its
-    `kind`.
+    """Return whether a fit file, a shipped fit or a mapping has the `kind` of a strength fit.
 
-    It is False if the file cannot be read, which is reported when it is read again.
+    If the file cannot be read, the result is False; the error is reported when the fit is read.
     """
     if isinstance(description, Mapping):
         return description.get("kind") == KIND
@@ -556,9 +582,9 @@ def read_fit(
     description
         Path or name, or the content.
     has_experiment
-        Whether the caller has the experiment, so that the fit need not name one.
+        Whether the caller provides the experiment, so that the fit need not name one.
     measured
-        Dataset in place of the file of the measurement.
+        Dataset that replaces the file of the measurement.
 
     Returns
     -------
@@ -590,7 +616,7 @@ def read_fit(
 
 
 def _with_dataset(source: Source) -> Source:
-    """Return the description with a dataset in place of the file of its measurement."""
+    """Return the description in which a dataset replaces the file of the measurement."""
     data = dict(source.data) if isinstance(source.data, Mapping) else {}
     file = data.get("measured") or {}
     if not isinstance(file, Mapping):

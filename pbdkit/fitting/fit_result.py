@@ -38,7 +38,7 @@ class FittedField:
     points : array of float, shape (point, axis)
         Points of the measurement.
     measured : array of float, shape (point, axis)
-        Measured displacements without the fitted distortion.
+        Measured displacements minus the fitted distortion.
     residual : array of float, shape (point, axis)
         Measured minus fitted displacements.
     """
@@ -50,18 +50,18 @@ class FittedField:
 
 @dataclass(frozen=True)
 class FittedNumbers:
-    """Measured numbers along a time or displacement, and the residuals of the fit.
+    """Measured values as a function of time or displacement, and the residuals of the fit.
 
     Parameters
     ----------
     along : array of float, shape (number,)
         Time or displacement.
     measured, fitted, residual : array of float, shape (number,)
-        Measured and fitted numbers, and their difference.
+        Measured and fitted values, and the differences between them.
     what, over : str
-        Labels of the numbers and of `along`.
+        Labels of the values and of `along`.
     joined : bool
-        Whether the numbers are one curve.
+        Whether the values form one curve, and not several tracks.
     """
 
     along: Floats
@@ -86,9 +86,9 @@ class Misfit:
     ratio
         Standard deviation of the residuals divided by the noise.
     numbers
-        Number of measured numbers.
+        Number of measured values.
     left_out, left_out_because
-        Number of rows that are left out, and the reason.
+        Number of rows of the file that are not used, and the reason.
     factor, unit
         If the experiment has units, `factor` times the noise is its value in `unit`.
     """
@@ -117,8 +117,8 @@ class Misfit:
 class Fitted:
     """Result of a fit.
 
-    Standard errors are scaled by the residuals if the residuals are larger than the noise divided
-    by the square root of the weight.
+    If the residuals are larger than the noise divided by the square root of the weight, the
+    standard errors are multiplied by the ratio of both.
 
     Parameters
     ----------
@@ -135,14 +135,14 @@ class Fitted:
     problem, solution
         Least-squares problem and its solution.
     profiles : mapping of str to Profile
-        Profile likelihoods by path, on request.
+        Profile likelihoods by path, of the parameters for which the fit requests them.
     combinations : tuple of Combination
-        Combinations of parameters that are not identifiable separately: identifiable ones, then the
-        others.
+        Combinations of parameters that are not identifiable separately. Identifiable combinations
+        come first.
     sample : Sample or None
-        Sample of the posterior, on request.
+        Sample of the posterior; None if the fit does not request it.
     candidates : tuple of Candidate
-        Compared models, the best first, on request.
+        Compared models, the best one first; empty if the fit has no candidates.
     """
 
     values: Mapping[str, Estimate]
@@ -248,8 +248,8 @@ class Fitted:
         Returns
         -------
         dict of str to Estimate
-            Amplitudes by polynomial, for instance "ux x^2 y^0", with x and y from -1 to 1 over the
-            points.
+            Amplitudes by polynomial, for instance "ux x^2 y^0". In the polynomials x and y are
+            scaled so that they range from -1 to 1 over the points.
         """
         observation, columns = [*self.problem.own_slices()][n]
         if not isinstance(observation, FieldObservation):
@@ -278,7 +278,7 @@ class Fitted:
         Returns
         -------
         FittedNumbers
-            Measured and fitted numbers, and residuals.
+            Measured and fitted values, and residuals.
 
         Raises
         ------
@@ -295,7 +295,7 @@ class Fitted:
         return FittedNumbers(along, measured, measured - residual, residual, what, over, joined)
 
     def information(self, n: int = 0) -> dict[str, Floats]:
-        """Return the information of each number of a measurement about each parameter.
+        """Return how much information each measured value contains about each parameter.
 
         Parameters
         ----------
@@ -309,8 +309,9 @@ class Fitted:
 
         Notes
         -----
-        It is the square of the part of the derivative that is orthogonal to the derivatives with
-        respect to all other unknowns.
+        The information is the square of the derivative of the prediction with respect to the
+        parameter. Before it is squared, the derivative is projected on the orthogonal complement of
+        the derivatives with respect to all other unknowns.
         """
         jacobian, result = self.solution.at.jacobian, dict[str, Floats]()
         _, rows = [*self.problem.rows()][n]
@@ -385,7 +386,7 @@ def _residuals_of(observation: Observation, residuals: Floats, loss: Loss) -> Mi
 
 
 def unit_of(observation: Observation) -> tuple[float, str]:
-    """Return the factor and unit that convert numbers of an observation to the experiment's units.
+    """Return the factor and the unit that convert an observation to the units of the experiment.
 
     Forces are in N, and lengths in lattice units. Without units the factor is 1, and the unit is an
     empty text.

@@ -1,14 +1,14 @@
-"""Observations of a fit: predictions of an equilibrium or a run for measured displacements, tracks
-and forces.
+"""Observations of a fit: predictions of measured displacements, tracks and forces.
 
-If the displacements of a measured boundary were prescribed, their noise would be prescribed, too.
-The displacement of each group that moves by `measured` is therefore a polynomial along the
-boundary. Its coefficients are estimated with all other unknowns, starting from the measured values.
+They are computed from an equilibrium or a run. If the measured displacements of a boundary were
+prescribed, their noise would be prescribed too. The displacement of each leader group with the
+motion `measured` is therefore a polynomial along the boundary. Its coefficients are estimated
+together with all other unknowns, starting from the measured values.
 
 Displacements between particles are interpolated bilinearly in the cells of the lattice. Derivatives
 of predictions of a run are central differences of order 8 of whole runs, in which the same bonds
-must break. If a run ends in equilibrium, the runs of the differences make the same number of steps,
-since the number of steps is not a smooth function of the parameters.
+must break. If a run ends in equilibrium, the runs for the differences make the same number of
+steps, because the number of steps to equilibrium is not a smooth function of the parameters.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from pbdkit.simulation import FAILED, Simulation
 from pbdkit.stepping.state import State, initial_state
 
 STRAIGHT = 1e-6
-"""Largest deviation of a group from a line, relative to its length."""
+"""Largest distance of a particle of a group from the line of the group, relative to the length."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,10 @@ class Boundary:
         return np.asarray(self.modes @ coefficients.reshape(len(self.leading.axes), -1).T)
 
     def moved(self, experiment: Experiment, coefficients: Floats) -> Experiment:
-        """Return the experiment with displacements for coefficients in place of the measured
-        ones."""
+        """Return the experiment in which the measured displacements are replaced.
+
+        The new displacements are those of the coefficients.
+        """
         group = self.leading.group
         full = np.zeros_like(self.leading.reference)
         full[:, list(self.leading.axes)] = self.displacements(coefficients)
@@ -107,8 +109,10 @@ class Boundary:
         return experiment.model_copy(update={"leaders": tuple(leaders)})
 
     def planes(self, scene: Scene, n: int) -> Floats:
-        """Return the displacements if coefficient n is 1 and all others are 0, (axis, sublattice,
-        cell, cell)."""
+        """Return the displacements for coefficients of 0, except for coefficient n, which is 1.
+
+        The result is a raster for each axis and sublattice, (axis, sublattice, cell, cell).
+        """
         axis, mode = divmod(n, self.modes.shape[1])
         planes = np.zeros((scene.axes, *scene.raster.shape))
         flat = planes.reshape(scene.axes, -1)
@@ -173,7 +177,7 @@ def _polynomials(points: Floats, modes: int, n: int) -> Floats:
 
 
 ON_EDGE = 1e-9
-"""Distance from a cell, relative to its size, up to which a point counts as inside."""
+"""Distance from a cell, relative to its size, up to which a point is treated as inside."""
 OUTSIDE = (
     "they do not lie in a complete cell of the body, or lie in one that is torn from the start"
 )
@@ -182,7 +186,7 @@ OUTSIDE = (
 
 @dataclass(frozen=True)
 class Interpolation:
-    """Linear interpolation at points in cells of a body.
+    """Linear interpolation between particles, at those points that lie in cells of the body.
 
     Parameters
     ----------
@@ -191,7 +195,7 @@ class Interpolation:
     rows : (point inside, corner)
         Rows of the particles around each point inside.
     shares : (point inside, corner)
-        Their weights.
+        Weights of these particles.
     """
 
     inside: NDArray[np.bool_]
@@ -202,10 +206,10 @@ class Interpolation:
     def at(cls, scene: Scene, points: Floats) -> Interpolation:
         """Interpolate at points.
 
-        On a lattice with one site in a cell, the four particles around a point are used, otherwise
-        the nearest three corners of a polygon of the lattice. Points for which one of these
-        particles is missing, for instance in a hole, are left out, and so are points between
-        particles with a bond that is broken from the start.
+        On a lattice with one site in a cell, the four particles around a point are used. On other
+        lattices the nearest three corners of a cell are used. Points are excluded if one of these
+        particles is missing, for instance in a hole, or if a bond between two of them is broken
+        from the start.
         """
         has_one_site = len(scene.raster.cell.sites) == 1
         interpolation = _in_cells(scene, points) if has_one_site else _in_triangles(scene, points)
@@ -216,22 +220,23 @@ class Interpolation:
         )
 
     def _restricted(self, mask: NDArray[np.bool_]) -> Interpolation:
-        """Keep some of the points inside; the others count as outside."""
+        """Return the interpolation at some of the points; all other points are treated as
+        outside."""
         inside = self.inside.copy()
         inside[self.inside] = mask
         return replace(self.part(mask), inside=inside)
 
     def part(self, selection: NDArray[Any]) -> Interpolation:
-        """Select points inside, by number or mask."""
+        """Return the interpolation at some of the points inside, given by indices or a mask."""
         return replace(self, rows=self.rows[selection], shares=self.shares[selection])
 
     @cached_property
     def _places(self) -> dict[str, tuple[Raster, Indices]]:
-        """Cache of the places of the rows on the last raster."""
+        """Cache of the positions of the particles in the raster that was used last."""
         return {}
 
     def of(self, planes: Floats, scene: Scene) -> Floats:
-        """Interpolate planes at the points inside, (point, axis)."""
+        """Interpolate rasters of displacements at the points inside, (point, axis)."""
         raster, place = self._places.get("last", (None, self.rows))
         if raster is not scene.raster:
             place = scene.raster.place_of(self.rows.ravel()).reshape(self.rows.shape)
@@ -254,7 +259,7 @@ def _in_cells(scene: Scene, points: Floats) -> Interpolation:
     for step in ((0, 0), (1, 0), (0, 1), (1, 1)):
         corners.append(raster.rows_of_sites((low + step) * cell.period))
     rows, weights = np.stack(corners, axis=1), np.stack(shares, axis=1)
-    is_unused = weights <= ON_EDGE  # The point lies on a side of the cell, or at its corner.
+    is_unused = weights <= ON_EDGE  # The point lies on a side or at a corner of the cell.
     body = np.append(raster.table_kind == FOLLOWER, False)
     inside = np.asarray((body[rows] | is_unused).all(axis=1))
     rows = np.where(is_unused | ~inside[:, None], 0, rows)
@@ -288,7 +293,7 @@ def _are_in_cells(scene: Scene, triangles: Indices) -> NDArray[np.bool_]:
         for corners in combinations(range(rows.shape[1]), 3)
     ]
     triples = np.concatenate([*threes, np.zeros((0, 3), np.intp)])
-    # Pairs are numbered, so that keys are below the square of the number of particles.
+    # A pair is represented by one number, below the square of the number of particles.
     pairs, number = np.unique(triples[:, :2] @ (count, 1), return_inverse=True)
     keys = number * count + triples[:, 2]
     ordered = np.sort(triangles, axis=1)
@@ -321,7 +326,7 @@ class FieldEvidence:
     points : (point, axis)
         Points within the body.
     measured : (axis · point,)
-        Displacements: x of all points, then y.
+        Displacements along x of all points, then those along y.
     interpolation
         Interpolation at the points.
     terms
@@ -344,7 +349,7 @@ class FieldEvidence:
         displacements: Floats,
         terms: tuple[tuple[tuple[int, int], ...], ...] = ((), ()),
     ) -> FieldEvidence:
-        """Return the field at scattered points (point, axis), without those outside of the body."""
+        """Return the field at those scattered points (point, axis) that lie inside the body."""
         interpolation = Interpolation.at(scene, points)
         inside = interpolation.inside
         points = points[inside]
@@ -362,8 +367,10 @@ class FieldEvidence:
 
     @cached_property
     def distortions(self) -> Floats:
-        """Return the polynomials of the distortions at the points, with coordinates from -1 to 1 in
-        the box."""
+        """Return the values of the polynomials of the distortions at the points.
+
+        Coordinates are scaled so that they range from -1 to 1 in the box.
+        """
         low, high = self.box
         x, y = (2.0 * (self.points - low) / np.maximum(high - low, 1e-300) - 1.0).T
         columns, n = [], len(x)
@@ -375,13 +382,15 @@ class FieldEvidence:
         return np.stack(columns, axis=1) if columns else np.zeros((2 * n, 0))
 
     def predict(self, planes: Floats, resting_scene: RestingScene) -> Floats:
-        """Interpolate displacements, given as planes, at the points."""
+        """Interpolate displacements at the points. They are given as rasters."""
         return self.interpolation.of(planes, resting_scene.scene).T.ravel()
 
 
 @dataclass(frozen=True)
 class GroupReaction:
-    """Force of a leader group in equilibrium along each axis, over Young's modulus and thickness.
+    """Force of a leader group in equilibrium, along each axis.
+
+    It is divided by Young's modulus and thickness.
 
     Parameters
     ----------
@@ -407,7 +416,7 @@ class GroupReaction:
         du
             Derivative of the displacements.
         parameter
-            Parameter that changes with them.
+            Parameter with respect to which the derivative is taken.
         """
         scene, u = self.resting_scene.scene, self.resting_scene.state.u
         if self.resting_scene.finder.linear:
@@ -437,11 +446,11 @@ class Prediction:
     residuals : (number,)
         (measured - predicted) / weighted noise.
     by_parameter : (number, parameter)
-        Derivatives of predictions over the weighted noise.
+        Derivatives of the predictions, divided by the weighted noise.
     by_own : (number, own unknown)
-        The same for unknowns of the observation itself.
+        The same derivatives with respect to unknowns that only this observation has.
     by_modulus : (number,)
-        The same for Young's modulus.
+        The same derivatives with respect to Young's modulus.
     """
 
     residuals: Floats
@@ -459,8 +468,8 @@ class NearbyPrediction:
     prediction
         The prediction.
     away
-        Largest distance of a parameter from its value there, as a fraction of the interval between
-        its bounds.
+        Largest difference between a parameter and its value in this prediction, as a fraction of
+        the interval between its bounds.
     """
 
     prediction: Prediction
@@ -469,7 +478,7 @@ class NearbyPrediction:
 
 @dataclass(frozen=True, kw_only=True)
 class Observation(ABC):
-    """Measured numbers of an experiment.
+    """Measured values, and their prediction by an experiment.
 
     Parameters
     ----------
@@ -478,13 +487,13 @@ class Observation(ABC):
     measured : (number,)
         Measured numbers.
     noise
-        Their standard deviation.
+        Standard deviation of the measured values.
     rows : (row,)
         Indices of the rows of the file that are used.
     left_out, left_out_because
-        Number of other rows, and the reason.
+        Number of rows that are not used, and the reason.
     unit
-        Unit of `measured` and `noise`, relative to that of the file.
+        Unit of `measured` and `noise` divided by the unit of the file.
     weight
         Weight of the measurement.
     """
@@ -501,7 +510,8 @@ class Observation(ABC):
 
     @property
     def weighted_noise(self) -> float:
-        """Return the unit of residuals: the noise divided by the square root of the weight."""
+        """Return the noise divided by the square root of the weight, by which residuals are
+        divided."""
         return float(self.noise / np.sqrt(self.weight))
 
     @property
@@ -511,11 +521,12 @@ class Observation(ABC):
 
     @property
     def own_unknowns(self) -> int:
-        """Return the number of unknowns besides the parameters."""
+        """Return the number of unknowns that only this observation has."""
         return 0
 
     def start(self) -> Floats:
-        """Return the initial values of these unknowns, (own unknown,)."""
+        """Return the initial values of the unknowns that only this observation has, (own
+        unknown,)."""
         return np.zeros(self.own_unknowns)
 
     @abstractmethod
@@ -536,11 +547,11 @@ class Observation(ABC):
         parameters
             Parameters of the derivatives.
         own_values : (own unknown,)
-            Unknowns of the observation itself.
+            Values of the unknowns that only this observation has.
         modulus
             Young's modulus.
         near
-            Prediction at similar parameters, from which the solution may start.
+            Prediction at similar parameters, which can serve as initial guess of the solution.
 
         Raises
         ------
@@ -551,17 +562,19 @@ class Observation(ABC):
         """
 
     def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:
-        """Return Σ measured · p and Σ p², with the predictions p for a modulus of 1, both divided
-        by the square of the weighted noise.
+        """Return two sums, of which the ratio is the initial modulus.
 
-        The ratio of the two sums is the initial modulus.
+        They are Σ measured · p and Σ p², divided by the square of the weighted noise. p is the
+        prediction for a modulus of 1.
         """
         return 0.0, 0.0
 
     @abstractmethod
     def places(self) -> Floats:
-        """Return coordinates of the rows, (row, coordinate); rows close to each other carry the
-        same information."""
+        """Return coordinates of the rows, (row, coordinate).
+
+        Rows with similar coordinates contain similar information.
+        """
 
     def part(self, mask: NDArray[np.bool_]) -> Self:
         """Select some of the rows by a mask."""
@@ -570,7 +583,7 @@ class Observation(ABC):
         return replace(self, measured=measured, rows=self.rows[mask])
 
     def with_noise(self, noise: float) -> Self:
-        """Return the observation with another noise."""
+        """Return the observation with another standard deviation of the noise."""
         return replace(self, noise=noise)
 
 
@@ -580,7 +593,7 @@ def read_at(experiment: Experiment, steps: Sequence[int] | None = None) -> Scene
     Parameters
     ----------
     steps
-        Recorded steps; default: those of the experiment.
+        Recorded steps; by default those of the experiment.
     """
     changed: dict[str, Any] = {"diagnostics": ()}
     if steps is not None:
@@ -590,7 +603,7 @@ def read_at(experiment: Experiment, steps: Sequence[int] | None = None) -> Scene
 
 @dataclass(frozen=True, kw_only=True)
 class RunObservation(Observation):
-    """Measured numbers of a run."""
+    """Measured values that are predicted by a run."""
 
     scene: Scene
 
@@ -602,7 +615,8 @@ class RunObservation(Observation):
         modulus: float,
         near: NearbyPrediction | None = None,
     ) -> Prediction:
-        """Predict by one run, and eight for each parameter."""
+        """Predict the measured values by one run, and derivatives by eight runs for each
+        parameter."""
         predicted, broken, steps = self._run(experiment)
         columns = [self._change(experiment, parameter, broken, steps) for parameter in parameters]
         rows = len(self.measured)
@@ -615,7 +629,7 @@ class RunObservation(Observation):
         )
 
     def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:
-        """Compute the terms by one run."""
+        """Compute the two sums from one run."""
         if not self.needs_modulus:
             return 0.0, 0.0
         predicted, *_ = self._run(experiment)
@@ -640,8 +654,7 @@ class RunObservation(Observation):
         return np.asarray(parameter.derivative(experiment, predicted))
 
     def _run(self, experiment: Experiment) -> tuple[Floats, Floats, int]:
-        """Return predictions (number,), the step in which each bond broke, and the number of
-        steps."""
+        """Return the predictions, the step in which each bond broke, and the number of steps."""
         original = self.scene.experiment
         changed = experiment.model_copy(
             update={"record": original.record, "diagnostics": original.diagnostics}
@@ -653,7 +666,7 @@ class RunObservation(Observation):
         return numbers, breaking_steps, run.driver.state.step
 
     def _recorded(self, run: Simulation) -> Iterator[tuple[float, State]]:
-        """Yield the moment, in steps, and the state of each record, and of the end of a run.
+        """Yield time and state of each record of a run, and of its end.
 
         Raises
         ------
@@ -678,7 +691,7 @@ class RunObservation(Observation):
 
 
 def _with_steps(experiment: Experiment, steps: int) -> Experiment:
-    """Return the experiment with this number of steps, which convergence does not shorten."""
+    """Return the experiment with a number of steps that all runs make, even if they converge."""
     changed: dict[str, Any] = {"steps": steps}
     if experiment.solver.makes_steps:
         changed["solver"] = experiment.stepping.model_copy(update={"settle": None})
@@ -686,16 +699,16 @@ def _with_steps(experiment: Experiment, steps: int) -> Experiment:
 
 
 SLACK = 1e-9
-"""Distance, relative to the range of a run, by which a row may lie beyond it."""
+"""Distance by which a row may lie beyond the range of a run, relative to this range."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CurveObservation(RunObservation):
-    """Force of a leader group along a direction, over displacements of the group until it stops or
-    turns, or over times.
+    """Force of a leader group along a direction, as a function of its displacement or of time.
 
-    Forces are divided by the thickness, and by Young's modulus unless that is unknown. They are
-    linear between recorded steps.
+    As a function of displacement, the curve ends where the group stops or reverses its motion.
+    Forces are divided by the thickness and, if it is known, by Young's modulus. They are
+    interpolated linearly between recorded steps.
 
     Parameters
     ----------
@@ -704,7 +717,7 @@ class CurveObservation(RunObservation):
     direction
         Unit vector.
     at_times
-        Whether the curve is over times.
+        Whether the force is a function of time.
     scaled
         Whether Young's modulus is unknown.
     along : (number,)
@@ -760,12 +773,13 @@ class CurveObservation(RunObservation):
         )._restricted_to_run()
 
     def _restricted_to_run(self) -> CurveObservation:
-        """Leave out rows that the run does not reach.
+        """Return the observation without the displacements that the run does not reach.
 
         Raises
         ------
         ExperimentError
-            If no row remains, or if times lie beyond the run.
+            If no row remains. Also if the force is a function of time, and a time lies beyond the
+            run.
         """
         reached, _ = self.curve(Simulation.of_scene(self.scene))
         inside = (self.along >= reached.min()) & (self.along <= reached.max())
@@ -807,10 +821,10 @@ class CurveObservation(RunObservation):
         return np.interp(self.along, reached, force)
 
     def curve(self, run: Simulation) -> tuple[Floats, Floats]:
-        """Return places and forces over Young's modulus and thickness at recorded moments, (step,).
+        """Return displacements or times, and forces, at recorded steps, (step,).
 
-        The curve ends where the group stops or turns. After a run has converged its force is
-        constant.
+        Forces are divided by Young's modulus and thickness. The curve ends where the group stops or
+        reverses its motion. After a run has converged the force is constant.
         """
         tables, places, forces = Tables(run.scene), [], []
         for moment, state in self._recorded(run):
@@ -832,7 +846,7 @@ class CurveObservation(RunObservation):
 
 
 def _monotonic_part(places: Floats, forces: Floats) -> tuple[Floats, Floats]:
-    """Return the first monotonic part of places, in increasing order, and its forces.
+    """Return the first monotonic part of the abscissae, in increasing order, and its forces.
 
     Raises
     ------
@@ -855,14 +869,19 @@ def _monotonic_part(places: Floats, forces: Floats) -> tuple[Floats, Floats]:
 
 
 DERIVATIVES = 1e-5
-"""Accuracy of derivatives, relative to the largest derivative; it is far below any noise."""
+"""Accuracy of derivatives, relative to the largest derivative.
+
+The resulting errors are far below any noise.
+"""
 CLOSE = 0.02
-"""Largest distance of parameters, relative to the interval between their bounds, for which
-derivatives with respect to boundaries are reused. Residuals are exact in any case, and estimates
-change by at most this fraction of their errors."""
+"""Largest change of parameters after which derivatives with respect to boundaries are reused.
+
+It is a fraction of the interval between the bounds. Residuals are exact in any case, and estimates
+change by at most this fraction of their errors.
+"""
 
 NEAR = ", or nearer to its outline than the margin"
-"""Reason why points are left out if there is a margin."""
+"""Addition to the reason for which points are excluded, if there is a margin."""
 
 
 @dataclass(frozen=True)
@@ -874,14 +893,14 @@ class FieldPrediction(Prediction):
     resting_scene
         The equilibrium.
     changes
-        Derivatives of its displacements with respect to the parameters, as planes.
+        Derivatives of the displacements with respect to the parameters, as rasters.
     answers
-        Derivatives with respect to the coefficients of boundaries, possibly of an equilibrium
-        nearby.
+        Derivatives with respect to the coefficients of boundaries. They can be those of another
+        equilibrium with similar parameters.
     answering
-        That equilibrium.
+        The equilibrium at which `answers` were computed.
     away
-        Distance of the parameters from those of `answering`, as in `NearbyPrediction`.
+        Difference between the parameters and those of `answering`, as in `NearbyPrediction`.
     """
 
     resting_scene: RestingScene
@@ -895,7 +914,8 @@ class FieldPrediction(Prediction):
 class FieldObservation(Observation):
     """A measured field in equilibrium.
 
-    Its own unknowns are the coefficients of the boundaries, then the amplitudes of the distortions.
+    The unknowns that only this observation has are the coefficients of the boundaries, followed by
+    the amplitudes of the distortions.
     """
 
     kind: ClassVar[str] = "field"
@@ -945,7 +965,7 @@ class FieldObservation(Observation):
         return sum(boundary.size for boundary in self.boundaries)
 
     def start(self) -> Floats:
-        """Return the coefficients of the measured boundaries, and no distortion."""
+        """Return the coefficients of the measured boundaries, and zeros for the distortions."""
         coefficients = [boundary.start(self.experiment.steps) for boundary in self.boundaries]
         return np.concatenate([*coefficients, np.zeros(self.own_unknowns - self._coefficients)])
 
@@ -1013,15 +1033,15 @@ class FieldObservation(Observation):
 
 
 ON_STEP = 1e-9
-"""Distance from a step, in steps, up to which a time counts as that step."""
+"""Difference between a time and a step, in steps, up to which both are treated as equal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TracksObservation(RunObservation):
-    """Measured displacements of points at times, x of all, then y.
+    """Measured displacements of points at times: those along x of all rows, then those along y.
 
-    Predictions are linear between steps and between particles, and constant after a run has
-    converged.
+    Predictions are interpolated linearly between steps and between particles, and are constant
+    after a run has converged.
 
     Parameters
     ----------
@@ -1116,12 +1136,14 @@ class TracksObservation(RunObservation):
 
 
 CORNERS = 1024
-"""Number of segments of a quarter of a circle, accurate to 3e-7 radii."""
+"""Number of segments that represent a quarter of a circle, with an error of 3e-7 radii."""
 
 
 def deeper(body: Body, lattice: Lattice, points: Floats, margin: float) -> NDArray[np.bool_]:
-    """Return whether points, (point,), are inside the outline of a body by at least `margin`, up to
-    rounding."""
+    """Return whether points are at least `margin` inside the outline of a body, (point,).
+
+    Rounding errors are tolerated.
+    """
     rounding = tolerance_of(body, lattice)
     return np.asarray(depths(body, lattice, points) >= margin - 2.0 * rounding)
 
@@ -1144,9 +1166,9 @@ def depths(body: Body, lattice: Lattice, points: Floats) -> Floats:
 
 
 def _region(body: Body, lattice: Lattice, rounding: float, removed: bool = False) -> Any:
-    """Return the region of a body, or of one that is removed from another.
+    """Return the region of a body, or of a body that is removed from another one.
 
-    Sides within `rounding` of each other are merged.
+    Sides with a distance of at most `rounding` are merged.
     """
     if isinstance(body, Grid):
         return _grid_region(body, lattice, removed)
@@ -1183,7 +1205,7 @@ def _disc(centre: tuple[float, ...], radius: float) -> Any:
 
 
 def _dogbone(body: Dogbone) -> Any:
-    """Return the region of a dogbone from its upper right quarter."""
+    """Return the region of a dogbone, constructed from its upper right quarter."""
     rise = min((body.width - body.gauge_width) / 2.0, body.radius)
     angle = np.linspace(0.0, np.arccos(1.0 - rise / body.radius), CORNERS)
     x = body.gauge_length / 2.0 + body.radius * np.sin(angle)
@@ -1197,8 +1219,10 @@ def _dogbone(body: Dogbone) -> Any:
 
 
 def _grid_region(grid: Grid, lattice: Lattice, removed: bool) -> Any:
-    """Return the cells that have all corners among the sites of a grid or, for a grid that is
-    removed from a body, at least one corner."""
+    """Return the cells of which all corners are sites of a grid.
+
+    For a grid that is removed from a body, one corner suffices.
+    """
     cell = lattice.cell()
     tiling = tiling_of(cell, ((),) * len(cell.sites))
     margin = margin_of(tiling)
