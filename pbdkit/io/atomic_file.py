@@ -1,5 +1,5 @@
-"""Atomic writing of files. A file appears complete or not at all, it is locked against other
-writers, and it replaces an earlier file only on request.
+"""Atomic writing of files. A file appears under its name complete or not at all. It is locked
+against other writers, and replaces an earlier file only on request.
 
 `NewFile` is a file under construction, for libraries that do not handle failed or incomplete
 writes.
@@ -25,7 +25,8 @@ from pbdkit.errors import WriteError
 
 LOCAL = {"apfs", "bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "hfs", "jfs", "overlay"}
 LOCAL |= {"ramfs", "reiserfs", "tmpfs", "xfs", "zfs"}
-"""File systems of one machine, where SQLite's write-ahead log can share memory."""
+"""File systems that are local to one machine, so that processes can share the memory of SQLite's
+write-ahead log."""
 FULL = "the disk is full; free some space, or record fewer steps"
 """Message for a full disk."""
 FULL_BYTES = 2**20
@@ -37,7 +38,8 @@ PAUSE_S = 0.02
 
 
 def is_local(path: Path, mounts: str = "/proc/self/mountinfo") -> bool:
-    """Return whether a file lies on a local file system; False if that cannot be determined."""
+    """Return whether a file lies on a local file system. Return False if this cannot be
+    determined."""
     types: dict[str, str] = {}
     with suppress(OSError):
         for line in Path(mounts).read_text(errors="surrogateescape").splitlines():
@@ -70,12 +72,13 @@ def lock(file: io.FileIO) -> bool:
 def open_locked(path: Path) -> io.FileIO | None:
     """Open an existing file and lock it; return None if another process writes it.
 
-    A process that only tests the lock holds it for a moment, so that several attempts are made.
+    Several attempts are made, because a process that only tests the lock holds it for a short time.
     Raises OSError.
     """
     for _ in range(TRIES):
         file = io.FileIO(path, "r+b")
-        with suppress(FileNotFoundError):  # The file may have been replaced or removed meanwhile.
+        # The file may have been replaced or removed in the meantime.
+        with suppress(FileNotFoundError):
             if lock(file) and os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
         file.close()
@@ -92,15 +95,15 @@ def is_full(folder: Path) -> bool:
 
 
 def write_all(file: io.FileIO, data: bytes | bytearray | memoryview) -> None:
-    """Write all of the data: a single write may be incomplete, in particular on a disk that is
-    nearly full. Raises OSError."""
+    """Write all of the data by repeated writes, because a single write may be incomplete, in
+    particular on a disk that is nearly full. Raises OSError."""
     view = memoryview(data)
     while view:
         view = view[file.write(view) :]
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync the entries of a folder to the disk, where the file system supports it."""
+    """Sync the entries of a folder to the disk, if the file system supports this."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -112,10 +115,10 @@ def sync_folder(folder: Path) -> None:
 class NewFile(io.RawIOBase):
     """File on the disk that records the first failed write instead of raising it.
 
-    HDF5 would repeat a failed write when the process ends and crash; other libraries lose the rest
-    of an incomplete write. Here every write is complete and none raises: after the first fault
-    nothing more is written, and `check` raises the fault. There is no `fileno`, by which libraries
-    could bypass the class.
+    If a write failed, HDF5 would repeat it when the process ends, and crash. Other libraries lose
+    the rest of an incomplete write. In this class every write is complete, and no write raises an
+    exception. After the first fault nothing more is written, and `check` raises the fault. The
+    class has no method `fileno`, because libraries could use it to bypass the class.
     """
 
     def __init__(self, disk: io.FileIO) -> None:
@@ -149,7 +152,7 @@ class NewFile(io.RawIOBase):
         return length
 
     def readinto(self, buffer: Any) -> int:
-        """Read into a buffer, with zeros for bytes that the disk does not return."""
+        """Read into a buffer. Bytes that the disk does not return are set to zero."""
         view = memoryview(buffer).cast("B")
         count = 0
         try:
@@ -199,15 +202,17 @@ class NewFile(io.RawIOBase):
 
 
 WHOLE = ("complete", "settled")
-"""Statuses of results that may replace an earlier file."""
+"""Statuses of complete results, which may replace an earlier file."""
 PARTIAL = "-partial"
-"""Suffix that is added to the name of any other result if a file has that name already."""
+"""Suffix that is added to the name of a result with another status if a file with that name
+exists."""
 TEMPORARY = ".partial"
 """Suffix of files under construction."""
 RANDOM_BYTES = 8
 """Number of random bytes in the name of a file under construction, as hexadecimal digits."""
 NAME_BYTES = 100
-"""Maximum number of bytes of a name to which a suffix is added; file systems allow 255."""
+"""Maximum number of bytes of a name to which a suffix is added. It leaves room for the suffix,
+since file systems allow 255 bytes."""
 KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
 """Descriptions of file types that are not replaced."""
 
@@ -216,21 +221,22 @@ File = TypeVar("File", bound=NewFile)
 
 @contextmanager
 def open_atomic(path: Path, kind: type[File], *, replace: bool) -> Iterator[File]:
-    """Write a file that appears under its name at the end of the block, complete and synced, or not
-    at all. Until then, and after a fault, an earlier file remains.
+    """Write a file in the block. At the end of the block it appears under its name, complete and
+    synced. Until then, and after a fault, an earlier file of that name is unchanged.
 
     Parameters
     ----------
     path
-        The name; with `replace` a plain file that has it is replaced.
+        Name of the file. With `replace`, an existing plain file of that name is replaced.
     kind
-        The class of the file that the block writes into: `NewFile`, or `PagedFile` for a result,
-        which is sealed and read back.
+        Class of the file to which the block writes: `NewFile`, or `PagedFile` for a result, which
+        is sealed and read back.
 
     Raises
     ------
     WriteError
-        If the system refuses an operation, or the name belongs to a link, a pipe or a device.
+        If the operating system refuses an operation, or the name belongs to a link, a pipe or a
+        device.
     """
     with _refusing(path):
         if kind_in_place := kind_of(path):
@@ -243,7 +249,7 @@ def open_atomic(path: Path, kind: type[File], *, replace: bool) -> Iterator[File
             file = kind(disk)
             try:
                 yield file
-            # An exception in the block may have been caused by a failed write in a library.
+            # If a write failed in a library, this may have caused the exception in the block.
             finally:
                 with _refusing(path):
                     file.check()
@@ -256,14 +262,15 @@ def open_atomic(path: Path, kind: type[File], *, replace: bool) -> Iterator[File
 
 
 def write(path: Path, content: str | bytes, *, replace: bool) -> None:
-    """Write a text, as UTF-8, or bytes, as `open_atomic` does."""
+    """Write bytes, or a text as UTF-8, in the same way as `open_atomic`."""
     data = content.encode(errors="replace") if isinstance(content, str) else content
     with open_atomic(path, NewFile, replace=replace) as file:
         file.write(data)
 
 
 def write_together(contents: Mapping[Path, str | bytes]) -> None:
-    """Write new files in the given order, each as `write` does; where one fails, none remains."""
+    """Write new files in the given order, each in the same way as `write`. If one of them fails,
+    all of them are removed."""
     with ExitStack() as undo:
         for path, content in contents.items():
             write(path, content, replace=False)
@@ -272,10 +279,11 @@ def write_together(contents: Mapping[Path, str | bytes]) -> None:
 
 
 def write_folder(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write a new folder of files, given by their relative paths, which appears complete or not at
-    all.
+    """Write a new folder that contains texts at the given relative paths. The folder appears
+    complete or not at all.
 
-    Raises WriteError if the system refuses anything, or if something has its name.
+    Raises WriteError if the operating system refuses an operation, or if a file or folder of that
+    name exists.
     """
     with _refusing(folder):
         temporary = folder.absolute().with_name(_hidden(folder.name))
@@ -297,7 +305,7 @@ def write_folder(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def kind_of(path: Path) -> str | None:
-    """Return a description of what is at a path if it is anything but a plain file, else None.
+    """Return a description of the object at a path if it is not a plain file, otherwise None.
     Raises OSError."""
     try:
         mode = path.lstat().st_mode
@@ -310,7 +318,7 @@ def kind_of(path: Path) -> str | None:
 
 @contextmanager
 def _refusing(path: Path) -> Iterator[None]:
-    """Convert an OSError of the block into a WriteError of that path."""
+    """Convert an OSError in the block to a WriteError with the path."""
     try:
         yield
     except OSError as error:
@@ -318,7 +326,7 @@ def _refusing(path: Path) -> Iterator[None]:
 
 
 def _hidden(name: str, random: str = "") -> str:
-    """Return the name of a file under construction, beside the result."""
+    """Return the name of a file under construction in the folder of the result."""
     return f".{_short(name)}.{random or secrets.token_hex(RANDOM_BYTES)}{TEMPORARY}"
 
 
@@ -332,19 +340,20 @@ def _short(name: str) -> str:
 class Destination:
     """Name of a result.
 
-    With `replace`, a complete result replaces an existing file; the result of a run that diverged
-    or did not converge gets another name in the same folder.
+    With `replace`, a complete result replaces an existing file. The result of a run that diverged
+    or did not converge never replaces a file; it gets another name in the same folder.
     """
 
     def __init__(self, path: Path, *, replace: bool) -> None:
         self.path, self.replace = path, replace
-        self._folder = path.parent.absolute()  # The folder of the process may change meanwhile.
+        # The working directory of the process may change later.
+        self._folder = path.parent.absolute()
         self.written = path
-        """Path of the finished result, which differs from `path` if that was in use."""
+        """Path of the finished result. It differs from `path` if that name was in use."""
 
     def temporary(self) -> io.FileIO:
-        """Create and lock a file beside the result, under a unique name; remove the files that
-        killed runs left behind under such names. Raises OSError."""
+        """Create and lock a file with a unique name in the folder of the result. Remove files with
+        such names that remain from killed runs. Raises OSError."""
         random = "[0-9a-f]" * 2 * RANDOM_BYTES
         prefix, _, end = _hidden(self.path.name, "*").rpartition("*")
         for leftover in self._folder.glob(f"{escape(prefix)}{random}{end}"):
@@ -355,18 +364,20 @@ class Destination:
             file = io.FileIO(self._folder / _hidden(self.path.name), "x+b")
             if lock(file) and os.fstat(file.fileno()).st_nlink:
                 return file
-            file.close()  # Another run has removed the file, which looked like one of a killed run.
+            # Another run has removed the file, because it looked like a file of a killed run.
+            file.close()
 
     def take(self, temporary: Path, status: str) -> None:
-        """Give a temporary file the name of the result. Raises OSError, and WriteError if the name
-        came into use meanwhile: the result is then beside it."""
+        """Give a temporary file the name of the result. Raises OSError. Also raises WriteError if a
+        file of that name has appeared in the meantime; the result then has another name in the same
+        folder."""
         whole = status in WHOLE
         if whole and self.replace:
             name = self._folder / self.path.name
-            with suppress(OSError):  # Permissions to read the file are unchanged.
+            with suppress(OSError):  # The permissions to read the earlier file are kept.
                 shutil.copymode(name, temporary)
             temporary.replace(name)
-            with suppress(OSError):  # Two names of one file are left unchanged.
+            with suppress(OSError):  # If both names belong to the same file, nothing is changed.
                 temporary.unlink(missing_ok=True)
         else:
             names = (p for p in self._free(whole) if _rename(temporary, self._folder / p.name))
@@ -389,8 +400,8 @@ class Destination:
 
 
 def _rename(file: Path, name: Path) -> bool:
-    """Rename a file unless the name is in use, and return whether it now has that name. A file that
-    had been linked before the process was killed counts as renamed."""
+    """Rename a file unless the name is in use, and return whether it now has that name. If a
+    process was killed after it had linked the file to the name, the file counts as renamed."""
     try:
         os.link(file, name)
     except FileExistsError:
@@ -400,6 +411,6 @@ def _rename(file: Path, name: Path) -> bool:
         if os.path.lexists(name):
             return False
         file.rename(name)
-    with suppress(OSError):  # The file has its name.
+    with suppress(OSError):  # The file already has the name.
         file.unlink(missing_ok=True)
     return True

@@ -1,4 +1,5 @@
-"""Checkpoints: all that determines how a run continues, as JSON facts and named arrays.
+"""Checkpoints: all data that determine how a run continues. They consist of facts, which are data
+in the form of JSON, and of named arrays.
 
 ========== ====================================================================================
 ``about``  constant data: the experiment with its name and number of steps, the versions of pbdkit
@@ -34,13 +35,13 @@ if TYPE_CHECKING:
     from pbdkit.stepping.state import State
 
 Arrays = dict[str, Any]
-"""Arrays by name; some are joined from parts when they are read."""
+"""Arrays by name. Some arrays are joined from parts when they are read."""
 
 
 @dataclass
 class RecordedSteps:
-    """The last step that was observed, and the last one that was recorded; either may be a moment
-    between two steps."""
+    """The last step that was observed, and the last step that was recorded. Each may be a fraction,
+    for an equilibrium within a step."""
 
     step: float = -1
     recorded: float = -1
@@ -54,7 +55,8 @@ NAMES = {type_: name for name, type_ in CLASSES.items()}
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that a run needs to continue with the same result bit for bit."""
+    """The data that a run needs to continue, so that its result has the same bits as that of an
+    uninterrupted run."""
 
     about: dict[str, Any]
     facts: dict[str, Any]
@@ -70,8 +72,8 @@ class Checkpoint:
         chosen: Sequence[str] = (),
         rate: float = 0.0,
     ) -> Checkpoint:
-        """Return the checkpoint of a run from the state `run` of its driver; arrays are not copied.
-        `rate` is in steps a second."""
+        """Return the checkpoint of a run, given the state `run` of its driver. Arrays are not
+        copied. `rate` is in steps per second."""
         arrays = Arrays()
         facts = {
             "run": pack(dict(run), "run", arrays),
@@ -91,8 +93,7 @@ class Checkpoint:
         return cls(about, facts, arrays)
 
     def with_origin(self, origin: Mapping[str, Any]) -> Checkpoint:
-        """Return the checkpoint of a run that a command began, with the arguments of the
-        command."""
+        """Return the checkpoint with the arguments of the command that started the run."""
         return Checkpoint(self.about | {"origin": dict(origin)}, self.facts, self.arrays)
 
     def copied(self) -> Checkpoint:
@@ -101,7 +102,7 @@ class Checkpoint:
         return Checkpoint(self.about, self.facts, arrays)
 
     def state(self, state_class: type) -> tuple[Any, Any]:
-        """Return the state and the recorded steps alone. Raises KeyError, TypeError, ValueError or
+        """Return only the state and the recorded steps. Raises KeyError, TypeError, ValueError or
         StorageError if they are damaged."""
         classes = CLASSES | {state_class.__name__: state_class}
         state = unpack(self.facts["run"]["state"], self.arrays, classes)
@@ -110,11 +111,12 @@ class Checkpoint:
     def parts(
         self, like: Mapping[str, Any], steps: int, classes: Mapping[str, type]
     ) -> dict[str, Any]:
-        """Return the parts of the driver's state, and the recorded steps under ``seen``.
+        """Return the parts of the driver's state, together with the recorded steps, which have the
+        key ``seen``.
 
         `like` is the state of the driver before its first step, `steps` the number of steps of the
         run, and `classes` are further dataclasses that the checkpoint may contain. Raises
-        StorageError if the checkpoint is damaged or of another scene.
+        StorageError if the checkpoint is damaged or belongs to another scene.
         """
         try:
             facts = {**self.facts["run"], "seen": self.facts["seen"]}
@@ -141,14 +143,15 @@ class Checkpoint:
 def _is_consistent(
     state: State, recorded: RecordedSteps, parts: dict[str, Any], steps: int
 ) -> bool:
-    """Return whether the numbers of steps follow each other, so that the run can end."""
+    """Return whether the numbers of steps are in the right order. Otherwise the run might not
+    end."""
     step = state.step
     guard, pace = parts.get("guard", {"good_step": 0, "next_look": step + 1}), parts.get("pace")
     try:
         earlier = [recorded.step, recorded.recorded, parts.get("kept", -1), guard["good_step"]]
         later = [guard["next_look"], pace.next_look if pace else step, steps]
         integral = all(isinstance(n, int) for n in (step, *earlier[2:], *later))
-        # An equilibrium may be recorded at a moment within a step, before the step is complete.
+        # An equilibrium within a step may be recorded before the step is complete.
         latest = max(step, parts.get("moment", 0.0))
         in_order = min(earlier) >= -1 and max(earlier) <= latest and step <= min(later)
         in_order = in_order and 0.0 <= parts.get("moment", 0.0) <= steps
@@ -158,7 +161,8 @@ def _is_consistent(
 
 
 def _is_like(facts: Any, template: Any) -> bool:
-    """Return whether facts have the types of a template, the facts of a run before its first step.
+    """Return whether facts have the same types as a template, which contains the facts of a run
+    before its first step.
 
     Where the template has None, the facts may have a number, an array, or a list of numbers.
     """
@@ -174,14 +178,14 @@ def _is_like(facts: Any, template: Any) -> bool:
     if isinstance(template, str) or isinstance(facts, str):
         return isinstance(template, str) and isinstance(facts, str)
     if isinstance(facts, float):
-        # A state of a run may contain infinity, but a number of steps may not.
+        # The state of a run may contain infinity, but a number of steps must be finite.
         return not isinstance(template, int)
     return facts is None or (isinstance(facts, int) and abs(facts) < 2**63)
 
 
 def pack(value: Any, name: str, arrays: Arrays) -> Any:
-    """Return a value as JSON facts; its arrays go into `arrays`, under names that begin with
-    `name`."""
+    """Convert a value to facts for JSON. Arrays in the value are added to `arrays`, with names that
+    begin with `name`."""
     if hasattr(value, "dtype") and not isinstance(value, np.generic):
         arrays[name] = value
         return {"array": name}
@@ -197,8 +201,8 @@ def pack(value: Any, name: str, arrays: Arrays) -> Any:
 
 
 def unpack(facts: Any, arrays: Mapping[str, NDArray[Any]], classes: Mapping[str, type]) -> Any:
-    """Return the value of packed facts; `classes` are the dataclasses that may occur, by name.
-    Raises StorageError for anything else."""
+    """Return the value that was converted to facts by `pack`. `classes` are the dataclasses that
+    may occur, by name. Raises StorageError for all other content."""
     if isinstance(facts, list):
         return tuple(unpack(part, arrays, classes) for part in facts)
     if not isinstance(facts, dict):

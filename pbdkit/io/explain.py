@@ -1,5 +1,5 @@
-"""Status of bonds: intact, broken or cut, and their distance from breaking; from a dataset and the
-scene of its experiment."""
+"""Status of bonds, computed from a dataset and the scene of its experiment. The status is intact,
+broken or cut; intact bonds also have a distance from breaking."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ Rows = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class BondStatus:
-    """Status of one bond: the numbers of its particles, its shell and rest length, and whether it
-    broke.
+    """Status of one bond. It contains the numbers of its particles, its shell and rest length, and
+    whether it broke.
 
-    `state` is "intact", "broken", "cut", "broken from the start" or "cannot break". `step`, `order`
-    (among the broken ones, from 1) and `strain_at_break` are None unless known; `breaks_above` is
-    the strain above which it breaks, None if the model does not define it. `strain` is the strain
-    at the recorded step `at_step`.
+    `state` is "intact", "broken", "cut", "broken from the start" or "cannot break". `step` is the
+    step of breaking, `order` the position among the broken bonds, counted from 1, and
+    `strain_at_break` the strain; they are None if they are unknown. `breaks_above` is the strain
+    above which the bond breaks, and None if the fracture model does not define it. `strain` is the
+    strain at the recorded step `at_step`.
     """
 
     bond: tuple[int, int]
@@ -52,7 +53,7 @@ class BondStatus:
 
     @property
     def share(self) -> float | None:
-        """Fraction of the breaking strain that is reached at `at_step`; the bond breaks at 1."""
+        """Strain at `at_step` divided by the breaking strain. The bond breaks when it reaches 1."""
         return self.strain / self.breaks_above if self.breaks_above else None
 
 
@@ -71,9 +72,9 @@ class BondRecords:
         self._remembered = [number.name for number in bond_numbers(scene.experiment)]
         self.bonds: Bonds = describe_bonds(scene)
         self.steps = self._of_bonds("broken_step", np.int32(-1))
-        """(bond,): the step in which each bond broke, -1 where it is intact."""
+        """(bond,): the step in which each bond broke; -1 if it is intact."""
         self.strains_at_break: Floats = self._of_bonds("broken_strain", np.nan)
-        """(bond,): strain at breaking, NaN where it is unknown."""
+        """(bond,): strain at breaking; NaN if it is unknown."""
         has_strains = "broken_strain" in dataset.variables
         self.cut = has_strains & (self.steps > 0) & np.isnan(self.strains_at_break)
         """(bond,): whether the bond was cut after the first step had begun."""
@@ -93,8 +94,8 @@ class BondRecords:
 
     @cached_property
     def limits(self) -> Floats:
-        """(bond,): strain at which each bond broke, or breaks at the last recorded step; NaN where
-        the model does not define it."""
+        """(bond,): strain at which each broken bond broke, and strain at which each intact bond
+        would break at the last recorded step. NaN if the model does not define it."""
         limits, last = np.full(len(self.bonds), np.nan), math.ceil(self._dataset["time"].values[-1])
         moments = np.where(self.steps > 0, self.steps, last)
         if not self._scene.experiment.time_dependent:
@@ -129,8 +130,8 @@ class BondRecords:
         return np.asarray(touches & (not self.model.breaks_frame_bonds()))
 
     def strains(self, rows: Rows, time: int | slice = -1) -> Floats:
-        """Return the strains of some bonds, (..., bond), at recorded times, given by index along
-        `time`."""
+        """Return the strains of some bonds, (..., bond), at recorded times. `time` is an index
+        along the dimension of this name."""
         particles = np.unique(self.bonds.ends[rows] - 1)
         at = {"time": time, "particle": particles}
         if "u" in self._dataset:
@@ -146,8 +147,8 @@ class BondRecords:
         return np.asarray(np.hypot(current[..., 0], current[..., 1]) / np.hypot(*rest.T) - 1.0)
 
     def statuses(self, rows: Rows, until: int | None = None) -> list[BondStatus]:
-        """Return the status of some bonds, with the strain at the last recorded step, or at the
-        last one until a given step."""
+        """Return the status of some bonds, with the strain at the last recorded step. If a step
+        `until` is given, the last recorded step up to it is used."""
         place = {row: n + 1 for n, row in enumerate(self.order.tolist())}
         times = self._dataset["time"].values
         time = int(np.searchsorted(times, times[-1] if until is None else until, "right")) - 1
@@ -186,7 +187,7 @@ class BondRecords:
 
     def row(self, a: int, b: int) -> int:
         """Return the row of the bond between two particle numbers. Raises ExperimentError if there
-        is none."""
+        is no such bond."""
         count = int(self._dataset.sizes["particle"])
         for number in (a, b):
             if not 1 <= number <= count:
@@ -201,8 +202,8 @@ class BondRecords:
         raise ExperimentError(f"no bond joins {a} and {b}; the bonds of {a} are to {partners}")
 
     def around(self, row: int) -> Rows:
-        """Return the other bonds at the ends of a bond: first the broken ones, in the order of
-        breaking."""
+        """Return the other bonds of both ends of a bond. Broken bonds are returned first, in the
+        order of breaking."""
         touches = np.asarray(np.isin(self.bonds.ends, self.bonds.ends[row]).any(axis=1))
         touches[row] = False
         broken = self.order[touches[self.order]]

@@ -1,5 +1,5 @@
-"""Variables and attributes of the dataset: one description shared by the file, xarray and the JSON
-Schema, the provenance in attributes, and the conversion of datasets of layout version 1.
+"""Variables and attributes of the dataset. The file, xarray and the JSON Schema use the same
+description. This module also converts datasets of layout version 1.
 """
 
 from __future__ import annotations
@@ -44,15 +44,16 @@ ATTRIBUTES = (
 )  # fmt: skip
 """Names of the attributes of every dataset."""
 INDICES = "ijk"
-"""Names of a site's indices, one for each axis of the lattice."""
+"""Names of the indices of a site, one for each axis of the lattice."""
 OF_BODY = np.int8(0)
-"""Role of leaders and followers, at every step."""
+"""Role of the particles of the body, which are leaders and followers."""
 OF_FRAME = np.int8(1)
 """Role of frame points."""
 TIMES = ("time", "step")
-"""Coordinates that count steps. They are fractional if increments of load are recorded."""
+"""Coordinates that count steps. Their values are fractions if equilibria within steps are
+recorded."""
 STEP = "step"
-"""Name of the coordinate of every step."""
+"""Name of the coordinate of quantities that are measured at every step."""
 ENDS = "their numbers, the lower one first"
 """Description of the ends of bonds."""
 Values = dict[str, Any]
@@ -70,7 +71,8 @@ class When(Enum):
 
 @dataclass(frozen=True)
 class Column:
-    """One variable of the dataset with all its dimensions; `coordinate` marks coordinates.
+    """Description of one variable of the dataset with all its dimensions. `coordinate` is true for
+    coordinates.
 
     `long_name` is short, for the axes of plots; `comment` has further explanations. `extra` are
     other attributes.
@@ -104,7 +106,8 @@ def as_step(time: Any) -> float:
 
 
 def broken_by(broken_step: Any, step: Any) -> Any:
-    """Return whether bonds are broken after a step, from their steps of breaking (-1: intact)."""
+    """Return whether bonds are broken after a step, given the steps in which they broke, -1 for
+    intact bonds."""
     return (broken_step >= 0) & (broken_step <= step)
 
 
@@ -119,7 +122,7 @@ def coordinate(
     comment: str = "",
     extra: dict[str, Any] | None = None,
 ) -> Column:
-    """Return a coordinate, by default that of the dimension with its name."""
+    """Return the description of a coordinate. By default its dimension has the same name."""
     return Column(name, dims or (name,), dtype, when, long_name, units, True, extra or {}, comment)
 
 
@@ -157,9 +160,10 @@ def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
 
 
 def optional_columns() -> list[list[Column]]:
-    """Return the columns that depend on the experiment but not on its diagnostics: the table of
-    bonds with the steps in which they broke, the coordinate of quantities measured at every step,
-    and the coordinates of leader groups, loads, obstacles and principal values."""
+    """Return the columns that depend on the experiment, but not on its diagnostics. These are the
+    table of bonds with the steps in which they broke, the coordinate of quantities that are
+    measured at every step, and the coordinates of leader groups, loads, obstacles and principal
+    values."""
     bond, by_ends = ("bond",), "counted from 1, by its ends"
     whole = "-1 where it has not broken"
     no_strain = "NaN where it has not broken, was cut, or was broken from the start"
@@ -199,14 +203,15 @@ def remembered_column(number: Remembered, owner: str, part_renews: bool) -> Colu
 
 
 def when_measured(diagnostic: Diagnostic | type[Diagnostic]) -> When:
-    """Return when a diagnostic is evaluated."""
+    """Return the time at which a diagnostic is evaluated."""
     if diagnostic.at_end:
         return When.END
     return When.STEP if diagnostic.every_step else When.RECORD
 
 
 def diagnostic_column(variable: Variable, diagnostic: Diagnostic | type[Diagnostic]) -> Column:
-    """Return the column of a diagnostic's variable, with its leading dimension."""
+    """Return the column of a variable of a diagnostic. Its first dimension is determined by the
+    time of measurement."""
     when = when_measured(diagnostic)
     dims = (*{When.STEP: ["step"], When.RECORD: ["time"]}.get(when, []), *variable.dims)
     description = variable.long_name, variable.units, False, variable.attributes
@@ -243,8 +248,9 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
 
 
 def diagnostics_that_provide(names: set[str]) -> list[str]:
-    """Return the built-in diagnostics, as written in experiments, that provide a variable of one of
-    these names, or of a name that begins with one of them and `_`."""
+    """Return the built-in diagnostics that provide a variable with one of these names, or with a
+    name that begins with one of them and `_`. They are returned as they are written in
+    experiments."""
     prefixes = tuple(f"{name}_" for name in names if name)
     spellings = []
     for each, types in Registry().spellings(Diagnostic, installed=False).items():
@@ -259,8 +265,9 @@ def diagnostics_that_provide(names: set[str]) -> list[str]:
 
 
 def _columns_of(diagnostic: type[Component]) -> list[Column]:
-    """Return the columns of a diagnostic with unset parameters. The list is empty if its variables
-    depend on parameters or cannot be evaluated; the schema then does not constrain them."""
+    """Return the columns of a diagnostic with unset parameters. If the variables of the diagnostic
+    depend on parameters or cannot be determined, the list is empty, and the schema does not
+    constrain these variables."""
     assert issubclass(diagnostic, Diagnostic)
     with suppress(Exception):  # Code of a plugin that the user has not selected must not fail here.
         variables = diagnostic.model_construct(type="").variables()
@@ -289,7 +296,7 @@ def _object(properties: dict[str, Any], required: list[str]) -> dict[str, Any]:
 
 
 def refuse_no_dataset(candidate: Any) -> None:
-    """Raise ExperimentError if a file, or anything else, is given in place of a dataset."""
+    """Raise ExperimentError if the argument is not a dataset but, for instance, a file."""
     if not hasattr(candidate, "data_vars"):
         opening = f"pbdkit.open({str(candidate)!r})" if isinstance(candidate, str | Path) else ""
         raise ExperimentError(
@@ -299,11 +306,12 @@ def refuse_no_dataset(candidate: Any) -> None:
 
 
 def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset in the current layout. Older datasets lack the indices and roles of
-    particles, and identify the particles of a bond by an index from 0 instead of the particle
-    number; all particles of the body count as inside its outline.
+    """Return the dataset in the current layout. Older datasets do not contain the indices and roles
+    of particles, and identify the particles of a bond by an index that begins at 0 instead of the
+    particle number. In the converted dataset all particles of the body count as lying inside its
+    outline.
 
-    Diagnostics are unchanged: at frame points they remain 0, whereas they are NaN in the current
+    Diagnostics are not changed: at frame points they remain 0, although they are NaN in the current
     layout. Raises ExperimentError if the argument is not a dataset.
     """
     refuse_no_dataset(dataset)
@@ -327,7 +335,7 @@ def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def _described(dataset: xarray.Dataset, new: dict[str, Any]) -> xarray.Dataset:
-    """Add new variables to a dataset, and the current attributes to all of them."""
+    """Add new variables to a dataset, and set the current attributes of all variables."""
     dataset = dataset.assign(new)
     crack = (diagnostic_column(v, CrackPath) for v in CrackPath().variables())
     layout_columns = chain(base_columns(len(INDICES)), *optional_columns(), crack)
@@ -342,8 +350,9 @@ def _described(dataset: xarray.Dataset, new: dict[str, Any]) -> xarray.Dataset:
 
 
 def json_attribute(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
-    """Return the map in an attribute, or in the scalar coordinate that replaces it in one member of
-    a sweep; empty if there is neither. Raises StorageError if it is damaged."""
+    """Return the mapping that an attribute contains as JSON. In one member of a sweep, a scalar
+    coordinate replaces the attribute. The result is empty if there is neither. Raises StorageError
+    if the text is damaged."""
     coordinate = dataset.coords.get(attribute)
     text = "{}" if coordinate is None or coordinate.ndim else coordinate.item()
     try:
@@ -356,9 +365,11 @@ def json_attribute(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
 
 
 def scene_of(dataset: xarray.Dataset, what: str) -> Scene:
-    """Build the scene of the run that made a dataset, which `what` needs.
+    """Build the scene of the run that made a dataset. `what` is the operation that needs the scene,
+    for messages.
 
-    Raises ExperimentError if it cannot be built, for example because a component is retired.
+    Raises ExperimentError if the scene cannot be built, for example because a component does not
+    exist any more.
     """
     refuse_retired(json_attribute(dataset, "experiment"), what)
     return build_scene(experiment_of(dataset))
@@ -367,8 +378,8 @@ def scene_of(dataset: xarray.Dataset, what: str) -> Scene:
 def experiment_of(
     dataset: xarray.Dataset, components: Iterable[type[Component]] = ()
 ) -> Experiment:
-    """Build the experiment of a dataset. Raises ExperimentError if there is none, or if it needs
-    components that are not available."""
+    """Build the experiment of a dataset. Raises ExperimentError if the dataset contains no
+    experiment, or if the experiment needs components that are not available."""
     refuse_no_dataset(dataset)
     parts = json_attribute(dataset, "experiment")
     if not parts:
@@ -391,7 +402,7 @@ def indices_of(dataset: xarray.Dataset) -> list[str]:
 
 def rows_at(dataset: xarray.Dataset, index: Mapping[str, int]) -> Array:
     """Return the rows of the particles at the given lattice indices. Raises ExperimentError if
-    there is no such particle, or for unknown names of indices."""
+    there is no such particle, or if the name of an index is unknown."""
     names = indices_of(dataset)
     matches = np.ones(dataset.sizes.get("particle", 0), np.bool_)
     for name, value in index.items():
@@ -407,7 +418,8 @@ def rows_at(dataset: xarray.Dataset, index: Mapping[str, int]) -> Array:
 
 
 def rows_of(numbers: Array, wanted: Array) -> Array:
-    """Return the rows of particles by number; -1 for numbers that are missing."""
+    """Return the rows of the particles with the wanted numbers, and -1 for numbers that do not
+    occur."""
     integers = np.nan_to_num(wanted, nan=-1.0).astype(np.int64)
     last = len(numbers)
     if last and numbers[0] == 1 and numbers[-1] == last:  # Most datasets contain all particles.

@@ -22,16 +22,17 @@ SWEEP = "sweep"
 STATUS = "status"
 """Variable with the status of each member."""
 TEXT = "_text"
-"""Suffix of the name of the coordinate that contains values as text, if the coordinate of the
-dimension itself only numbers them."""
+"""Suffix of the name of a coordinate that contains the values of a parameter as text. It is used if
+the coordinate of the dimension itself contains only their numbers."""
 PARAMETER = "parameter"
-"""Attribute of a coordinate with the path of its parameter in the experiment."""
+"""Attribute of a coordinate that contains the path of its parameter in the experiment."""
 SHOWN = 6
 """Maximum number of values in messages."""
 
 
 def type_alone(text: str) -> str:
-    """Return the type of a component given as JSON without parameters; any other text unchanged."""
+    """Return the type of a component that is given as JSON without parameters. Any other text is
+    returned unchanged."""
     with suppress(ValueError, RecursionError):
         part = json.loads(text)
         if isinstance(part, dict) and part.keys() == {"type"}:
@@ -40,10 +41,10 @@ def type_alone(text: str) -> str:
 
 
 def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset:
-    """Return the part of a sweep in which parameters have these values.
+    """Return the part of a sweep in which parameters have the chosen values.
 
-    If every parameter is given, the result has the experiment of that member as an attribute, and
-    the choice in its title.
+    If every parameter is given, the result is a single member. It then has the experiment of this
+    member as an attribute, and its title contains the choice.
 
     Parameters
     ----------
@@ -56,8 +57,8 @@ def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset
     Raises
     ------
     ExperimentError
-        If the dataset is that of a single run, a name is not that of a parameter, or no member has
-        a value.
+        If the dataset is the result of a single run, if a name is not the name of a parameter, or
+        if no member has the value.
     """
     if SWEEP not in dataset.attrs:
         raise ExperimentError(
@@ -88,8 +89,8 @@ def choices(dataset: xarray.Dataset) -> str:
 
 
 def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
-    """Return the labels along a dimension: the coordinate of text values if there is one, otherwise
-    the coordinate of the dimension, or the indices if it has none."""
+    """Return the labels along a dimension. These are the values of the coordinate with texts if
+    there is one, otherwise those of the coordinate of the dimension, or else the indices."""
     for label in (f"{name}{TEXT}", name):
         if label in dataset.coords:
             return np.asarray(dataset[label].values)
@@ -127,7 +128,7 @@ def _is_alike(label: Any, value: Any) -> bool:
 
 
 def _with_experiment(selection: xarray.Dataset) -> xarray.Dataset:
-    """Return a member with its experiment, without the times that only other members reached."""
+    """Return a member with its experiment. Times that only other members reached are removed."""
     from pbdkit.model.experiment import Experiment  # This import loads pydantic.
 
     source = Source(data=json_attribute(selection, SWEEP).get("experiment"))

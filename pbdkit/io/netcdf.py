@@ -1,6 +1,6 @@
-"""Write a dataset to a netCDF-4 file while it is recorded, each chunk once. The file appears only
-when it is complete; after the first second of a run, the part recorded so far is preserved for
-`resume`."""
+"""Write a dataset to a netCDF-4 file while it is recorded. Each chunk is written once. The file
+appears under its name only when it is complete. After the first second of a run, the part that has
+been recorded is preserved for `resume`."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ LEVEL = 1
 """Compression level of zlib. For positions, higher levels take much more time and reduce the size
 little."""
 LABELS = "coordinates"
-"""CF's attribute for coordinates that are not those of a dimension; xarray reads it from the file
-too."""
+"""Attribute of the CF conventions that lists coordinates with a name other than that of a
+dimension. xarray reads it, too."""
 FIRST_LENGTH = 1024
 """Initial length of a growing dimension."""
 
 Waiting = dict[str, list[Array]]
-"""Entries by column that do not fill a chunk yet."""
+"""Buffered entries of each column, which do not yet fill a chunk."""
 
 
 class NetcdfFile:
     """File with the columns of a dataset, which are written while a run continues. Its state
-    consists of the buffered entries, `waiting`, and of the number of entries of each column in the
-    file, `written`."""
+    consists of the buffered entries (`waiting`) and of the number of entries of each column that
+    are in the file (`written`)."""
 
     def __init__(self, file: PagedFile, columns: list[Column], *, compress: bool = False) -> None:
         self.file, self._compress = file, compress
@@ -63,8 +63,8 @@ class NetcdfFile:
             self._define(column, sizes, planned)
 
     def reopen(self, waiting: Waiting, written: Mapping[str, Any]) -> None:
-        """Continue with a file in the state of its last commit. Raises StorageError if it holds
-        fewer entries than `written`."""
+        """Continue with a file in the state of its last commit. Raises StorageError if the file
+        contains fewer entries than `written`."""
         self.waiting |= waiting
         self.written |= written
         self._open("r+")
@@ -85,7 +85,7 @@ class NetcdfFile:
                 self._store(self._columns[name], value)
 
     def flush(self) -> None:
-        """Write everything but the buffered entries to the file and its pages."""
+        """Write all data except the buffered entries to the file and its pages."""
         self._h5.flush()
 
     def finish(self, attributes: Mapping[str, str]) -> None:
@@ -111,13 +111,14 @@ class NetcdfFile:
         for key, array in arrays.items():
             dims = {f"{key}_{n}": length for n, length in enumerate(array.shape)}
             group.dimensions.update(dims)
-            # The library would choose chunks that are larger than empty arrays.
+            # Otherwise the library would choose chunks that are larger than the array if the array
+            # is empty.
             heuristic = {"chunking_heuristic": "h5py"}
             variable = group.create_variable(key, tuple(dims), array.dtype, **heuristic)
             _fill(variable, array)
 
     def give_up(self) -> None:
-        """Discard the file; nothing is raised."""
+        """Discard the file. No exception is raised."""
         self.file.give_up()
         for file in (self._content, self._h5):
             with suppress(Exception):
@@ -142,7 +143,7 @@ class NetcdfFile:
             self._lengthen(dim, min(FIRST_LENGTH, planned[dim]))
         dtype = import_module("h5py").string_dtype() if column.dtype == "str" else column.dtype
         attributes = column.attributes
-        # xarray writes truth values in the same way, since netCDF has no such type.
+        # xarray writes truth values in the same way, because netCDF has no type for them.
         if column.dtype == "bool":
             dtype, attributes = "i1", attributes | {"dtype": "bool"}
         variable = self._content.create_variable(column.name, column.dims, dtype, **options)
@@ -151,7 +152,8 @@ class NetcdfFile:
             variable.attrs[LABELS] = " ".join(labels)
 
     def _labels(self, dims: set[str]) -> list[str]:
-        """Return the coordinates along these dimensions that do not bear the name of one."""
+        """Return the coordinates along these dimensions with a name other than that of a
+        dimension."""
         of_others = (c for c in self._columns.values() if c.coordinate and c.dims != (c.name,))
         return [column.name for column in of_others if dims.issuperset(column.dims)]
 
@@ -174,7 +176,8 @@ class NetcdfFile:
 
     def _write_chunk(self, dataset: Any, place: tuple[int, ...], chunk: Array) -> None:
         data: Any = np.ascontiguousarray(chunk)
-        # Bytes of equal significance are stored together, as by HDF5's shuffle filter.
+        # Bytes of equal significance are stored together, in the same way as by HDF5's shuffle
+        # filter.
         if dataset.compression:
             planes = data.reshape(-1).view(np.uint8).reshape(-1, data.itemsize).T
             data = np.frombuffer(zlib.compress(planes.tobytes(), LEVEL), np.uint8)
@@ -205,8 +208,8 @@ def _fill(variable: Any, values: Array | PiecedArray) -> None:
 
 
 def _parts(entries: list[Any], chunks: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
-    """Generate the chunks of entries, (entry, ...), along their first dimension, with the start of
-    each."""
+    """Generate the chunks of entries, (entry, ...), along their first dimension, and the position
+    at which each chunk starts."""
     if isinstance(entries[0], PiecedArray):
         for n, rows in enumerate(entries[0].rows(chunks[1])):
             yield n * chunks[1], rows[None]
@@ -225,13 +228,14 @@ def _chunks(
 ) -> tuple[int, ...]:
     inner = [max(1, sizes[dim]) for dim in column.dims[1:]]
     entry = int(np.prod(inner)) * np.dtype(column.dtype).itemsize
-    if inner:  # Parts are of equal size, so that the last one is not padded much.
+    # All parts have about the same size, so that little padding is needed for the last one.
+    if inner:
         inner[0] = -(-inner[0] // -(-entry // CHUNK_BYTES))
     return max(1, min(CHUNK_BYTES // entry, planned[column.dims[0]])), *inner
 
 
 def _padded(part: Array, shape: tuple[int, ...]) -> Array:
-    """Pad an array with zeros to the shape of a chunk."""
+    """Add zeros to an array so that it has the shape of a chunk."""
     if part.shape == shape:
         return part
     whole = np.zeros(shape, part.dtype)
@@ -240,22 +244,24 @@ def _padded(part: Array, shape: tuple[int, ...]) -> Array:
 
 
 FIRST_S = 1.0
-"""Time in seconds before the first commit. A run that ends earlier has no store."""
+"""Time in seconds before the first commit. A run that ends earlier creates no store."""
 EVERY_S = 1.0
 """Minimum interval between commits in seconds."""
 SHARE = 50
-"""Minimum interval between commits as a multiple of the duration of the last commit."""
+"""Minimum interval between commits, divided by the duration of the last commit."""
 FINAL_STATE = "final_state"
-"""The group of the file with the state from which a run can be continued to more steps."""
+"""Group of the file that contains the final state, from which a run can be continued with more
+steps."""
 WAITING = "waiting."
 """Prefix of the names of arrays of buffered entries in a checkpoint."""
 
 
 class NetcdfSink(KeepingSink):
-    """Sink that writes a temporary file beside `path`, commits it after a second as the records of
-    an unfinished run, and renames it at `finish`. `origin` are the arguments of the command.
+    """Sink that writes a temporary file in the folder of `path`. After a second the file is
+    committed and becomes the records of an unfinished run. `finish` renames it to `path`. `origin`
+    are the arguments of the command.
 
-    Raises StorageError if a write fails; earlier commits remain.
+    Raises StorageError if a write fails; earlier commits are preserved.
     """
 
     def __init__(
@@ -275,7 +281,8 @@ class NetcdfSink(KeepingSink):
 
     @property
     def written(self) -> Path:
-        """Path of the finished result: `path`, or a name beside it if `path` was in use."""
+        """Path of the finished result: `path` or, if this name was in use, another name in the same
+        folder."""
         return self._destination.written
 
     @property
@@ -284,7 +291,7 @@ class NetcdfSink(KeepingSink):
         return self.unfinished is not None and self.unfinished.has_checkpoint
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Open the file, so that errors are found before the first step."""
+        """Open the file, so that errors occur before the first step."""
         path = self._destination.path
         if not path.absolute().parent.is_dir():
             raise StorageError(f"{path}: there is no folder {path.parent}")
@@ -327,11 +334,12 @@ class NetcdfSink(KeepingSink):
             file.put(values)
 
     def due(self) -> bool:
-        """Return whether a commit is due: after a second, and then about once a second."""
+        """Return whether a commit is due. The first commit is due after a second, and further
+        commits about once a second."""
         return time.perf_counter() >= self._next
 
     def keep(self, checkpoint: Checkpoint) -> None:
-        """Commit a checkpoint, which survives the process and the machine."""
+        """Commit a checkpoint. It is preserved if the process is killed or the machine stops."""
         start = time.perf_counter()
         with self._storing() as file:
             if self.unfinished is None:
@@ -345,7 +353,7 @@ class NetcdfSink(KeepingSink):
         self._next = end + max(EVERY_S, SHARE * (end - start))
 
     def suspend(self, checkpoint: Checkpoint) -> None:
-        """Commit a checkpoint and close."""
+        """Commit a checkpoint and close the file."""
         self.keep(checkpoint)
         self.abandon()
 
@@ -355,7 +363,7 @@ class NetcdfSink(KeepingSink):
             file.add_group(FINAL_STATE, json.dumps(checkpoint.facts), checkpoint.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
-        """Complete the file, seal and sync it, read it back, rename it, and remove the store."""
+        """Complete the file: seal and sync it, read it back, rename it, and remove the store."""
         with self._storing() as file:
             file.finish(attributes)
             file.file.check()
@@ -376,8 +384,8 @@ class NetcdfSink(KeepingSink):
             file.disk.close()
 
     def abandon(self) -> None:
-        """Remove the file. If it belongs to an unfinished run, remove only the part after the last
-        commit."""
+        """Remove the file. If it belongs to an unfinished run, remove only the part that was
+        written after the last commit."""
         if self._file is None:
             return
         self._file.give_up()
@@ -404,7 +412,7 @@ class NetcdfSink(KeepingSink):
             raise WriteError(f"{path}: cannot be written: {reason}") from None
 
     def _reason(self, error: Exception) -> str:
-        """Return the error of the disk if there is one, since the errors of the library are not
+        """Return the error of the disk if there is one, because the messages of the library are not
         informative."""
         try:
             if self._file:

@@ -1,5 +1,5 @@
-"""Open results of finished and unfinished runs, and single members of sweeps. For files of other
-kinds the error message names the command that reads them."""
+"""Open results of finished and unfinished runs, and single members of sweeps. If a file is of
+another kind, the error message contains the command that reads it."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ UNSEALED = "has no seal: changes since it was written cannot be detected"
 def open(path: str | Path) -> xarray.Dataset:
     """Open a result file.
 
-    Values are read when they are used, and verified by the checksums of the file. For an unfinished
-    run the dataset of its last checkpoint is returned, with the status "interrupted".
+    Values are read when they are used, and are verified with the checksums of the file. For an
+    unfinished run the dataset of its last checkpoint is returned, with the status "interrupted".
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def open(path: str | Path) -> xarray.Dataset:
     Warns
     -----
     StorageWarning
-        If the file has no checksums. It is then read in a separate process first.
+        If the file has no checksums. It is then first read in a separate process.
 
     Examples
     --------
@@ -122,7 +122,7 @@ def _dataset(content: Any) -> xarray.Dataset:
     import xarray
     from xarray.backends import StoreBackendEntrypoint
 
-    # Times are numbers of steps and must not be decoded as dates.
+    # Times are numbers of steps, and xarray must not decode them as dates.
     store = xarray.backends.H5NetCDFStore(content)
     return xarray.open_dataset(store, engine=StoreBackendEntrypoint, decode_times=False)
 
@@ -135,8 +135,8 @@ def _unfinished(output: Path) -> xarray.Dataset:
 
 
 def _output_of(file: Path) -> Path | None:
-    """Return the output of the unfinished run to which a path refers, whether it is the path of the
-    output or of the store."""
+    """Return the output of the unfinished run to which a path refers. The path may be that of the
+    output or that of the store."""
     if file.name.endswith(STORE) and file.is_file():
         return file.with_name(file.name.removesuffix(STORE))
     return file if not file.exists() and has_committed(file) else None
@@ -146,12 +146,14 @@ def _output_of(file: Path) -> Path | None:
 def reading(
     path: str | Path, *, sweeps: bool = False, at: Mapping[str, str] | None = None
 ) -> Iterator[xarray.Dataset]:
-    """Open the dataset of a run, or of a sweep if `sweeps` allows it, for reading in the block.
+    """Open the dataset of a run for reading in the block. With `sweeps` it may also be the dataset
+    of a sweep.
 
-    `at` selects a member of a sweep. Raises the errors of `open`, and ExperimentError for a sweep
-    from which no member is selected, unless `sweeps` is true. Any other error in reading and using
-    the values is raised as a StorageError, since files are sound when they are written; errors of
-    pbdkit, such as a WriteError of another file in the block, keep their type.
+    `at` selects a member of a sweep. Raises the errors of `open`. Also raises ExperimentError for a
+    sweep from which no member is selected, unless `sweeps` is true. Errors of pbdkit in the block,
+    such as a WriteError of another file, keep their type. Any other error in the block is raised as
+    a StorageError: since files are correct when they are written, the error must be caused by
+    damage.
     """
     with open(path) as whole:
         dataset = _chosen(whole, path, at) if at else whole

@@ -1,5 +1,5 @@
-"""Identification of files that are not results by their content, and of the command that reads
-them."""
+"""Identification of files that are not results. The kind of a file, and the command that reads it,
+are determined from its content."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from pbdkit.untrusted_files import BEGINNINGS
 TEXTS = (".yaml", ".yml", ".json")
 """Suffixes of files that may be experiments."""
 FAULTY = "faulty"
-"""Kind of a file that is not text, or not valid YAML."""
+"""Kind of a file that is not text or is not valid YAML."""
 
 
 def refuse_other_file(path: Path) -> None:
-    """Raise ExperimentError if a path is known to lead to something other than a result."""
+    """Raise ExperimentError if a path leads to a file that is certainly not a result."""
     if description := other_file(path):
         raise ExperimentError(f"{path}: {description}")
 
 
 def other_file(path: Path) -> str:
-    """Return a description of a file that is not a result and the command for it; empty for
-    results, missing files and unknown content."""
+    """Return a description of a file that is not a result, and the command that reads it. The text
+    is empty for results, missing files and unknown content."""
     if path.is_dir():
         inner = path / "sweep.nc"
         sweep = f"is the folder of a sweep; its dataset is {inner}"
@@ -45,8 +45,8 @@ def other_file(path: Path) -> str:
 
 
 def is_experiment(path: Path) -> bool:
-    """Return whether a path leads to an experiment, in a file or shipped; a file that cannot be
-    read is judged by its suffix."""
+    """Return whether a path leads to an experiment, which is a file or is shipped with pbdkit. For
+    a file that cannot be read, the suffix decides."""
     if not path.is_file():
         return path.as_posix() in shipped_names()
     kind = _kind_of_text(path)
@@ -54,8 +54,8 @@ def is_experiment(path: Path) -> bool:
 
 
 def _kind_of_text(path: Path) -> str | None:
-    """Return the kind of a YAML file, FAULTY for invalid text; None for results and unreadable
-    files."""
+    """Return the kind of a YAML file, and FAULTY for invalid text. Return None for results and for
+    files that cannot be read."""
     try:
         with path.open("rb") as file:
             if file.read(8).startswith(BEGINNINGS):
@@ -68,7 +68,8 @@ def _kind_of_text(path: Path) -> str | None:
 
 
 def refuse_store(path: Path) -> None:
-    """Raise ExperimentError for the store of an unfinished run given in place of its output."""
+    """Raise ExperimentError if the store of an unfinished run is given in place of the output of
+    the run."""
     if path.name.endswith(STORE) and path.is_file():
         output = path.with_name(path.name.removesuffix(STORE))
         raise ExperimentError(

@@ -1,5 +1,5 @@
 """File object for the HDF5 library. Committed bytes are never overwritten, and large arrays are
-appended piece by piece."""
+appended part by part."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ MAGIC = b"pbdkit-r"
 HDF5 = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file."""
 LAYOUT = struct.Struct("<8s16sQ")
-"""Layout of the header: first bytes, identity, number of commits."""
+"""Layout of the header: the first bytes, the identity, and the number of commits."""
 HEADER_BYTES = LAYOUT.size + 8
-"""Length of the header with its digest. In the finished file the superblock of HDF5, which is
-longer, replaces the header; until then the superblock is in a page of the store."""
+"""Length of the header with its digest. In the finished file the header is replaced by the
+superblock of HDF5, which is longer. Until then the superblock is stored in a page."""
 TRIES = 3
 """Number of attempts to read a header that is being written."""
 PAUSE_S = 0.02
@@ -43,12 +43,13 @@ class Header(NamedTuple):
 
 
 FINALIZED = Header(b"", 1)
-"""Header returned for a file in which the superblock of HDF5 has already replaced the header, which
-happens after at least one commit."""
+"""Header that is returned for a file in which the superblock of HDF5 has already replaced the
+header. At least one commit precedes the replacement."""
 
 
 def write_header(file: io.FileIO, header: Header) -> None:
-    """Write the header into open records, in one sector of the disk. Raises OSError."""
+    """Write the header into the open records. It fits into one sector of the disk. Raises
+    OSError."""
     fields = LAYOUT.pack(MAGIC, *header)
     file.seek(0)
     write_all(file, fields + xxhash.xxh3_64_digest(fields))
@@ -82,16 +83,16 @@ LARGE_BYTES = 2**16
 
 
 class PagedFile(NewFile):
-    """A file on the disk overlaid by pages in memory.
+    """A file on the disk that is overlaid by pages in memory.
 
     Large writes are appended to the file on the disk, after all bytes that existed at the last
-    `commit`. Each extent is written once. Everything else, such as the metadata that HDF5 rewrites,
-    stays in memory until `finalize`. The bytes on the disk together with the pages, extents and
-    size of a commit therefore form the file as of that commit, independent of later writes. With
-    `read_only` all writes stay in memory.
+    `commit`. Such a range of bytes is called an extent and is written once. All other data, such as
+    the metadata that HDF5 rewrites, remain in memory until `finalize`. The bytes on the disk and
+    the pages, extents and size that were stored at a commit therefore define the file at that
+    commit, independent of later writes. With `read_only` all writes remain in memory.
 
-    Extents passed to the constructor are verified before any of their bytes are returned; damage
-    raises BrokenSealError.
+    An extent that is passed to the constructor is verified before any of its bytes is returned.
+    BrokenSealError is raised if it is damaged.
     """
 
     def __init__(
@@ -112,8 +113,8 @@ class PagedFile(NewFile):
         self.changed: set[int] = set()
         """Numbers of the pages written since the last commit."""
         self.values_bytes = -1
-        """Number of bytes of a write that is treated as values even if it is small; -1 if there is
-        none."""
+        """A write of this number of bytes is appended to the disk even if it is small; -1 if there
+        is no such write."""
         self.noted = len(self.extents)
         """Number of extents at the last commit."""
         self._unchecked = {extent.start for extent in extents}
@@ -131,12 +132,12 @@ class PagedFile(NewFile):
         return self._place
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the size, as in any file; on the disk it is set by `finalize`."""
+        """Set the size. On the disk it is set by `finalize`."""
         self.size = self._place if size is None else size
         return self.size
 
     def readinto(self, buffer: Any) -> int:
-        """Read from the pages, and from the disk elsewhere."""
+        """Read from the pages, and from the disk where there is no page."""
         view = memoryview(buffer).cast("B")
         view = view[: max(0, self.size - self._place)]
         self.verify(self._place, self._place + len(view))
@@ -147,7 +148,7 @@ class PagedFile(NewFile):
         return len(view)
 
     def write(self, data: Any) -> int:
-        """Append large new writes to the disk and put all others into pages."""
+        """Append large writes of new bytes to the disk, and store all other writes in pages."""
         view = memoryview(data).cast("B")
         values = len(view) >= LARGE_BYTES or len(view) == self.values_bytes
         to_disk = values and self._place >= self._append_from
@@ -164,8 +165,8 @@ class PagedFile(NewFile):
         return len(view)
 
     def verify(self, start: int = 0, stop: int = 2**63) -> None:
-        """Verify the extents passed to the constructor that overlap a range, once each. Raises
-        BrokenSealError."""
+        """Verify those extents passed to the constructor that overlap a range and have not been
+        verified yet. Raises BrokenSealError."""
         if not self._unchecked:
             return
         first = bisect_right(self.extents, start, key=lambda extent: extent.stop)
@@ -185,12 +186,12 @@ class PagedFile(NewFile):
         self.fail(OSError("writing was abandoned"))
 
     def forget(self) -> None:
-        """Remove what a killed process wrote after the last commit. Raises OSError."""
+        """Remove the bytes that a killed process wrote after the last commit. Raises OSError."""
         self.disk.truncate(max((extent.stop for extent in self.extents), default=HEADER_BYTES))
 
     def commit(self) -> None:
-        """Mark the present content as committed, after its pages, extents and size have been
-        stored."""
+        """Mark the present content as committed. The caller has stored its pages, extents and size
+        before."""
         self._append_from = max(self._append_from, self.size)
         self.noted, self.changed = len(self.extents), set()
 
@@ -212,8 +213,8 @@ class PagedFile(NewFile):
             )
 
     def is_finalized(self) -> bool:
-        """Return whether the pages are at their positions on the disk; the seal is written after
-        the last page."""
+        """Return whether the pages are at their positions on the disk. This is so if the file has a
+        seal, because the seal is written after the last page."""
         for number, page in self.pages.items():
             length = min(PAGE, max(0, self.size - number * PAGE))
             if self._on_disk(number * PAGE, length) != page[:length]:
@@ -221,7 +222,8 @@ class PagedFile(NewFile):
         return True
 
     def _with_present_digest(self, extent: ByteRange) -> ByteRange:
-        """Return an extent with its present digest, which differs where a page overlaps it."""
+        """Return an extent with its present digest, which has changed if a page overlaps the
+        extent."""
         pages = range(extent.start // PAGE, -(-extent.stop // PAGE))
         if not any(page in self.pages for page in pages):
             return extent
@@ -238,7 +240,7 @@ class PagedFile(NewFile):
         self._append_from = self.extents[-1].stop
 
     def _on_disk(self, start: int, length: int) -> bytes:
-        """Read from the disk, with zeros beyond the end of the file."""
+        """Read from the disk. Bytes beyond the end of the file are zero."""
         self.disk.seek(start)
         return self.disk.read(length).ljust(length, b"\0")
 
@@ -246,8 +248,9 @@ class PagedFile(NewFile):
 def _overlaps(
     begin: int, length: int, among: Container[int] | None = None
 ) -> Iterator[tuple[int, slice, slice]]:
-    """Generate the pages that a byte range touches, optionally only those in `among`: number, slice
-    of the page, slice of the range."""
+    """Generate the pages that overlap a byte range, optionally only the pages in `among`. A page is
+    given by its number, the overlap as a slice of the page, and the overlap as a slice of the
+    range."""
     end = begin + length
     touched = range(begin // PAGE, -(-end // PAGE))
     for page in touched if among is None else [page for page in touched if page in among]:
@@ -257,8 +260,8 @@ def _overlaps(
 
 
 class PiecedArray:
-    """An array of given shape and dtype, generated as `pieces` in memory order. It can be read only
-    once."""
+    """An array of given shape and dtype that is generated in parts, `pieces`, in the order of
+    memory. It can be read only once."""
 
     def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any], pieces: Iterable[Array]):
         self.shape, self.dtype, self.ndim = shape, dtype, len(shape)
@@ -268,7 +271,7 @@ class PiecedArray:
 
     @classmethod
     def of(cls, array: Array) -> PiecedArray:
-        """Return an existing array as a single piece."""
+        """Return an existing array as a PiecedArray with a single part."""
         return cls(array.shape, array.dtype, [array])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
@@ -277,20 +280,20 @@ class PiecedArray:
         return whole if dtype is None else whole.astype(dtype, copy=False)
 
     def blocks(self, nbytes: int) -> Iterator[Bytes]:
-        """Generate blocks of `nbytes` bytes; the last may be shorter."""
+        """Generate blocks of `nbytes` bytes. The last block may be shorter."""
         for at in range(0, self.nbytes, nbytes):
             yield self._read(min(nbytes, self.nbytes - at))
 
     def rows(self, count: int) -> Iterator[Array]:
-        """Generate `count` entries of the first axis at a time; the last part may be shorter."""
+        """Generate parts with `count` entries of the first axis. The last part may be shorter."""
         each = math.prod(self.shape[1:]) * self.dtype.itemsize
         for block in self.blocks(max(1, count * each)):
             yield block.view(self.dtype).reshape(-1, *self.shape[1:])
 
     def tiles(self, nbytes: int) -> Iterator[tuple[tuple[Any, ...], Array]]:
-        """Generate index and values of tiles of about `nbytes` bytes. A tile consists of entries
-        along the first axis of an array with one or two axes, and along the last but one axis of
-        others."""
+        """Generate the index and the values of tiles of about `nbytes` bytes. If the array has one
+        or two axes, a tile consists of entries along the first axis; otherwise it consists of
+        entries along the last but one axis."""
         *lead, count = self.shape[: max(1, self.ndim - 1)]
         inner = self.shape[len(lead) + 1 :]
         each = math.prod(inner) * self.dtype.itemsize
@@ -302,7 +305,7 @@ class PiecedArray:
                 yield (*at, slice(first, last)), values.reshape(last - first, *inner)
 
     def drain(self) -> None:
-        """Consume the remaining pieces."""
+        """Generate and discard the remaining parts."""
         for _ in self._pieces:
             pass
 

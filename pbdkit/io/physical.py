@@ -1,4 +1,4 @@
-"""Conversion of results to physical units, mm, MPa and N, for experiments with `units`."""
+"""Conversion of results to physical units (mm, MPa, N) for experiments with `units`."""
 
 from __future__ import annotations
 
@@ -21,28 +21,32 @@ if TYPE_CHECKING:
 IN_MM = f"_{LENGTH.unit}"
 """Suffix of the names of variables in mm."""
 OF_GIVEN = {"youngs_modulus": "stress unit", "thickness": "thickness unit"}
-"""Names of the units of these quantities if they are given as plain numbers."""
+"""Names of the units of these quantities if the quantities are given as plain numbers."""
 UNITS = "physical_units"
-"""Attribute of a variable in lattice units with its physical unit."""
+"""Attribute of a variable in lattice units that contains its physical unit."""
 FACTOR = "physical_factor"
-"""Attribute of a variable in lattice units with the factor to its physical unit."""
+"""Attribute of a variable in lattice units that contains the factor for conversion to the physical
+unit."""
 TWIN_OF = "physical_of"
-"""Attribute of a converted copy with the name of the original."""
+"""Attribute of a converted copy that contains the name of the original variable."""
 
 
 class Physical:
-    """Physical units of the variables of a dataset; without `units` nothing changes.
+    """Physical units of the variables of a dataset. Without `units` all methods leave variables
+    unchanged.
 
-    Stresses, forces and energies, which need a modulus, are stored in MPa, N and mJ with their
-    lattice units as attributes. All other variables keep their values and have the factor as an
-    attribute; lengths, except positions because of their size, are also stored in mm.
+    Stresses, forces and energies are stored in MPa, N and mJ, because they need a modulus;
+    attributes contain their lattice units. All other variables keep their values in lattice units,
+    with the conversion factor as an attribute. Lengths are stored in mm, too, except positions,
+    which are too large.
     """
 
     def __init__(self, units: Units | None) -> None:
         self._units = units
 
     def scaled(self, diagnostic: Diagnostic) -> Iterator[tuple[Variable, float]]:
-        """Generate the variables of a diagnostic, each with the factor for its values."""
+        """Generate the variables of a diagnostic, and for each the factor by which its values are
+        multiplied."""
         for variable in diagnostic.variables():
             quantity = QUANTITIES.get(variable.units)
             if quantity and quantity.youngs_modulus and self._defines_units(diagnostic, quantity):
@@ -58,8 +62,8 @@ class Physical:
                 yield variable, 1.0
 
     def _defines_units(self, diagnostic: Diagnostic, quantity: Quantity) -> bool:
-        """Return whether the diagnostic's modulus, and thickness where needed, are those of
-        `units`."""
+        """Return whether the diagnostic's modulus and, if it is needed, its thickness are the same
+        as in `units`."""
         if self._units is None or self._units.missing_entries(quantity):
             return False
         fields = [n for n in ("youngs_modulus", "thickness") if getattr(quantity, n)]
@@ -68,8 +72,8 @@ class Physical:
         )
 
     def columns(self, columns: Iterable[Column]) -> list[Column]:
-        """Return the columns with their scales, comments on units, and the copies in mm. Raises
-        PluginError if a name is in use."""
+        """Return the columns with their scales and with comments on units, and the columns of the
+        copies in mm. Raises PluginError if a name is already used."""
         entries = list(map(_with_comment, columns))
         if self._units is None:
             return entries
@@ -93,7 +97,7 @@ class Physical:
 
 
 def _with_comment(column: Column) -> Column:
-    """Add the given quantities, which define the units of a column, to its comment."""
+    """Add the quantities that define the units of a column to its comment."""
     notes = [
         f"{unit}: that of {n} as it is given"
         for n, unit in OF_GIVEN.items()

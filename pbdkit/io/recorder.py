@@ -1,5 +1,5 @@
-"""Recorder, which evaluates the variables of the dataset, diagnostics and state variables included,
-in the states of a run and passes them to a sink."""
+"""Recorder of a run. It evaluates the variables of the dataset, including diagnostics and state
+variables, in the states of a run, and passes them to a sink."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 
 
 Measured = tuple[int, Diagnostic, list[tuple[Variable, float]]]
-"""Number of a diagnostic, the diagnostic, and its variables with the factors of their values."""
+"""Index of a diagnostic, the diagnostic, and its variables with the factors by which their values
+are multiplied."""
 
 
 class RecordedVariables:
@@ -101,8 +102,8 @@ class RecordedVariables:
         return sizes | {name: len(values) for name, values in self.coordinates.items()}
 
     def columns(self) -> list[Column]:
-        """Return the columns of state variables and diagnostics. Raises PluginError for names in
-        use, and for dimensions of unknown length."""
+        """Return the columns of state variables and diagnostics. Raises PluginError if a name is
+        already used, or if the length of a dimension is unknown."""
         names, columns = layout.reserved_names(), list(self._remembered)
         for column in columns:
             _reserve_name(
@@ -136,7 +137,7 @@ class RecordedVariables:
 
     @cached_property
     def _scaled(self) -> dict[When, list[Measured]]:
-        """Diagnostics by the time of measurement."""
+        """Diagnostics, sorted by the time of measurement."""
         result = {when: list[Measured]() for when in When}
         for n, diagnostic in enumerate(self._diagnostics):
             variables = list(self.physical.scaled(diagnostic))
@@ -149,8 +150,8 @@ class RecordedVariables:
         return {n: values for d in self._diagnostics for n, values in d.coordinates().items()}
 
     def remembered(self, moment: Moment, *, first: bool) -> Values:
-        """Return the changing state variables and, if `first` is true, also the constant ones.
-        Variables of type float are NaN at frame points. Raises FloatingPointError if a changing
+        """Return the state variables that change and, if `first` is true, also the constant ones.
+        Floating-point variables are NaN at frame points. Raises FloatingPointError if a changing
         variable is not finite."""
         values: Values = {}
         for column in (c for c in self._remembered if c.grows or first):
@@ -164,12 +165,12 @@ class RecordedVariables:
     def diagnosed(
         self, when: When, moment: Moment, which: Callable[[Diagnostic], bool] = lambda _: True
     ) -> Values:
-        """Evaluate the diagnostics that are measured at the time `when`, or those of them selected
-        by `which`. Returns values by variable.
+        """Evaluate the diagnostics that are measured at the time `when`, restricted to those for
+        which `which` returns true. Returns values by variable.
 
-        Raises PluginError for a shape other than the declared one, and FloatingPointError for
-        values that are not finite. At the end of a run such values are kept, since the run may have
-        ended because of them.
+        Raises PluginError if a shape differs from the declared one, and FloatingPointError if a
+        value is not finite. At the end of a run values that are not finite are kept, because the
+        run may have ended because of them.
         """
         values: Values = {}
         occasion = "at the end" if when is When.END else f"at step {moment.step}"
@@ -181,8 +182,8 @@ class RecordedVariables:
                 results = as_values(diagnostic.measure(moment), "measure")
                 for (variable, factor), value in zip(variables, results, strict=True):
                     if dimension in variable.dims and np.ndim(value) == len(variable.dims):
-                        # The first variable determines the length of the dimension, which the
-                        # others must have, too.
+                        # The first variable determines the length of the dimension. All other
+                        # variables must have the same length.
                         sizes.setdefault(dimension, np.shape(value)[variable.dims.index(dimension)])
                     shape = tuple(sizes.get(dim, -1) for dim in variable.dims)
                     if np.shape(value) != shape:
@@ -202,7 +203,7 @@ class RecordedVariables:
 
 
 def _reserve_name(name: str, names: set[str], what: str) -> None:
-    """Add a name to those in use. Raises PluginError if it is among them already."""
+    """Add a name to the names that are used. Raises PluginError if it is already used."""
     if name in names:
         raise PluginError(
             f"{what}, but the dataset already has a variable or dimension of this name; rename it"
@@ -222,7 +223,7 @@ def _refuse_infinite(variable: Variable, value: Any, moment: Moment, offset: int
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """Outcome of a run; `error_bound` holds the error bound of an equilibrium."""
+    """Outcome of a run. `error_bound` is the error bound of an equilibrium."""
 
     status: str
     stop_reason: str
@@ -231,8 +232,8 @@ class RunOutcome:
 
 
 class Recorder:
-    """Records the run of one scene into a sink; `last_steps` holds the last step observed and the
-    last step recorded."""
+    """Recorder of the run of one scene into a sink. `last_steps` contains the last observed step
+    and the last recorded step."""
 
     def __init__(self, scene: Scene, sink: Sink) -> None:
         self._scene, self.sink = scene, sink
@@ -243,8 +244,8 @@ class Recorder:
         self.warnings: tuple[str, ...] = ()
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
-        """Pass the columns and initial values to the sink or, for a run that is continued, its
-        `history`."""
+        """Pass the columns and the initial values to the sink. For a run that is continued, its
+        `history` is passed instead."""
         count = self._scene.experiment.record_count
         planned = {"time": count, "step": max(count, self._scene.experiment.steps + 1)}
         self.sink.begin(self._columns, self._measured.sizes, planned)
@@ -254,7 +255,8 @@ class Recorder:
             self.sink.put(values)
 
     def initial_values(self) -> Iterator[Values]:
-        """Generate the values known before the first step, one after the other to save memory."""
+        """Generate the values that are known before the first step, one after the other in order to
+        save memory."""
         raster, scene = self._scene.raster, self._scene
         numbers = raster.particle_offset + np.arange(1, raster.count + 1)
         yield {"particle": numbers, "number": numbers}
@@ -286,10 +288,10 @@ class Recorder:
     def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
         """Record the variables that are due at this step.
 
-        A step that was observed before is skipped, unless it is the `last` one of a run that stops
-        early, which is recorded in any case. `time` is the time of an equilibrium within a step.
-        Raises FloatingPointError if a recorded value is not finite; nothing of the step is then
-        recorded.
+        A step that was observed before is skipped. The `last` step of a run that stops early,
+        however, is recorded in any case. `time` is the time of an equilibrium within a step. Raises
+        FloatingPointError if a recorded value is not finite; in this case no variable of the step
+        is recorded.
         """
         if (state.step if time is None else time) > self.last_steps.step or last:
             self._put(state, self._record_of(state, last, time))
@@ -330,9 +332,9 @@ class Recorder:
         return self._measured.diagnosed(when, moment)
 
     def finish(self, state: State, outcome: RunOutcome, prediction: dict[str, Any]) -> None:
-        """Record the final values, and the attributes with the prediction made before the first
-        step; `warnings` then holds warnings about the last state."""
-        # In a run that diverged, bonds that broke after the last record are not a result.
+        """Record the final values and the attributes, including the prediction that was made before
+        the first step. After this, `warnings` contains warnings about the last state."""
+        # If the run diverged, bonds that broke after the last record do not belong to the result.
         diverged, recorded = outcome.status == "diverged", self.last_steps.recorded
         if state.step < recorded < state.step + 1:
             moment = StateMoment(state, self._tables, time=recorded)
@@ -362,7 +364,8 @@ class Recorder:
 
 
 def provenance_of(experiment: Experiment) -> dict[str, str]:
-    """Return the attributes with the experiment and the versions that made a dataset."""
+    """Return the attributes that contain the experiment and the versions of the software that made
+    a dataset."""
     return {
         "Conventions": layout.CONVENTIONS,
         "schema_version": layout.SCHEMA_VERSION,
@@ -374,7 +377,7 @@ def provenance_of(experiment: Experiment) -> dict[str, str]:
 
 
 class Snapshots:
-    """Builder of labelled datasets of single states of a scene."""
+    """Builder of labelled datasets for single states of a scene."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._tables = scene, Tables(scene)
@@ -393,7 +396,7 @@ class Snapshots:
         self._attributes = provenance_of(scene.experiment)
 
     def dataset(self, state: State) -> xarray.Dataset:
-        """Return a state with its labels; its values are copies that cannot be written to."""
+        """Return a state as a labelled dataset. The values are copies and cannot be written to."""
         import xarray
 
         moment = StateMoment(state, self._tables)

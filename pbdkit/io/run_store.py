@@ -1,5 +1,5 @@
-"""Store of an unfinished run beside its output: a SQLite database with the last checkpoint, and the
-records, a file that becomes the result."""
+"""Store of an unfinished run in the folder of its output. It consists of a SQLite database with the
+last checkpoint, and of the records, a file that becomes the result."""
 
 from __future__ import annotations
 
@@ -47,16 +47,17 @@ from pbdkit.io.sqlite_file import (
 )
 
 FORMAT = "3"
-"""Version of the store; later versions are refused."""
+"""Version of the store. Stores of later versions are refused."""
 TABLE = "CREATE TABLE pieces (key TEXT PRIMARY KEY, digest BLOB NOT NULL, data BLOB NOT NULL)"
-"""SQL statement that creates the table of pieces."""
+"""SQL statement that creates the table of pieces. A piece is a block of bytes that is stored under
+a key."""
 SCHEMA = [(TABLE,), (None,)]
-"""Schema of the database: the table and the index of its keys, which allows digests to be read
-without the data."""
+"""Schema of the database: the table, and the index of its keys. With the index, digests can be read
+without reading the data."""
 IDENTITY = "identity"
-"""Key of the random number on which every digest depends."""
+"""Key of the random number that identifies the store. Every digest depends on it."""
 COMMIT = "commit"
-"""Key of the number of the commit, with the digest of all other digests."""
+"""Key of the number of the last commit and of the digest of all other digests."""
 IDENTITY_BYTES = 16
 """Number of bytes of the random number."""
 PART_BYTES = 2**20
@@ -64,7 +65,7 @@ PART_BYTES = 2**20
 LONGEST = 2**26
 """Maximum number of bytes of a value that is read from the file."""
 JOURNAL_MARK = bytes.fromhex("d9d505f920a163d7")
-"""Last bytes of a journal of SQLite that names another journal."""
+"""Last bytes of a journal of SQLite that refers to another journal."""
 MARK = 0x70626472
 """The application_id of the file: `pbdr`."""
 
@@ -72,26 +73,28 @@ Piece = tuple[str, bytes | memoryview]
 
 
 class RunStore:
-    """Pieces of data by key in one SQLite file. A commit is complete or absent, even if the process
-    or the machine stops; when `commit` returns, it is on the disk.
+    """Pieces of data by key in one SQLite file. Even if the process or the machine stops, a commit
+    is complete or absent. When `commit` returns, the commit is on the disk.
 
-    All data that are read belong to one commit of one store; pieces of another commit or store
-    count as damage. Raises StorageError, with the name of the file, for errors of SQLite and wrong
-    digests.
+    All data that are read belong to one commit of one store. A piece of another commit or store
+    counts as damage. Errors of SQLite and wrong digests are raised as StorageError with the name of
+    the file.
     """
 
     def __init__(self, path: Path, *, mode: str = "ro") -> None:
         """Open a store; `mode` is ro, rw, or rwc to create it.
 
-        With ro nothing on the disk changes, even if it is damaged. With rw SQLite drops a damaged
-        log; therefore `check` and the header of the records are verified first.
+        With ro nothing on the disk is changed, even if the store is damaged. With rw SQLite would
+        discard a damaged log. Therefore `check` is called and the header of the records is verified
+        before.
         """
         self.path, self._writes = path, mode != "ro"
         self.identity, self.commits = b"", 0
-        """Identity of the store, and number of commits that it holds."""
+        """Identity of the store, and number of commits that it contains."""
         self._verified: dict[str, bytes] = {}
         self._listed: dict[str, bytes] = {}
-        """Digests of the pieces written or read so far, and of all pieces, by key."""
+        """Digests by key: `_verified` contains those of the pieces that were written or read so
+        far, and `_listed` those of all pieces."""
         self._is_checkpointed, self._closing = False, ExitStack()
         _refuse_others(path)
         try:
@@ -108,7 +111,8 @@ class RunStore:
         self.close()
 
     def commit(self, pieces: Iterable[Piece], obsolete: Iterable[str] = ()) -> None:
-        """Store pieces, replacing those with the same keys, and delete `obsolete` ones."""
+        """Store pieces, which replace pieces with the same keys, and delete the pieces with the
+        keys `obsolete`."""
         with self._sqlite():
             self._file.execute("BEGIN IMMEDIATE")
             try:
@@ -128,7 +132,8 @@ class RunStore:
                 raise
             self._listed, self.commits = listed, number
             self._verified |= digests
-            # The table and the first commit are written last, in case the log is lost.
+            # The table and the first commit are also written to the database itself, in case the
+            # log is lost.
             if not self._is_checkpointed:
                 _, frames, moved = self._file.execute("PRAGMA wal_checkpoint").fetchone()
                 self._is_checkpointed = frames == moved
@@ -138,7 +143,7 @@ class RunStore:
         return [key for key in self._listed if key.startswith(begin)]
 
     def piece(self, key: str) -> bytes:
-        """Return the piece last committed under a key."""
+        """Return the piece with a key in the last commit."""
         with self._sqlite():
             query = "SELECT data, digest FROM pieces WHERE key = ?"
             row = self._file.execute(query, (key,)).fetchone()
@@ -159,14 +164,14 @@ class RunStore:
             self.piece(key)
 
     def facts(self, key: str) -> Any:
-        """Return the JSON facts committed under a key."""
+        """Return the facts, stored as JSON, with a key in the last commit."""
         try:
             return json.loads(self.piece(key))
         except (ValueError, RecursionError):
             raise StorageError(f"{self.path}: is damaged: '{key}' is not valid JSON") from None
 
     def close(self) -> None:
-        """Close the store, as a single file if possible, without raising an error in any state of
+        """Close the store, as a single file if possible. No error is raised, whatever the state of
         the disk."""
         with suppress(sqlite3.Error):
             if self._writes:
@@ -208,7 +213,7 @@ class RunStore:
         self._file.execute("COMMIT")
 
     def _put(self, key: str, data: bytes | memoryview) -> bytes:
-        """Store a piece, unless it is present already, and return its digest."""
+        """Store a piece, unless the same piece is already stored, and return its digest."""
         digest = self._digest(key, data)
         if self._verified.get(key) != digest:
             self._file.execute("REPLACE INTO pieces VALUES (?, ?, ?)", (key, digest, data))
@@ -248,12 +253,13 @@ class RunStore:
 
 
 def json_piece(facts: Any) -> bytes:
-    """Return facts as a piece."""
+    """Convert facts, which are data in the form of JSON, to a block of bytes that can be stored
+    under a key."""
     return json.dumps(facts).encode()
 
 
 def parts_of(name: str, array: np.ndarray[Any, Any] | PiecedArray) -> Iterator[Piece]:
-    """Generate the pieces of an array, of bounded size."""
+    """Generate the pieces in which an array is stored. Their size is limited."""
     pieced = array if isinstance(array, PiecedArray) else PiecedArray.of(array)
     for key, block in zip(keys_of(name, array), pieced.blocks(PART_BYTES), strict=True):
         yield key, block.data
@@ -265,9 +271,9 @@ def keys_of(name: str, array: np.ndarray[Any, Any] | PiecedArray) -> list[str]:
 
 
 class StoredArray:
-    """Array stored in pieces, which is read on access: all of it, or some rows, ``array[:, :,
-    3:7]``, with one axis sliced and all axes before it whole. Raises StorageError if pieces are
-    missing."""
+    """Array that is stored in pieces and read when it is accessed. Either the whole array is read,
+    or some rows, ``array[:, :, 3:7]``; then one axis is sliced, and all axes before it are
+    complete. Raises StorageError if pieces are missing."""
 
     def __init__(
         self, store: RunStore, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
@@ -294,7 +300,7 @@ class StoredArray:
         return values.reshape(*lead, last - first, *inner)
 
     def _read(self, start: int, into: Array) -> None:
-        """Read from a byte offset on."""
+        """Read bytes from an offset into an array."""
         data: memoryview = into.reshape(-1).view(np.uint8).data
         position = 0
         while position < len(data):
@@ -310,8 +316,8 @@ class StoredArray:
 
 
 def _refuse_others(path: Path) -> None:
-    """Raise StorageError if the journal names another file, which SQLite would remove after rolling
-    back: no store has such a journal."""
+    """Raise StorageError if the journal refers to another file, because SQLite would remove this
+    file after rolling back. No store has such a journal."""
     with suppress(FileNotFoundError), Path(f"{path}-journal").open("rb") as journal:
         journal.seek(max(0, journal.seek(0, os.SEEK_END) - len(JOURNAL_MARK)))
         if journal.read() == JOURNAL_MARK:
@@ -341,14 +347,15 @@ def records_of(output: Path) -> Path:
 
 
 def remove_unfinished(output: Path) -> None:
-    """Remove the files of a store; the records last, since their lock excludes other runs."""
+    """Remove the files of a store. The records are removed last, because their lock excludes other
+    runs."""
     remove_store(output)
     with suppress(OSError):
         records_of(output).unlink(missing_ok=True)
 
 
 class StoreState(Enum):
-    """State of the store of a run beside its output."""
+    """State of the store of a run."""
 
     NOTHING = auto()
     """There is no store."""
@@ -357,11 +364,11 @@ class StoreState(Enum):
     COMMITTED = auto()
     """The store has a commit, from which the run can be resumed."""
     FINISHED = auto()
-    """The records have the name of the result, but the store still exists."""
+    """The records already have the name of the result, but the store still exists."""
 
 
 def is_unfinished(output: Path) -> bool:
-    """Return whether there is a run to resume; the store of a finished one is removed.
+    """Return whether there is a run that can be resumed. The store of a finished run is removed.
 
     Raises ExperimentError if a run is in progress, and StorageError if the store is damaged.
     """
@@ -373,10 +380,10 @@ def is_unfinished(output: Path) -> bool:
 
 
 def make_room(output: Path, *, discard: bool = False) -> bool:
-    """Return whether an output is free for a run, removing stores without commits.
+    """Return whether an output is free for a run. A store without commits is removed.
 
-    The output of an unfinished run is free only if the run is to be discarded, which is also
-    possible for a damaged run. Raises the errors of `is_unfinished`.
+    The output of an unfinished run is free only if the run is to be discarded. This is also
+    possible if its store is damaged. Raises the errors of `is_unfinished`.
     """
     with _exclusive(output):
         if not discard and has_committed(output):
@@ -387,8 +394,8 @@ def make_room(output: Path, *, discard: bool = False) -> bool:
 
 @contextmanager
 def _exclusive(output: Path) -> Iterator[None]:
-    """Exclude other writers of an output during the block. A finished run's records have the name
-    of the result."""
+    """Exclude other writers of an output during the block, by a lock on the records. The records of
+    a finished run have the name of the result."""
     has_store = store_of(output).exists()
     for path in (records_of(output), output) if has_store else [records_of(output)]:
         try:
@@ -414,14 +421,14 @@ def busy_error(output: Path) -> ExperimentError:
 
 
 def has_committed(output: Path) -> bool:
-    """Return whether there is a checkpoint of an unfinished run. Raises StorageError as
-    `store_state` does."""
+    """Return whether there is a checkpoint of an unfinished run. Raises StorageError in the same
+    cases as `store_state`."""
     return store_state(output) is StoreState.COMMITTED
 
 
 def store_state(output: Path) -> StoreState:
-    """Return the state of the store of a run; nothing on the disk changes. Raises StorageError if
-    it is damaged."""
+    """Return the state of the store of a run, without changing anything on the disk. Raises
+    StorageError if the store is damaged."""
     store, records = store_of(output), records_of(output)
     if not has_store_files(output):
         return StoreState.NOTHING
@@ -445,8 +452,8 @@ def store_state(output: Path) -> StoreState:
 
 
 def header_of(records: Path) -> Header | None:
-    """Read the header of the records of a run; None if it is missing or was overwritten at the end
-    of the run. Raises StorageError."""
+    """Read the header of the records of a run. Return None if there is no header, or if it was
+    overwritten at the end of the run. Raises StorageError."""
     try:
         with io.FileIO(records, "rb") as file:
             return read_header(file)
@@ -474,7 +481,7 @@ def damage_error(path: Path, what: str) -> StorageError:
 
 
 def has_store_files(output: Path) -> bool:
-    """Return whether any file of a store, or records, exist."""
+    """Return whether the records or any file of a store exist."""
     return any(path.exists() for path in (*files_of(store_of(output)), records_of(output)))
 
 
@@ -500,9 +507,9 @@ ARRAYS = "array/"
 class UnfinishedRun:
     """The store of a run and its records.
 
-    The writing process holds a lock on the records. A commit contains the checkpoint and the file
-    of the result so far: its pages, the extents of the records, and the entries buffered until a
-    chunk is full. Raises StorageError.
+    The writing process holds a lock on the records. A commit contains the checkpoint and the
+    present content of the result file: its pages, the extents in the records, and the entries that
+    are buffered until a chunk is full. Raises StorageError.
     """
 
     def __init__(self, output: Path, disk: io.FileIO, store: RunStore) -> None:
@@ -510,12 +517,12 @@ class UnfinishedRun:
         self._arrays: set[str] = set()
         self.records = records_of(output)
         self.has_checkpoint = False
-        """True once anything was committed."""
+        """True after the first commit."""
 
     @classmethod
     def begin(cls, output: Path, temporary: Path, disk: io.FileIO) -> UnfinishedRun:
-        """Create a store beside the output; the temporary file, open as `disk`, becomes its
-        records."""
+        """Create a store in the folder of the output. The temporary file, which is open as `disk`,
+        becomes the records."""
         store, records = store_of(output), records_of(output)
         conflict = StorageError(f"{output}: another run has started to write it")
         try:
@@ -528,7 +535,7 @@ class UnfinishedRun:
             temporary.rename(records)
         else:
             temporary.unlink()
-        if store.exists():  # The store of a run that is being finished.
+        if store.exists():  # This is the store of a run that is being finished.
             records.unlink()
             raise conflict
         try:
@@ -539,8 +546,8 @@ class UnfinishedRun:
 
     @classmethod
     def open(cls, output: Path, *, writing: bool, anyway: bool = False) -> UnfinishedRun:
-        """Open an existing store; with `anyway`, even one that has lost commits. A damaged store is
-        not changed. Raises ExperimentError if another process writes it."""
+        """Open an existing store. With `anyway`, a store that has lost commits is opened, too. A
+        damaged store is not changed. Raises ExperimentError if another process writes the store."""
         store, records = store_of(output), records_of(output)
         try:
             disk = open_locked(records) if writing else io.FileIO(records, "rb")
@@ -575,8 +582,9 @@ class UnfinishedRun:
         waiting: Mapping[str, list[NDArray[Any]]],
         written: Mapping[str, int],
     ) -> None:
-        """Commit a checkpoint together with the file. Buffered entries are stored with the
-        checkpoint, all other entries in the pages of the file."""
+        """Commit a checkpoint and the present content of the result file in one transaction.
+        Buffered entries are stored with the checkpoint, and all other entries in the pages and
+        extents of the file."""
         batches = {f"waiting.{n}": np.stack(v) for n, v in waiting.items() if v}
         arrays = batches | checkpoint.arrays
         types = {n: [a.dtype.str, list(a.shape)] for n, a in arrays.items()}
@@ -614,13 +622,13 @@ class UnfinishedRun:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """State of the run without the arrays."""
+        """Facts of the checkpoint: the state of the run without its arrays."""
         return self._dict("facts")
 
     def checkpoint(self, *, on_disk: bool = False) -> Checkpoint:
-        """Return the checkpoint of the last commit. It contains the arrays of the run, which are
-        read on access if `on_disk` is true, and the buffered entries of each column, under the name
-        ``waiting.NAME``."""
+        """Return the checkpoint of the last commit. It contains the arrays of the run and, with the
+        names ``waiting.NAME``, the buffered entries of each column. If `on_disk` is true, the
+        arrays are read when they are accessed."""
         facts, arrays = self.facts, Arrays()
         try:
             for name, (dtype, shape) in facts["arrays"].items():
@@ -653,20 +661,20 @@ class UnfinishedRun:
         return PagedFile(self.disk, layout["size"], pages, extents, read_only=read_only)
 
     def close(self) -> None:
-        """Close the store, which remains for `resume` if anything was committed and is removed
-        otherwise."""
+        """Close the store. If there is a commit, the store remains for `resume`; otherwise it is
+        removed."""
         self._store.close()
         if not self.has_checkpoint and not self.disk.closed:
             remove_unfinished(self.output)
         self.disk.close()
 
     def release(self) -> None:
-        """Close the store for writers; the records can still be read."""
+        """Close the store for writing. The records can still be read."""
         self._store.close()
 
     def remove(self) -> None:
-        """Remove the store and release the lock. The records have the name of the result by
-        then."""
+        """Remove the store and release the lock, after the records have got the name of the
+        result."""
         self._store.close()
         remove_store(self.output)
         self.disk.close()
@@ -678,13 +686,14 @@ class UnfinishedRun:
         return facts
 
     def _note_commits(self) -> None:
-        """Write the number of commits to the records. The store must have at least that number from
-        now on."""
+        """Write the number of commits to the records. From now on a store with fewer commits counts
+        as damaged."""
         write_header(self.disk, Header(self._store.identity, self._store.commits))
 
     def _refuse_other(self, header: Header | None, anyway: bool) -> None:
-        """Raise StorageError if the records belong to another run or, unless opened with `anyway`,
-        if the store has fewer commits than the header of the records states."""
+        """Raise StorageError if the records belong to another run. Unless the store is opened with
+        `anyway`, also raise it if the store has fewer commits than the header of the records
+        contains."""
         commits, store = self._store.commits, self._store.path
         if header is None or (header is FINALIZED and "finished" not in self.facts):
             raise damage_error(self.records, "its first bytes have changed since they were written")
@@ -708,15 +717,16 @@ class UnfinishedRun:
 
 
 def status_of(output: Path) -> dict[str, Any] | None:
-    """Return the status of the unfinished run of an output: `step`, `steps`, `rate` in steps a
-    second, `left_s`, the predicted seconds to its end, `age_s`, the seconds since the last
-    checkpoint, and `state`, running or stopped; None if there is no such run."""
+    """Return the status of the unfinished run of an output, or None if there is no such run. `step`
+    is the last step and `steps` the number of steps. `rate` is the number of steps per second, and
+    `left_s` the predicted time to the end of the run in seconds. `age_s` is the time since the last
+    checkpoint in seconds. `state` is running or stopped."""
     try:
         return _status(output) if has_committed(output) else None
     except StorageError:
         if has_store_files(output):
             raise
-        return None  # The run was finished meanwhile.
+        return None  # The run has finished in the meantime.
 
 
 def _status(output: Path) -> dict[str, Any]:
@@ -727,7 +737,8 @@ def _status(output: Path) -> dict[str, Any]:
         steps = int(about["steps"])
         step = steps if "finished" in facts else int(facts["step"])
         rate = float(facts.get("rate", 0.0))
-        age = max(0.0, time.time() - float(facts.get("at", math.inf)))  # Clocks can be set back.
+        # The clock may have been set back.
+        age = max(0.0, time.time() - float(facts.get("at", math.inf)))
         remaining = max(0.0, (steps - step) / rate - age) if rate > 0.0 else None
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StorageError(f"{store_of(output)}: is damaged: {error}") from None

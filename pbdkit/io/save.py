@@ -1,5 +1,5 @@
-"""Write datasets as sealed result files, and check before a computation that the name of its file
-is free."""
+"""Write datasets as sealed result files, and check before a computation that the name of the result
+file is free."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def save(dataset: xarray.Dataset, path: str | Path, *, force: bool = False) -> P
 
 
 def write_dataset(dataset: xarray.Dataset, path: Path, *, replace: bool) -> None:
-    """Write a dataset as a complete, sealed file, or not at all. Raises WriteError."""
+    """Write a dataset as a sealed file, which appears complete or not at all. Raises WriteError."""
     import h5netcdf
     import h5py
     from xarray.backends import H5NetCDFStore
@@ -77,8 +77,8 @@ def write_dataset(dataset: xarray.Dataset, path: Path, *, replace: bool) -> None
 
 
 def refuse_existing(path: Path, *, force: bool) -> None:
-    """Raise ExperimentError if a path cannot be written: without `force` if an unfinished run or a
-    file has that name, and always if it is not a plain file."""
+    """Raise ExperimentError if a path cannot be written. This is so if the path exists and is not a
+    plain file. Without `force` it is also so if an unfinished run or a file has that name."""
     try:
         kind = kind_of(path)
     except OSError as error:

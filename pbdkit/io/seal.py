@@ -1,9 +1,9 @@
-"""The seal of a result: digests of its bytes, extent by extent, appended behind the last extent
-that HDF5 uses.
+"""The seal of a result. It consists of digests of the bytes of the file, extent by extent, and is
+appended behind the last extent that HDF5 uses. An extent is a range of bytes.
 
 Each extent is verified immediately before it is read, so that a flipped bit reaches neither the
-HDF5 library nor a figure. Extents that are not read are not verified, which matters for files
-larger than memory. Other programs read the file as if there were no seal.
+HDF5 library nor a figure. Extents that are not read are not verified; this saves time for files
+that are larger than the memory. Other programs ignore the seal.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from pbdkit.io.atomic_file import write_all
 from pbdkit.untrusted_files import check_declared
 
 BLOCK = 2**20
-"""Maximum number of bytes that one digest covers, and therefore of the bytes that are read in
-addition to those requested."""
+"""Maximum number of bytes to which one digest applies. At most this number of bytes is read in
+addition to the requested ones."""
 MARK = b"pbdkit seal 2\n\0\0"
 """Last bytes of a sealed file."""
 FOOT = struct.Struct("<QQ16s16s")
-"""Layout of the end of the file: number of bytes of content, number of digests, digest of these and
-of the table, and the mark."""
+"""Layout of the end of the file: the number of bytes of content, the number of digests, the digest
+of these two numbers and of the table, and the mark."""
 ROW = np.dtype([("stop", "<u8"), ("digest", "<u8"), ("values", "<u8")])
-"""Row of the table: end of an extent, which begins at the end of the previous one; its digest; and
-whether it contains values alone, without structure of HDF5."""
+"""Row of the table: the end of an extent, which begins at the end of the previous extent; the
+digest of the extent; and whether it contains only values, without structure of HDF5."""
 
 
 class BrokenSealError(StorageError):
-    """A result differs from what was written; the message names file and position."""
+    """A result differs from what was written. The message contains the file and the position."""
 
 
 class ByteRange(NamedTuple):
-    """Bytes of a file, from `start` to before `stop`, with their digest."""
+    """Bytes of a file from `start` to `stop`, which is excluded, with their digest."""
 
     start: int
     stop: int
@@ -68,7 +68,7 @@ def digest(data: Any) -> int:
 
 
 class SealedFile(io.RawIOBase):
-    """The content of a sealed file; each extent is verified before its first byte is returned.
+    """The content of a sealed file. Each extent is verified before any of its bytes is returned.
 
     Raises OSError, and BrokenSealError when changed bytes are read.
     """
@@ -76,8 +76,8 @@ class SealedFile(io.RawIOBase):
     def __init__(self, path: Path, file: io.FileIO | None = None) -> None:
         self.path, self._file = path, file or path.open("rb", buffering=0)
         self.seal = seal_of(self._file)
-        """Seal of the file; None if there is none. The whole file is then content, and nothing is
-        verified."""
+        """Seal of the file; None if the file has no seal. The whole file is then content, and
+        nothing is verified."""
         self._size = self.seal.size if self.seal else os.fstat(self._file.fileno()).st_size
         self._place = 0
         self._unchecked = np.ones(len(self.seal.table) if self.seal else 0, bool)
@@ -91,13 +91,13 @@ class SealedFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Set the position, as in any file; the end is that of the content."""
+        """Set the position. The end of the file is the end of the content."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size}[whence]
         self._place = max(0, start + offset)
         return self._place
 
     def readinto(self, buffer: Any) -> int:
-        """Verify the extents that have not been verified yet, and read."""
+        """Read into a buffer, after verifying those extents that have not been verified yet."""
         view = memoryview(buffer).cast("B")
         view = view[: max(0, self._size - self._place)]
         self.check(self._place, self._place + len(view))
@@ -107,13 +107,15 @@ class SealedFile(io.RawIOBase):
         return count
 
     def check_structure(self) -> None:
-        """Verify all extents with structure, which the HDF5 library trusts."""
+        """Verify all extents that contain structure of HDF5, because the HDF5 library does not
+        check it."""
         table = self.seal.table if self.seal else np.empty(0, ROW)
         for n in np.flatnonzero(table["values"] == 0).tolist():
             self.check(int(table["stop"][n]) - 1, int(table["stop"][n]))
 
     def check(self, start: int = 0, stop: int | None = None) -> None:
-        """Verify the extents that overlap a range, once each. Raises BrokenSealError."""
+        """Verify those extents that overlap a range and have not been verified yet. Raises
+        BrokenSealError."""
         if self.seal is None:
             return
         stops = self.seal.table["stop"]
@@ -134,8 +136,8 @@ class SealedFile(io.RawIOBase):
 
 
 def put_seal(file: io.FileIO, extents: Iterable[ByteRange] = ()) -> None:
-    """Seal a finished file, open for reading and writing. The sorted `extents` of values with known
-    digests are not read. Raises OSError."""
+    """Seal a finished file, which is open for reading and writing. The sorted `extents` contain
+    values and have known digests, so that they are not read. Raises OSError."""
     size, extents = file.seek(0, os.SEEK_END), tuple(extents)
     values = {extent.start for extent in extents}
     rows = [(e.stop, e.digest, e.start in values) for e in _gapless(file, size, extents)]
@@ -145,7 +147,7 @@ def put_seal(file: io.FileIO, extents: Iterable[ByteRange] = ()) -> None:
 
 
 def _gapless(file: io.FileIO, size: int, extents: tuple[ByteRange, ...]) -> Iterator[ByteRange]:
-    """Generate the known extents and, between them, new ones that fill the file."""
+    """Generate the known extents, and new extents that fill the gaps between them."""
     place = 0
     for extent in (*extents, ByteRange(size, size, 0)):
         while place < extent.start:
@@ -159,7 +161,8 @@ def _gapless(file: io.FileIO, size: int, extents: tuple[ByteRange, ...]) -> Iter
 
 
 def seal_of(file: io.FileIO) -> Seal | None:
-    """Read the seal of an open file; None if it has none. Raises BrokenSealError."""
+    """Read the seal of an open file. Return None if the file has no seal. Raises
+    BrokenSealError."""
     length = file.seek(0, os.SEEK_END)
     if length < FOOT.size:
         return None
@@ -191,8 +194,8 @@ def is_whole(file: io.FileIO) -> bool:
 def open_sealed(path: Path, mode: str = "r") -> Any:
     """Open the content of a sealed file as an h5netcdf.File.
 
-    Anyone can write a seal: declarations and references are checked, and raise StorageError where
-    they are not acceptable.
+    Since a seal is no protection against malicious files, declarations and references are checked,
+    too. StorageError is raised if they are not acceptable.
     """
     file = SealedFile(path)
     file.check_structure()
@@ -216,6 +219,6 @@ def open_content(file: io.RawIOBase) -> Any:
         content.close()
         raise
     dataset = h5netcdf.File(content, "r", decode_vlen_strings=True)
-    # HDF5 calls Python here, and must be closed before Python ends.
+    # HDF5 calls Python to read this file, and must therefore be closed before Python ends.
     weakref.finalize(dataset, content.close)
     return dataset

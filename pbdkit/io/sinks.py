@@ -1,5 +1,5 @@
-"""Sinks of a dataset under construction: the interface, a sink in memory, and one that writes in a
-second thread while the run continues.
+"""Sinks, to which the recorder passes a dataset under construction: the interface, a sink in
+memory, and a sink that writes in a second thread while the run continues.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 
 class Sink(ABC):
-    """Destination of a dataset under construction. A sink may keep the values without copying: they
-    are not changed afterwards."""
+    """Destination of a dataset under construction. A sink may keep values without copying them,
+    because they are not changed afterwards."""
 
     @abstractmethod
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
         """Receive the columns, the sizes of the fixed dimensions, and the planned lengths of the
-        growing ones."""
+        growing dimensions."""
 
     @abstractmethod
     def put(self, values: Values) -> None:
-        """Receive one entry of each growing column, or all values of other columns."""
+        """Receive one entry of each growing column, or all values of columns that do not grow."""
 
     @abstractmethod
     def finish(self, attributes: dict[str, str]) -> None:
@@ -38,7 +38,7 @@ class Sink(ABC):
 
     @abstractmethod
     def abandon(self) -> None:
-        """Discard the dataset: the run failed."""
+        """Discard the dataset, because the run failed."""
 
 
 class KeepingSink(Sink):
@@ -50,11 +50,12 @@ class KeepingSink(Sink):
 
     @abstractmethod
     def keep(self, checkpoint: Checkpoint) -> None:
-        """Store a checkpoint with the values received so far; it survives `abandon`."""
+        """Store a checkpoint with the values received so far. It is preserved if `abandon` is
+        called."""
 
     @abstractmethod
     def suspend(self, checkpoint: Checkpoint) -> None:
-        """Store a checkpoint and stop; the run can be resumed."""
+        """Store a checkpoint and stop. The run can be resumed later."""
 
     @abstractmethod
     def keep_final(self, checkpoint: Checkpoint) -> None:
@@ -65,7 +66,7 @@ class MemorySink(Sink):
     """A dataset in memory, with the `columns` and `sizes` received by `begin`."""
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Begin; nothing is allocated in advance."""
+        """Begin the dataset. Nothing is allocated in advance."""
         self.columns, self.sizes = columns, sizes
         self._entries: dict[str, list[Any]] = {c.name: [] for c in columns}
 
@@ -91,7 +92,8 @@ class MemorySink(Sink):
         return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)
 
     def values(self, column: Column, rows: Iterable[int] | None = None) -> Any:
-        """Return the values of a column; if it grows, only the entries `rows` (default: all)."""
+        """Return the values of a column. If the column grows, only the entries `rows` are returned,
+        by default all."""
         entries = self._entries[column.name]
         if column.grows:
             entries = entries if rows is None else [entries[row] for row in rows]
@@ -102,17 +104,16 @@ class MemorySink(Sink):
 
 
 LARGE_BYTES = 2**20
-"""Number of bytes below which values are written directly, because a second thread would not save
-time."""
+"""Values with fewer bytes are written directly, because a second thread would not save time."""
 MAX_WAITING = 2
-"""Maximum number of pending large values; beyond it the run waits."""
+"""Maximum number of pending large values. If there are more, the run waits."""
 MAX_CALLS = 100
-"""Maximum number of pending calls; beyond it the run waits."""
+"""Maximum number of pending calls. If there are more, the run waits."""
 
 
 class OverlappingSink(KeepingSink):
-    """Sink that passes everything on to another sink, in order. Large values, and calls that follow
-    while they are written, are passed on in a second thread.
+    """Sink that passes all calls to another sink, in their order. Large values, and calls that
+    follow while large values are written, are passed in a second thread.
 
     Errors in that thread are raised at the next call.
     """
@@ -124,7 +125,7 @@ class OverlappingSink(KeepingSink):
         self._keeping: Future[None] | None = None
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Begin immediately, so that errors are found before the first step."""
+        """Begin immediately, so that errors occur before the first step."""
         self._inner.begin(columns, sizes, planned)
 
     def put(self, values: Values) -> None:
@@ -151,7 +152,8 @@ class OverlappingSink(KeepingSink):
         self._inner.suspend(checkpoint)
 
     def keep_final(self, checkpoint: Checkpoint) -> None:
-        """Store the final state after all values are written; only final values follow."""
+        """Store the final state after all values are written. After this call only final values are
+        written."""
         self._wait()
         self._inner.keep_final(checkpoint)
 

@@ -1,13 +1,14 @@
-"""One time step as a table for the dataset and the diagnostics: a row for each particle, with
-strain, stress and materials computed on request.
+"""One state as a table for the dataset and the diagnostics. The table has a row for each particle;
+strain, stress and materials are computed on request. A moment is the time of a state: a step, or a
+fraction of steps for an equilibrium within a step.
 
-The displacement gradient at a particle is the mean over the cells that meet there, weighted by
-area. The mean gradient of a polygon is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1), divided by its
-area (Green's theorem); it is that of the bilinear displacement of a rectangle, or of the linear
-displacement of a triangle. The mean over cells is a value at the mean of their centres. At an edge
-this point is not the position of the particle, and the gradient is extrapolated to the particle
-with its slope, which is computed in the same way. The result is exact for quadratic displacements
-of rectangular cells, also at edges.
+The displacement gradient at a particle is the mean over the cells that meet at the particle,
+weighted by area. The mean gradient of a polygon is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1),
+divided by its area (Green's theorem). This is the mean gradient of a bilinear displacement on a
+rectangle, and of a linear displacement on a triangle. The mean over cells is the gradient at the
+mean of the centres of the cells. At an edge this point differs from the position of the particle.
+The gradient is therefore extrapolated to the particle; its slope is computed in the same way. The
+result is exact for quadratic displacements of rectangular cells, also at edges.
 """
 
 from __future__ import annotations
@@ -66,13 +67,13 @@ from pbdkit.stepping.state import State, describe_bonds
 
 
 def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
-    """Return the first Piola-Kirchhoff stress lost to damage, over Young's modulus, as planes
-    (component × axis, sublattice, cell, cell); at each particle the mean over the given cells
-    around it, weighted by their area fractions.
+    """Return the part of the first Piola-Kirchhoff stress that is lost because of damage, divided
+    by Young's modulus, (component × axis, sublattice, cell, cell). At each particle it is the mean
+    over the given cells around it, weighted by their area fractions.
 
     In a cell it is -Σ ΔF ⊗ X over its corners, divided by its area, where ΔF is the change of the
-    force on a corner by damage: the formula for the mean stress of a body under forces on its
-    surface.
+    force on a corner that damage causes. This is the formula for the mean stress of a body with
+    forces on its surface.
     """
     total, area = np.zeros((4, *scene.raster.shape)), np.zeros(scene.raster.shape)
     for patch, share in cells:
@@ -93,7 +94,7 @@ def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, 
 
 
 def _places(scene: Scene, patch: Patch, corner: int, cells: NDArray[np.intp]) -> Places:
-    """Return the places of one corner of the cells with these indices in a patch."""
+    """Return the places of one corner, for the cells of a patch with the given indices."""
     block, shape = patch.corners[corner], scene.raster.shape
     at = np.unravel_index(cells, patch.whole.shape)
     index = [n + start for n, start in zip(at, block.start, strict=True)]
@@ -104,8 +105,8 @@ def _places(scene: Scene, patch: Patch, corner: int, cells: NDArray[np.intp]) ->
 def _lost_forces(
     scene: Scene, state: State, u: Floats, patch: Patch, corner: int, place: Places
 ) -> Iterator[Any]:
-    """Generate the forces of each other corner on one corner of these cells, undamaged minus
-    damaged."""
+    """Generate, for one corner of cells, the change of the force that each other corner exerts on
+    it: the force without damage minus the force with damage."""
     around = Surroundings(scene, place, patch.corners[corner].sublattice)
     evaluator = Evaluator(scene)
     particle = around.here(u, state)
@@ -145,8 +146,8 @@ def _of_sides(w: Any, sides: list[bool]) -> Any:
 
 
 def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness | None:
-    """Return the stiffness over Young's modulus at each particle, each component (particle,), or
-    the stiffness of the rule if it is uniform."""
+    """Return the stiffness at each particle, divided by Young's modulus; each component is
+    (particle,). If the stiffness is uniform, return the stiffness of the rule."""
     rule = experiment.rule
     if not (rule.varying and rule.uses_cells):
         return material_of(rule)
@@ -157,8 +158,8 @@ def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness 
 
 
 def through_thickness_of_particles(experiment: Experiment, raster: Raster) -> Floats | float:
-    """Return σ_zz over σ_xx + σ_yy at each particle, (particle,), or the ratio of the rule if it is
-    uniform."""
+    """Return the ratio of σ_zz to σ_xx + σ_yy at each particle, (particle,). If it is uniform,
+    return the ratio of the rule."""
     rule = experiment.rule
     if not isinstance(rule, Calibrated):
         return 0.0
@@ -171,8 +172,8 @@ def through_thickness_of_particles(experiment: Experiment, raster: Raster) -> Fl
 
 
 def phases_of_particles(experiment: Experiment, raster: Raster) -> NDArray[np.int64]:
-    """Return the regions of the rule that contain each particle, (particle,), a bit for each
-    region."""
+    """Return the regions of the rule that contain each particle, as a bit mask with a bit for each
+    region, (particle,)."""
     x, y = raster.reference().T
     phases, cell = np.zeros(len(x), np.int64), experiment.lattice.cell()
     for bit, region in enumerate(regions_of(experiment).values()):
@@ -184,20 +185,21 @@ Array = TypeVar("Array", bound=NDArray[Any])
 
 
 def read_only(values: Array) -> Array:
-    """Return a read-only view, for values that several diagnostics share."""
+    """Return a read-only view of values that several diagnostics share."""
     view: Array = values.view()
     view.flags.writeable = False
     return view
 
 
 class Tables:
-    """Data shared by all moments of a scene: the reference configuration and the neighbourhoods."""
+    """Data that all moments of a scene share: the reference configuration and the
+    neighbourhoods."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
 
     def at(self, moment: float) -> Tables:
-        """Return the tables with the time-dependent constants of a moment."""
+        """Return the tables with the values that time-dependent constants have at a moment."""
         if (scene := self.scene.at(moment)) is self.scene:
             return self
         tables = Tables(scene)
@@ -205,7 +207,8 @@ class Tables:
         return tables
 
     def add_reference(self, u: Floats) -> Floats:
-        """Add X to u, (particle, axis), in place; X is kept where it is needed more than twice."""
+        """Add X to u, (particle, axis), in place. If more than two steps are recorded, X is
+        computed once and stored; otherwise it is computed in chunks, which saves memory."""
         experiment = self.scene.experiment
         if experiment.record_count > 2:
             u += self.reference
@@ -215,7 +218,7 @@ class Tables:
         return u
 
     def of_body(self, planes: Floats) -> Floats:
-        """Return the values of planes by particle, (particle, ...); NaN at frame points."""
+        """Convert values on rasters to a table, (particle, ...), with NaN at frame points."""
         table = self.scene.raster.table(planes)
         table[~self.body] = np.nan
         return read_only(table)
@@ -232,8 +235,8 @@ class Tables:
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
-        """(particle,): whether a particle of the body lies inside or on its outline: all but some
-        corners of cells that it cuts."""
+        """(particle,): whether a particle of the body lies inside the outline or on it. Only
+        corners of cut cells can lie outside."""
         scene, raster = self.scene, self.scene.raster
         if scene.cells is None or scene.cells.share is None:
             return self.body
@@ -251,12 +254,12 @@ class Tables:
 
     @cached_property
     def followers(self) -> SlotFollowers:
-        """The rule on the scene, for forces and energy."""
+        """The followers of the scene, which evaluate forces and energy with its rule."""
         return SlotFollowers(self.scene)
 
     @cached_property
     def stiffness(self) -> Stiffness | None:
-        """Stiffness of the rule, at each particle where it varies."""
+        """Stiffness of the rule. If it varies, it is the stiffness at each particle."""
         return stiffness_of_particles(self.scene.experiment, self.scene.raster)
 
     @cached_property
@@ -276,14 +279,14 @@ class Tables:
 
 
 FLAT = 0.1
-"""Threshold of the area of a cell after its corners are moved to the mean centres of the cells
-around them, relative to its area at rest. Below it the centres are nearly collinear, as in a body
-of one row of cells, and define no slope."""
+"""Each corner of a cell is moved to the mean of the centres of the cells around it. If the area of
+the cell is then smaller than this fraction of its area at rest, these points are nearly collinear,
+as in a body with a single row of cells, and no slope can be computed."""
 
 
 def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]) -> Floats:
-    """Return ∂u_a/∂X_b as planes (2a + b, sublattice, cell, cell), from planes u and the cells with
-    their shares; 0 where there are no cells."""
+    """Return ∂u_a/∂X_b, (2a + b, sublattice, cell, cell), from the displacements u on rasters, and
+    the cells with their area fractions. The result is 0 at places without cells."""
     cells = list(cells)
     shape = u.shape[1:]
     area, offset, gradient = np.zeros(shape), np.zeros((2, *shape)), np.zeros((2, 2, *shape))
@@ -323,8 +326,8 @@ def _extrapolation(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Fl
 
 
 def _mean_gradient(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
-    """Return the area of a polygon with corners r, and area times the mean gradient of d,
-    (component of d, axis, ...)."""
+    """Return the area of a polygon with corners r. Also return its area times the mean gradient of
+    d, (component of d, axis, ...)."""
     slopes = np.zeros((len(d[0]), 2, *d[0].shape[1:]))
     for k, value in enumerate(d):
         ahead, behind = r[(k + 1) % len(r)], r[k - 1]
@@ -336,9 +339,9 @@ def _mean_gradient(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
 def _extend_gradient(
     gradient: Floats, phase_cells: list[tuple[Patch, Floats]], cells: list[tuple[Patch, Floats]]
 ) -> Floats:
-    """Extend a gradient computed from some cells only, (4, ...), to particles without such cells:
-    they have the mean over the particles with which they share any cell, or NaN if none of these
-    has a gradient."""
+    """Extend a gradient, (4, ...), that was computed from some cells only, to particles without
+    such cells. Their gradient is the mean over the particles with which they share any cell, or NaN
+    if none of these particles has a gradient."""
     shape = gradient.shape[1:]
     weight, total, count = np.zeros(shape), np.zeros_like(gradient), np.zeros(shape)
     for patch, share in phase_cells:
@@ -356,8 +359,8 @@ def _extend_gradient(
 
 
 TURNED = -1e-6
-"""Threshold of the ratio of a cell's area to that at rest below which the cell is inverted. Values
-closer to zero are rounding errors, also in single precision."""
+"""A cell is inverted if the ratio of its signed area to its area at rest is below this number.
+Negative ratios closer to zero are rounding errors, also in single precision."""
 
 
 class StateCells(CellValues):
@@ -372,7 +375,8 @@ class StateCells(CellValues):
         *,
         intact_only: bool = False,
     ) -> Floats:
-        """Evaluate the function patch by patch, each with the cells of one shape."""
+        """Evaluate the function for one patch after the other. A patch contains cells of one
+        shape."""
         parts = [np.empty(0)]
         for patch in self._scene.patches:
             counted = self._intact(patch) if intact_only else patch.whole
@@ -381,7 +385,7 @@ class StateCells(CellValues):
         return np.concatenate(parts)
 
     def gradient(self) -> Floats:
-        """Return the gradient, which is computed once for each moment."""
+        """Return the displacement gradient. It is computed once for each state."""
         return self._gradient
 
     @cached_property
@@ -394,7 +398,8 @@ class StateCells(CellValues):
         return read_only(whole.reshape(-1, 2, 2))
 
     def lost_stress(self) -> Floats | None:
-        """Return the stress lost to damage, computed at each call: only one diagnostic uses it."""
+        """Return the stress that is lost because of damage. It is computed at each call, because
+        only one diagnostic uses it."""
         scene, state = self._scene, self._state
         if not (scene.tears and isinstance(scene.experiment.fracture, (Softens, SoftensCells))):
             return None
@@ -414,9 +419,9 @@ class StateCells(CellValues):
     def _by_phase(
         self, phase: NDArray[Any], u: Floats, cells: list[tuple[Patch, Floats]], whole: Floats
     ) -> Floats:
-        """Return the gradient at each particle computed only from cells of its own material, since
-        gradients are discontinuous at interfaces. A particle without such cells has the mean of the
-        neighbouring particles that have some."""
+        """Return the gradient at each particle. It is computed only from cells of the particle's
+        own material, because gradients are discontinuous at interfaces. If a particle has no such
+        cells, its gradient is the mean over neighbouring particles that have such cells."""
         gradient, phases = whole.copy(), self._tables.phase
         for number in np.unique(phases).tolist():
             phase_cells = [
@@ -430,8 +435,8 @@ class StateCells(CellValues):
         return gradient
 
     def inside_out(self) -> str | None:
-        """Return a warning if cells, or corners of cells, are inverted; None otherwise. Torn cells
-        do not count, since the parts of a broken body move apart."""
+        """Return a warning if cells, or corners of cells, are inverted, otherwise None. Torn cells
+        are ignored, because the parts of a broken body move apart."""
         remedy = "reduce the displacement of the leaders, or the coupling of x and y in the rule"
         if description := self._turned(area_share, "cells are inverted"):
             return f"the last state has inverted cells: {description}; {remedy}"
@@ -440,8 +445,9 @@ class StateCells(CellValues):
         return None
 
     def _turned(self, share: Callable[..., Any], what: str) -> str | None:
-        """Describe the inverted cells: their number, and the place of the most inverted cell with
-        the ratio of its area to that at rest. None if no cell is inverted."""
+        """Describe the inverted cells. The description contains their number, the place of the most
+        inverted cell, and the ratio of its area to its area at rest. Return None if no cell is
+        inverted."""
         turned = total = number = 0
         worst = 0.0
         for patch in self._scene.patches:
@@ -475,10 +481,10 @@ class StateCells(CellValues):
 
 
 class StateMoment(Moment):
-    """A state as a table; bonds that broke after `no_later_than` count as intact.
+    """A state as a table. Bonds that broke after the step `no_later_than` count as intact.
 
-    An equilibrium within a step, at an increment of load, has a `time` of its own. Particles then
-    have their roles in that step, and constants and loads are evaluated at that time.
+    For an equilibrium within a step, at an increment of load, `time` is given. Particles then have
+    the roles of that step, and constants and loads are evaluated at that time.
     """
 
     def __init__(
@@ -495,7 +501,7 @@ class StateMoment(Moment):
         self._scene, self._raster = tables.scene, tables.scene.raster
 
     def of(self, state: State, tables: Tables) -> StateMoment:
-        """Return the same moment of another state."""
+        """Return the table of another state at the same moment."""
         return StateMoment(state, tables, self._no_later_than, self._time)
 
     @property
@@ -510,20 +516,22 @@ class StateMoment(Moment):
 
     @cached_property
     def cells(self) -> StateCells:
-        """Values on the cells, computed on request."""
+        """Values on cells, which are computed on request."""
         return StateCells(self._state, self._tables)
 
     @cached_property
     def forces(self) -> ForceValues:
-        """Forces and energy, computed on request."""
+        """Forces and energy, which are computed on request."""
         return StateForces(self._state, self._tables)
 
     def rows(self, numbers: tuple[int, ...]) -> Indices:
-        """Return the rows of particles by number, which count from 1 in the order of rows."""
+        """Return the rows of the particles with the given numbers. Numbers begin at 1 and have the
+        order of the rows."""
         return np.array(numbers, np.intp) - 1
 
     def nearest(self, points: tuple[Pair, ...]) -> Indices:
-        """Return the rows of the particles nearest to points, as leaders are selected."""
+        """Return the rows of the particles nearest to points, by the same rule by which leaders are
+        selected."""
         return Selecting(self._raster).nearest(points)
 
     @cached_property
@@ -531,8 +539,9 @@ class StateMoment(Moment):
         return read_only(self._raster.table(self._state.u))
 
     def displacement(self, rows: Indices | None = None) -> Floats:
-        """Return the displacements of all particles, from a table that is computed once for each
-        moment, or those of some rows without computing the table."""
+        """Return the displacements of all particles or of some rows. The table of all particles is
+        computed once for each state; the displacements of some rows are returned without computing
+        it."""
         if rows is None:
             return self._u
         place = self._raster.place_of(rows)
@@ -549,7 +558,8 @@ class StateMoment(Moment):
         return read_only(self._raster.reference(rows))
 
     def position(self) -> Floats:
-        """Return x = X + u, (particle, axis), in float64 whatever the run's precision."""
+        """Return x = X + u, (particle, axis), always in float64, independent of the precision of
+        the run."""
         return self._tables.add_reference(
             self._raster.table(self._state.u).astype(float, copy=False)
         )
@@ -561,7 +571,8 @@ class StateMoment(Moment):
     def sum_over_neighbours(
         self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
-        """Sum a function over the neighbours of the body's particles, as stepping does."""
+        """Sum a function over the neighbours of the body's particles, in the same way as in a
+        step."""
 
         def contribution(d: Any, u: Any, to: Neighbour) -> tuple[Any, ...]:
             value = function(d, to.r)
@@ -577,7 +588,8 @@ class StateMoment(Moment):
         return read_only(self._raster.table(sums[None])[:, 0])
 
     def leader_groups(self) -> tuple[LeaderRows, ...]:
-        """Return the leader groups; at time 0 those active in step 1."""
+        """Return the leader groups that are active in this step. At time 0 these are the groups
+        that are active in step 1."""
         step = max(self.step, 1)
         return tuple(
             LeaderRows(read_only(each.rows), each.group.leads(step), each.axes)
@@ -593,7 +605,7 @@ class StateMoment(Moment):
         )
 
     def touching(self) -> tuple[TouchingRows, ...]:
-        """Return the contacts with obstacles, which are computed once for each moment."""
+        """Return the contacts with obstacles. They are computed once for each state."""
         return self._touching
 
     @cached_property
@@ -609,13 +621,13 @@ class StateMoment(Moment):
         return 0 if broken is None else int((broken >= 0).sum())
 
     def bonds(self) -> BondHistory:
-        """Return the table of bonds with their histories, computed at each call."""
+        """Return the table of bonds with their histories. It is computed at each call."""
         parts = vars(describe_bonds(self._scene)).values()
         values = (*parts, self.broken_step(), self.broken_strain())
         return BondHistory(*(read_only(value) for value in values))
 
     def broken_step(self) -> NDArray[np.int32]:
-        """Return the step in which each bond broke, -1 for intact ones."""
+        """Return the step in which each bond broke, and -1 for intact bonds."""
         bonds, broken = self._scene.bonds, self._state.broken_step
         if broken is None:
             return np.full(len(bonds.ends), -1, np.int32)
@@ -623,8 +635,8 @@ class StateMoment(Moment):
         return np.where(steps > self._no_later_than, np.int32(-1), steps)
 
     def broken_strain(self) -> Floats:
-        """Return the strain at breaking, in float64 whatever the run's precision; NaN for bonds
-        that were cut."""
+        """Return the strain at breaking, always in float64, independent of the precision of the
+        run. It is NaN for bonds that were cut."""
         scene, lengths, steps = self._scene, self._state.broken_length, self.broken_step()
         if lengths is None:
             return np.full(len(steps), np.nan)
@@ -633,7 +645,8 @@ class StateMoment(Moment):
         return np.where((steps > 0) & (strains > -1.0), strains, np.nan)
 
     def remembered(self, name: str) -> NDArray[Any]:
-        """Return a state variable, in the order of the table of bonds, or of the particles."""
+        """Return the values of a state variable of bonds, in the order of the table of bonds, or of
+        a state variable of particles, in the order of the particles."""
         experiment, state = self._scene.experiment, self._state
         labels = [number.name for number in bond_numbers(experiment)]
         of_bonds = dict(zip(labels, state.bond_values, strict=True))
@@ -647,7 +660,8 @@ class StateMoment(Moment):
         raise ValueError(f"no component has a state variable '{name}'{did_you_mean(name, names)}")
 
     def _of_bonds(self, planes: NDArray[Any]) -> NDArray[Any]:
-        """Convert values on the planes of bonds to one value for each bond, (bond,)."""
+        """Convert values that are stored by plane and place to one value for each bond of the
+        table, (bond,)."""
         bonds = self._scene.bonds
         return np.asarray(planes.reshape(len(planes), -1)[bonds.plane, bonds.place])
 
@@ -661,7 +675,7 @@ class StateForces(ForceValues):
 
     @property
     def stiffness(self) -> Stiffness:
-        """Stiffness of the rule, at each particle where it varies."""
+        """Stiffness of the rule. If it varies, it is the stiffness at each particle."""
         stiffness = self._tables.stiffness
         if stiffness is None:
             raise ValueError(
@@ -676,7 +690,7 @@ class StateForces(ForceValues):
         return self._tables.through_thickness
 
     def on_particles(self) -> Floats:
-        """Return the forces on particles, which are computed once for each moment."""
+        """Return the forces on particles. They are computed once for each state."""
         return self._on_particles
 
     @cached_property

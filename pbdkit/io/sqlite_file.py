@@ -1,4 +1,4 @@
-"""Access to SQLite files, for writing or for reading without a change to anything on the disk."""
+"""Access to SQLite files for writing, and for reading without changing anything on the disk."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ SMALLEST_PAGE = 512
 PATIENCE_S = 60.0
 """Time in seconds to wait for another program that has locked the file."""
 LOGS = ("-journal", "-wal")
-"""Suffixes of the files with commits that are not yet in the database, or that are being rolled
-back."""
+"""Suffixes of the files that contain commits that are not yet in the database, or transactions that
+have to be rolled back."""
 SHARED_MEMORY = "-shm"
 """Suffix of the file of shared memory."""
 ONE_PAGE = 4096
@@ -26,25 +26,25 @@ ONE_PAGE = 4096
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the paths of all files that SQLite keeps of a database, whether they exist or not."""
+    """Return the paths of all files that SQLite may create for a database. They need not exist."""
     return [path.with_name(path.name + suffix) for suffix in ("", *LOGS, SHARED_MEMORY)]
 
 
 def journal_mode(path: Path) -> str:
-    """Return the journal mode. No write-ahead log is used on a network drive, since it would need
+    """Return the journal mode. On a network drive no write-ahead log is used, because it would need
     shared memory."""
     return "WAL" if is_local(path) else "TRUNCATE"
 
 
 def size_of(path: Path) -> int:
-    """Return the size of a file in bytes; 0 where there is none."""
+    """Return the size of a file in bytes, and 0 if it does not exist."""
     return path.stat().st_size if path.exists() else 0
 
 
 def is_database(path: Path) -> bool:
-    """Return whether a file begins as an SQLite database does. Raises OSError.
+    """Return whether a file begins in the same way as an SQLite database. Raises OSError.
 
-    SQLite would remove the log beside a file that is not a database.
+    The check is necessary because SQLite would remove the log of a file that is not a database.
     """
     try:
         with path.open("rb") as file:
@@ -67,7 +67,8 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
         uri=True,
     )
     settings = ["trusted_schema = OFF", "cell_size_check = ON"]
-    if mode != "ro":  # SQLite reads the database to set this, which may need to be rolled back.
+    # In order to set this, SQLite reads the database, which may have to be rolled back first.
+    if mode != "ro":
         settings.append("synchronous = FULL")
     try:
         for setting in settings:
@@ -79,11 +80,11 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
 
 
 def open_read_only(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connection:
-    """Open a database to read one commit of it; `closing` closes it.
+    """Open a database in order to read one of its commits. `closing` closes it.
 
     A connection with write access would drop a damaged write-ahead log when it is closed. A
-    transaction that a killed process left in a journal has to be rolled back before reading: that
-    is done in a copy. Raises sqlite3.Error and OSError.
+    transaction that a killed process left in a journal has to be rolled back before the database
+    can be read. This is done in a copy. Raises sqlite3.Error and OSError.
     """
     connection = closing.enter_context(contextlib.closing(connect(path, "ro")))
     try:
@@ -102,7 +103,8 @@ def open_read_only(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connect
 
 
 def fault_of(connection: sqlite3.Connection) -> str:
-    """Return the first fault that SQLite finds in a database; empty if there is none."""
+    """Return the first fault that SQLite finds in a database. The text is empty if there is
+    none."""
     try:
         (report,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     except sqlite3.DatabaseError as error:

@@ -1,4 +1,4 @@
-"""The dataset of an unfinished run, at its last checkpoint; nothing is written."""
+"""The dataset of an unfinished run at its last checkpoint. Nothing is written to the disk."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pbdkit.stepping.state import State, initial_state
 
 
 class Overlay(Sink):
-    """Sink that overlays the end of a dataset on a file, in memory only."""
+    """Sink that writes the end of a dataset into an open file. The changes are only in memory."""
 
     def __init__(self, file: NetcdfFile) -> None:
         self._file = file
@@ -45,8 +45,8 @@ class Overlay(Sink):
 def unfinished_dataset(output: Path) -> Any:
     """Return the dataset of an unfinished run as of its last commit, as an h5netcdf.File.
 
-    It contains what was recorded until then, the state of the checkpoint and the final values, with
-    status "interrupted". Raises StorageError, and the errors of building the experiment's scene.
+    It contains the data that were recorded until then, the state of the checkpoint and the final
+    values. Its status is "interrupted". Raises StorageError, and the errors of `build_scene`.
     """
     run = UnfinishedRun.open(output, writing=False)
     facts, file = run.facts, run.file(read_only=True)

@@ -1,8 +1,9 @@
 """Export to ParaView in the format VTKHDF, written without VTK. The body consists of vertices,
 lines and polygons.
 
-The format is described at docs.vtk.org, "VTKHDF file format", version 2: an UnstructuredGrid with
-points and data that follow each other step by step, and the beginning of each step in `Steps`.
+The format is described at docs.vtk.org, "VTKHDF file format", version 2. The file contains an
+UnstructuredGrid. Its points and data are stored one step after the other, and `Steps` contains the
+position at which each step begins.
 """
 
 from __future__ import annotations
@@ -48,11 +49,12 @@ QUAD = 9
 
 @dataclass(frozen=True)
 class UnstructuredGrid:
-    """A vertex for each particle, a line for each bond, then the polygons between particles.
-    `connectivity` holds rows of the particle table, those of cell n from offsets[n] to offsets[n +
-    1]; `types` are VTK's; `part` is what each cell represents; `broken_step` is the step in which a
-    bond, or the first bond of a polygon, broke: -1 where none did, and None for a scene without
-    fracture."""
+    """Grid of VTK cells: a vertex for each particle, then a line for each bond, then the polygons
+    between particles. `connectivity` contains rows of the particle table; the entries of cell n are
+    those from offsets[n] to offsets[n + 1]. `types` are the numbers of cell types in VTK. `part` is
+    PARTICLE, BOND or CELL for each cell. `broken_step` is the step in which a bond broke or, for a
+    polygon, the first step in which one of its bonds broke. It is -1 if nothing broke, and None for
+    a scene without fracture."""
 
     connectivity: Array
     offsets: Array
@@ -61,15 +63,16 @@ class UnstructuredGrid:
     broken_step: Array | None
 
     def of_bonds(self, values: Array, elsewhere: Any) -> Array:
-        """Return values by cell: those of the bonds, and `elsewhere` in all other cells."""
+        """Return a value for each cell: `values` for the bonds, and `elsewhere` for all other
+        cells."""
         cells = np.full(len(self.part), elsewhere, values.dtype)
         cells[self.part == BOND] = values
         return cells
 
 
 def grid_of(dataset: xarray.Dataset, scene: Scene | None) -> UnstructuredGrid:
-    """Return the grid of a dataset. It has no polygons if the scene is not given, or on a lattice
-    in space."""
+    """Return the grid of a dataset. It has no polygons if the scene is not given, or if the lattice
+    is in space."""
     count = dataset.sizes["particle"]
     has_bonds = "bond_ends" in dataset.variables
     bonds = dataset["bond_ends"].values - 1 if has_bonds else np.empty((0, 2), int)
@@ -110,8 +113,8 @@ def _type(rows: Array) -> int:
 
 
 def _first_breaking(rows: Array, bonds: Array, steps: Array, count: int) -> Array:
-    """Return the step in which the first bond between two corners of a cell broke, (cell,), else
-    -1."""
+    """Return for each cell the first step in which a bond between two of its corners broke, and -1
+    if none broke, (cell,)."""
     broken = np.flatnonzero(steps >= 0)
     key = bonds[broken] @ (count, 1)
     order = np.argsort(key)
@@ -131,22 +134,22 @@ VERSION = (2, 2)
 TYPE = b"UnstructuredGrid"
 """Type of the grid."""
 BLOCK_BYTES = 2**25
-"""Approximate number of bytes of a variable that are in memory at a time."""
+"""Approximate number of bytes of a variable that are in memory at the same time."""
 CHUNK = 2**16
 """Number of values in a chunk of a growing array."""
 ELSEWHERE = ("position", "time", "particle", "site", "axis", "bond_ends", "broken_step")
-"""Variables that the grid itself contains."""
+"""Variables that are not written, because the grid itself contains them."""
 NOT_HERE = {"i": -1, "u": 0, "f": np.nan}
-"""Fill values by kind of number, for cells without a value."""
+"""Values for cells that have no value, by kind of data type."""
 
 
 def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace: bool) -> None:
-    """Write every recorded step: particles, bonds and, with a `scene`, the cells between them, with
-    all variables of the dataset.
+    """Write every recorded step with all variables of the dataset. The file contains particles,
+    bonds and, if the `scene` is given, the cells between particles.
 
-    Only some steps are in memory at a time. Raises ExperimentError if there are no positions, as in
-    a sweep that did not keep them, and WriteError if the file cannot be written; an earlier file
-    then remains.
+    Only some steps are in memory at a time. Raises ExperimentError if the dataset contains no
+    positions, for instance because a sweep did not keep them. Raises WriteError if the file cannot
+    be written; an earlier file of that name then remains.
     """
     import h5py
 
@@ -197,12 +200,14 @@ class Parts:
     steps: int
 
     def once(self, where: str, values: Array) -> None:
-        """Write values that hold for every step; entries of field data are tuples."""
+        """Write values that are valid for every step. Each entry of field data is a tuple of
+        VTK."""
         self.root[f"{where}/{self.name}"] = values
         self._from(where, np.zeros(self.steps, int), values)
 
     def each(self, where: str, rows: Iterator[Array]) -> None:
-        """Write values for each step; unchanged ones are stored once."""
+        """Write values for each step. Values that do not change from one step to the next are
+        stored once."""
         last: Array | None = None
         starts, start, length, array = list[int](), 0, 0, None
         for values in rows:
@@ -236,8 +241,8 @@ class Parts:
 def _put(
     parts: Parts, values: xarray.DataArray, dims: tuple[Any, ...], grid: UnstructuredGrid
 ) -> None:
-    """Write a variable as point or cell data; variables of neither particles nor bonds are field
-    data."""
+    """Write a variable. Variables of particles are point data, variables of bonds are cell data,
+    and all other variables are field data."""
     along = {*dims} - {"time", "axis"}
     if parts.name in ELSEWHERE or values.dtype.kind not in "biuf" or "step" in along:
         return
@@ -261,8 +266,8 @@ def _put(
 
 
 def _put_broken(parts: Parts, dataset: xarray.Dataset, grid: UnstructuredGrid) -> None:
-    """Write what each cell represents and, with fracture, which cells are broken at each step: a
-    polygon counts as broken with the first bond between its corners."""
+    """Write `part`, the kind of each cell. With fracture, also write which cells are broken at each
+    step. A polygon counts as broken as soon as the first bond between its corners has broken."""
     Parts(parts.root, "part", parts.steps).once("CellData", grid.part)
     if grid.broken_step is None:
         return

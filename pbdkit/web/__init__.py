@@ -1,6 +1,6 @@
-"""Browser pages: reports of a dataset, and live bodies moved by the mouse.
+"""Pages for a browser: reports of a dataset, and live views of bodies that are moved by the mouse.
 
-Python selects and packs the data, JavaScript draws them.
+Python selects and packs the data, and JavaScript draws them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def live(
     components: ComponentClasses = (),
     output: str | Path | None = None,
 ) -> LiveWidget:
-    """Return a notebook widget in which the mouse leads the particles of an experiment.
+    """Return a notebook widget in which the particles of an experiment are moved by the mouse.
 
     Parameters
     ----------

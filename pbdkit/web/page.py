@@ -1,7 +1,7 @@
 """Self-contained HTML pages: content, script and style in one file.
 
-Arrays are text inside a page: little-endian numbers, with bytes of equal significance together,
-compressed by gzip and encoded as base64.
+Arrays are stored as text in a page. They are little-endian numbers, in which bytes of equal
+significance are stored together, compressed by gzip and encoded as base64.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./([a-z_]+)\.js";$', re.M)
-"""Pattern of an import in JavaScript."""
+"""Regular expression for an import statement in JavaScript."""
 EXPORT = re.compile(r"^export ((?:async )?(?:function\*?|class|const) (\w+))", re.M)
-"""Pattern of an export in JavaScript."""
+"""Regular expression for an export in JavaScript."""
 
 
 def source(name: str) -> str:
@@ -32,10 +32,11 @@ def source(name: str) -> str:
 
 
 def script(name: str, *, exports: bool = False) -> str:
-    """Bundle the module `name`.js with all its imports into one without imports.
+    """Bundle the module `name`.js and all modules that it imports into a single script without
+    imports.
 
-    Each module becomes a function that is called once and returns its exports. With `exports` the
-    bundle exports the names of the module.
+    Each module becomes a function that is called once and returns the exports of the module. With
+    `exports` the script exports the names that the module `name`.js exports.
     """
     texts: dict[str, str] = {}
 
@@ -61,9 +62,10 @@ def _closed(module: str, text: str) -> str:
 
 
 def page(content: dict[str, Any]) -> str:
-    """Return the page as HTML. The content is embedded as data, and the page makes no requests."""
+    """Return the page as HTML. The content is embedded as data, so that the page makes no
+    requests."""
     code = script("report")
-    # In JSON `<` occurs in texts only. It is escaped, so that no text ends the element.
+    # In JSON `<` occurs only in texts. It is escaped so that no text can end the HTML element.
     data = json.dumps(_finite(content), allow_nan=False).replace("<", "\\u003c")
     digest = b64encode(sha256(code.encode()).digest()).decode()
     return Template(source("page.html")).substitute(
@@ -89,14 +91,15 @@ def _finite(value: Any) -> Any:
 KINDS = {"f4": "<f4", "f8": "<f8", "i4": "<i4", "u1": "<u1"}
 """Data types of arrays by their names in JavaScript."""
 LARGEST = 1e30
-"""Largest number in a page: WebGL does not draw beyond it."""
+"""Largest magnitude of a number in a page. WebGL cannot draw larger numbers."""
 
 
 def packed(values: ArrayLike, kind: str) -> dict[str, Any]:
-    """Pack values as one of KINDS, for `packed.js` to read.
+    """Pack values with the data type `kind`, one of KINDS. `packed.js` reads them.
 
-    The lowest bytes of all numbers come first, then the next ones. Numbers that vary slowly along
-    the last dimension then take a tenth of the size after compression.
+    The least significant bytes of all numbers are stored first, then the next bytes of all numbers,
+    and so on. After compression, numbers that vary slowly along the last dimension take only a
+    tenth of the size.
     """
     array = np.asarray(values)
     if kind[0] == "f":

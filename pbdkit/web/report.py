@@ -1,4 +1,5 @@
-"""Report of a dataset as one self-contained page of HTML: ``pbdkit.report`` and `pbdkit report`.
+"""Report of a dataset as a single self-contained page of HTML (``pbdkit.report`` and `pbdkit
+report`).
 
 The sections of this file are names and units, curves, selection of steps and particles within a
 maximum size, bonds, the moving lattice, the experiment, convergence, the page of a run, statistics
@@ -53,13 +54,13 @@ def meaning_of(variable: xarray.DataArray) -> str:
 
 
 def units_of(variable: xarray.DataArray) -> str:
-    """Return the units of a variable in a page: physical units if the variable has a scale, empty
-    for dimensionless quantities."""
+    """Return the units of a variable in a page. They are physical units if the variable has a
+    scale. The text is empty for dimensionless quantities."""
     return signed(in_its_units(variable.attrs)[1])
 
 
 def factor_of(variable: xarray.DataArray) -> float:
-    """Return the factor that converts values to the units of the page."""
+    """Return the factor by which values are multiplied to convert them to the units of the page."""
     return in_its_units(variable.attrs)[0]
 
 
@@ -68,12 +69,13 @@ MAX_POINTS = 1200
 MAX_SERIES = 12
 """Maximum number of curves of a variable."""
 AGAINST = {"nominal_stress": "nominal_strain", "load_resultant": "load_displacement"}
-"""Variables that are drawn over another variable as well as over time."""
+"""Pairs of variables: the first is drawn over the second, in addition to the curve over time."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Lines over one axis: `x`, the `steps` of its points, and the packed values of each series."""
+    """Lines over one axis. It contains the values `x` of the axis, the `steps` of the points, and
+    the packed values of each line."""
 
     title: str
     steps: dict[str, Any]
@@ -84,8 +86,9 @@ class Curve:
 
 
 def curves(dataset: xarray.Dataset, points: int = MAX_POINTS) -> list[dict[str, Any]]:
-    """Return the curves of all variables over time, or over every step, with at most a few small
-    dimensions, and of the pairs AGAINST, with at most `points` points."""
+    """Return the curves of all variables over time, or over every step, and the curves of the pairs
+    AGAINST. Variables of particles or bonds, and variables with more than MAX_SERIES curves, are
+    omitted. Each curve has at most `points` points."""
     names = _names(dataset)
     lines = [_over_time(dataset, name, points) for name in names]
     lines += [_against(dataset, y, x, points) for y, x in AGAINST.items() if {x, y} <= {*names}]
@@ -93,7 +96,7 @@ def curves(dataset: xarray.Dataset, points: int = MAX_POINTS) -> list[dict[str, 
 
 
 def fewer_points(dataset: xarray.Dataset) -> list[str]:
-    """Return a note where curves show fewer points than were recorded."""
+    """Return a note if curves have fewer points than steps were recorded."""
     longest = max((dataset.sizes.get(dim, 0) for dim in ("time", "step")), default=0)
     every = _every(longest, MAX_POINTS)
     return [] if every == 1 else [f"Curves show one of {every} points, of up to {longest}."]
@@ -146,8 +149,8 @@ def _word(dataset: xarray.Dataset, dim: str, n: int) -> str:
 
 
 def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
-    """Return one variable over another. A chart has only one horizontal axis. Of several pairs,
-    only the one with the largest values is therefore drawn."""
+    """Return the curve of one variable over another. If there are several pairs of lines, only the
+    pair with the largest values is drawn, because a chart has only one horizontal axis."""
     pairs = list(zip(_lines(dataset, x, "time"), _lines(dataset, y, "time"), strict=True))
     (label, across), (_, up) = max(pairs, key=lambda pair: float(np.nanmax(np.abs(pair[1][1]))))
     rows = slice(None, None, _every(len(across), points))
@@ -164,18 +167,18 @@ def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
 
 Rows = NDArray[np.intp]
 MIN_STEPS = 60
-"""Minimum number of steps of a run, if that many are recorded."""
+"""Minimum number of steps of a run that are shown, if at least that number is recorded."""
 MAX_PARTICLES = 50_000
-"""Maximum number of particles that a browser moves smoothly, with their bonds."""
+"""Maximum number of particles that a browser can draw smoothly in motion, with their bonds."""
 FEW_LEADERS = 200
-"""Number of leaders up to which all are shown, since they drive the motion."""
+"""Number of leaders up to which all leaders are shown, because they cause the motion."""
 
 
 @dataclass(frozen=True)
 class Thinning:
-    """Selection of the steps and particles that are shown: every `stride`-th particle along each
-    axis of the lattice, and all leaders if `with_leaders`, out of `recorded` steps and `count`
-    particles."""
+    """Selection of the `steps` and `particles` that are shown, out of `recorded` steps and `count`
+    particles. Along each axis of the lattice every `stride`-th particle is shown. If `with_leaders`
+    is true, all leaders are shown, too."""
 
     steps: Rows
     particles: Rows
@@ -216,8 +219,8 @@ def thinned(
     fewest: int = MIN_STEPS,
 ) -> Thinning:
     """Select as many steps and particles as fit into `budget` bytes, with `size` bytes for each
-    particle and step. Steps are omitted first, down to the number `fewest`, then particles.
-    `leaders` (particle,) are included if they are few."""
+    particle and step. First steps are omitted, until `fewest` steps remain, then particles.
+    `leaders`, (particle,), is a mask; leaders are included if their number is small."""
     recorded, count = dataset.sizes.get("time", 1), dataset.sizes["particle"]
     affordable = max(1, budget // (size * count))
     every = math.ceil(recorded / max(affordable, min(recorded, fewest)))
@@ -250,10 +253,12 @@ STATES = ("intact", "broken", "cut", "broken from the start", "cannot break")
 
 @dataclass(frozen=True)
 class BondArrays:
-    """Arrays along the bonds: `ends` the numbers of their particles, `rest` the rest offset, `step`
-    of breaking or -1, `strain` at breaking and `limit`, NaN where unknown, `state` an index of
-    STATES; and the final state variables of each. `order` holds the rows of the broken ones;
-    `nearest` is the one closest to breaking."""
+    """Data of the bonds, as arrays with one entry for each bond. `ends` are the numbers of the two
+    particles, and `rest` is the rest offset. `step` is the step of breaking, and -1 for bonds that
+    are not broken. `strain` is the strain at breaking and `limit` the strain above which the bond
+    breaks; they are NaN if unknown. `state` is an index of STATES. `remembered` contains the final
+    state variables. `order` contains the rows of the broken bonds in the order of breaking, and
+    `nearest` is the bond that is closest to breaking."""
 
     ends: Array
     rest: Array
@@ -278,7 +283,8 @@ class BondArrays:
         return self.model not in ("none", "not known") or len(self.order) > 0
 
     def shown(self, particles: Rows) -> dict[str, Any]:
-        """Return the bonds between the particles shown, by rows of these."""
+        """Return the bonds between the particles that are shown. Their ends are indices among these
+        particles."""
         rows = self._between(particles)
         return {
             "ends": packed(np.searchsorted(particles, self.ends[rows] - 1), "i4"),
@@ -292,7 +298,7 @@ class BondArrays:
         }
 
     def broken(self, particles: Rows) -> dict[str, Any]:
-        """Return how the bonds between these particles broke."""
+        """Return the data about breaking of the bonds between these particles."""
         rows, place = self._between(particles), np.full(len(self.ends), -1)
         place[self.order] = np.arange(1, len(self.order) + 1)
         return {
@@ -326,10 +332,11 @@ class BondArrays:
 
 
 def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
-    """Return the bonds of a dataset or, if it has no table, of its scene, unless neighbours are
-    re-evaluated; None if there are none. Lengths are in the units of the page.
+    """Return the bonds of a dataset. If it has no table of bonds, return the bonds of its scene,
+    unless neighbours are re-evaluated. Return None if there are no bonds. Lengths are in the units
+    of the page.
 
-    Raises ExperimentError if dataset and scene do not go together.
+    Raises ExperimentError if the scene does not match the dataset.
     """
     bonds = _in_lattice_units(dataset, scene)
     return bonds and replace(bonds, rest=lattice_unit(dataset) * bonds.rest)
@@ -372,9 +379,9 @@ def _from_bond_table(table: BondRecords, dataset: xarray.Dataset) -> BondArrays:
 
 
 def _from_table(dataset: xarray.Dataset) -> BondArrays | None:
-    """Return the bonds from the dataset alone."""
+    """Return the bonds, without using the scene."""
     complete = (dataset["bond_ends"].values > 0).all(axis=1)
-    if not complete.all():  # In datasets of sweeps other members may have more bonds.
+    if not complete.all():  # In the dataset of a sweep, other members may have more bonds.
         dataset = dataset.isel(bond=complete)
     ends = dataset["bond_ends"].values
     if not len(ends) or "reference" not in dataset.variables:
@@ -408,15 +415,16 @@ def _states(steps: Array, cut: Array, spared: Array) -> Array:
 
 
 AT_ONCE = 2**28
-"""Maximum number of bytes of a variable that is read at once. Larger variables are read step by
+"""A variable with at most this number of bytes is read at once. Larger variables are read step by
 step."""
 FAR = 20.0
-"""Ratio of the extent of all positions to that of the body at rest above which a run counts as
-diverged, and its positions are not followed."""
+"""If the ratio of the extent of all positions to the extent of the body at rest exceeds this
+number, the run counts as diverged, and the view is not extended to its positions."""
 
 
 def shown_variables(dataset: xarray.Dataset) -> list[str]:
-    """Return the variables that colours can show: a number, or a vector, of each particle."""
+    """Return the variables that can be shown as colours. They have a number, or a vector, for each
+    particle."""
     return [
         str(name)
         for name, variable in dataset.data_vars.items()
@@ -428,7 +436,8 @@ def shown_variables(dataset: xarray.Dataset) -> list[str]:
 
 
 def bytes_a_particle(dataset: xarray.Dataset) -> int:
-    """Return the bytes of a particle in one step before packing: displacement, kind and values."""
+    """Return the number of bytes for one particle and step before packing. They are used for
+    displacement, kind and values."""
     values = (2 if "axis" in dataset[n].dims else 1 for n in shown_variables(dataset))
     return 9 + 4 * sum(values)
 
@@ -455,10 +464,11 @@ def in_units(values: Any, factor: float) -> Array:
 def resting(
     dataset: xarray.Dataset, reference: Array, thinning: Thinning, spacing: float
 ) -> dict[str, Any]:
-    """Return the static content: names, reference, triangles.
+    """Return the content that is constant in time: names of variables, reference positions, and
+    triangles.
 
     `reference`, (particle, axis), contains the positions for zero displacement, and `spacing` is
-    the distance between neighbours there, both in the units of the page.
+    the distance between neighbours in these positions. Both are in the units of the page.
     """
     rows, role = thinning.particles, role_of(dataset)
     labels = {n: dataset[n].values for n in ("number", "i", "j") if n in dataset.variables}
@@ -475,8 +485,9 @@ def resting(
 
 
 def _outline(dataset: xarray.Dataset, reference: Array, rows: Rows) -> dict[str, Any]:
-    """Return the signed distance of particles from the outline, negative inside, in lattice units,
-    if the outline cuts cells: fields end there."""
+    """Return the signed distance of particles from the outline, negative inside, in lattice units.
+    It is returned only if the outline cuts cells; the page needs it in order to end the colours of
+    fields at the outline."""
     if "inside" not in dataset.variables or dataset["inside"].ndim != 1:
         return {}
     if dataset["inside"].values.all() or (shape := shape_of(dataset)) is None:
@@ -485,8 +496,8 @@ def _outline(dataset: xarray.Dataset, reference: Array, rows: Rows) -> dict[str,
 
 
 def moving(dataset: xarray.Dataset, reference: Array, thinning: Thinning) -> dict[str, Any]:
-    """Return the moving content: arrays of the particles shown, with time as their last dimension;
-    and statistics of each variable over all particles."""
+    """Return the content that changes in time: arrays of the particles that are shown, with time as
+    the last dimension, and statistics of each variable over all particles."""
     u, summary = _particles_over_time(
         _displacements(dataset, reference, thinning.steps), thinning.particles
     )
@@ -501,15 +512,16 @@ def moving(dataset: xarray.Dataset, reference: Array, thinning: Thinning) -> dic
 
 
 def role_of(dataset: xarray.Dataset) -> Array:
-    """Return body or frame, (particle,); all body where roles are not recorded."""
+    """Return for each particle the role OF_BODY or OF_FRAME, (particle,). If roles were not
+    recorded, it is OF_BODY for all particles."""
     if "role" in dataset.variables:
         return np.asarray(dataset["role"].values)
     return np.full(dataset.sizes["particle"], OF_BODY)
 
 
 def _particles_over_time(each: Iterator[Array], rows: Rows) -> tuple[Array, dict[str, Any]]:
-    """Return the values of some rows, (particle, ..., time), and, for each time, the mean, maximum
-    and minimum over all rows; for vectors these are statistics of their lengths."""
+    """Return the values of some rows, (particle, ..., time). Also return, for each time, the mean,
+    the maximum and the minimum over all rows. For vectors these are statistics of the lengths."""
     selection, statistics = [], []
     for values in each:
         selection.append(values[rows])
@@ -551,8 +563,8 @@ def _kinds(dataset: xarray.Dataset, thinning: Thinning) -> Array:
 
 
 def _box(reference: Array, places: Array) -> list[float]:
-    """Return the left, bottom, right and top bounds of all positions shown or, if these extend far
-    beyond the body at rest, the bounds of that body."""
+    """Return the left, bottom, right and top bounds of all positions that are shown. If the
+    positions extend far beyond the body at rest, return the bounds of the body at rest."""
     low, high = np.nanmin(places, axis=(0, 2)), np.nanmax(places, axis=(0, 2))
     rest = np.nanmin(reference, axis=0), np.nanmax(reference, axis=0)
     if not (np.ptp([low, high], axis=0) < FAR * np.ptp(rest, axis=0).max()).all():
@@ -568,8 +580,8 @@ def spacing_of(reference: Array) -> float:
 
 
 def _triangles(reference: Array, sites: list[Array], body: NDArray[np.bool_]) -> Array:
-    """Return the rows of the triangles that fill the body at rest, (triangle, 3), by its `sites` if
-    they are known."""
+    """Return the rows of the corners of triangles that fill the body at rest, (triangle, 3). If the
+    `sites` of the particles are known, they are used."""
     rows = np.flatnonzero(body & np.isfinite(reference).all(axis=1))
     if not sites:
         return np.asarray(rows[triangles_of(reference[rows])])
@@ -580,7 +592,7 @@ def _triangles(reference: Array, sites: list[Array], body: NDArray[np.bool_]) ->
 
 KeyPath = tuple[str | int, ...]
 MAX_TRIED = 150
-"""Maximum number of keys for which omission is tried."""
+"""Maximum number of keys of an experiment for which it is tested whether they can be omitted."""
 PARTS = ("lattice", "body", "neighbours", "rule", "frame", "fracture", "solver")
 """Parts of an experiment that the summary describes."""
 
@@ -620,8 +632,8 @@ def _type(part: Any) -> str:
 
 
 def experiment_text(parts: dict[str, Any]) -> str:
-    """Return the experiment, or the sweep, as YAML; keys of an experiment with known default values
-    are omitted."""
+    """Return the experiment, or the sweep, as YAML. Keys of an experiment that have their default
+    values are omitted."""
     can_be_brief = "lattice" in parts and not retired_parts(parts)
     return yaml_text(_brief(parts) if can_be_brief else parts)
 
@@ -637,7 +649,7 @@ def _brief(parts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _paths(part: Any, path: KeyPath = ()) -> Iterator[KeyPath]:
-    """Generate the paths of all keys except types, outer before inner ones."""
+    """Generate the paths of all keys except `type`. Outer keys are generated before inner keys."""
     if isinstance(part, dict):
         yield from ((*path, key) for key in part if key not in ("version", "name", "type"))
     inner = part.items() if isinstance(part, dict) else enumerate(part)
@@ -660,7 +672,7 @@ def _same(brief: dict[str, Any], parts: dict[str, Any]) -> bool:
         rebuilt: dict[str, Any] = Experiment.build(Source("page", brief)).model_dump(
             mode="json", by_alias=True
         )
-    except PbdkitError:  # The key is needed, or the part is not installed here.
+    except PbdkitError:  # The key is needed, or a component is not installed.
         return False
     return rebuilt == parts
 
@@ -671,25 +683,26 @@ def title_of(dataset: xarray.Dataset) -> str:
 
 
 def file_name(title: str) -> str:
-    """Return a plain name for the files of an experiment."""
+    """Return a title as a name for files, without special characters."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", title).strip("-")[:60] or "experiment"
 
 
 LARGEST = 20_000
-"""Maximum number of particles for which the page contains a prediction of stability, which takes
-longer for larger bodies."""
+"""Maximum number of particles for which the page contains a prediction of stability. For larger
+bodies the prediction would take too long."""
 FEWEST = 8
 """Minimum number of moves from which a decay is measured."""
 MAX_MOVES = 800
 """Maximum number of moves from which a decay is measured."""
 ROUNDING_RTOL = 1e-11
-"""Ratio to the largest move below which moves are rounding errors."""
+"""Moves with a smaller ratio to the largest move are treated as rounding errors."""
 
 
 @dataclass(frozen=True)
 class MoveHistory:
-    """The largest move per step of any follower, `move`, up to each of the `steps`; `free` is the
-    first row after the last event: a leader that moves, begins or ends, or a bond that breaks."""
+    """Largest displacement per step of any follower, `move`, in the interval that ends at each of
+    the `steps`. `free` is the index of the first of these steps after the last event. Events are a
+    leader that moves, begins or ends, and a bond that breaks."""
 
     steps: Array
     move: Array
@@ -697,31 +710,31 @@ class MoveHistory:
 
     @property
     def fitted(self) -> Rows:
-        """Return the rows from which the decay is measured: the second half of those after the last
-        event and above rounding errors."""
+        """Return the indices of the moves from which the decay is measured. These are the second
+        half of the moves that are after the last event and larger than rounding errors."""
         rows = np.arange(self.free, len(self.move))
         rows = rows[self.move[rows] > ROUNDING_RTOL * self.move.max(initial=0.0)]
         return np.asarray(rows[len(rows) // 2 :])
 
     @property
     def decay(self) -> float | None:
-        """Return the final factor of the moves per step."""
+        """Return the factor by which the moves finally decrease in each step."""
         rows = self.fitted
         if len(rows) < FEWEST:
             return None
         return float(np.exp(np.polyfit(self.steps[rows], np.log(self.move[rows]), 1)[0]))
 
     def steps_to(self, share: float) -> int | None:
-        """Return the steps from the last event until moves fell below a fraction of the first
-        one."""
+        """Return the number of steps from the last event until the moves are at most a fraction
+        `share` of the first move."""
         free = self.move[self.free :]
         below = np.flatnonzero(free <= share * free[:1].max(initial=0.0))
         return int(self.steps[self.free + below[0]] - self.steps[self.free]) if len(below) else None
 
 
 def moves_of(dataset: xarray.Dataset) -> MoveHistory | None:
-    """Return the moves between equidistant recorded steps, at most MAX_MOVES; None if there are too
-    few steps, or if the kinds of particles were not recorded."""
+    """Return the moves between at most MAX_MOVES equidistant recorded steps. Return None if there
+    are too few steps, or if the kinds of particles were not recorded."""
     recorded = dataset.sizes["time"]
     steps = np.arange(0, recorded, -(-recorded // MAX_MOVES))
     times = dataset["time"].values[steps]
@@ -746,8 +759,8 @@ def moves_of(dataset: xarray.Dataset) -> MoveHistory | None:
 
 
 def convergence(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
-    """Return the predicted and measured values, notes, and the curve of the moves; or the reason
-    why there is none."""
+    """Return the predicted and the measured values of convergence, notes, and the curve of the
+    moves. If there is no curve, return the reason."""
     if scene is None:
         return {
             "notes": [("There is no prediction: the experiment cannot be built on this machine.")]
@@ -832,7 +845,7 @@ def _notes(analysis: Analysis) -> list[str]:
 
 def _curve(analysis: Analysis, moves: MoveHistory) -> dict[str, Any]:
     """Return the logarithm of the moves and a line with the predicted slope. The line passes
-    through the middle one of the moves from which the decay is measured."""
+    through the move in the middle of those from which the decay is measured."""
     with np.errstate(divide="ignore"):
         logs = np.log10(moves.move)
     logs[~np.isfinite(logs)] = np.nan
@@ -855,14 +868,15 @@ def _curve(analysis: Analysis, moves: MoveHistory) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Origin:
-    """The scene of a dataset's experiment, None if it cannot be built, and the reason."""
+    """The scene of the experiment of a dataset. If it cannot be built, the scene is None, and the
+    reason is given."""
 
     scene: Scene | None
     fault: str = ""
 
 
 def origin_of(dataset: xarray.Dataset) -> Origin:
-    """Build the scene of a dataset, if possible: a page can be made without it."""
+    """Build the scene of a dataset if possible. A page can also be made without the scene."""
     try:
         return Origin(scene_of(dataset, "the lattice of a page"))
     except PbdkitError as error:
@@ -892,7 +906,8 @@ class RunContent:
         }
 
     def within(self, budget: int) -> dict[str, Any]:
-        """Return the content, with a moving lattice of about `budget` bytes before packing."""
+        """Return the content. The data of the moving lattice have about `budget` bytes before
+        packing."""
         dataset, reference, bonds = self._dataset, self._reference, self._bonds
         thinning = thinned(dataset, leaders_of(dataset), bytes_a_particle(dataset), budget)
         spacing = bonds.spacing if bonds else spacing_of(reference)
@@ -907,7 +922,8 @@ class RunContent:
 
 
 def _refuse_no_motion(dataset: xarray.Dataset) -> None:
-    """Raise ExperimentError unless there are positions of one run in the plane."""
+    """Raise ExperimentError if the dataset has no positions, has positions of several runs, or is
+    not in the plane."""
     if "position" not in dataset:
         raise ExperimentError("has no positions; keep `position`, which a page requires")
     position = dataset["position"]
@@ -921,7 +937,7 @@ def _refuse_no_motion(dataset: xarray.Dataset) -> None:
 
 
 def _bonds(dataset: xarray.Dataset, origin: Origin) -> tuple[BondArrays | None, list[str]]:
-    """Return the known bonds, and notes on what is unknown."""
+    """Return the bonds as far as they are known, and notes about data that are not known."""
     notes = []
     if origin.fault:
         notes.append(f"The experiment cannot be built on this machine: {origin.fault}")
@@ -938,7 +954,7 @@ def _bonds(dataset: xarray.Dataset, origin: Origin) -> tuple[BondArrays | None, 
 
 
 def leaders_of(dataset: xarray.Dataset) -> NDArray[np.bool_]:
-    """Return a mask of the particles that lead at the first or at the last recorded step,
+    """Return a mask of the particles that are leaders at the first or at the last recorded step,
     (particle,)."""
     if "kind" not in dataset or "time" not in dataset["kind"].dims:
         return np.zeros(dataset.sizes["particle"], np.bool_)
@@ -947,8 +963,9 @@ def leaders_of(dataset: xarray.Dataset) -> NDArray[np.bool_]:
 
 
 def reference_of(dataset: xarray.Dataset, scene: Scene | None) -> NDArray[np.float64]:
-    """Return the positions of zero displacement, (particle, axis), in the units of the page: the
-    reference positions or, if they are missing, those of the first recorded step."""
+    """Return the positions of zero displacement, (particle, axis), in the units of the page. These
+    are the reference positions or, if they were not recorded, the positions at the first recorded
+    step."""
     if "reference" in dataset.variables and dataset["reference"].ndim == 2:
         return in_units(dataset["reference"].values, factor_of(dataset["reference"]))
     if scene is not None and scene.raster.count == dataset.sizes["particle"]:
@@ -965,8 +982,9 @@ def _finite_values(variable: xarray.DataArray) -> Array:
 
 
 def numbers(dataset: xarray.Dataset, grid: list[str]) -> Iterator[dict[str, Any]]:
-    """Generate statistics of members. They are the last and the largest value of every variable
-    that is common to all members; for variables of particles their mean and maximum."""
+    """Generate statistics of members: the last and the largest value of every variable that all
+    members have in common. For variables of particles they are computed from the mean and the
+    maximum over the particles."""
     for name, variable in dataset.data_vars.items():
         if name in (STATUS, MESSAGE, "kind", "position") or not {*grid} <= {*variable.dims}:
             continue
@@ -988,8 +1006,8 @@ def numbers(dataset: xarray.Dataset, grid: list[str]) -> Iterator[dict[str, Any]
 
 
 def _statistics(values: Array, rest: list[str]) -> Iterator[tuple[str, Array]]:
-    """Generate statistics of values of shape (member, *rest), one number for each member, each with
-    its description."""
+    """Generate statistics of values of shape (member, *rest). A statistic is one number for each
+    member, with a description."""
     if "axis" in rest:
         values = np.linalg.norm(values, axis=1 + rest.index("axis"))
         rest = [dim for dim in rest if dim != "axis"]
@@ -1017,16 +1035,16 @@ def _reduced(how: np.ufunc, values: Array) -> Array:
 
 
 def _last(values: Array) -> Array:
-    """Return the last finite number of each row, NaN where there is none."""
+    """Return the last finite number of each row, and NaN if a row has no finite number."""
     finite = np.isfinite(values)
     last = values.shape[1] - 1 - np.argmax(finite[:, ::-1], axis=1)
     return np.asarray(values[np.arange(len(values)), last])
 
 
 MIN_STEPS_OF_MEMBER = 6
-"""Minimum number of steps shown of each member, if recorded."""
+"""Minimum number of steps of each member that are shown, if at least that number is recorded."""
 MIN_POINTS = 50
-"""Minimum number of points of the curves of each member, if recorded."""
+"""Minimum number of points in the curves of each member, if at least that number is recorded."""
 POINTS = 100_000
 """Maximum number of points in the curves of all members together."""
 
@@ -1054,8 +1072,8 @@ class SweepContent:
         }
 
     def within(self, budget: int) -> dict[str, Any]:
-        """Return the content, with moving lattices of all members of about `budget` bytes before
-        packing."""
+        """Return the content. The data of the moving lattices of all members together have about
+        `budget` bytes before packing."""
         each = self._members
         points = max(MIN_POINTS, POINTS // len(each))
         successful = [str(member[STATUS].item()) in STORED_STATUSES for member in each]
@@ -1088,7 +1106,7 @@ class SweepContent:
 
 @dataclass(frozen=True)
 class _Body:
-    """The reference of one member, (particle, axis), and its bonds."""
+    """The reference positions of one member, (particle, axis), and its bonds."""
 
     reference: Array
     bonds: BondArrays | None
@@ -1111,7 +1129,7 @@ class _Body:
         return same_bonds and np.array_equal(self.reference, other.reference, equal_nan=True)
 
     def resting(self, member: xarray.Dataset, thinning: Thinning) -> dict[str, Any]:
-        """Return the static content of the member."""
+        """Return the content of the member that is constant in time."""
         finite = self.reference[np.isfinite(self.reference).all(axis=1)]
         spacing = self.bonds.spacing if self.bonds else spacing_of(finite)
         return {
@@ -1122,7 +1140,8 @@ class _Body:
     def moving(
         self, member: xarray.Dataset, thinning: Thinning, points: int, *, whole: bool
     ) -> dict[str, Any]:
-        """Return the moving content of the member; with `whole` the static content, too."""
+        """Return the content of the member that changes in time. With `whole` also return the
+        content that is constant."""
         fixed = self.resting(member, thinning) if whole else {"lattice": {}}
         broken = self.bonds.broken(thinning.particles) if self.bonds else None
         last = member["position"].isel(time=thinning.steps)
@@ -1152,7 +1171,8 @@ def _facts(dataset: xarray.Dataset) -> list[list[str]]:
 
 
 def _labels(dataset: xarray.Dataset, dim: str) -> list[str]:
-    """Return the labels along a dimension of the grid; for cases, the values of each."""
+    """Return the labels along a dimension of the grid. The label of a case contains the values of
+    its parameters."""
     coordinates = [str(n) for n, c in dataset.coords.items() if c.dims == (dim,) and n != dim]
     if dim == CASE and coordinates:
         rows = zip(*(dataset[n].values.tolist() for n in coordinates), strict=True)
@@ -1163,7 +1183,7 @@ def _labels(dataset: xarray.Dataset, dim: str) -> list[str]:
     if name not in dataset.variables:
         return [str(n) for n in range(dataset.sizes[dim])]
     values = dataset[name].values
-    if values.dtype.kind == "f":  # Rounding errors are set to 0.
+    if values.dtype.kind == "f":  # Values that are only rounding errors are set to 0.
         values = np.where(np.abs(values) < 1e-12 * np.abs(values).max(), 0.0, values)
     return [_label(value) for value in values.tolist()]
 
@@ -1174,7 +1194,8 @@ def _label(value: Any) -> str:
 
 
 def _scene(specification: dict[str, Any]) -> Scene | None:
-    """Return the scene of the varied experiment, None if the body varies."""
+    """Return the scene of the experiment that the sweep varies. Return None if members have
+    different bodies."""
     experiment = specification.get("experiment", {})
     varied = {
         path.split(".")[0] for key in ("vary", "together") for path in specification.get(key, {})
@@ -1189,8 +1210,9 @@ def _scene(specification: dict[str, Any]) -> Scene | None:
 
 
 def speed(path: Path) -> dict[str, Any]:
-    """Return headings with their meanings, and a row for each method. Raises StorageError if the
-    file cannot be read, and ExperimentError for other content."""
+    """Return the table of a benchmark: headings with their meanings, and a row for each method.
+    Raises StorageError if the file cannot be read, and ExperimentError if it contains something
+    else."""
     try:
         content = json.loads(path.read_text("utf-8"))
         rows: list[dict[str, Any]] = [dict(row) for row in content["rows"]]
@@ -1224,15 +1246,16 @@ def _cell(row: dict[str, Any], name: str) -> str:
 BUDGET = 4_900_000
 """Maximum size of a page in bytes."""
 FIRST = 20_000_000
-"""Number of bytes of the lattice before compression in the first attempt. The compression ratio
-depends on the motion and is known afterwards."""
+"""Number of bytes of the lattice's data before compression in the first attempt. The compression
+ratio depends on the motion and is not known before."""
 MAX_PAGE_BYTES = 80_000_000
-"""Maximum number of bytes before compression that a browser moves smoothly."""
+"""Maximum number of bytes of the lattice's data, before compression, with which a browser draws
+smoothly."""
 ATTEMPTS = 4
 """Maximum number of attempts."""
 SMALL = 0.6
-"""Fraction of the maximum size below which a page without all steps and particles is built again
-with more of them."""
+"""If steps or particles were omitted and the page is smaller than this fraction of the maximum
+size, the page is built again with more of them."""
 
 
 def report(
@@ -1245,8 +1268,8 @@ def report(
     """Write a run or a sweep as one self-contained HTML page.
 
     The page contains the moving lattice, histories of particles and bonds, curves, predictions,
-    broken bonds and the experiment. It has at most 5 MB: steps or particles are omitted if
-    necessary, and the page states which.
+    broken bonds and the experiment. It has at most 5 MB. If necessary, steps or particles are
+    omitted, and the page states which.
 
     Parameters
     ----------
@@ -1285,7 +1308,7 @@ def report(
 
 
 def report_text(dataset: xarray.Dataset, measured: dict[str, Any] | None = None) -> str:
-    """Return the page as text, with the figures of `speed` if given."""
+    """Return the page as text. `measured` is a table of a benchmark, as returned by `speed`."""
     content = (SweepContent if SWEEP in dataset.attrs else RunContent)(dataset)
     budget, best = FIRST, ""
     for _ in range(ATTEMPTS):

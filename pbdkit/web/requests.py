@@ -1,4 +1,4 @@
-"""Requests of a page to a session: their validation and their execution."""
+"""Requests of a page to a session. This module validates and executes them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pbdkit.web.session import Session
 LONGEST = 4096
 """Maximum length of a command in bytes."""
 FARTHEST = 1e12
-"""Largest coordinate in lattice units, such that squares and differences of coordinates are
-finite."""
+"""Largest coordinate in lattice units. It is limited so that squares and differences of coordinates
+are finite."""
 Step = Annotated[int, Field(ge=0, lt=2**31)]
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Place = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
@@ -23,7 +23,7 @@ Place = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 
 
 class Play(Strict):
-    """Continue stepping, or stop."""
+    """Start stepping, or stop it."""
 
     do: Literal["play"]
     on: bool
@@ -37,7 +37,7 @@ class Advance(Strict):
 
 
 class Rewind(Strict):
-    """Go to about that step, back or forward."""
+    """Go back or forward to about the given step."""
 
     do: Literal["rewind"]
     step: Step
@@ -51,14 +51,15 @@ class Speed(Strict):
 
 
 class Grab(Strict):
-    """Grab a visible particle by its row; a leader with its group."""
+    """Grab a visible particle, given by its row. If it is a leader, its group is grabbed."""
 
     do: Literal["grab"]
     row: Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Drag(Strict):
-    """Move the grabbed particle, relative to where it was grabbed."""
+    """Move the grabbed particle. The displacement is relative to the position at which it was
+    grabbed."""
 
     do: Literal["drag"]
     by: Place
@@ -71,7 +72,7 @@ class Release(Strict):
 
 
 class Turn(Strict):
-    """Change a parameter, by its name."""
+    """Change the value of a parameter, given by its name."""
 
     do: Literal["turn"]
     name: Annotated[str, Field(max_length=200)]
@@ -87,14 +88,14 @@ class CutLine(Strict):
 
 
 class CutBond(Strict):
-    """Cut one bond, by its row."""
+    """Cut one bond, given by its row."""
 
     do: Literal["cut-bond"]
     row: Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Colour(Strict):
-    """Select the variable of the particles' colours."""
+    """Select the variable that determines the colours of the particles."""
 
     do: Literal["colour"]
     by: Literal["kind", "displacement", "last-step"]
@@ -107,7 +108,7 @@ class Save(Strict):
 
 
 class PictureReceived(Strict):
-    """Acknowledge the last picture; the next may be sent."""
+    """Acknowledge the last picture, so that the next picture may be sent."""
 
     do: Literal["seen"]
 
@@ -121,7 +122,7 @@ _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discrimin
 
 
 def command_of(message: str | bytes | dict[str, Any]) -> Command:
-    """Parse the command of a message. Raises ExperimentError for anything else."""
+    """Parse the command in a message. Raises ExperimentError if the message is not a command."""
     try:
         if not isinstance(message, dict):
             if len(message) > LONGEST:
@@ -139,8 +140,8 @@ def command_of(message: str | bytes | dict[str, Any]) -> Command:
 
 
 def execute(session: Session, command: Command) -> None:
-    """Execute a command between two steps. Raises PbdkitError, without any effect, if that is
-    impossible."""
+    """Execute a command between two steps. If this is impossible, PbdkitError is raised and nothing
+    is changed."""
     match command:
         case Play():
             session.running, session.due_steps = command.on, 0
@@ -155,7 +156,9 @@ def execute(session: Session, command: Command) -> None:
         case Drag():
             session.drag(command.by)
             if session.next_steps:
-                return  # The next step shows the result; a picture now would only delay it.
+                # The picture after the next step shows the result. A picture now would only delay
+                # it.
+                return
         case Release():
             session.release()
         case Turn():

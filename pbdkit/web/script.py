@@ -1,7 +1,7 @@
-"""Script of a live session: leader groups moved by the mouse, changed parameters and cuts, step by
-step, and its conversion to an experiment file.
+"""Script of a live session. It contains the leader groups that are moved by the mouse, the changed
+parameters, and the cuts, each with its step. The script can be converted to an experiment file.
 
-Long paths of the mouse are written to tables beside the file.
+Long paths of the mouse are written to tables in the folder of the file.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ Displacement = tuple[float, float]
 
 
 class ManualMotion(Motion):
-    """Motion of a leader group that is moved by the mouse, given by knots. Between knots and after
-    the last one it is the same as `path`.
+    """Motion of a leader group that is moved by the mouse. It is given by knots, pairs of a step
+    and a displacement. Between knots and after the last knot it is the same as the motion `path` of
+    an experiment.
 
-    Knots are appended while steps are made, so that an engine is not rebuilt for each movement of
-    the mouse.
+    Knots are appended while steps are made. For this reason the engine need not be rebuilt for each
+    movement of the mouse.
     """
 
     type: Literal["hand"] = "hand"
@@ -46,31 +47,32 @@ class ManualMotion(Motion):
     _displacements: list[Displacement] = PrivateAttr(default_factory=list)
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """Return the offset of the path with these knots."""
+        """Return the offset at step n of the path with these knots."""
         if not self._steps:
             return np.zeros(2)
-        # The lists are shared, since copying the path at each call would cost as much as its
-        # length.
+        # The lists are shared, because copying the path at each call would take time in proportion
+        # to its length.
         knots: dict[str, Any] = {"steps": self._steps, "displacements": self._displacements}
         return Path.model_construct(**knots).offset(n, start)
 
     def knots(self) -> tuple[int, ...]:
-        """Return the last knot; earlier knots have no effect on later steps."""
+        """Return the last knot. Earlier knots have no effect on later steps."""
         return tuple(self._steps[-1:])
 
     def at(self, n: int) -> Displacement:
-        """Return the offset at the end of its n-th step, n ≥ 0."""
+        """Return the offset at the end of the n-th step of the motion, n ≥ 0."""
         x, y = self.offset(n, np.zeros((1, 2))) if n else (0.0, 0.0)
         return float(x), float(y)
 
     def lead(self, begin: int, end: int, displacement: Displacement) -> None:
-        """Move linearly, after its step `begin`, to `displacement` at its step `end`."""
+        """Append a linear motion, which begins after step `begin` of this motion and reaches the
+        offset `displacement` at its step `end`."""
         if begin and (not self._steps or self._steps[-1] < begin):
             self._add(begin, self.at(begin))
         self._add(end, displacement)
 
     def cut_back(self, n: int) -> None:
-        """Remove the motion after step n; all steps until then remain the same to the last bit."""
+        """Remove the motion after step n. In all steps up to n the offsets keep all their bits."""
         knots = [(step, displacement) for step, displacement in self.path if step <= n]
         if len(knots) < len(self._steps):
             begin = knots[-1][0] if knots else 0
@@ -100,7 +102,7 @@ ADJUSTABLE = ("rule", "fracture", "solver")
 SOLVER = {"relaxation": 1.0, "memory": 0.0}
 """Adjustable numbers of the solver, with their defaults."""
 TEST_FACTOR = 1 + 2**-10
-"""Factor by which a number is changed to test whether it is adjustable."""
+"""Factor by which a number is multiplied in order to test whether it is adjustable."""
 TEST_VALUE = 2**-10
 """Value that replaces zero in this test."""
 SPANS = {"solver.relaxation": (0.01, 2.0), "solver.memory": (0.0, 1.0)}
@@ -109,11 +111,12 @@ SPANS = {"solver.relaxation": (0.01, 2.0), "solver.memory": (0.0, 1.0)}
 
 @dataclass
 class AdjustableNumber:
-    """One number by its path in the file, e.g. ``fracture.thresholds.0``.
+    """One adjustable number of the experiment, given by its path in the file, for instance
+    ``fracture.thresholds.0``.
 
-    `initial` is the number or schedule of the experiment, `turns` are the steps after which it was
-    changed, each with the new value, `bounds` are its bounds, and `span` is the range of its
-    slider.
+    `initial` is the number or the schedule in the experiment. `turns` are the steps after which it
+    was changed, each with the new value. `bounds` are the bounds of the number, and `span` is the
+    range of its slider.
     """
 
     name: str
@@ -139,7 +142,7 @@ class AdjustableNumber:
         return max(low, min(inner[0], value)), min(high, max(inner[1], value))
 
     def after(self, step: int) -> float | dict[str, Any]:
-        """Return the value from the next step on: a number or a schedule."""
+        """Return the value for the steps after `step`: a number or a schedule."""
         values = [value for when, value in self.turns if when <= step]
         return values[-1] if values else self.initial
 
@@ -157,8 +160,8 @@ class AdjustableNumber:
         self.turns.append((step, value))
 
     def turned(self, value: float) -> dict[str, Any]:
-        """Return a schedule that changes from the present value to another. Validation rejects it
-        if a component needs the number before the first step."""
+        """Return a schedule that changes from the present value to another value. If a component
+        needs the number before the first step, the schedule is rejected by validation."""
         return {"steps": [0, 1], "values": [self.at(0), value]}
 
     def cut_back(self, step: int) -> None:
@@ -180,8 +183,8 @@ class AdjustableNumber:
         return {"steps": list(steps), "values": list(values)}
 
     def _begun(self, until: int) -> list[tuple[int, float]]:
-        """Return the knots of the initial schedule up to a step. The last interval is written step
-        by step if it ends before its knot, because interpolation to another knot would differ in
+        """Return the knots of the initial schedule up to a step. If the last interval ends before
+        its knot, it is written step by step, because interpolation to a different knot would change
         the last digits."""
         if not isinstance(self.initial, dict):
             return [(until, self.initial)]
@@ -208,7 +211,8 @@ def numbers_of(experiment: Experiment, parts: dict[str, Any]) -> dict[str, Adjus
 
 
 def with_number(parts: dict[str, Any], number: AdjustableNumber, value: Any) -> dict[str, Any]:
-    """Return the parts with another value; unaffected parts are shared."""
+    """Return the parts of the experiment with another value of the number. Parts that do not change
+    are shared."""
     *parents, last = number.where
     parts = dict(parts)
     container: Any = parts
@@ -244,16 +248,19 @@ def _bounds(experiment: Experiment, name: str) -> tuple[float, float]:
 NEVER = 2**62 - 1
 """Last step of a session without end."""
 MADE = "-live"
-"""Suffix of the names of saved sessions, so that their results are separate files."""
+"""Suffix of the names of saved sessions. The names of their results then differ from those of the
+experiment's results."""
 Parts = dict[str, Any]
 
 
 @dataclass
 class LeaderScript:
-    """Leader group as in the file (`of_file`), or moved by the mouse after a certain step.
+    """Leader group of the file (`of_file`), or leader group that is moved by the mouse after a
+    certain step.
 
-    `ended` is the last step in which it leads. `instead_of` is the group that had not begun to lead
-    when this one, moved by the mouse, replaced it.
+    `ended` is the last step in which the group is active. `instead_of` is given for a group that is
+    moved by the mouse and has replaced a group of the file before that group became active: it is
+    the replaced group.
     """
 
     of_file: Parts
@@ -263,11 +270,11 @@ class LeaderScript:
 
     @property
     def begins(self) -> int:
-        """Return the first step in which it leads."""
+        """Return the first step in which the group is active."""
         return int(self.of_file.get("from", 1))
 
     def leads(self, step: int) -> bool:
-        """Return whether it leads in a step."""
+        """Return whether the group is active in a step."""
         ends = [end for end in (self.of_file.get("until"), self.ended) if end is not None]
         return self.begins <= step <= min(ends, default=step)
 
@@ -292,8 +299,8 @@ class Script:
 
     @classmethod
     def of(cls, experiment: Experiment) -> Script:
-        """Return the script of an experiment with numbers for relaxation and memory, without
-        changes."""
+        """Return the script of an experiment at the beginning of a session, when nothing has been
+        changed. The experiment must contain numbers for relaxation and memory, not `auto`."""
         parts = parts_of(experiment)
         groups = [LeaderScript(_without_defaults(group)) for group in parts.get("leaders", ())]
         return cls(experiment, parts, numbers_of(experiment, parts), groups)
@@ -304,12 +311,12 @@ class Script:
         return replace(self, numbers=numbers, groups=deepcopy(self.groups), cuts=[*self.cuts])
 
     def restore(self, snapshot: Script) -> None:
-        """Restore the changes of a copy, which must not be used afterwards."""
+        """Restore the changes that a copy contains. The copy must not be used afterwards."""
         self.numbers, self.groups, self.cuts = snapshot.numbers, snapshot.groups, snapshot.cuts
 
     def grab(self, group: int, step: int) -> int:
-        """Let the mouse move a leader group after a step; return the index of the group that it
-        moves."""
+        """Let the mouse move a leader group after a step. Return the index of the group that is
+        moved."""
         original = self.groups[group]
         if original.manual is not None:
             return group
@@ -332,7 +339,7 @@ class Script:
         return len(self.groups) - 1
 
     def let_go(self, group: int, step: int) -> None:
-        """Let the particles of a group follow after a step."""
+        """Let the particles of a group become followers after a step."""
         led_group = self.groups[group]
         if led_group.begins > step:
             del self.groups[group]
@@ -340,7 +347,7 @@ class Script:
             led_group.ended = step
 
     def turn(self, name: str, step: int, value: float) -> None:
-        """Change a number after a step. Raises ExperimentError for an invalid one."""
+        """Change a number after a step. Raises ExperimentError if the new value is invalid."""
         number = self.numbers.get(name)
         if number is None:
             raise ExperimentError(f"there is no parameter '{name}' that can be changed")
@@ -377,9 +384,10 @@ class Script:
         return min((when for when in turns if when > step), default=NEVER)
 
     def playing(self, step: int) -> Parts:
-        """Return the parts with which the next steps are made: parameters are constant until the
-        next change, groups moved by the mouse are at rest, and one past cut is included, which
-        keeps bonds breakable."""
+        """Return the parts of the experiment with which the next steps are made. Parameters are
+        constant until the next change, and groups that are moved by the mouse are at rest. If there
+        is no later cut, one past cut is included, so that the scene still stores the states of
+        bonds."""
         parts = dict(self.parts)
         for number in self.numbers.values():
             if number.turns:
@@ -415,8 +423,8 @@ class Script:
 
 
 def parts_of(experiment: Experiment) -> Parts:
-    """Return the parts of an experiment for a session, in lattice units and without a last step;
-    optional parts are omitted."""
+    """Return the parts of an experiment for a session. They are in lattice units and have no last
+    step. Optional parts are omitted."""
     parts: Parts = json.loads(experiment.model_dump_json(by_alias=True))
     parts["solver"].pop("settle", None)
     whole = experiment.of_parts(parts)
@@ -448,23 +456,24 @@ def _with_key(parts: Parts, key: str, values: list[Any]) -> Parts:
 
 
 INLINE = 500
-"""Maximum number of knots of a path in the experiment; longer ones are written to a table."""
+"""Maximum number of knots of a path that is written in the experiment. Longer paths are written to
+a table."""
 COMMENT = "# Written by pbdkit live: `pbdkit run` repeats the session bit for bit.\n"
 """First line of a saved session."""
 
 
 @dataclass(frozen=True)
 class Saved:
-    """Path of the saved experiment; `text` is the content of the file if it refers to no other
-    files, otherwise None."""
+    """Saved experiment: its path, and the content `text` of the file. `text` is None if the file
+    refers to other files."""
 
     path: FilePath
     text: str | None
 
 
 def save_script(script: Script, step: int, output: FilePath | None) -> Saved:
-    """Write the session until a step, under the next free name if the file exists or no file is
-    given.
+    """Write the session up to a step. If the file exists or no file is given, the next free name is
+    used.
 
     Raises ExperimentError if no step has been made or the session exceeds the size of an experiment
     file, and StorageError if the file cannot be written.
@@ -495,13 +504,13 @@ def _free(path: FilePath, groups: int) -> FilePath:
 
 
 def _table(path: FilePath, group: int) -> FilePath:
-    """Return the path of the table of a group, beside the experiment."""
+    """Return the path of the table of a group, in the folder of the experiment."""
     return path.with_name(f"{path.stem}-{group}.csv")
 
 
 def _tables(parts: dict[str, Any], path: FilePath) -> dict[FilePath, str]:
-    """Move the longest paths of groups into tables beside the file; return the text of each table
-    by its file path."""
+    """Move the longest paths of groups to tables in the folder of the file. Return the text of each
+    table by its path."""
     tables = {}
     for n, group in enumerate(parts["leaders"]):
         motion = group["motion"]

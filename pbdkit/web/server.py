@@ -1,8 +1,9 @@
-"""Server of a live session: one page and a socket, on this machine only.
+"""Server of a live session. It serves one page and a socket, on this machine only.
 
-A browser sends requests to this machine on behalf of any page. Requests of other pages are
-recognised, because these do not have the token, and because the browser adds their origin (Origin)
-and the name of the server (Host). The session runs in a separate thread, shared by all viewers.
+A browser sends requests to this machine on behalf of any page that it displays. Requests of other
+pages are recognised for two reasons: these pages do not have the token, and the browser adds to a
+request the origin of the page (Origin) and the name of the server (Host). All viewers share the
+session, which runs in a separate thread.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from pbdkit.web.view_frames import ViewFrame
 HOST = "127.0.0.1"
 """Address on which the server listens."""
 NAMES = (HOST, "localhost")
-"""Names of the server in requests."""
+"""Names of this server that are accepted in requests."""
 Headers = Callable[[str], Sequence[str]]
 """Function that returns all values of a header."""
 
@@ -50,7 +51,7 @@ def new_token() -> str:
 
 @dataclass(frozen=True)
 class Access:
-    """Address of the server, and the check of requests to it."""
+    """Address of the server, with a method that checks requests."""
 
     port: int
     token: str = field(default_factory=new_token, repr=False)
@@ -61,8 +62,9 @@ class Access:
         return f"http://{HOST}:{self.port}/?token={self.token}"
 
     def refusal(self, target: str, headers: Headers, *, is_socket: bool) -> str:
-        """Return the reason why a request is refused, or an empty text. A socket has the origin of
-        its page; an address typed by the user has none."""
+        """Return the reason why a request is refused, or an empty text. The request for a socket
+        contains the origin of the page. The request for a page contains no origin if the user
+        entered the address."""
         hosts, origins = headers("Host"), headers("Origin")
         if len(hosts) != 1 or hosts[0] not in self._hosts:
             return "the Host header does not name this server"
@@ -84,7 +86,7 @@ class Access:
 SHORTEST_S = 1 / 60
 """Minimum time in seconds between two pictures."""
 CLOSE_S = 1.0
-"""Time in seconds to wait for the end of the thread of the session."""
+"""Time in seconds to wait until the thread of the session ends."""
 
 
 class Viewer(ABC):
@@ -92,7 +94,7 @@ class Viewer(ABC):
     wait."""
 
     is_ready = True
-    """True once the last picture was acknowledged, so that the next may be sent."""
+    """True if the last picture was acknowledged, so that the next picture may be sent."""
     last_frame: ViewFrame | None = None
     """The frame that was sent last."""
 
@@ -114,8 +116,8 @@ ViewerRequest = tuple[Viewer | None, What]
 
 
 class Conductor:
-    """Thread that passes commands to a session, makes steps in between, and sends the newest
-    picture to each viewer that is ready. Pictures are never queued."""
+    """Thread that passes commands to a session and makes steps between the commands. It sends the
+    newest picture to each viewer that is ready; pictures are never queued."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -130,7 +132,7 @@ class Conductor:
         self._thread = threading.Thread(target=self._work, name="session", daemon=True)
 
     def start(self) -> None:
-        """Start the thread; the body rests until a viewer starts it."""
+        """Start the thread. No steps are made until a viewer starts stepping."""
         self._thread.start()
 
     def join(self, viewer: Viewer) -> None:
@@ -146,8 +148,8 @@ class Conductor:
         self._queue.put((viewer, command))
 
     def close(self) -> None:
-        """End the session's thread after the steps in progress; if these take longer than
-        `CLOSE_S`, it ends with the process."""
+        """End the thread of the session after the steps in progress. If these take longer than
+        `CLOSE_S`, the thread ends with the process."""
         self._queue.put((None, "close"))
         self._judge.close()
         if self._thread.is_alive():
@@ -166,8 +168,8 @@ class Conductor:
             self._try(None, self._publish)
 
     def _requests(self, seconds: float | None) -> Iterator[ViewerRequest]:
-        """Generate the queued requests, waiting for some time for the first. Of consecutive rewinds
-        only the last counts."""
+        """Generate the queued requests, after waiting for some time for the first one. Of
+        consecutive requests to rewind only the last one is generated."""
         requests: list[ViewerRequest] = []
         try:
             requests.append(self._queue.get(timeout=seconds))
@@ -201,8 +203,8 @@ class Conductor:
             self._try(viewer, lambda: execute(self._session, what))
 
     def _try(self, viewer: Viewer | None, act: Any) -> None:
-        """Execute an action and report errors to the viewer, or to all; no error ends the
-        session."""
+        """Execute an action. Errors are reported to the viewer, or to all viewers, and do not end
+        the session."""
         try:
             act()
         except PbdkitError as error:
@@ -241,11 +243,12 @@ class Conductor:
 
 
 MAX_WAITING = 1000
-"""Maximum number of messages that wait for a page; if it does not read them, it is disconnected."""
+"""Maximum number of messages that wait for a page. A page that does not read them is
+disconnected."""
 MAX_PAGES = 8
 """Maximum number of connected pages."""
 SERVER_CLOSE_S = 0.5
-"""Time in seconds for pages to answer at the end; then they are disconnected."""
+"""Time in seconds that pages have to answer at the end, before they are disconnected."""
 POLICY = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; "
     "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -254,7 +257,8 @@ POLICY = (
 
 
 def _silent() -> logging.Logger:
-    """Return a logger that suppresses the library's notes on doubtful connections."""
+    """Return a logger that suppresses the messages of the library about incomplete and invalid
+    connections."""
     log = logging.getLogger("pbdkit.web")
     log.setLevel(logging.CRITICAL)
     return log
@@ -272,19 +276,20 @@ class SocketViewer(Viewer):
         self._put(as_json(message))
 
     def show(self, picture: bytes) -> None:
-        """Queue a picture; there is at most one."""
+        """Queue a picture. At most one picture is queued, because the next one is sent only after
+        the last one was acknowledged."""
         self._put(picture)
 
     async def send(self, socket: ServerConnection) -> None:
         """Send queued messages until the connection is closed."""
-        with suppress(ConnectionClosed):  # The viewer receives the close event.
+        with suppress(ConnectionClosed):  # The viewer is informed of the end by the close event.
             while (message := await self._waiting.get()) is not None:
                 await socket.send(message)
             await socket.close()
 
     def _put(self, message: str | bytes) -> None:
         def put() -> None:
-            if self._waiting.full():  # The viewer does not receive messages.
+            if self._waiting.full():  # The viewer does not read messages.
                 self._waiting.get_nowait()
                 self._waiting.put_nowait(None)
             else:
@@ -295,7 +300,7 @@ class SocketViewer(Viewer):
 
 
 class SessionServer:
-    """Serves one session on a port of 127.0.0.1; port 0 selects one that is free."""
+    """Server of one session on a port of 127.0.0.1. Port 0 selects a free port."""
 
     def __init__(self, conductor: Conductor, title: str, port: int = 0) -> None:
         self._conductor, self._title, self._port = conductor, title, port
@@ -304,8 +309,8 @@ class SessionServer:
         self.access = Access(port)
 
     async def run(self, on_ready: Callable[[str], None], end: asyncio.Event) -> None:
-        """Serve until the end; `on_ready` is called with the address. Raises ExperimentError if the
-        port is in use."""
+        """Serve until the event `end`. `on_ready` is called with the address. Raises
+        ExperimentError if the port is in use."""
         try:
             server = await self._started()
         except OSError as error:
@@ -319,7 +324,8 @@ class SessionServer:
             server.close()
             with suppress(TimeoutError):
                 await asyncio.wait_for(server.wait_closed(), SERVER_CLOSE_S)
-            # These are half-open requests, and pages that do not read.
+            # The remaining connections are requests that are not complete, and pages that do not
+            # read.
             for transport in self._transports:
                 transport.abort()
 
@@ -333,8 +339,8 @@ class SessionServer:
         return server
 
     def _connection(self) -> type[ServerConnection]:
-        """Return the class of connections, which registers the transport of each connection
-        here."""
+        """Return the class of connections. It registers the transport of each connection in this
+        server."""
         transports = self._transports
 
         class Connection(ServerConnection):

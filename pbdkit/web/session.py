@@ -1,9 +1,9 @@
-"""Live session: an experiment that is stepped while leaders are moved, parameters changed and bonds
-cut.
+"""Live session: steps of an experiment are made while leaders are moved, parameters are changed and
+bonds are cut.
 
-Stability is analysed in a separate thread, steps are made by the same engines as in a run, earlier
-states are kept so that the user can go back, and cuts are mapped from the deformed body to the body
-at rest.
+Steps are made with the same engines as in a run, and stability is analysed in a separate thread.
+Earlier states are kept so that the user can go back. Cuts are mapped from the deformed body to the
+body at rest.
 """
 
 from __future__ import annotations
@@ -108,13 +108,13 @@ class Judge:
         self._thread.start()
 
     def submit(self, experiment: Experiment) -> None:
-        """Queue an experiment, which replaces one that is still waiting."""
+        """Queue an experiment. It replaces an experiment that is still waiting."""
         with self._requested:
             self._newest = experiment
             self._requested.notify()
 
     def close(self) -> None:
-        """End the thread after the present analysis."""
+        """End the thread after the analysis in progress."""
         with self._requested:
             self._closed = True
             self._requested.notify()
@@ -131,8 +131,8 @@ class Judge:
 
 
 SMALL = 20_000
-"""Number of particles up to which steps are made by numpy: some changes of parameters would require
-kernels to be compiled again, which takes seconds each time."""
+"""Number of particles up to which steps are made with numpy. With compiled kernels, some changes of
+parameters would require compiling again, which takes seconds."""
 
 
 class LiveStepper:
@@ -164,7 +164,7 @@ class LiveStepper:
         return fitted(state, self.scene)
 
     def advance(self, state: State, steps: int) -> State:
-        """Advance a state by a number of steps; the arrays of `state` are reused."""
+        """Advance a state by a number of steps. The arrays of `state` are reused."""
         end = min(state.step + steps, NEVER)
         while state.step < end:
             state = self.set(state)
@@ -174,9 +174,9 @@ class LiveStepper:
 
 
 def stepped(experiment: Experiment) -> Scene:
-    """Build the scene of an experiment to be stepped, with values for relaxation and momentum. For
-    an equilibrium solver the relaxation is the one that converges fastest, if it can be computed
-    quickly."""
+    """Build the scene of an experiment for stepping, with numbers for relaxation and momentum. If
+    the solver computes equilibria, the relaxation is the optimal one, provided that it can be
+    computed quickly."""
     scene = build_scene(experiment)
     if experiment.solver.makes_steps:
         return tuned(scene)
@@ -192,7 +192,7 @@ def stepped(experiment: Experiment) -> Scene:
 
 
 def _led(scene: Scene, groups: Sequence[LeaderScript]) -> tuple[Leading, ...]:
-    """Return the groups of the scene, with the motions of the mouse for those that it moves."""
+    """Return the groups of the scene. Groups that are moved by the mouse have its motion."""
     groups_of_scene = []
     for leading, group_of_script in zip(
         build_leading(scene.raster, scene.experiment), groups, strict=True
@@ -232,8 +232,8 @@ MAX_STATES = 200
 
 
 class History:
-    """The initial state and later ones. The intervals between them increase with their number, so
-    that they fit into the memory."""
+    """The initial state and kept later states. The intervals between kept states increase with the
+    number of steps, so that they fit into the memory."""
 
     def __init__(self, start: State) -> None:
         self._states = [start.copy()]
@@ -260,7 +260,7 @@ class History:
         return history
 
     def before(self, step: int) -> State:
-        """Return a copy of the last kept state not later than a step."""
+        """Return a copy of the last kept state that is not later than a step."""
         return self._states[max(0, bisect_right(self.steps, step) - 1)].copy()
 
     def cut_back(self, step: int) -> None:
@@ -288,16 +288,17 @@ def _size(state: State) -> int:
 SAMPLES = 64
 """Number of points at which a line is mapped to the body at rest."""
 NEAR = 0.25
-"""Tolerance of straightening a line, in units of the spacing."""
+"""Tolerance with which a line is replaced by a polyline, in units of the spacing."""
 ALONG = 0.29
-"""Position along a bond where it is cut. It is not in the middle, where bonds cross each other."""
+"""Position along a bond, as a fraction of its length, at which it is cut. It is not in the middle,
+because bonds cross each other there."""
 WIDTH = 1e-3
-"""Width of such a cut."""
+"""Length of the segment that cuts a single bond."""
 
 
 def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float) -> list[Segment]:
-    """Map a line across the deformed body to straight segments at rest. The displacement of the
-    nearest particle is subtracted from each point."""
+    """Map a line across the deformed body to straight segments in the body at rest. From each point
+    of the line the displacement of the nearest particle is subtracted."""
     a, b = np.array(line[0]), np.array(line[1])
     count = min(SAMPLES, 2 + int(2 * math.dist(*line) / spacing))
     places = a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
@@ -314,8 +315,8 @@ def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float)
 
 
 def across(ends: Floats) -> Segment:
-    """Return a short segment at rest that crosses a bond and none of the bonds that cross this
-    bond."""
+    """Return a short segment in the body at rest. It crosses a bond, and none of the bonds that
+    cross this bond."""
     (x, y), direction = ends[0], ends[1] - ends[0]
     middle = np.array([x, y]) + ALONG * direction
     aside = WIDTH * np.array([-direction[1], direction[0]])
@@ -324,8 +325,8 @@ def across(ends: Floats) -> Segment:
 
 
 def _straightened(places: Floats, tolerance: float) -> list[int]:
-    """Return the indices of the places that are corners of a polyline; all others are within the
-    tolerance of it."""
+    """Return the indices of those places that are the corners of a polyline. The distance of all
+    other places from the polyline is within the tolerance."""
     first, last = places[0], places[-1]
     direction, offsets = last - first, places - first
     length = math.hypot(*direction)
@@ -365,11 +366,11 @@ class GrabbedParticle:
 
 @dataclass
 class Session:
-    """Experiment that is stepped without end, with commands executed between two steps.
+    """Experiment of which steps are made without end. Commands are executed between two steps.
 
-    All changes are recorded in the script; a change made after going back removes later ones.
-    Messages other than pictures are passed to `notify`. Raises ExperimentError if the scene of the
-    experiment cannot be built.
+    All changes are recorded in the script. If the user goes back and makes a change, later changes
+    are removed. Messages other than pictures are passed to `notify`. Raises ExperimentError if the
+    scene of the experiment cannot be built.
     """
 
     experiment: Experiment
@@ -381,7 +382,7 @@ class Session:
     grabbed: GrabbedParticle | None = None
     step_s: float = 0.0
     pictures: int = 0
-    """Number of the present picture."""
+    """Number of the current picture."""
 
     def __post_init__(self) -> None:
         scene = stepped(self.experiment)
@@ -397,8 +398,8 @@ class Session:
         return self.state.step
 
     def advance(self, steps: int) -> None:
-        """Advance by steps, with the grabbed group moved linearly to the mouse. If a step fails,
-        the state is restored, stepping stops, and an error is reported."""
+        """Advance by a number of steps, in which the grabbed group moves linearly to the mouse. If
+        a step fails, the state is restored, stepping stops, and an error is reported."""
         begin = self.step
         self._lead(begin, begin + steps)
         clock = perf_counter()
@@ -421,14 +422,15 @@ class Session:
 
     @property
     def next_steps(self) -> int:
-        """Return the number of steps to the next picture; 0 while stepping is stopped."""
+        """Return the number of steps until the next picture. It is 0 while stepping is stopped."""
         if not (self.running or self.due_steps):
             return 0
         limit = max(1, int(LONGEST_S / self.step_s)) if self.step_s else 1
         return min(limit, self.speed if self.running else self.due_steps)
 
     def rewind(self, step: int) -> None:
-        """Go to a step, or to a kept state before it if replaying would take long, and stop."""
+        """Go to a step and stop. If repeating the steps from the last kept state would take long,
+        go to this kept state instead."""
         self.running, self.due_steps, self.grabbed = False, 0, None
         step = min(step, self.end)
         snapshot = self.history.before(step)
@@ -437,7 +439,7 @@ class Session:
         self._replay(step)
 
     def grab(self, row: int) -> None:
-        """Grab the particle of a visible row; it leads once it is moved."""
+        """Grab the particle of a visible row. It becomes a leader when it is moved."""
         if row >= len(self.camera.rows):
             raise ExperimentError(f"there is no particle {row}")
         self.release()
@@ -455,7 +457,8 @@ class Session:
         self.grabbed.by = by
 
     def release(self) -> None:
-        """Release the particle: a leader stays where it is, a follower follows again."""
+        """Release the particle. If it was a leader when it was grabbed, it stays at its place;
+        otherwise it becomes a follower again."""
         grabbed, self.grabbed = self.grabbed, None
         if grabbed and grabbed.group is not None and grabbed.frees:
             with self._editing():
@@ -481,14 +484,15 @@ class Session:
         self._cut(segments)
 
     def cut_bond(self, row: int) -> None:
-        """Cut a bond by its row."""
+        """Cut a bond, given by its row."""
         if row >= len(self.camera.bonds):
             raise ExperimentError(f"there is no bond {row}")
         ends = self.camera.reference[self.camera.bonds[row].astype(int)]
         self._cut([across(ends)])
 
     def save(self) -> Saved:
-        """Write the session until now as an experiment, beside existing files."""
+        """Write the session up to the current step as an experiment. Existing files are not
+        overwritten."""
         result = save_script(self.script, self.step, self.output)
         self.notify(
             {"is": "saved", "path": str(result.path), "text": result.text, "steps": self.step}
@@ -496,11 +500,11 @@ class Session:
         return result
 
     def frame(self) -> ViewFrame:
-        """Return a picture of the present state."""
+        """Return a picture of the current state."""
         return self.camera.frame(self.stage.scene, self.state, self.end, self.pictures, self.step_s)
 
     def plain(self) -> Experiment:
-        """Return the experiment with its present numbers."""
+        """Return the experiment with the current values of its parameters."""
         return self.script.experiment.of_parts(self.script.playing(self.step))
 
     def _cut(self, segments: list[Segment]) -> None:
@@ -512,7 +516,7 @@ class Session:
             self.script.cut(segments, self.step)
 
     def _take(self, grabbed: GrabbedParticle) -> None:
-        # There is no grabbed particle if the particle cannot be moved.
+        # If the particle cannot be moved, it is not grabbed.
         step, self.grabbed = self.step, None
         with self._editing():
             leading = self.stage.scene.leading
@@ -545,8 +549,8 @@ class Session:
 
     @contextmanager
     def _editing(self) -> Iterator[None]:
-        """Change the script in the block, after changes that follow this step have been removed.
-        After an error everything is restored."""
+        """Change the script in the block. Changes after the current step are removed before. If an
+        error occurs, everything is restored."""
         script, history = self.script.copy(), self.history.copy()
         state, end = self.state, self.end
         try:
@@ -590,8 +594,8 @@ Message = dict[str, Any]
 
 
 def static_message(session: Session) -> Message:
-    """Return the static content of a session: the body, its bonds (pairs of rows, 32 bits each),
-    its numbers."""
+    """Return the content of a session that is constant: the body, its bonds (pairs of rows, with 32
+    bits each), and the names and ranges of its adjustable numbers."""
     camera, scene = session.camera, session.stage.scene
     return {
         "is": "scene",
@@ -609,7 +613,8 @@ def static_message(session: Session) -> Message:
 
 
 def status_message(session: Session) -> Message:
-    """Return the content of a session that may change at any step, except for pictures."""
+    """Return the data of a session that may change at any step, for instance whether it is running.
+    Pictures are sent separately."""
     choice, grabbed = session.stage.choice, session.grabbed
     threads = f" on {choice.threads} threads" if choice.threads > 1 else ""
     return {

@@ -1,5 +1,5 @@
-"""Frames of a live session: positions in single precision, of selected particles if there are
-many."""
+"""Frames of a live session. A frame contains positions in single precision. If there are many
+particles, it contains only some of them."""
 
 from __future__ import annotations
 
@@ -38,10 +38,11 @@ BROKEN = 4
 
 @dataclass(frozen=True)
 class ViewFrame:
-    """A state as it is shown: positions (particle, 2), a value of each (None: coloured by kind),
-    its kind, and which bonds are broken. `kinds` and `broken` are the same objects until they
-    change. `end` is the last step that was made, `picture` the number of the picture, and `step_s`
-    the time of a step in seconds."""
+    """A state as it is shown: the positions of particles, (particle, 2), a value of each particle,
+    the kind of each particle, and which bonds are broken. If the values are None, particles are
+    coloured by their kinds. `kinds` and `broken` are the same objects as in the previous frame
+    until they change. `end` is the last step that was made, `picture` is the number of the picture,
+    and `step_s` the duration of a step in seconds."""
 
     step: int
     end: int
@@ -53,7 +54,8 @@ class ViewFrame:
     broken: Bytes
 
     def encoded(self, previous: ViewFrame | None) -> bytes:
-        """Encode the frame for a viewer of the previous one: unchanged parts are omitted."""
+        """Encode the frame for a viewer. Parts that are the same as in the previous frame, which
+        the viewer has, are omitted."""
         parts: list[NDArray[Any]] = [self.positions]
         holds = 0
         for bit, part, previous_part in (
@@ -75,8 +77,9 @@ class ViewFrame:
 class Camera:
     """Builder of frames from states of a body.
 
-    For large bodies every n-th particle along both axes is shown, with n = `every`, and those at
-    the ends and leaders; `rows` are the shown particles, and `spacing` is their distance at rest.
+    For large bodies every n-th particle along both axes is shown, with n = `every`. The last
+    particles along the axes and leaders are shown, too. `rows` are the shown particles, and
+    `spacing` is their distance at rest.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -94,7 +97,8 @@ class Camera:
 
     @cached_property
     def bonds(self) -> NDArray[np.uint32]:
-        """Rows of the ends of bonds, (bond, end); none if particles or bonds are omitted."""
+        """Rows of both ends of bonds, (bond, end). The array is empty if particles or bonds are
+        omitted."""
         table = self._scene.bonds.ends if self._shows_bonds else np.zeros((0, 2))
         return table.astype(np.uint32) if len(table) <= MAX_BONDS else np.zeros((0, 2), np.uint32)
 
@@ -111,7 +115,8 @@ class Camera:
         self, scene: Scene, state: State, end: int, pictures: int, step_s: float
     ) -> ViewFrame:
         """Return the frame of a state."""
-        with np.errstate(over="ignore"):  # Displacements of a diverging run may be too large.
+        # In a diverging run displacements may be too large for single precision.
+        with np.errstate(over="ignore"):
             positions = self.positions(state).astype(np.float32)
             values = self._values(state)
         kinds, broken = self._kinds_of(scene, state.step), self._broken_of(state)
@@ -145,8 +150,8 @@ class Camera:
 
 
 def _thinned(scene: Scene, every: int) -> NDArray[np.intp]:
-    """Return the rows of each n-th particle along both axes, of the last, and of leaders unless
-    they are many."""
+    """Return the rows of every n-th particle along both axes, of the last particles along them, and
+    of leaders unless there are many."""
     raster = scene.raster
     site = raster.site_table()
     selection = ((site % every == 0) | (site == site.max(axis=0))).all(axis=1)

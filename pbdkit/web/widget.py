@@ -1,4 +1,5 @@
-"""Widget with the live view for notebooks: messages of the widget in place of a socket."""
+"""Widget for notebooks with the live view. It uses the messages of the widget in place of a
+socket."""
 
 from __future__ import annotations
 
@@ -54,7 +55,7 @@ class LiveWidget(anywidget.AnyWidget):
         super().close()
 
     def _receive(self, widget: Any, message: Any, buffers: Any) -> None:
-        """Execute the message of a cell; a new cell joins as a new viewer."""
+        """Execute the message of a cell. A new cell joins as a new viewer."""
         if message == {"do": "join"}:
             self._conductor.leave(self._cells)
             self._cells = _Cells(self)
