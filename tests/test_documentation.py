@@ -68,12 +68,18 @@ def is_sweep(code):
     return re.search("^experiment:", code, re.M) is not None
 
 
+def name_of(page, code):
+    """Return the name of the file of a block: that of the experiment, which is the file that the
+    page runs if the block has no name, or that in the first line of a sweep."""
+    names = re.findall(r"\A# (\S+)\.yaml" if is_sweep(code) else r"(?m)^name: (\S+)", code)
+    (name,) = names or re.findall(r"^\$ pbdkit run (\S+)\.yaml$", page.read_text(), re.M)
+    return name
+
+
 def save_experiments(page):
-    """Save the page's own experiments, each as NAME.yaml in the current folder, and its sweeps,
-    which have their name in their first line."""
+    """Save the page's own experiments and sweeps in the current folder."""
     for code in blocks_in(page, "yaml"):
-        (name,) = re.findall(r"\A# (\S+)\.yaml" if is_sweep(code) else r"(?m)^name: (\S+)", code)
-        Path(f"{name}.yaml").write_text(code)
+        Path(f"{name_of(page, code)}.yaml").write_text(code)
 
 
 def install(page):
@@ -126,8 +132,9 @@ def test_experiments_run(page, code):
     if is_sweep(code):
         assert f"$ pbdkit sweep {code.split()[1]}" in text
         return
-    (name,) = re.findall(r"(?m)^name: (\S+)", code)
-    if f"\n$ pbdkit run {name}.yaml\n" in text:  # by `test_commands_work_in_their_order`
+    if (
+        f"\n$ pbdkit run {name_of(page, code)}.yaml\n" in text
+    ):  # by `test_commands_work_in_their_order`
         return
     experiment = pbdkit.Experiment.build(read_text(code, page.name))
     assert pbdkit.run(experiment, progress=False).attrs["status"] in ("complete", "settled")
