@@ -17,46 +17,53 @@ from pbdkit.model.reading import with_value
 from pbdkit.plugin.fields import ByRegion, TakesFields
 
 ORDER_4 = (2 / 3, -1 / 12)
-"""Weights of central differences of order 4, over 1 and 2 steps (Fornberg)."""
+"""Weights of central differences of order 4, at distances of 1 and 2 steps (Fornberg)."""
 WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
-"""Weights of central differences of order 8, over 1, 2, 3 and 4 steps (Fornberg)."""
+"""Weights of central differences of order 8, at distances of 1 to 4 steps (Fornberg)."""
 STEP = 2e-3
-"""Step of differences as a fraction of the value, or of 0.1 if the value is smaller."""
+"""Step of differences as a fraction of the value. For values below 0.1 it is a fraction of 0.1."""
 
 LARGE_STEP = 1e-2
-"""Step of differences for parts of the experiment that may change the particles, where errors are
-larger."""
+"""Step of differences for parts of the experiment that can change which particles exist.
+
+Errors of the prediction are larger for these parts.
+"""
 
 MIN_STEP = 1e-7
 """Smallest step as a fraction of the value, used near a bound."""
 SMOOTH = 1e-5
-"""If the results of orders 2 and 4 differ by at most this fraction, the relative error of order 4
-is about the square of this number."""
+"""Relative difference of the results of orders 2 and 4 up to which order 4 is sufficient.
+
+The relative error of order 4 is then about the square of this number.
+"""
 
 ROUGH = 1e-8
-"""Order 2 suffices for a relative accuracy of at least this number; the step is a quarter of the
-square root of the accuracy."""
+"""Smallest required relative accuracy for which order 2 is used.
+
+The step is then a quarter of the square root of the accuracy.
+"""
 PARTS = ("rule", "fracture")
 """Parts of an experiment that are replaced without any other change."""
 SEPARATE_PARTS = ("leaders", "loads")
-"""Parts that are replaced without any other change, after the experiment has been validated."""
+"""Parts that, after the experiment has been validated, are replaced without any other change."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an experiment.
+    """A parameter of an experiment that is a single number.
 
     Parameters
     ----------
     path
-        Dotted path: `rule.poisson_ratio`, `loads.0.force.1`, `rule.stiffness.inclusion` of a field
-        by region.
+        Dotted path, for example `rule.poisson_ratio` or `loads.0.force.1`.
+        `rule.stiffness.inclusion` is the value of a parameter that varies by region, in the region
+        `inclusion`.
     """
 
     path: str
 
     def value_in(self, experiment: Experiment) -> float:
-        """Return the number.
+        """Return the value of the parameter.
 
         Raises
         ------
@@ -64,7 +71,7 @@ class Parameter:
             If there is no number at the path.
         """
         words = self.path.split(".")
-        # Groups of leaders may have thousands of numbers, which are not converted unless necessary.
+        # Leader groups may have thousands of values, which are converted only if necessary.
         value: Any = experiment.model_dump(
             mode="json", by_alias=True, exclude={"leaders"} - {*words}
         )
@@ -134,12 +141,12 @@ class Parameter:
         function
             Function of an experiment that returns an array.
         accuracy
-            Relative accuracy that suffices.
+            Required relative accuracy.
 
         Notes
         -----
         Order 2 is used if an accuracy of about 1e-7 suffices. Otherwise order 4 is used if its
-        error is about 1e-10, and order 8 if not.
+        error is at most about 1e-10, and else order 8.
 
         Raises
         ------

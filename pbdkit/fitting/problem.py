@@ -1,11 +1,13 @@
-"""Least-squares problem of a fit: residuals divided by their noise, their derivatives, an initial
-guess, and a Gauss-Newton iteration restricted to identifiable directions.
+"""Least-squares problem of a fit, solved by Gauss-Newton iterations.
 
-The initial guess minimises the equilibrium gap. With the true parameters θ, measured displacements
-u at the particles are in equilibrium: the moves m(u, θ) are zero wherever all neighbours are
-measured. Since m is nearly linear in θ, a few linear problems give θ without computing an
-equilibrium (Claire, Hild and Roux 2004). The guess is biased by noise, but it does not depend on
-the bounds; the middle of the bounds may be far from the solution.
+Residuals are divided by their noise. The iteration is restricted to identifiable directions.
+
+The initial guess minimises the equilibrium gap. For the true parameters θ the measured
+displacements u are in equilibrium: the moves m(u, θ) are zero at all particles of which all
+neighbours are measured. Because m is nearly linear in θ, θ is computed by solving a few linear
+problems, without computing an equilibrium (Claire, Hild and Roux 2004). The guess is biased by
+noise. Its advantage is that it does not depend on the bounds, whereas the middle of the bounds may
+be far from the solution.
 """
 
 from __future__ import annotations
@@ -37,11 +39,13 @@ MIN_POINTS = 3
 """Number of points that determine a plane."""
 
 NEAREST = 12
-"""Number of points through which a plane is fitted."""
+"""Number of points to which a plane is fitted."""
 
 FAR = 2.0
-"""Distance from the nearest point, relative to the spacing of points, beyond which displacements
-are unknown."""
+"""Distance from the nearest point beyond which displacements are unknown.
+
+It is relative to the distance between the points.
+"""
 
 
 def least_gap(
@@ -84,7 +88,7 @@ def least_gap(
 def _on_particles(field: FieldObservation) -> Floats:
     """Interpolate measured displacements at the particles by planes through the nearest points.
 
-    They are NaN where no point is near.
+    The result is NaN at particles without a point nearby.
     """
     from scipy.spatial import KDTree
 
@@ -110,8 +114,10 @@ def _on_particles(field: FieldObservation) -> Floats:
 
 
 WIDE = 10.0
-"""Ratio of the upper to the lower bound above which the initial guess is not the middle of the
-bounds."""
+"""Ratio of the upper to the lower bound above which the bounds are wide.
+
+The initial guess is then not the middle of the bounds.
+"""
 
 
 @dataclass(frozen=True)
@@ -130,7 +136,7 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """The problem, linearised at z.
+    """The least-squares problem, linearised at z.
 
     Parameters
     ----------
@@ -139,7 +145,7 @@ class Linearisation:
     residuals : (residual,)
         (measured - predicted) / weighted noise of all observations.
     jacobian : (residual, unknown)
-        Derivatives of the predictions over the weighted noise.
+        Derivatives of the predictions, divided by the weighted noise.
     predictions
         Prediction of each observation.
     """
@@ -154,8 +160,8 @@ class Linearisation:
 class Problem:
     """Least-squares problem of a fit.
 
-    The unknowns z are the parameters, then Young's modulus if an observation needs it, then the own
-    unknowns of each observation.
+    The vector z of unknowns contains the parameters, then Young's modulus if an observation needs
+    it, and then the unknowns that each observation has for itself.
 
     Parameters
     ----------
@@ -190,7 +196,7 @@ class Problem:
             yield observation, slice(first, first := first + len(observation.measured))
 
     def own_slices(self) -> Iterator[tuple[Observation, slice]]:
-        """Yield each observation with the slice of its own unknowns."""
+        """Yield each observation with the slice of the unknowns that only this observation has."""
         first = self.shared
         for observation in self.observations:
             yield observation, slice(first, first := first + observation.own_unknowns)
@@ -198,8 +204,9 @@ class Problem:
     def start(self) -> Floats:
         """Return initial values.
 
-        Parameters are in the middle of their bounds, or minimise the equilibrium gap if bounds are
-        wide and a field is measured. Boundaries have their measured displacements.
+        If bounds are wide and a field is measured, the parameters minimise the equilibrium gap.
+        Otherwise they are in the middle of their bounds. Boundaries have their measured
+        displacements.
         """
         z, count = np.zeros(self.size), len(self.unknowns)
         low, high = (bound[:count] for bound in self.bounds())
@@ -244,7 +251,7 @@ class Problem:
         return z
 
     def bounds(self) -> tuple[Floats, Floats]:
-        """Return the bounds of the unknowns, infinite for all but parameters."""
+        """Return the bounds of the unknowns, which are infinite except for those of parameters."""
         low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         for n, unknown in enumerate(self.unknowns):
             low[n], high[n] = unknown.low, unknown.high
@@ -314,12 +321,14 @@ class Problem:
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 IDENTIFIABLE_RATIO = 0.25
-"""Ratio of the standard error along a direction to the interval between bounds below which the
-direction is identifiable."""
+"""Largest standard error along an identifiable direction, relative to the bounds.
+
+It is divided by the interval between the bounds.
+"""
 MIN_COMPONENT = 0.3
-"""Component of a direction above which a parameter belongs to it."""
+"""Component of a direction above which a parameter is considered a part of the direction."""
 AT_BOUND = 1e-6
-"""Distance from a bound, relative to the interval, up to which a value is at the bound."""
+"""Distance from a bound up to which a value is at the bound, relative to the interval."""
 MAX_ITERATIONS = 30
 """Maximum number of Gauss-Newton iterations."""
 
@@ -329,19 +338,23 @@ ARMIJO_C1 = 0.25
 """Fraction of the predicted decrease of the cost that a step must achieve (Armijo)."""
 
 SLACK = 1e-9
-"""Relative increase of the cost that counts as rounding error."""
+"""Relative increase of the cost that is treated as a rounding error."""
 MAX_REWEIGHTINGS = 100
 """Maximum number of iteratively reweighted linear problems."""
 
 STEADY = 1e-6
-"""Change of residuals at which the weights have converged."""
+"""Largest change of the residuals after which the weights have converged."""
 
 RANK = 1e-5
-"""Relative tolerance of singular values, for columns of unit length; it is the accuracy of
-derivatives."""
+"""Relative tolerance of singular values, for columns of unit length.
+
+It is equal to the accuracy of derivatives.
+"""
 INVOLVED = 1e-2
-"""Component of a null direction, relative to the largest, below which an unknown is not part of
-it."""
+"""Component of a null direction below which an unknown is not a part of the direction.
+
+It is relative to the largest component.
+"""
 NULL_VARIANCE = 1e12
 """Variance along null directions."""
 MODULUS = "Young's modulus"
@@ -349,27 +362,28 @@ MODULUS = "Young's modulus"
 CONVERGED = 1e-2
 """Largest step, in standard errors, of a converged fit."""
 MAX_REVERSAL = 0.25
-"""If a step reverts more than this fraction of the change by the previous step, its length is
-halved."""
+"""Fraction of the previous step that a step may revert; otherwise its length is halved."""
 FROZEN = 1e-3
-"""Change of all residuals between the bounds, in units of their noise, below which an unknown is
-fixed."""
+"""Change of all residuals between the bounds below which an unknown is fixed.
+
+It is in units of the noise.
+"""
 MIN_SLOPE = 0.05
-"""Smallest mean slope ψ' of a loss; below it nearly all residuals are outliers."""
+"""Smallest admissible mean slope ψ' of a loss. Below it nearly all residuals are outliers."""
 OUTLIERS = 1.345
 """Residual, in units of the noise, above which a loss reduces its weight (Huber)."""
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Independent directions of z.
+    """Linearly independent directions in the space of the unknowns z, with variances.
 
     Parameters
     ----------
     vectors : (direction, unknown)
         Directions, in units of `scale`.
     variance : (direction,)
-        Variance along each.
+        Variance along each direction.
     scale : (unknown,)
         Scale of the unknowns.
     """
@@ -390,8 +404,12 @@ class Directions:
 
     @property
     def unsure(self) -> NDArray[np.bool_]:
-        """Return a mask of the unknowns for which the data determine the value along a direction
-        insufficiently, (direction, unknown)."""
+        """Return a mask of unknowns that the data do not determine sufficiently, (direction,
+        unknown).
+
+        An unknown is marked for each direction to which it belongs and along which its value is
+        uncertain.
+        """
         components = np.abs(self.vectors)
         is_large = components * np.sqrt(self.variance)[:, None] > IDENTIFIABLE_RATIO
         is_uncertain = (self.variance > IDENTIFIABLE_RATIO**2)[:, None]
@@ -402,13 +420,16 @@ class Directions:
         )
 
     def errors(self, step: Floats) -> Floats:
-        """Return a step along each direction in standard errors; 0 along null directions."""
+        """Return the component of a step along each direction, in standard errors; 0 along null
+        directions."""
         along = (self.vectors @ (step / self.scale)) / np.sqrt(self.variance)
         return np.where(self.is_null, 0.0, along)
 
     def error_of(self, gradient: Floats) -> float:
-        """Return the standard error of a number from its gradient with respect to z, without null
-        directions."""
+        """Return the standard error of a function of z, computed from its gradient.
+
+        Null directions are excluded.
+        """
         along = self.vectors @ (gradient * self.scale)
         return float(np.sqrt(np.square(along[~self.is_null]) @ self.variance[~self.is_null]))
 
@@ -422,13 +443,14 @@ class Solution:
     z : (unknown,)
         Best values.
     at
-        Linearisation there.
+        Problem linearised at the best values.
     directions
-        Directions with their variance.
+        Linearly independent directions in the space of the unknowns, with the variance along each.
     ratio
         Standard deviation of the residuals divided by their noise.
     unidentified, on_bounds
-        Paths of parameters that are not identifiable, and of those at their bounds.
+        Paths of the parameters that are not identifiable, and of the parameters that are at their
+        bounds.
     evaluations
         Number of linearisations.
     """
@@ -455,8 +477,9 @@ class Solution:
 def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     """Solve the problem by Gauss-Newton iterations with exact derivatives.
 
-    The linearised problem is solved between bounds, with its loss, until z converges along all
-    identifiable directions. Along others z keeps its initial values.
+    In each iteration the linearised problem with its loss is solved between the bounds. The
+    iteration ends when z has converged along all identifiable directions. Along all other
+    directions z has its initial values.
 
     Parameters
     ----------
@@ -498,8 +521,10 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
 def _line_search(
     problem: Problem, at: Linearisation, z: Floats, step: Floats, length: float, loss: Loss
 ) -> tuple[float, Linearisation, int]:
-    """Return the step length that reduces the cost sufficiently, the linearisation there, and the
-    number of trials."""
+    """Return a step length that reduces the cost sufficiently.
+
+    Also return the linearisation after this step, and the number of trials.
+    """
     cost = cost_of(at.residuals, loss)
     gain = cost - cost_of(at.residuals - at.jacobian @ step, loss)
     count = 0
@@ -546,8 +571,10 @@ def _linear_step(at: Linearisation, low: Floats, high: Floats, loss: Loss) -> Fl
 
 
 def _singular(columns: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the singular value decomposition of columns of unit length, without null
-    directions."""
+    """Return the singular value decomposition after scaling columns to unit length.
+
+    Null directions are omitted.
+    """
     basis, triangle = np.linalg.qr(columns)
     left_vectors, sizes, vectors = np.linalg.svd(triangle, full_matrices=False)
     is_regular = sizes > RANK * sizes.max(initial=0.0)
@@ -587,7 +614,7 @@ def spread_of(residuals: Floats, unknowns: int, loss: Loss) -> float:
 def _identify_directions(
     problem: Problem, at: Linearisation, loss: Loss
 ) -> tuple[Directions, tuple[str, ...]]:
-    """Return the directions of z with their variance, and the parameters that are not identifiable.
+    """Return directions with their variance, and the parameters that are not identifiable.
 
     Residuals are assumed to be at least as large as their noise. Parameters are scaled by the
     interval between their bounds, Young's modulus by its value.
@@ -617,7 +644,10 @@ def _identify_directions(
 
 
 def _variance_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
-    """Return the factor of the variance, mean ψ² / (mean ψ')², in units of the noise."""
+    """Return the factor by which a loss changes the variance, mean ψ² / (mean ψ')².
+
+    The scores ψ are in units of the noise.
+    """
     square, slope = _scores(residuals, unknowns, loss)
     return square / slope**2
 
@@ -629,10 +659,10 @@ def rise_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
 
 
 def _scores(residuals: Floats, unknowns: int, loss: Loss) -> tuple[float, float]:
-    """Return mean ψ², in units of the noise, and mean ψ', of residuals at least as large as the
-    noise.
+    """Return mean ψ², in units of the noise, and mean ψ' of the residuals.
 
-    For a linear loss the first is the square of Birge's ratio.
+    The residuals are assumed to be at least as large as the noise. For a linear loss mean ψ² is the
+    square of Birge's ratio.
     """
     spread = spread_of(residuals, unknowns, loss)
     if loss == "linear":

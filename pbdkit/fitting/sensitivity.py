@@ -1,9 +1,10 @@
 """Sensitivity of an equilibrium to a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
 
-In equilibrium no follower moves, m(u, θ) = 0. A = -∂m/∂u is the matrix of the equilibrium solver,
-so that each parameter requires one more solution, and evaluations of the moves of a few scenes with
-slightly different parameters. The derivatives of a scalar J = w · u with respect to all parameters
-require a single solution, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ (adjoint method).
+In equilibrium no follower moves, m(u, θ) = 0. A = -∂m/∂u is the matrix of the equilibrium solver.
+Each parameter therefore requires one further solution of a linear system. ∂m/∂θ is computed from
+the moves of a few scenes with slightly different parameters. The derivatives of a scalar J = w · u
+with respect to all parameters require a single solution, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ (adjoint
+method).
 """
 
 from __future__ import annotations
@@ -29,11 +30,13 @@ from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import State, initial_state
 
 GEOMETRY = ("lattice", "body", "regions", "neighbours", "frame", "initial", "loads", "cuts")
-"""Parts of an experiment that determine its scene, besides parameters and motions."""
+"""Parts of an experiment that determine which particles its scene has."""
 
 
 def scene_like(scene: Scene, experiment: Experiment) -> Scene:
-    """Return the scene of an experiment that differs by parameters, reusing as much as possible.
+    """Return the scene of an experiment that differs from a scene in parameters only.
+
+    Data that do not depend on the parameters are shared with that scene.
 
     Raises
     ------
@@ -82,11 +85,11 @@ class RestingScene:
     error_bound
         Error bound of the equilibrium.
     finder
-        Solver, with the parameters of the last step.
+        Object that computes equilibria, with the parameters of the last step.
     accuracy
         Accuracy of derivatives, relative to the largest.
     former
-        Solutions of earlier equilibria, by their right-hand side.
+        Solutions of linear systems at earlier equilibria, by the key of the right-hand side.
     """
 
     scene: Scene
@@ -110,16 +113,16 @@ class RestingScene:
         experiment
             The experiment.
         start
-            Scene, or equilibrium, of an experiment that differs by parameters alone. The scene is
-            reused, and solutions of the equilibrium are initial guesses.
+            Scene or equilibrium of an experiment that differs in parameters only. Its scene is
+            reused, and solutions of an equilibrium serve as initial guesses.
         accuracy
             Accuracy of derivatives, relative to the largest.
 
         Raises
         ------
         ExperimentError
-            If bonds changed on the way, or if the scene has obstacles: the equilibrium then depends
-            on the path.
+            If bonds changed before the equilibrium was reached, or if the scene has obstacles. In
+            both cases the equilibrium depends on the loading path.
         """
         similar = start.scene if isinstance(start, RestingScene) else start
         scene = scene_like(similar, experiment) if similar else build_scene(experiment)
@@ -155,7 +158,7 @@ class RestingScene:
 
     @cached_property
     def system(self) -> System:
-        """Return A at the equilibrium; for linear scenes that of the body at rest, which is exact.
+        """Return A at the equilibrium. For linear scenes it is the same as for the body at rest.
 
         Raises
         ------
@@ -184,8 +187,9 @@ class RestingScene:
             return linearised(self.finder.scene, state, steps, method, Watch(), self.finder.moves)
 
     def change(self, parameter: Parameter) -> Floats:
-        """Return ∂u/∂θ as planes, (axis, sublattice, cell, cell), for leaders, followers and frame
-        points.
+        """Return ∂u/∂θ as rasters, (axis, sublattice, cell, cell).
+
+        The derivative is computed for leaders, followers and frame points.
 
         Raises
         ------
@@ -201,7 +205,7 @@ class RestingScene:
         Parameters
         ----------
         weights
-            Planes over leaders, followers and frame points.
+            Weights of leaders, followers and frame points, as rasters.
         parameters
             The parameters θ.
 
@@ -221,8 +225,10 @@ class RestingScene:
         return Adjoint(weights, combined, pull)
 
     def answer(self, leaders: Floats) -> Floats:
-        """Return the change of u caused by displacements of leaders, with followers in equilibrium,
-        as planes."""
+        """Return the change of u that displacements of leaders cause, as rasters.
+
+        Followers remain in equilibrium.
+        """
         load = self.system.pushed_by(leaders) if self.finder.linear else None
         moves = self.along(self._moves, leaders) if load is None else load
         return self._with_frame(0.0, leaders + self._solve(moves, leaders.tobytes()))
@@ -230,7 +236,8 @@ class RestingScene:
     def along(self, function: Callable[[Floats], Floats], direction: Floats) -> Floats:
         """Return the derivative of a function of displacements along a direction.
 
-        It is computed by a difference for linear scenes, otherwise by a central difference.
+        For linear scenes it is computed by a one-sided difference, which is exact, otherwise by a
+        central difference.
         """
         linear, u = self.finder.linear, self.state.u
         if linear and function == self._moves:
@@ -254,8 +261,11 @@ class RestingScene:
         return direct, moves
 
     def _leaders_and_moves(self, experiment: Experiment) -> Floats:
-        """Return the displacements of leaders and frame points in a similar experiment, and the
-        moves of followers there, (2, axis, sublattice, cell, cell)."""
+        """Return two rasters of an experiment with other parameters, (2, axis, sublattice, cell,
+        cell).
+
+        They are the displacements of leaders and frame points, and the moves of followers.
+        """
         scene = scene_like(self.scene, experiment)
         u, steps = self.state.u.copy(), experiment.steps
         leaders, _ = prescribe(scene, replace(self.state, u=u), steps)
@@ -301,15 +311,16 @@ class RestingScene:
 class Adjoint:
     """Adjoint solution of J = Σ weights · u.
 
-    dJ/dθ = Σ weights · ∂u/∂θ + Σ pull · ∂m/∂θ, where ∂u/∂θ is the derivative for leaders and frame
-    points while followers are fixed. All arrays are planes.
+    dJ/dθ = Σ weights · ∂u/∂θ + Σ pull · ∂m/∂θ. Here ∂u/∂θ is the derivative of the displacements of
+    leaders and frame points while followers are fixed. All arrays are rasters.
 
     Parameters
     ----------
     weights
         Weights of J.
     combined
-        The weights, with those of frame points added to the particles that they follow.
+        Weights of J in which the weights of frame points are added to those of the particles that
+        they follow.
     pull
         A⁻ᵀ combined.
     """
@@ -342,10 +353,10 @@ def along(
     Parameters
     ----------
     linear
-        Whether the function is linear, so that a difference is exact; else a central difference is
-        used.
+        Whether the function is linear, so that a one-sided difference is exact. Otherwise a central
+        difference is used.
     spacing
-        Length that scales its step.
+        Length by which the step of the difference is scaled.
     """
     if linear:
         return function(u + direction) - function(u)

@@ -1,24 +1,26 @@
-"""Strength of bonds and its scatter from repeated tests: likelihood, simulated specimens, result.
+"""Strength of bonds and its scatter, fitted to repeated tests.
 
-The load of the first break is computed for bodies with displacements proportional to the load.
-With the difference d along a bond under the full load of the experiment, the strain of the bond at
-the load factor λ is ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1, p = r·d/|r|², q =
-|d|²/|r|². The strain is a convex function of λ and 0 at λ = 0, so that the strain of a stretched
-bond increases with λ.
+The load of the first break is computed for bodies with displacements proportional to the load. Let
+d be the difference between the displacements of the ends of a bond under the full load of the
+experiment. With the coefficients p = r·d/|r|² and q = |d|²/|r|² the strain of the bond at the load
+factor λ is ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1. It is a convex function of λ and 0
+at λ = 0, so that the strain of a stretched bond increases with λ.
 
-A specimen survives the load λ if all its bonds do, with probability Π_b (1 - F(ε_b(λ))), where F is
-the distribution of strengths. The likelihood of repeated tests therefore follows without a run
-(weakest link: W. Weibull, J. Appl. Mech. 18 (1951) 293). Location μ and scale σ of ln strength
-(Weibull: μ = ln s, σ = 1/m) or of strength (uniform) have the prior density dμ dσ/σ, and the
-likelihood is integrated. If all bonds have equal strains, the strengths of specimens belong to a
-location-scale family, too, and intervals from the integrated likelihood are exact for any number of
+A specimen survives the load λ if all its bonds survive it. The probability is Π_b (1 - F(ε_b(λ))),
+where F is the distribution of strengths. The likelihood of repeated tests can therefore be computed
+without a run (weakest link: W. Weibull, J. Appl. Mech. 18 (1951) 293). The parameters are
+transformed to a location μ and a scale σ, of ln strength for the Weibull distribution (μ = ln s, σ
+= 1/m), and of strength for the uniform distribution. They have the prior density dμ dσ/σ, and the
+likelihood is integrated. If all bonds have equal strains, the strengths of specimens also belong to
+a location-scale family, and intervals from the integrated likelihood are exact for any number of
 specimens (J. Berger, Statistical Decision Theory, 1985, section 6.6).
 
-If specimens do not fail with their first bond, a synthetic likelihood is used: single specimens are
-simulated with strengths between all bounds, and then with strengths for which the measurement is
-likely. Mean and spread of ln peak follow by regression over the logarithms of the parameters. They
-are compared with the mean of the measured ln peaks and the logarithm of their standard deviation,
-which are approximately normal (S. Wood, Nature 466 (2010) 1102).
+If specimens do not fail when their first bond breaks, a synthetic likelihood is used. Single
+specimens are simulated, first with strengths from the whole range between the bounds, and then with
+strengths for which the measurement is likely. Mean and spread of ln peak as functions of the
+logarithms of the parameters are obtained by regression. They are compared with the mean of the
+measured ln peaks and the logarithm of their standard deviation, which are approximately normal (S.
+Wood, Nature 466 (2010) 1102).
 """
 
 from __future__ import annotations
@@ -55,17 +57,20 @@ from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import State, initial_state, unmoved_state
 
 PARTS = 4
-"""Number of load increments after which proportionality is checked."""
+"""Number of load increments after each of which displacements must be proportional to the load."""
 PROPORTION = 1e-6
 """Largest deviation from proportionality, relative to the largest displacement."""
 
 ALIKE = 1e-9
-"""Largest difference of p and q of equal bonds, relative to the largest p and q."""
+"""Largest difference between the coefficients p and q of bonds that are treated as equal.
+
+It is relative to the largest p and q.
+"""
 
 NOT_PROPORTIONAL = (
     "the load of the first break does not follow from one equilibrium; use method: simulation"
 )
-"""End of messages about bodies that are not proportional to the load."""
+"""End of messages about bodies of which the displacements are not proportional to the load."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +80,9 @@ class BondStrains:
     Parameters
     ----------
     p, q : (bond,)
-        Coefficients, see the module.
+        Coefficients of the strain, see the docstring of the module.
     count : (bond,)
-        Number of bonds that a row stands for.
+        Number of equal bonds that a row represents.
     """
 
     p: Floats
@@ -112,9 +117,9 @@ class BondStrains:
 
 
 def bond_strains(scene: Scene, state: State) -> BondStrains:
-    """Return the strains of the bonds of a scene, extrapolated from a state.
+    """Return the strains of the bonds of a scene as functions of the load, from a state under load.
 
-    The coefficients p and q of a bond that is broken or cannot break are 0.
+    The strain of a bond that is broken or cannot break is 0 for all loads.
     """
     bonds, shape = scene.bonds, scene.raster.shape
     p, q = np.zeros((2, len(bonds.ends)))
@@ -159,13 +164,15 @@ def strengths(scene: Scene, state: State) -> Floats:
 
 
 def has_forces(scene: Scene) -> bool:
-    """Return whether the rule of a scene defines forces, or displacements alone."""
+    """Return whether the rule of a scene defines forces."""
     return isinstance(scene.experiment.rule, Calibrated)
 
 
 class MachineReading(NamedTuple):
-    """Reading of a testing machine: force and displacement; the force is NaN if the rule defines
-    none."""
+    """Reading of a testing machine: force and displacement.
+
+    The force is NaN if the rule does not define forces.
+    """
 
     force: float
     displacement: float
@@ -182,7 +189,7 @@ class LoadedGroup:
     direction
         Unit vector of its displacement.
     factor
-        Factor of forces.
+        Factor by which forces are multiplied.
     """
 
     group: int
@@ -224,7 +231,7 @@ class LoadedGroup:
         )
 
     def displacement(self, scene: Scene, state: State) -> float:
-        """Return the displacement alone."""
+        """Return the mean displacement of the group along its direction."""
         return float(self.direction @ _mean(scene, state, self.group))
 
 
@@ -235,18 +242,18 @@ def _mean(scene: Scene, state: State, group: int) -> Floats:
 
 @dataclass(frozen=True)
 class ElasticResponse:
-    """A body before fracture under the experiment's full load.
+    """A body before fracture, under the full load of the experiment.
 
     Parameters
     ----------
     strains
-        Strains of its bonds.
+        Strains of the bonds.
     pull
         Leader group that loads it, if forces or displacements are measured.
     full
         Reading of the testing machine at the full load.
     u
-        Displacements as planes.
+        Displacements, as rasters.
     """
 
     strains: BondStrains
@@ -256,7 +263,7 @@ class ElasticResponse:
 
     @classmethod
     def of(cls, experiment: Experiment, peaks: Peaks) -> ElasticResponse:
-        """Compute the equilibrium of an experiment with bonds that do not break.
+        """Compute the equilibrium of an experiment under the assumption that no bond breaks.
 
         Raises
         ------
@@ -309,11 +316,11 @@ class Specimen:
     Parameters
     ----------
     peak
-        Reading of the testing machine at its peak.
+        Reading of the testing machine at the peak.
     first
-        Reading at the first break; None if it does not follow from one equilibrium.
+        Reading when the first bond breaks; None if it cannot be computed from a single equilibrium.
     failed
-        Whether it failed.
+        Whether the specimen failed.
     """
 
     peak: MachineReading
@@ -321,11 +328,11 @@ class Specimen:
     failed: bool
 
     def peak_of(self, quantity: str) -> float:
-        """Return force or displacement at the peak."""
+        """Return the force or the displacement at the peak, as `quantity` states."""
         return self.peak.force if quantity == "force" else self.peak.displacement
 
     def first_of(self, quantity: str) -> float:
-        """Return force or displacement at the first break."""
+        """Return the force or the displacement when the first bond breaks."""
         assert self.first is not None
         return self.first.force if quantity == "force" else self.first.displacement
 
@@ -341,7 +348,7 @@ class Specimens:
     peaks
         Measured peaks.
     elastic
-        The body before fracture, if it is known.
+        The body before fracture, if it has been computed.
     """
 
     scene: Scene
@@ -399,9 +406,10 @@ class Specimens:
         return is_deterministic and self.elastic is not None
 
     def _advance_to_first_break(self, state: State, first: MachineReading) -> float:
-        """Set a state to the last increment before the first break, and return its moment.
+        """Set a state to the last increment before the first bond breaks, and return its time.
 
-        Until then only the load changes.
+        Before the first break no simulation is needed, because displacements are proportional to
+        the load.
         """
         assert self.elastic is not None
         full = self.elastic.full.displacement
@@ -418,7 +426,7 @@ class Specimens:
 
     @cached_property
     def _load_path(self) -> list[tuple[float, float]]:
-        """Return the ends of all increments but the last, with the load factor."""
+        """Return the ends of all increments except the last one, with their load factors."""
         assert self.elastic is not None
         assert self.elastic.pull is not None
         count, path = self.scene.experiment.solver.equilibrium.increments, []
@@ -431,7 +439,11 @@ class Specimens:
         return path
 
     def _first(self, limits: Floats) -> MachineReading:
-        """Return the reading at the first break, exactly."""
+        """Return the reading at the load at which the first bond breaks.
+
+        The load is computed from the strains and limits of the bonds, and is not rounded to an
+        increment.
+        """
         assert self.elastic is not None
         share = float(self.elastic.strains.load_at(limits).min())
         return MachineReading(
@@ -440,7 +452,7 @@ class Specimens:
 
 
 def seeded(experiment: Experiment, seed: int) -> Experiment:
-    """Return the experiment with another seed, from which strengths and random fields are drawn."""
+    """Return the experiment with another seed for its random strengths and random fields."""
     varies = any(getattr(part, "varying", None) for part in (experiment.rule, experiment.fracture))
     if not varies:
         return experiment.model_copy(update={"seed": seed})
@@ -450,15 +462,17 @@ def seeded(experiment: Experiment, seed: int) -> Experiment:
 
 
 COARSE = 40
-"""Number of nodes along a parameter to locate the likelihood."""
+"""Number of nodes along a parameter for locating the region in which the likelihood is large."""
 
 FINE = 64
-"""Number of nodes along a parameter to integrate it."""
+"""Number of nodes along a parameter for integrating the likelihood."""
 NEGLIGIBLE = 18.0
-"""Difference from the largest logarithm of the likelihood above which the likelihood is negligible
-(2e-8)."""
+"""Decrease of the logarithm of the likelihood from its maximum that makes it negligible.
+
+The likelihood is then smaller by a factor of about 2e-8.
+"""
 DRAWS = 20_000
-"""Number of draws for the likelihood."""
+"""Number of samples of the parameters."""
 NEGLIGIBLE_DEPTH = 1e-8
 """Fraction of the strain of the weakest specimen that is negligible."""
 LawBounds = tuple[tuple[float, float], tuple[float, float]]
@@ -467,7 +481,7 @@ LawBounds = tuple[tuple[float, float], tuple[float, float]]
 
 @dataclass(frozen=True)
 class Breaks:
-    """Load factors of specimens, (specimen,), and whether each broke there or survived."""
+    """Load factors of specimens, (specimen,), and whether each specimen broke or survived."""
 
     load: Floats
     broke: Mask
@@ -482,18 +496,18 @@ class WeightedSamples:
 
 
 class StrengthLaw(ABC):
-    """A distribution of strengths with two parameters, `paths` in an experiment."""
+    """A distribution of strengths with two parameters, at the `paths` of an experiment."""
 
     paths: ClassVar[tuple[str, str]]
 
     @staticmethod
     @abstractmethod
     def whole(path: str) -> float:
-        """Return a value of the parameter at a path for which no bond breaks."""
+        """Return a value with which no bond breaks, for the parameter at a path."""
 
     @abstractmethod
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
-        """Draw parameters from the integrated likelihood between bounds."""
+        """Sample parameters between bounds from the integrated likelihood."""
 
     @staticmethod
     @abstractmethod
@@ -508,7 +522,8 @@ class WeibullLaw(StrengthLaw):
 
     @staticmethod
     def whole(path: str) -> float:
-        """Return a scale that no strain reaches, or a modulus without scatter."""
+        """Return a scale that no strain reaches, or a modulus for which strengths do not
+        scatter."""
         return 1e60 if path == "fracture.scale" else 1000.0
 
     @staticmethod
@@ -521,8 +536,8 @@ class WeibullLaw(StrengthLaw):
 
         Notes
         -----
-        For a modulus, Σ_specimens Σ_b ε^m / s^m has a gamma distribution with the number of
-        failures. Moduli are drawn from the marginal density.
+        For a given modulus, Σ_specimens Σ_b ε^m / s^m has a gamma distribution with the number of
+        failures as its shape. Moduli are sampled from the marginal density.
         """
         count = int(breaks.broke.sum())
 
@@ -554,8 +569,10 @@ class WeibullLaw(StrengthLaw):
 
 
 def weibull_sums(strains: BondStrains, breaks: Breaks, m: Floats) -> tuple[Floats, Floats]:
-    """Return ln Σ_b ε^m for each modulus and load, and the logarithm of its derivative by the load,
-    (modulus, specimen)."""
+    """Return ln Σ_b ε^m for each modulus and load, (modulus, specimen).
+
+    Also return the logarithm of the derivative of the sum with respect to the load.
+    """
     with np.errstate(divide="ignore"):
         strain = np.log(strains.at(breaks.load))
         rate = np.where(strain > -np.inf, strains.rate(breaks.load), 1.0)
@@ -570,14 +587,19 @@ def weibull_sums(strains: BondStrains, breaks: Breaks, m: Floats) -> tuple[Float
 
 
 class UniformLaw(StrengthLaw):
-    """Uniform distribution within f (1 ± s): from a = f (1 - s), with the width w = 2 f s."""
+    """Uniform distribution over f (1 ± s).
+
+    It begins at a = f (1 - s) and has the width w = 2 f s.
+    """
 
     paths = ("fracture.failure", "fracture.scatter")
 
     @staticmethod
     def whole(path: str) -> float:
-        """Return the value with which a parameter has no effect: a strain that is never reached, or
-        zero scatter."""
+        """Return a value with which no bond breaks, or zero scatter.
+
+        For the failure strain it is a strain that no bond reaches.
+        """
         return 1e60 if path == "fracture.failure" else 0.0
 
     @staticmethod
@@ -586,8 +608,11 @@ class UniformLaw(StrengthLaw):
         return np.asarray(second / np.sqrt(3.0))
 
     def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
-        """Draw parameters on a grid over ln w and the logarithm of the distance between the lower
-        end of the distribution and the strain of the weakest specimen."""
+        """Sample parameters on a grid.
+
+        Its coordinates are ln w, and the logarithm of the distance between the lower end of the
+        distribution and the strain of the weakest specimen.
+        """
         strain, rate = strains.at(breaks.load), strains.rate(breaks.load)
         lowest = float(strain[breaks.broke].max(axis=1).min())
 
@@ -618,8 +643,10 @@ class UniformLaw(StrengthLaw):
 
 
 def _uniform(strain: Floats, rate: Floats, count: Floats, broke: Mask, a: float, w: float) -> float:
-    """Return the logarithm of the likelihood; -inf if a specimen survived a load at which a bond is
-    certain to break."""
+    """Return the logarithm of the likelihood.
+
+    It is -inf if a specimen survived a load at which one of its bonds must break.
+    """
     z = (strain - a) / w
     if z.max() >= 1.0 or z[broke].max(axis=1).min() <= 0.0:
         return -np.inf
@@ -663,10 +690,12 @@ LIMITS = (0.025, 0.975)
 MIDDLE = (0.15865525393145707, 0.8413447460685429)
 """Quantiles at a distance of one standard error from the median."""
 CUT = 1.02
-"""Ratio of a bound to the end of an interval up to which the interval ends at the bound."""
+"""Ratio of a bound to the end of an interval up to which both are treated as equal."""
 SHIFT = 0.25
-"""Largest mean of ln(peak / first break) that is harmless, in standard errors of the mean: an
-interval of 95 % with this bias still contains 94.3 %."""
+"""Largest harmless mean of ln(peak / first break), in standard errors of the mean.
+
+With this bias an interval of 95 % still contains the true value with a probability of 94.3 %.
+"""
 
 
 @dataclass(frozen=True)
@@ -676,13 +705,13 @@ class StrengthEstimate:
     Parameters
     ----------
     value, error
-        Median, and half of the interval of 68.3 %.
+        Median, and half the width of the interval of 68.3 %.
     low, high
         Ends of the interval of 95 %.
     identifiable
         Whether the data determine the value.
     cut
-        Whether the interval ends at a bound, and might extend beyond it without the bound.
+        Whether the interval ends at a bound, so that it might be wider without the bound.
     """
 
     value: float
@@ -705,14 +734,14 @@ class StrengthEstimate:
 
 @dataclass(frozen=True)
 class Checked:
-    """Test of the assumption that specimens fail at their first break.
+    """Test of the assumption that specimens fail when their first bond breaks.
 
     Parameters
     ----------
     excess
         Mean of ln(peak / first break) over simulated specimens.
     bore_more
-        Number of specimens with a peak above their first break.
+        Number of specimens with a peak above the load at the first break.
     count
         Number of specimens.
     limit
@@ -726,8 +755,7 @@ class Checked:
 
     @classmethod
     def of(cls, excess: Sequence[float], peaks: Floats) -> Checked:
-        """Return the test for the excess of each specimen, compared with the spread of measured
-        peaks."""
+        """Return the test from the excess of each specimen and the spread of the measured peaks."""
         limit = SHIFT * float(np.log(peaks).std(ddof=1)) / len(peaks) ** 0.5
         larger = sum(value > 1e-6 for value in excess)
         return cls(float(np.mean(excess)), larger, len(excess), limit)
@@ -767,7 +795,7 @@ class FittedStrength:
     specimens, failed : int
         Number of specimens, and of broken ones.
     checked : Checked or None
-        Test whether specimens fail at their first break.
+        Test whether specimens fail when their first bond breaks.
     draws : WeightedSamples
         Samples of the parameters.
     """
@@ -782,7 +810,7 @@ class FittedStrength:
     draws: WeightedSamples = field(kw_only=True, repr=False)
 
     def with_check(self, checked: Checked | None) -> FittedStrength:
-        """Return the result with a test of the first break."""
+        """Return the result with a test whether specimens fail when their first bond breaks."""
         return replace(self, checked=checked)
 
     def as_dict(self) -> dict[str, Any]:
@@ -877,27 +905,30 @@ def _plain(estimate: StrengthEstimate) -> dict[str, Any]:
 
 
 SHARES = 0.2, 0.2, 0.6
-"""Fractions of the specimens: the first between all bounds, the next two where the measurement is
-likely."""
+"""Fractions of the specimens that are simulated in three passes.
+
+In the first pass strengths are from the whole range between the bounds, in the next two from the
+region in which the measurement is likely.
+"""
 POINTS = 2**14
 """Number of points at which the likelihood is evaluated."""
 LIKELY = 8.0
-"""Difference to the largest logarithm of the likelihood up to which points are kept."""
+"""Difference from the largest logarithm of the likelihood up to which points are likely."""
 
 WIDER = 0.25
-"""Margin of the box around these points, relative to its size."""
+"""Margin of the box around the likely points, relative to its size."""
 REGRESSION_ITERATIONS = 50
 """Number of iterations of the regression of the spread."""
 
 MAX_LOG_STEP = 3.0
 """Largest step in the logarithm of a variance."""
 MIN_LOAD_RATIO = 1.25
-"""Smallest ratio of the experiment's load to the largest measured one."""
+"""Smallest ratio of the load in the experiment to the largest measured load."""
 
 
 @dataclass(frozen=True)
 class PeakDistribution:
-    """Distribution of ln peak over ln parameters in a box.
+    """Distribution of ln peak as a function of ln parameters in a box.
 
     Parameters
     ----------
@@ -921,8 +952,10 @@ class PeakDistribution:
 
     @classmethod
     def of(cls, logs: Floats, y: Floats) -> PeakDistribution:
-        """Fit the distribution by maximum likelihood with normal residuals, alternating between
-        mean and variance."""
+        """Fit the distribution by maximum likelihood with normal residuals.
+
+        Mean and variance are fitted alternately.
+        """
         empty = np.zeros(0)
         ends = logs.min(axis=0), logs.max(axis=0)
         distribution = cls(*ends, empty, empty, empty, 0.0, 3.0)
@@ -949,7 +982,10 @@ class PeakDistribution:
         )
 
     def terms(self, logs: Floats) -> Floats:
-        """Return constant, linear and quadratic terms, (point, term), over the box from -1 to 1."""
+        """Return constant, linear and quadratic terms, (point, term).
+
+        Coordinates are scaled so that they range from -1 to 1 in the box.
+        """
         x = 2.0 * (logs - self.low) / (self.high - self.low) - 1.0
         pairs = combinations_with_replacement(range(x.shape[1]), 2)
         return np.column_stack([np.ones(len(x)), x, *(x[:, a] * x[:, b] for a, b in pairs)])
@@ -959,9 +995,9 @@ class PeakDistribution:
 
         Notes
         -----
-        The mean of the measured ln peaks y and ln of their standard deviation have the variances
-        σ²/n and (κ - 1)/4n, and the covariance σ · skewness/2n. The uncertainty of mean and
-        variance due to the number of simulated specimens is added.
+        The mean of the measured ln peaks y has the variance σ²/n. The logarithm of their standard
+        deviation has the variance (κ - 1)/4n, and both have the covariance σ · skewness/2n. The
+        uncertainty of mean and variance due to the number of simulated specimens is added.
         """
         n, x = len(y), self.terms(logs)
         variance = np.exp(x @ self.log_variance)
@@ -979,8 +1015,9 @@ class PeakDistribution:
 def fit_by_simulation(
     fit: StrengthFit, experiment: Experiment, specimens: Specimens
 ) -> WeightedSamples:
-    """Draw strengths that agree with the measured peaks, between bounds, with a prior uniform in
-    the logarithm.
+    """Sample strengths that agree with the measured peaks.
+
+    They lie between the bounds, and the prior density of their logarithms is constant.
 
     Raises
     ------
@@ -1017,8 +1054,8 @@ def fit_by_simulation(
 
 
 def _spread(box: Floats, count: int, seed: int) -> Floats:
-    """Return points that fill a box uniformly, (point, parameter), by a scrambled Sobol
-    sequence."""
+    """Return points of a scrambled Sobol sequence, which fill a box uniformly, (point,
+    parameter)."""
     from scipy.stats import qmc
 
     unit_points = qmc.Sobol(box.shape[1], seed=seed).random_base2(int(np.ceil(np.log2(count))))
@@ -1040,10 +1077,10 @@ def _simulate_peaks(
 
 
 def _refuse_short_load(specimens: Specimens, largest: float) -> None:
-    """Raise ExperimentError if the load of the experiment is not far above the measured ones.
+    """Raise ExperimentError if the load of the experiment is not much larger than measured loads.
 
-    The load at which the simulation ends would be counted as the peak of a specimen that survives
-    it.
+    Otherwise the load at which the simulation ends would be treated as the peak of a specimen that
+    survives it.
     """
     if (elastic := specimens.elastic) is None:
         return
@@ -1142,10 +1179,9 @@ def _check_first_break(
     elastic: ElasticResponse,
     result: FittedStrength,
 ) -> Checked | None:
-    """Simulate specimens with the fitted strengths, to test whether they fail when their first bond
-    breaks.
+    """Simulate specimens with the fitted strengths to test whether they fail at the first break.
 
-    Return None if the experiment does not define what happens afterwards.
+    Return None if the experiment does not define the behaviour after the first break.
     """
     kind = experiment.fracture.type
     if (
@@ -1165,7 +1201,7 @@ def _check_first_break(
 
 
 def _excess(specimen: Specimen, quantity: str) -> float:
-    """Return the logarithm of the ratio of the peak to the value at the first break."""
+    """Return ln(peak / value at the first break)."""
     assert specimen.first is not None
     return float(np.log(specimen.peak_of(quantity) / specimen.first_of(quantity)))
 

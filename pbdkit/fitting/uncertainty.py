@@ -1,24 +1,24 @@
-"""Uncertainty of a fit: standard errors, identifiable combinations, profile likelihoods, samples of
-the posterior, and comparison of models by cross-validation.
+"""Uncertainty of a fit, and comparison of models.
 
-Profile likelihood: all other parameters are fitted again for each value of one. The 95 % interval
-contains the values at which -2 log L exceeds its minimum by less than 3.84 (Wilks), also for
-strongly nonlinear predictions. With a loss, the increase is divided by mean ψ² / mean ψ', as
-for M-estimators.
+Profile likelihood: for each value of one parameter, all other parameters are fitted again. The 95 %
+interval contains the values at which -2 log L exceeds its minimum by less than 3.84 (Wilks). This
+is also valid for strongly nonlinear predictions. With a loss, the increase is divided by mean ψ² /
+mean ψ', as for M-estimators.
 
-Posterior: unknowns that enter linearly (boundaries of a linear rule, distortions, Young's modulus)
-are integrated out exactly, and boundaries of rules that are not linear by linearisation at the fit.
-With the derivatives J with respect to these unknowns, the remaining residuals r and a flat prior,
-log p = -½ |r|² - ½ log det JᵀJ. The sampler uses the affine-invariant stretch moves of Goodman and
-Weare (emcee).
+Posterior: unknowns on which predictions depend linearly are integrated out exactly. These are the
+boundaries of a linear rule, distortions and Young's modulus. The boundaries of nonlinear rules are
+integrated out after linearisation at the fit. With the derivatives J with respect to these
+unknowns, the remaining residuals r and a flat prior, log p = -½ |r|² - ½ log det JᵀJ. The sampler
+uses the affine-invariant stretch moves of Goodman and Weare (emcee).
 
-Combinations: if predictions do not change along a direction v of the parameters θ, they do not
-change along the direction v / θ of ln θ either, to first order. Products of powers Π θ^e with e ·
-(v / θ) = 0 are then identifiable, and so are sums Σ e θ with e · v = 0. Product and sum agree near
-the fit. Residuals are evaluated to choose the one that is valid over the longer distance.
+Combinations: let the predictions not change if the parameters θ change along a direction v. To
+first order they do not change either if ln θ changes along the direction v / θ. Products of powers
+Π θ^e with e · (v / θ) = 0 are then identifiable, and so are sums Σ e θ with e · v = 0. Near the fit
+a product and a sum are equivalent. Farther away they differ, and residuals are evaluated to choose
+the one that is valid over the longer distance.
 
-Cross-validation leaves out blocks of adjacent points (Roberts et al. 2017, Ecography 40, 913),
-since a single point could be predicted from its neighbours.
+Cross-validation: blocks of adjacent points are left out (Roberts et al. 2017, Ecography 40, 913),
+because a single point could be predicted from its neighbours.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ class Estimate:
     identifiable : bool
         Whether the data determine the value.
     on_bound : bool
-        Whether the value is at a bound, beyond which the fit might be better.
+        Whether the value is at a bound, so that the fit might be better without the bound.
     unit : str
-        Unit of both; empty if the experiment has no units.
+        Unit of value and error; empty if the experiment has no units.
     """
 
     value: float
@@ -90,10 +90,10 @@ class Estimate:
 
 
 def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) -> Estimate | None:
-    """Return Young's modulus from curves or, if there are none, from a force; None if there is no
-    force either.
+    """Return Young's modulus, computed from curves or, if there are none, from a force.
 
-    It is in MPa if the experiment has units.
+    The result is None if there are neither curves nor a force. It is in MPa if the experiment has
+    units.
     """
     count, units = len(problem.unknowns), problem.observations[0].experiment.units
     unit = STRESS.unit if units else ""
@@ -147,8 +147,10 @@ def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> E
 
 
 BLOCKS_PER_SIDE = 32
-"""Number of blocks along the longest side. With larger blocks, the displacement of an end would
-depend on a single block."""
+"""Number of blocks along the longest side.
+
+With larger blocks, the displacement of an end would depend on a single block.
+"""
 
 
 @dataclass(frozen=True)
@@ -162,8 +164,8 @@ class Candidate:
     name
         Name of the model.
     left_out, error
-        Mean square of left-out residuals divided by their noise (1 is the noise alone), and its
-        standard error over blocks.
+        Mean square of the residuals of points that were left out, divided by their noise, and its
+        standard error over blocks. The mean square is 1 if the residuals are only noise.
     behind, behind_error
         Mean difference over blocks between `left_out` and that of the best model, and its standard
         error.
@@ -201,8 +203,9 @@ class SolvedProblem:
 def compare_models(
     models: Sequence[SolvedProblem], folds: int, loss: Loss, seed: int
 ) -> tuple[Candidate, ...]:
-    """Compare models by cross-validation, the best first, over blocks of the points that all of
-    them include.
+    """Compare models by cross-validation, and return them in order, the best one first.
+
+    Only points that all models can predict are used.
 
     Raises
     ------
@@ -301,18 +304,17 @@ STEP = 0.75
 """First step of a profile in standard errors."""
 
 EQUAL_STEPS = 4
-"""Number of equal steps; each further step is twice the previous one."""
+"""Number of equal steps. Each further step is twice as long as the previous one."""
 
 MAX_STEPS = 12
 """Largest number of steps."""
 MAX_FIRST_STEP = 0.1
 """Largest first step, as a fraction of the interval between the bounds."""
 STRAIGHT = 1.5
-"""Largest increment of the square root of the rise over which the square root is interpolated
-linearly."""
+"""Largest increment of the square root of the rise for linear interpolation of the root."""
 
 REFINEMENTS = 30
-"""Maximum number of additional values for that interpolation."""
+"""Maximum number of additional values of a profile between which the root is interpolated."""
 MAX_RISE = 8.0
 """Rise at which a profile ends."""
 RISE_95 = 3.841
@@ -352,7 +354,7 @@ class Profile:
 
 
 def profile_likelihood(problem: Problem, solution: Solution, n: int, loss: Loss) -> Profile:
-    """Compute the profile of parameter n from the fit outwards, in both directions."""
+    """Compute the profile of parameter n in both directions, beginning at the fit."""
     best = (float(solution.z[n]), 0.0)
     sides = [
         _refine(
@@ -372,8 +374,10 @@ def profile_likelihood(problem: Problem, solution: Solution, n: int, loss: Loss)
 def _walk(
     problem: Problem, solution: Solution, n: int, direction: float, loss: Loss
 ) -> Iterator[tuple[float, float]]:
-    """Yield values of one parameter in one direction, with the increase of -2 log L at each. The
-    first value for which the other parameters cannot be fitted ends the iteration."""
+    """Yield values of one parameter in one direction, with the increase of -2 log L at each.
+
+    The iteration ends at the first value for which the other parameters cannot be fitted.
+    """
     low, high = _ends(problem.unknowns[n])
     value, z = float(solution.z[n]), solution.z
     step = min(STEP * float(solution.errors[n]), MAX_FIRST_STEP * (high - low))
@@ -411,13 +415,13 @@ def _refine(side: Floats, problem: Problem, solution: Solution, n: int, loss: Lo
 
 
 def _unit(problem: Problem, solution: Solution, loss: Loss) -> tuple[float, float]:
-    """Return the increase of the cost that counts as 1 in -2 log L, and the minimum of the cost."""
+    """Return the increase of the cost that corresponds to 1 in -2 log L, and the minimum cost."""
     residuals = solution.at.residuals
     return rise_of_loss(residuals, problem.size, loss), cost_of(residuals, loss)
 
 
 def _ends(unknown: Any) -> tuple[float, float]:
-    """Return the bounds, slightly reduced, since derivatives are taken on both sides."""
+    """Return bounds that are slightly narrower, because derivatives use values on both sides."""
     inset = 1e-9 * unknown.span
     return unknown.low + inset, unknown.high - inset
 
@@ -425,7 +429,7 @@ def _ends(unknown: Any) -> tuple[float, float]:
 def _fit_at(
     problem: Problem, n: int, value: float, start: Floats, loss: Loss
 ) -> tuple[float, Floats]:
-    """Return the smallest cost with parameter n at a value, and z there."""
+    """Return the smallest cost for a fixed value of parameter n, and the z with this cost."""
     parameter = problem.unknowns[n].parameter
     observations = tuple(
         replace(observation, experiment=parameter.put(observation.experiment, value))
@@ -442,7 +446,10 @@ def _fit_at(
 
 
 def _crossing(values: Floats, rises: Floats) -> float | None:
-    """Interpolate where the rise first reaches RISE_95; its square root is nearly linear."""
+    """Return the value at which the rise first reaches RISE_95, by interpolation.
+
+    The square root of the rise is interpolated linearly, because it is nearly a linear function.
+    """
     roots = np.sqrt(np.maximum(rises, 0.0))
     indices = np.flatnonzero(roots >= np.sqrt(RISE_95))
     if not indices.size or indices[0] == 0:
@@ -522,7 +529,7 @@ def sample_posterior(
 
 
 def _marginal(problem: Problem, z: Floats, values: Floats, size: float) -> float:
-    """Return log p of parameters, for residuals `size` times as large as their noise."""
+    """Return log p of parameters, if the residuals are `size` times as large as their noise."""
     observations = []
     for observation in problem.observations:
         experiment = observation.experiment
@@ -539,7 +546,7 @@ def _marginal(problem: Problem, z: Floats, values: Floats, size: float) -> float
         size_of = np.linalg.norm(linearisation.jacobian, axis=0)
         size_of[size_of == 0.0] = 1.0
         basis, sizes, _ = np.linalg.svd(linearisation.jacobian / size_of, full_matrices=False)
-        # The other directions have no influence.
+        # All other directions have no influence.
         is_regular = sizes > RANK * sizes.max(initial=0.0)
         residuals = residuals - basis[:, is_regular] @ (basis[:, is_regular].T @ residuals)
         log_volume = float(np.log(size_of).sum() + np.log(sizes[is_regular]).sum())
@@ -547,19 +554,25 @@ def _marginal(problem: Problem, z: Floats, values: Floats, size: float) -> float
 
 
 SAME = 1e-3
-"""Fraction of the largest exponent below which an exponent counts as 0."""
+"""Fraction of the largest exponent below which an exponent is treated as 0."""
 
 SIMPLE = 5e-3
 """Largest deviation of an exponent from a whole or half number to which it is rounded."""
 NEAR_ZERO = 1e-2
-"""Fraction of the interval between its bounds up to which a parameter is regarded as possibly 0."""
+"""Distance from 0 up to which the true value of a parameter may be 0.
+
+It is a fraction of the interval between the bounds.
+"""
 UNSEEN = 1e-2
-"""Change of the squared residuals, relative to that of the noise, that is negligible."""
+"""Largest negligible change of the squared residuals, relative to that due to noise."""
 MAX_RELATIVE_CHANGE = 0.2
 """Largest relative change of parameters along a direction that is not identifiable."""
 
 MAX_BOUND_FRACTION = 0.8
-"""Largest change along such a direction as a fraction of the distance to the bounds."""
+"""Largest change along a direction that is not identifiable, relative to the bounds.
+
+It is a fraction of the distance to the bounds.
+"""
 
 
 @dataclass(frozen=True)
@@ -611,8 +624,10 @@ def _power(path: str, exponent: float) -> str:
 
 
 def combinations(problem: Problem, solution: Solution) -> tuple[Combination, ...]:
-    """Return combinations of parameters that are not identifiable separately: identifiable ones,
-    then the others."""
+    """Return combinations of parameters that are not identifiable separately.
+
+    Identifiable combinations come first.
+    """
     count, directions = problem.shared, solution.directions
     names = [unknown.parameter.path for unknown in problem.unknowns]
     names += [MODULUS] if problem.with_modulus else []
@@ -644,8 +659,11 @@ def combinations(problem: Problem, solution: Solution) -> tuple[Combination, ...
 def _is_product(
     problem: Problem, solution: Solution, rows: NDArray[np.intp], direction: Floats
 ) -> bool:
-    """Return whether residuals change less if the logarithms of the parameters are moved along a
-    direction than if the parameters themselves are."""
+    """Return whether a product is a better combination than a sum for a direction.
+
+    It is better if residuals change less when the logarithms of the parameters change along the
+    direction than when the parameters themselves change along it.
+    """
     low, high = (bound[rows] for bound in problem.bounds())
     z, direction = solution.z[rows], direction / np.abs(direction).max()
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -666,8 +684,9 @@ def _is_product(
 
 
 def _complementary(directions: Floats, scale: Floats | float = 1.0) -> tuple[Floats, Floats]:
-    """Return bases of a space of directions, and of its orthogonal complement as factors of
-    parameters.
+    """Return a basis of a space of directions, and a basis of its orthogonal complement.
+
+    The second basis consists of factors of parameters.
 
     Parameters
     ----------
@@ -683,8 +702,7 @@ def _complementary(directions: Floats, scale: Floats | float = 1.0) -> tuple[Flo
 
 
 def _round_factors(rows: Floats) -> Floats:
-    """Divide each row by its first entry, and round entries that are nearly whole or half
-    numbers."""
+    """Divide each row by its first entry, and round entries close to a multiple of one half."""
     first = (rows != 0.0).argmax(axis=1)
     rows = rows / rows[np.arange(len(rows)), first][:, None]
     simple = np.round(2.0 * rows) / 2.0
