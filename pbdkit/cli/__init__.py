@@ -20,7 +20,7 @@ from pbdkit.cli.streams import standard_streams
 from pbdkit.memory import refuse_little_memory
 
 COMPLETING = "_PBDKIT_COMPLETE"
-"""Environment variable by which a shell requests completions."""
+"""Environment variable with which a shell requests completions."""
 
 
 FIRST = {
@@ -28,17 +28,17 @@ FIRST = {
     "pbdkit plot paper-a.nc --color pe1": "Draw the result: paper-a.png.",
     "pbdkit init": "Write a template: experiment.yaml.",
 }
-"""First commands to type, with their purpose."""
+"""The first commands that a user needs, with their purpose."""
 WELCOME = """\
 pbdkit computes the deformation of bodies on lattices. Particles follow their
 neighbours by rules instead of forces. An experiment file describes the run; its
 result is a dataset.
 """
-"""Text that is printed without a command."""
+"""Text that is printed if no command is given."""
 SYSTEM = dict.fromkeys(
     (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENAMETOOLONG), ""
 )
-"""Errors of the operating system that are no bug of pbdkit, with the remedy."""
+"""Errors of the operating system that are not caused by a defect of pbdkit, with the remedy."""
 SYSTEM |= dict.fromkeys(
     (errno.EMFILE, errno.ENFILE),
     "; raise the limit (`ulimit -n`), or use fewer processes",
@@ -68,7 +68,7 @@ def program(context: click.Context, debug: bool) -> None:
 
 
 def _welcome() -> str:
-    """Return the first commands to type, and all commands."""
+    """Return a text that lists the first commands that a user needs, and all commands."""
     lines = [WELCOME, "First commands:"]
     lines += [f"  {typed:<36} {does}" for typed, does in FIRST.items()]
     for group, commands in groupby(builtin_commands().values(), key=lambda command: command.group):
@@ -82,7 +82,8 @@ def main(arguments: list[str] | None = None) -> None:
     storage failed, 130 interrupted, 128 plus the number of another signal."""
     with standard_streams():
         code = _exit_status(arguments)
-        exec("")  # After an interrupt in another `exec`, Python would end by the signal.
+        # If an interrupt had occurred in another `exec`, Python would be ended by the signal.
+        exec("")
         sys.exit(code)
 
 
@@ -91,7 +92,7 @@ def _exit_status(arguments: list[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     if debug := "--debug" in words:
         words = [argument for argument in words if argument != "--debug"]
-    # pydantic would search for its own plugins, and stop at a distribution with damaged metadata.
+    # pydantic would search for its own plugins, and fail if a distribution has damaged metadata.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         with warnings.catch_warnings():
@@ -148,14 +149,15 @@ def _report(error: BaseException) -> int:
 
 
 def _contexts(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield the error and those that were handled when it was raised."""
+    """Yield the error, and the errors that were being handled when it was raised."""
     while error:
         yield error
         error = error.__context__
 
 
 def _of_memory(error: BaseException) -> bool:
-    """Return whether memory is exhausted, which threads and libraries report in different ways."""
+    """Return whether the error means that memory is exhausted. Threads and libraries report this in
+    different ways."""
     words = "can't start new thread", "failed to map segment", "Cannot allocate memory"
     return isinstance(error, MemoryError) or any(word in str(error) for word in words)
 

@@ -22,7 +22,7 @@ from pbdkit.stability.relaxation import tuned
 
 Row = tuple[str, str]
 MAX_LISTED = 3
-"""Number of groups that are listed in a line without --verbose."""
+"""Maximum number of groups that are listed in a line without --verbose."""
 
 
 def check(
@@ -37,7 +37,8 @@ def check(
     loading_warnings
         Warnings that were issued when it was loaded.
     verbose, as_json
-        Whether all details, or one JSON object, are printed.
+        Whether all details are printed (`verbose`), and whether the forecast is printed as a JSON
+        object (`as_json`).
     """
     with waiting(f"checking {experiment.name}", silent=as_json):
         scene = tuned(build_scene(experiment))
@@ -60,7 +61,8 @@ def check(
 
 
 def _boundary_rows(scene: Scene, predicted: Forecast, limit: int | None) -> Iterator[Row]:
-    """Yield rows about the body, supports, leaders and loads; groups are listed up to `limit`."""
+    """Yield rows about the body, supports, leaders and loads. At most `limit` groups are listed in
+    a row."""
     if predicted.size_mm:
         yield "size", f"{' × '.join(f'{side:.6g}' for side in predicted.size_mm)} mm"
     raster = scene.raster
@@ -146,14 +148,16 @@ def _motion(group: Driven) -> str:
 
 
 def _duration(group: Driven) -> str:
-    """Describe the axes and steps of a group, except where they are all axes or all steps."""
+    """Describe the axes and the steps of a group. Axes are omitted if the group acts along all
+    axes, and steps if it acts in all steps."""
     axes, until = "".join(getattr(group, "axes", None) or ()), group.until
     begins = f" from step {group.from_}" * (group.from_ > 1)
     return f" along {axes}" * bool(axes) + begins + f" until step {until}" * (until is not None)
 
 
 def _force(load: Load, units: Units | None) -> str:
-    """Format a load in the units of the experiment: N or kN, and N/mm²."""
+    """Format a load in the units of the experiment: a force in N or kN, and a force per area in
+    N/mm²."""
     force, unit = load.force_at(max(load.from_, 1)), ""
     quantity = FORCE if load.force else BODY_FORCE
     if units and not units.missing_entries(quantity):

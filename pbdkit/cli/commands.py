@@ -1,7 +1,9 @@
-"""The table of commands: those of pbdkit and those that plugins add by the hook `pbdkit_commands`.
+"""The table of commands. It contains the commands of pbdkit, and the commands that plugins add with
+the hook `pbdkit_commands`.
 
-A command is listed by name, target and one sentence; its module is imported when it is called.
-Plugins are searched if a name is not a command of pbdkit itself, and for `pbdkit --help`.
+The table lists a command by its name, its target and one sentence. The module of a command is
+imported when the command is called. Plugins are searched only if a name is not a command of pbdkit
+itself, and for `pbdkit --help`.
 """
 
 from __future__ import annotations
@@ -31,8 +33,8 @@ from pbdkit.hooks import (
 
 T = TypeVar("T")
 BUILTIN_MODULES = ("pbdkit.cli.commands", "pbdkit.web", "pbdkit.bench")
-"""Modules of pbdkit that implement `pbdkit_commands`. The last two import from this package; only
-this table refers to them."""
+"""Modules of pbdkit that implement `pbdkit_commands`. The last two modules import from this
+package; therefore no module except this table refers to them."""
 GROUPS = ("Start", "Run", "Look", "Understand", "Vary and fit", "Extend")
 """Headings of `pbdkit --help`, in the order of a first session."""
 
@@ -57,7 +59,7 @@ MEANT = {
     ("gui", "play", "interactive"): "`pbdkit live` shows a body that is moved by the mouse",
     ("version",): "`pbdkit --version` prints the version",
 }
-"""The remedy for words that are no commands but are often typed as one."""
+"""Remedies for words that are often typed as commands but are not commands."""
 
 
 @hookimpl
@@ -106,7 +108,7 @@ def builtin_commands() -> dict[str, Command]:
     """Return the commands of pbdkit itself by name, in the order of the groups."""
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
-    # pluggy calls the module that was registered last first.
+    # pluggy calls modules in the reverse order of registration.
     for module in reversed(BUILTIN_MODULES):
         manager.register(import_module(module))
     listed = [command for answer in manager.hook.pbdkit_commands() for command in answer]
@@ -115,7 +117,8 @@ def builtin_commands() -> dict[str, Command]:
 
 
 def plugins_with_commands() -> list[Plugin]:
-    """Return the installed plugins that add commands, loaded or with the reason why not."""
+    """Return the installed plugins that add commands. A plugin that could not be loaded contains
+    the reason."""
     return [with_commands(plugin) for plugin in installed_plugins(COMMAND_GROUP)]
 
 
@@ -128,13 +131,14 @@ class CommandTable(click.Group):
         return list(dict.fromkeys([*builtin_commands(), *added]))
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        """Return the command of that name; a usage error names the nearest one."""
+        """Return the command of that name. If there is none, a usage error proposes the command
+        with the nearest name."""
         if listed := builtin_commands().get(name):
             command: click.Command = listed.load()
             return with_no_plugins(command)
         plugins = plugins_with_commands()
         offers = _offers(plugins).get(name, [])
-        if not offers and not ctx.resilient_parsing:  # Otherwise a shell completes the line.
+        if not offers and not ctx.resilient_parsing:  # Otherwise a shell is completing the line.
             ctx.fail(_no_command(name, plugins))
         if not offers:
             return None
@@ -151,7 +155,8 @@ class CommandTable(click.Group):
         return with_no_plugins(loaded)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; an error of a plugin's own code names the plugin."""
+        """Run the command. If an error occurs in the code of a plugin, the message contains the
+        name of the plugin."""
         try:
             return super().invoke(ctx)
         except (PbdkitError, click.ClickException, click.exceptions.Exit, click.Abort):
@@ -171,11 +176,11 @@ class CommandTable(click.Group):
 
 
 DISABLE_ONE = f"name one of them in {DISABLE} to use the other"
-"""Remedy for commands of the same name."""
+"""Remedy for several commands with the same name."""
 
 
 def _sections() -> dict[str, list[tuple[str, str]]]:
-    """Return the lines of `pbdkit --help`: (command, sentence) by group."""
+    """Return the lines of `pbdkit --help`, (command, sentence), by group."""
     sections: dict[str, list[tuple[str, str]]] = {group: [] for group in GROUPS}
     for command in builtin_commands().values():
         sections[command.group].append((command.name, command.does))
@@ -199,7 +204,7 @@ def _sections() -> dict[str, list[tuple[str, str]]]:
 
 
 def _offers(plugins: list[Plugin]) -> dict[str, list[tuple[Plugin, Command]]]:
-    """Return the plugins' commands by name, with the plugins that offer them."""
+    """Return the commands of plugins by name, each with the plugins that offer it."""
     offers: dict[str, list[tuple[Plugin, Command]]] = {}
     for plugin in plugins:
         for command in plugin.commands:
@@ -219,7 +224,7 @@ def _no_command(name: str, plugins: list[Plugin]) -> str:
 
 
 def _call_plugin(plugin: Plugin, command: Command, call: Callable[[], T]) -> T:
-    """Call the plugin's code; its errors become a PluginError that names the plugin."""
+    """Call code of a plugin. An error is converted to a PluginError with the name of the plugin."""
     try:
         return call()
     except PbdkitError:

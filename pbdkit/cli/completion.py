@@ -1,4 +1,5 @@
-"""Completion with the Tab key: names of experiments and results, and contents of results.
+"""Completion of command lines with the Tab key: names of experiments and results, and contents of
+results.
 
 Click completes files and choices. `setting_completion` completes the settings of experiments.
 """
@@ -27,15 +28,16 @@ SUFFIXES = (".yaml", ".yml", ".json")
 RESULT = ".nc"
 """Ending of the names of results."""
 MAX_TIMES = 200
-"""Maximum number of steps that are offered at once: the first and the last, and some between."""
+"""Maximum number of steps that are offered: the first step, the last step, and some steps between
+them."""
 Completer = Callable[[click.Context, click.Parameter, str], list[CompletionItem]]
 Candidates = Callable[[click.Context, str], Iterable[str | CompletionItem]]
 
 
 def completer(candidates: Candidates) -> Completer:
-    """Return a completer that offers the candidates that begin with the word on the line.
+    """Return a completer. It offers those candidates that begin with the word to be completed.
 
-    There are none if they cannot be computed, since a shell shows no messages.
+    If the candidates cannot be computed, none are offered, because a shell shows no messages.
     """
 
     def complete(context: click.Context, _: click.Parameter, prefix: str) -> list[CompletionItem]:
@@ -82,7 +84,7 @@ def _shipped_names() -> list[str]:
 
 @completer
 def results(context: click.Context, prefix: str) -> Iterator[str | CompletionItem]:
-    """Complete results, unfinished ones too, and folders."""
+    """Complete the names of results, including unfinished results, and folders."""
     from pbdkit.io.run_store import STORE
 
     folder = prefix[: prefix.rfind("/") + 1]
@@ -100,7 +102,8 @@ def results(context: click.Context, prefix: str) -> Iterator[str | CompletionIte
 
 @completer
 def variables(context: click.Context, prefix: str) -> Iterator[str]:
-    """Complete the variables of particles and bonds of the result on the line, with components."""
+    """Complete the name of a variable of particles or bonds, or of its component. The variables are
+    those of the result in the command line."""
     with _content(context) as content:
         variables = dict(content.variables)
         objects = (content, *variables.values())
@@ -116,7 +119,7 @@ def variables(context: click.Context, prefix: str) -> Iterator[str]:
 
 @completer
 def times(context: click.Context, prefix: str) -> Iterator[str]:
-    """Complete the recorded steps of the result on the line."""
+    """Complete a step. The candidates are the recorded steps of the result in the command line."""
     with _content(context) as content:
         times = [f"{time}" for time in content.variables["time"][...].tolist()]
     times = [time for time in times if time.startswith(prefix)]
@@ -126,7 +129,7 @@ def times(context: click.Context, prefix: str) -> Iterator[str]:
 
 @contextmanager
 def _content(context: click.Context) -> Iterator[Any]:
-    """Open the first result on the line, without xarray."""
+    """Open the first result in the command line, without using xarray."""
     from pbdkit.io.seal import open_sealed
 
     paths = [value for value in context.params.values() if isinstance(value, Path)]
@@ -141,7 +144,7 @@ def _content(context: click.Context) -> Iterator[Any]:
 class _Bash(BashComplete):
     """Completion in bash, which splits words at `=` and appends a space to completions.
 
-    In this class `--set rule.K=1` has a single value, and no space follows `=`.
+    With this class `--set rule.K=1` counts as a single word, and no space is added after `=`.
     """
 
     source_template = BashComplete.source_template.replace(
@@ -149,10 +152,10 @@ class _Bash(BashComplete):
         "COMPREPLY+=($value); [[ $value == *[=/] ]] && compopt -o nospace",
     )
     _prefix_length = 0
-    """Length of the part of a word that bash does not replace."""
+    """Length of the first part of the word, which bash does not replace."""
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Return the preceding words, and the word to complete."""
+        """Return the words before the one to be completed, and the word to be completed."""
         parts, index = split_arg_string(os.environ["COMP_WORDS"]), int(os.environ["COMP_CWORD"])
         parts = [*parts, ""][: index + 1]
         words = parts[:1]
@@ -167,7 +170,8 @@ class _Bash(BashComplete):
         return words[1:-1], words[-1]
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return an item without the part of the word that bash does not replace."""
+        """Return the text of an item without the first part of the word, which bash does not
+        replace."""
         return f"{item.type},{item.value[self._prefix_length :]}"
 
 

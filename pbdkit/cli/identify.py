@@ -43,7 +43,7 @@ def identify(experiment: Experiment, *, verbose: bool, as_json: bool) -> None:
 
 
 def _show(identity: Identity, materials: str, verbose: bool) -> None:
-    """Print the table of one material, or of several with the same identity."""
+    """Print the table of one material, or of several materials with the same identity."""
     remark = f" ({materials})" if materials else ""
     click.echo(
         f"{identity.name}: {identity.rule}{remark}, {identity.lattice} lattice, "

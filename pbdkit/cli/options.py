@@ -32,7 +32,7 @@ def call(target: str, *args: Any, **options: Any) -> int | None:
 
 
 def load_experiment(name: str, settings: tuple[str, ...]) -> Experiment:
-    """Return an experiment by its file or shipped name, with settings.
+    """Load an experiment, given by its file or its shipped name, with settings.
 
     The file is read before the modules that validate it are imported, so that a mistyped name is
     reported quickly.
@@ -46,7 +46,8 @@ def load_experiment(name: str, settings: tuple[str, ...]) -> Experiment:
 
 
 def completed_by(name: str) -> Completer:
-    """Return a completer, given as ``file:name``, which is imported only when a shell needs it."""
+    """Return a completer that is given as ``file:name``. It is imported only when a shell requests
+    completions."""
 
     def complete(
         context: click.Context, parameter: click.Parameter, incomplete: str
@@ -58,7 +59,7 @@ def completed_by(name: str) -> Completer:
 
 
 def result_argument(name: str, metavar: str = "OUT.nc", **more: Any) -> Callable[[F], F]:
-    """Return a click argument for one result or several."""
+    """Return a click argument for one or several results."""
     complete = completed_by("completion:results")
     return click.argument(name, metavar=metavar, type=PATH, shell_complete=complete, **more)
 
@@ -90,7 +91,8 @@ set_option = click.option(
 def _choice(
     context: click.Context, option: click.Parameter, texts: tuple[str, ...]
 ) -> dict[str, str]:
-    """Return the values by name; raise click.BadParameter for a text that is not NAME=VALUE."""
+    """Return the values by name. Raise click.BadParameter for a text that does not have the form
+    NAME=VALUE."""
     for text in texts:
         if not all(text.partition("=")):
             raise click.BadParameter(f"'{text}': expected NAME=VALUE, for instance steel=3")
@@ -111,8 +113,8 @@ verbose_option = click.option("--verbose", is_flag=True, help="Print all details
 def _setting(constant: str) -> Callable[[click.Context, click.Parameter, bool], None]:
     """Return the callback of a flag that sets an environment variable to "*".
 
-    The variable is set for this call and the processes that it starts. Its name is a constant,
-    given as ``module:name``.
+    The variable is set for this call and the processes that it starts. Its name is the value of a
+    constant, which is given as ``module:name``.
     """
 
     def set_variable(context: click.Context, option: click.Parameter, flag: bool) -> None:
@@ -142,7 +144,8 @@ outside_option = click.option(
 
 
 def experiment_argument(command: F) -> F:
-    """Add the argument EXPERIMENT, and the option that permits files elsewhere."""
+    """Add the argument EXPERIMENT, and the option that permits an experiment to refer to files
+    outside its folder."""
     argument = click.argument(
         "experiment", metavar="EXPERIMENT", shell_complete=completed_by("completion:experiments")
     )

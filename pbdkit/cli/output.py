@@ -1,4 +1,4 @@
-"""Output of commands: checks of paths before anything is computed, and writing of pictures."""
+"""Output of commands. Paths are checked before anything is computed, and pictures are written."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
     Raises
     ------
     ExperimentError
-        If the name is not UTF-8, if the path is a folder or no regular file, if it is the
-        experiment under any name, or if a file exists and `force` is not set.
+        If the name is not UTF-8, if the path is a folder or another object that is not a regular
+        file, if it leads to the experiment file, or if a file exists and `force` is not set.
     StorageError
         If the file system returns an error.
     """

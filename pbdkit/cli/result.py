@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import xarray
 
 MAX_LISTED = 20
-"""Number of broken bonds that are listed as text; --json lists all."""
+"""Maximum number of broken bonds that are listed as text; --json lists all of them."""
 
 
 def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_json: bool) -> None:
@@ -113,8 +113,8 @@ def _bond_in_words(facts: dict[str, Any]) -> Iterator[str]:
 
 
 def _around_in_words(around: list[BondStatus], step: int | None) -> Iterator[str]:
-    """Describe the other bonds at the ends of a bond: those that broke before it, with it and after
-    it."""
+    """Describe the other bonds of both ends of a bond. They are grouped into bonds that broke
+    before it, in the same step, and after it."""
     broken = [status for status in around if status.step is not None]
     groups = {"adjacent bonds broken": broken}
     if step is not None:
@@ -181,7 +181,8 @@ def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> 
 
 
 def _scene_of(dataset: xarray.Dataset) -> Scene | None:
-    """Return the scene of the cells; without it, warn that there are no cells."""
+    """Return the scene, which is needed for the cells. If it cannot be built, warn that the file
+    contains no cells."""
     try:
         return scene_of(dataset, "a grid of cells")
     except PbdkitError as error:

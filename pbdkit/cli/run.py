@@ -1,4 +1,5 @@
-"""Command ``pbdkit run``. A signal ends a run between two steps: all its records are complete."""
+"""Command ``pbdkit run``. A signal ends a run between two steps, so that all its records are
+complete."""
 
 from __future__ import annotations
 
@@ -53,7 +54,8 @@ def run(
     force
         Whether an existing file is replaced, and an unfinished run discarded.
     quiet, as_json
-        Whether nothing, or one JSON object, is printed.
+        Whether nothing is printed (`quiet`), and whether the outcome is printed as a JSON object
+        (`as_json`).
     """
 
     def run_by(execution: Execution, is_repeated: bool) -> int:
@@ -65,7 +67,8 @@ def run(
         warn(disk_warnings(path, scene), quiet)
         with progress_of_run(path, quiet or as_json, file) as (stop, watch):
             simulation = execution.run(scene, watch)
-            del scene  # Each of several processes keeps its part of the scene alone.
+            # If there are several processes, each of them keeps only its part of the scene.
+            del scene
             warn([*simulation.warnings, *([] if quiet else simulation.further_warnings())], quiet)
             report = record(simulation, simulation.sink(file))
         if execution.communicator.is_root:
@@ -76,7 +79,8 @@ def run(
 
 
 def refuse_unfinished(path: Path, *, force: bool) -> None:
-    """Raise ExperimentError if there is an unfinished run, unless `force` discards it.
+    """Raise ExperimentError if there is an unfinished run. With `force` the unfinished run is
+    discarded instead.
 
     A run that another process is writing is never discarded.
     """
@@ -88,7 +92,7 @@ def refuse_unfinished(path: Path, *, force: bool) -> None:
 
 
 def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
-    """Warn if the output may not fit on its disk."""
+    """Warn if the output may be too large for its disk."""
     output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total).output
     with suppress(OSError):  # A missing folder is reported when the file is opened.
         if output > (free := shutil.disk_usage(path.parent).free):
@@ -100,13 +104,14 @@ def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
 
 
 def run_together(execution: Execution, quiet: bool, work: Callable[[Execution, bool], int]) -> int:
-    """Let all processes work together; if they cannot share the work, let the first do it alone."""
+    """Let all processes work together. If they cannot share the work, the first process does it
+    alone."""
     try:
         return work(execution, False)
     except NotSharedError as error:
         text = str(error).replace("; run it in one process", "; the first process runs it alone")
         warn([text], quiet)
-    # A signal that is sent to all processes must not end those that are waiting.
+    # A signal may be sent to all processes, and must not end those that are waiting.
     with nullcontext() if execution.communicator.is_root else stop_on_signals():
         return execution.by_root(lambda: work(Execution(), True))
 
@@ -128,7 +133,7 @@ def progress_of_run(
 
 @contextmanager
 def advice_on_failure(path: Path, file: NetcdfSink) -> Iterator[None]:
-    """Print how to resume a run that fails with records on disk."""
+    """If a run fails and its records are on the disk, print how to resume it."""
     try:
         yield
     except NotSharedError:
@@ -183,7 +188,7 @@ def report_end(
 
 
 def exit_status(outcome: RunOutcome, stop: Stop) -> int:
-    """Return the exit status of the program, the same in all processes."""
+    """Return the exit status of the program. It is the same in all processes."""
     if outcome.status in SUCCESSFUL:
         return 0
     return stop.exit_status if outcome.status == "interrupted" else 4

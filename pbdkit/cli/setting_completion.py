@@ -1,4 +1,5 @@
-"""Completion of ``--set PATH=VALUE`` from the experiment on the line and the JSON Schema."""
+"""Completion of ``--set PATH=VALUE``. The candidates are determined from the experiment in the
+command line and from the JSON Schema."""
 
 from __future__ import annotations
 
@@ -18,14 +19,14 @@ from pbdkit.plugin.registry import Registry
 
 Schema = Mapping[str, Any]
 MISSING = object()
-"""The value of an entry that an experiment leaves out."""
+"""Value of an entry that is omitted in an experiment."""
 NEEDS_QUOTES = {*" \"'{}$"}
-"""Characters that have a meaning for a shell."""
+"""Characters that have a special meaning in a shell."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry of an experiment by its path: its value, or the default, and its schema."""
+    """An entry of an experiment: its path, its value or default, and its schema."""
 
     path: str
     value: Any
@@ -37,17 +38,18 @@ def _entry(path: str, data: Mapping[str, Any], key: str, schema: Schema) -> Entr
 
 
 class SettingPaths:
-    """The paths that can be set in the `data` of an experiment with that schema."""
+    """The paths that can be set in an experiment. `data` are its values, and `schema` is the JSON
+    Schema of experiments."""
 
     def __init__(self, data: Mapping[str, Any], schema: Schema) -> None:
         self._definitions, self._root = schema.get("$defs", {}), Entry("", data, schema)
 
     def paths(self) -> list[str]:
-        """Return the paths of single values, and of lists of them."""
+        """Return the paths of single values, and of lists of single values."""
         return [entry.path for entry in self._leaves(self._root)]
 
     def values(self, path: str) -> list[str]:
-        """Return the words that the schema lists at a path, and the present value."""
+        """Return the words that the schema permits at a path, and the present value."""
         entry, keys = self._root, path.split(".")
         for depth in range(1, len(keys) + 1):
             inner = {entry.path: entry for entry in self._entries(entry)}
@@ -68,7 +70,7 @@ class SettingPaths:
             yield entry
 
     def _entries(self, entry: Entry) -> Iterator[Entry]:
-        """Yield the entries of a map, or of a list of maps; none of a single value."""
+        """Yield the entries of a map or of a list of maps. A single value has no entries."""
         path, data = f"{entry.path}." if entry.path else "", entry.value
         forms = [*self._forms(entry.schema)]
         if isinstance(data, list):
@@ -91,7 +93,8 @@ class SettingPaths:
                 yield _entry(path, {}, key, schema)
 
     def _forms(self, schema: Schema) -> Iterator[Schema]:
-        """Yield the alternatives of a schema that are not deprecated, with references resolved."""
+        """Yield the alternatives of a schema, with references resolved. Deprecated alternatives are
+        omitted."""
         if "$ref" in schema:
             yield from self._forms(self._definitions.get(schema["$ref"].split("/")[-1], {}))
             return
@@ -111,17 +114,19 @@ class SettingPaths:
 
 
 def _fits(form: Schema, data: Mapping[str, Any]) -> bool:
-    """Return whether the `type` of a map agrees with that of a form, if the form has one."""
+    """Return whether a map may have this form of the schema. If the form defines a `type`, the map
+    must have the same `type`."""
     kind = form["properties"].get("type")
     return kind is None or data.get("type") in (kind.get("const"), *kind.get("enum", ()))
 
 
 @completer
 def settings(context: click.Context, prefix: str) -> Iterator[str]:
-    """Complete the paths that can be set in the experiment on the line, with its other settings;
-    after `=`, the words that the schema lists and the present value."""
+    """Complete a setting. Before `=` the candidates are the paths that can be set in the experiment
+    in the command line, after its other settings are applied. After `=` they are the words that the
+    schema permits, and the present value."""
     path, equals, _ = prefix.partition("=")
-    # Plugins are loaded only to list their types.
+    # Plugins are only loaded if their types have to be listed.
     schema = experiment_schema(Registry(), installed=bool(equals))
     setting_paths = SettingPaths(_data(context), schema)
     if equals:
@@ -131,7 +136,7 @@ def settings(context: click.Context, prefix: str) -> Iterator[str]:
 
 
 def _data(context: click.Context) -> dict[str, Any]:
-    # Click does not assign the arguments while an option has no value.
+    # Click does not assign the arguments as long as an option has no value.
     name = context.params.get("experiment") or next(iter(context.args), None)
     defaults = Experiment.defaults()
     source = read_experiment(name) if name else Source(data={})

@@ -1,4 +1,4 @@
-"""Standard output and error, and the current folder, while the program runs."""
+"""Standard output, standard error and the current folder while the program runs."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pbdkit.errors import PbdkitError, StorageError, WriteError
 
 
 class NoReaderError(PbdkitError):
-    """The reader of standard output has closed it, as `head` does. This is no error of the
-    program."""
+    """The reader of standard output has closed it, as the command `head` does. This is not an error
+    of the program."""
 
     exit_status, is_reported = 0, True
 
@@ -27,9 +27,9 @@ def standard_streams() -> Iterator[None]:
     exit status remains meaningful.
 
     A failed write to standard output raises WriteError, or NoReaderError if the reader has closed
-    it. A failed write to standard error is ignored. Closed standard descriptors are opened on the
-    null device, because otherwise the next open file would get the number of a standard descriptor,
-    to which other programs and libraries write. Streams that replace those of Python are kept.
+    it. A failed write to standard error is ignored. A standard descriptor that is closed is opened
+    on the null device. Otherwise the next file would get its number, and other programs and
+    libraries would write to this file. Streams that replace those of Python are kept.
     """
     if os.name != "posix":
         yield
@@ -54,7 +54,8 @@ def standard_streams() -> Iterator[None]:
 
 @contextmanager
 def restoring_folder() -> Iterator[None]:
-    """Return to the current folder after the block: plugins may change it when they are imported.
+    """Return to the current folder after the block, because plugins may change the folder when they
+    are imported.
 
     Raises
     ------
@@ -70,7 +71,8 @@ def restoring_folder() -> Iterator[None]:
 
 
 def _stream(standard: TextIO | None, kind: type[io.FileIO]) -> TextIO:
-    """Return a stream like one of Python's; if that is closed, each write fails."""
+    """Return a stream that behaves like a standard stream of Python. If the standard stream is
+    closed, each write fails."""
     if standard is None:
         raw = kind(os.open(os.devnull, os.O_RDONLY), "w")
         return io.TextIOWrapper(io.BufferedWriter(raw))
@@ -83,12 +85,12 @@ def _stream(standard: TextIO | None, kind: type[io.FileIO]) -> TextIO:
 
 
 class _Output(io.FileIO):
-    """Raise the first failure of a write, and ignore further writes."""
+    """Stream that raises the first failure of a write, and ignores further writes."""
 
     _failed = False
 
     def write(self, data: Any) -> int:
-        """Write data, or raise NoReaderError or WriteError at the first failure."""
+        """Write data. At the first failure, raise NoReaderError or WriteError."""
         if self._failed:
             return len(data)
         try:
@@ -102,10 +104,10 @@ class _Output(io.FileIO):
 
 
 class _Errors(io.FileIO):
-    """Ignore failures of writes."""
+    """Stream that ignores failures of writes."""
 
     def write(self, data: Any) -> int:
-        """Write data, or ignore it if that fails."""
+        """Write data. A failure is ignored."""
         try:
             return super().write(data)
         except OSError:

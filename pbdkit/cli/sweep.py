@@ -1,4 +1,5 @@
-"""Commands ``pbdkit sweep`` and ``fit``, and ``schema`` of the files that they read."""
+"""Commands ``pbdkit sweep``, ``fit`` and ``schema``. The last one prints the schema of the files
+that the others read."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ from pbdkit.sweeps.specification import SweepPlan, read_sweep, sweep_schema
 CONNECT_S = 10.0
 """Timeout for the connection to a cluster in seconds."""
 MAX_LISTED = 20
-"""Number of failures that are listed; `message` in the dataset contains all."""
+"""Maximum number of failures that are listed. The variable `message` of the dataset contains all of
+them."""
 
 
 def sweep(
@@ -59,7 +61,7 @@ def _refuse_folder(folder: Path) -> None:
 
 @contextmanager
 def _client(address: str | None) -> Iterator[Any]:
-    """Yield the client of the cluster at an address, or None if there is no address. Raises
+    """Yield the client of the cluster at an address. If no address is given, yield None. Raises
     ExperimentError."""
     if address is None:
         yield None
@@ -72,7 +74,8 @@ def _client(address: str | None) -> Iterator[Any]:
     # Log messages about lost connections, with tracebacks, would hide the messages of the program.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
-        client: Any = distributed.Client(address, timeout=CONNECT_S)  # type: ignore[no-untyped-call]  # distributed is untyped
+        # type: ignore[no-untyped-call]  # distributed is untyped
+        client: Any = distributed.Client(address, timeout=CONNECT_S)
     except (OSError, ValueError, ImportError) as error:
         raise ExperimentError(f"--dask {address}: no scheduler responds: {error}") from None
     with client:

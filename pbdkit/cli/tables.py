@@ -1,4 +1,5 @@
-"""Tables of commands. Only this file imports rich, which takes longer than most commands."""
+"""Tables that commands print. Only this module imports rich, because the import takes longer than
+most commands."""
 
 from __future__ import annotations
 
@@ -17,13 +18,13 @@ UNLIMITED = 10_000
 
 
 def add_rows(table: Table, rows: Iterable[Sequence[str]]) -> None:
-    """Add rows of plain text, in which ``[x]`` is no markup."""
+    """Add rows of plain text. In them ``[x]`` is not interpreted as markup."""
     for row in rows:
         table.add_row(*map(Text, row))
 
 
 def show_table(table: Table, *, stderr: bool = False) -> None:
-    """Print a table; one line for each row if the output is no terminal."""
+    """Print a table. If the output is not a terminal, each row is one line."""
     is_terminal = (sys.stderr if stderr else sys.stdout).isatty()
     width = None if is_terminal else UNLIMITED
     Console(stderr=stderr, width=width, highlight=False).print(table)

@@ -27,7 +27,7 @@ def verify(files: tuple[Path, ...]) -> int:
 
 
 def _fault_of(file: Path) -> str:
-    """Return the fault of a result, or an empty string."""
+    """Return the fault of a result. The text is empty if there is none."""
     fault = ""
     try:
         if description := other_file(file):

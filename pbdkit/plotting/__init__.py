@@ -1,7 +1,7 @@
-"""Pictures over matplotlib: set-ups of experiments, bodies, histories, curves, cracks, movies.
+"""Pictures with matplotlib: set-ups of experiments, bodies, histories, curves, cracks and movies.
 
 The functions of this module are public. The modules that draw are imported when the functions are
-called, since matplotlib is an optional dependency.
+called, because matplotlib is an optional dependency.
 """
 
 from __future__ import annotations
@@ -342,8 +342,9 @@ def history(
         Result of one run.
     name : str, optional
         Variable of particles or bonds, or a component such as `u_x`. The first component of a
-        vector is a solid line, the others are dashed. By default the displacement `u`, computed
-        from the positions if it was not recorded. `track` contains every step.
+        vector is a solid line, the others are dashed. By default the displacement `u`; if it was
+        not recorded, it is computed from the positions. To draw every step and not only the
+        recorded ones, name the variable `track` of the diagnostic `track`.
     particle : int or iterable of int, optional
         Numbers of the particles.
     i, j : int, optional

@@ -1,4 +1,5 @@
-"""Colours of particle kinds, roles and other classes, and the colour scale of a quantity.
+"""Colours of the kinds of particles, of roles and of other classes, and the colour scale of a
+quantity.
 
 The colours of a quantity with both signs are centred at zero.
 """
@@ -25,21 +26,23 @@ KINDS = {
     int(FOLLOWER): ("follower", "#0072B2"),
     int(LEADER): ("leader", "#D55E00"),
 }
-"""Names and colours (of Okabe and Ito), in drawing order."""
+"""Names and colours of the kinds of particles, in drawing order. The colours are those of Okabe and
+Ito."""
 CLASS_COLOURS = ("#0072B2", "#F0E442", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-"""Colours of other classes (of Okabe and Ito)."""
+"""Colours of other classes. They are also colours of Okabe and Ito."""
 
 
 @dataclass(frozen=True)
 class Palette:
-    """Names and colours by class number, in drawing order. The classes are the kinds of particles
-    if `of_kind`, otherwise the values of a quantity."""
+    """Names and colours by class number, in drawing order. If `of_kind` is true, the classes are
+    the kinds of particles, otherwise the values of a quantity."""
 
     colours: dict[int, tuple[str, str]]
     of_kind: bool
 
     def ranks(self, snapshot: Snapshot) -> NDArray[Any]:
-        """Return the index of the colour of each particle; NaN for particles of no class."""
+        """Return the index of the colour of each particle. It is NaN for particles that belong to
+        no class."""
         classes = snapshot.kind if self.of_kind or snapshot.values is None else snapshot.values
         ranks = np.full(len(snapshot.kind), np.nan)
         for rank, number in enumerate(self.colours):
@@ -52,7 +55,7 @@ OF_KINDS = Palette(KINDS, True)
 
 
 def palette_of(quantity: PlottedQuantity) -> Palette:
-    """Return the palette of a quantity with flag meanings."""
+    """Return the palette of a quantity with integer codes, which are the classes."""
     if quantity.variable == "kind":
         return OF_KINDS
     words = enumerate(quantity.words.items())
@@ -70,17 +73,18 @@ BOTH_SIGNS = "RdBu_r"
 NOTHING = "#E0E0E0"
 """Colour of missing values."""
 NEARLY = 1e-9
-"""Fraction of the largest value below which values and differences count as zero."""
+"""Values and differences below this fraction of the largest value count as zero."""
 FROM_ZERO = 0.3
-"""Ratio of the lowest to the highest value below which a scale begins at zero."""
+"""A scale begins at zero if the ratio of the lowest value to the highest value is smaller than this
+number."""
 LEVELS = 12
 """Number of levels of contours."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Colour scale from `low` to `high`; `extend` as in matplotlib. Tick labels are to be
-    multiplied by ten to the `exponent`."""
+    """Colour scale from `low` to `high`. `extend` has the same meaning as in matplotlib. The tick
+    labels have to be multiplied by ten to the power `exponent`."""
 
     low: float
     high: float
@@ -95,9 +99,9 @@ def scale_of(
 ) -> Scale:
     """Return the colour scale of a quantity with values in a range.
 
-    If the values have both signs and zero is neutral, the scale is symmetric about zero unless
-    `look` has limits; zero has the neutral colour in any case. Raises ExperimentError for a colour
-    map that does not exist.
+    If the values have both signs and zero is neutral, the scale is symmetric about zero, unless
+    `look` contains limits. In both cases zero has the neutral colour. Raises ExperimentError for a
+    colour map that does not exist.
     """
     low, high = values
     largest = max(abs(low), abs(high))
@@ -122,7 +126,7 @@ def scale_of(
         high = low + (largest or 1.0)
     name = look.cmap or (BOTH_SIGNS if diverging else FIELD if filled else DOTS)
     if quantity.is_signed and low < high <= 0.0 and not look.cmap:
-        name += "_r"  # Values next to zero then have similar colours on both sides.
+        name += "_r"  # Values near zero then have similar colours on both sides of zero.
     norm: Normalize = Normalize(low, high)
     if look.contours:
         levels = MaxNLocator(LEVELS, symmetric=diverging and not has_limits).tick_values(low, high)
@@ -135,8 +139,8 @@ def scale_of(
 
 
 def _map(name: str, about_zero: tuple[float, float] | None) -> Colormap:
-    """Return the colour map of a name, cropped to the range `about_zero` (low, high) such that zero
-    has its middle colour."""
+    """Return the colour map of a name. With a range `about_zero` (low, high), the map is cropped
+    such that zero has the middle colour of the complete map."""
     if name not in colormaps:
         suggestion = did_you_mean(name, colormaps) or "; viridis, YlOrRd and RdBu_r are"
         raise ExperimentError(f"'{name}' is not a colour map of matplotlib{suggestion}")
@@ -149,7 +153,7 @@ def _map(name: str, about_zero: tuple[float, float] | None) -> Colormap:
 
 
 def _exponent(largest: float) -> int:
-    """Return the power of ten that is written once in the label instead of at each tick."""
+    """Return the power of ten that is written once in the label and not at each tick."""
     if largest == 0.0 or not math.isfinite(largest):
         return 0
     power = math.floor(math.log10(largest) + 1e-9)

@@ -1,7 +1,7 @@
 """Pictures of configurations: one or several steps of a run, or of two runs.
 
-Particles are drawn as dots, bonds as lines, and a variable as a field of pixels, depending on what
-is legible at the distance of particles on the page.
+Particles are drawn as dots, bonds as lines, and a variable as a field of pixels. Which of these are
+drawn depends on the distance of particles on the page: only what is legible is drawn.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def draw(
     look: PlotOptions,
     ax: Axes | Sequence[Axes] | None = None,
 ) -> Axes | list[Axes]:
-    """Draw recorded steps as `plot` does, with the options in `look`."""
+    """Draw recorded steps in the same way as `plot`, with the options in `look`."""
     recording = Trajectory(dataset, color or "kind")
     is_list = isinstance(time, Iterable)
     rows = [recording.row(step) for step in _listed(time)]
@@ -95,7 +95,8 @@ def draw_comparison(
     *,
     difference: bool,
 ) -> Axes | list[Axes]:
-    """Draw one step of two datasets, or their difference, as `pbdkit.plotting.compare` does."""
+    """Draw one step of two datasets, or their difference, in the same way as
+    `pbdkit.plotting.compare`."""
     first, second = in_this_layout(first), in_this_layout(second)
     if difference:
         changed, name = difference_of(first, second, color or "position", time)
@@ -124,9 +125,9 @@ def _side_by_side(
 def difference_of(
     first: xarray.Dataset, second: xarray.Dataset, color: str, time: float | None
 ) -> tuple[xarray.Dataset, str]:
-    """Return the second dataset at one step, in the reference configuration and with the difference
-    in `color` as an additional variable, for particles with the same number in both datasets; and
-    the name of the variable to draw."""
+    """Return a dataset for drawing a difference, and the name of the variable to draw. The dataset
+    is the second one at one step, in the reference configuration. It is restricted to particle
+    numbers that both datasets contain, and the difference in `color` is an additional variable."""
     runs = [of_one_run(dataset) for dataset in (first, second)]
     quantity, _ = (quantity_of(dataset, color) for dataset in reversed(runs))
     if quantity.owner != "particle":
@@ -165,10 +166,11 @@ MANY_BONDS = 200_000
 
 @dataclass(frozen=True)
 class RenderStyle:
-    """Rendering style: `filled` draws a field; `crowded` particles are not dots by default; `lined`
-    draws whole bonds as lines. `dots` show the quantity ("values"), its classes ("classes"), the
-    kinds of particles beside another coloured quantity ("kinds"), or nothing (""). `distance` is
-    that of particles on the page, in points."""
+    """Rendering style. With `filled` a field is drawn. If particles are `crowded`, they are not
+    drawn as dots by default. With `lined` a bond is drawn as a single line. `dots` is "values" if
+    dots show the quantity, "classes" if they show its classes, "kinds" if they show the kinds of
+    particles beside another coloured quantity, and "" if there are no dots. `distance` is the
+    distance of particles on the page, in points."""
 
     filled: bool
     crowded: bool
@@ -184,7 +186,8 @@ class RenderStyle:
 
     @property
     def alone(self) -> float:
-        """Return the diameter of a particle outside a field; 0 where it would be invisible."""
+        """Return the diameter of a particle outside a field. It is 0 if the particle would be
+        invisible."""
         size = min(0.62 * self.distance, 9.0)
         return size if size > 1.0 else 0.0
 
@@ -197,8 +200,8 @@ class RenderStyle:
 def choose_style(
     body: ReferenceBody, quantity: PlottedQuantity, look: PlotOptions, distance: float
 ) -> RenderStyle:
-    """Choose the rendering style by the options that are given, and otherwise by legibility. Raises
-    ExperimentError for an option that is impossible or too expensive."""
+    """Choose the rendering style. Given options are followed; all other choices depend on
+    legibility. Raises ExperimentError for an option that is impossible or takes too long."""
     crowded = len(body.reference) > DETAILED or distance < CROWDED_PT
     of_bonds, filled = quantity.owner == "bond", _is_filled(body, quantity, look, distance)
     if quantity.words:
@@ -256,13 +259,13 @@ def _is_lined(
 
 
 NUMBERED_PT = 20.0
-"""Distance of particles on the page, in points, from which numbers are legible."""
+"""Distance of particles on the page, in points, above which numbers are legible."""
 LARGEST = 2.5
-"""Maximum enlargement of the page for legible numbers."""
+"""Maximum factor by which the page is enlarged to make numbers legible."""
 
 
 class Panel:
-    """Axes with layers, each of which shows one step at a time."""
+    """Axes with layers. Each layer shows one step at a time."""
 
     def __init__(self, ax: Axes, drawn: list[Layer]) -> None:
         self.ax, self._layers = ax, drawn
@@ -277,9 +280,9 @@ class Panel:
 class PanelFigure:
     """Axes and panels, each of which shows steps of a recording.
 
-    All panels have the limits and the scale of an extent. Fields have `finer` times as many pixels
-    as the picture along each axis. Given `axes` are used as they are; otherwise a figure is created
-    around them, `standalone` or managed by pyplot.
+    All panels have the limits and the colour scale of an extent. Along each axis, fields have
+    `finer` times as many pixels as the picture. If `axes` are given, they are used unchanged;
+    otherwise a figure is created, which is `standalone` or managed by pyplot.
 
     Raises ExperimentError if there is not enough room or no data.
     """
@@ -319,7 +322,7 @@ class PanelFigure:
         self._key()
         self._style = replace(
             self._style, distance=self._spacing()
-        )  # The legend takes part of the page.
+        )  # The legend occupies a part of the page.
         self.panels = [
             Panel(ax, list(self._layers(ax, recording)))
             for ax, recording in zip(self.axes, recordings, strict=True)
@@ -350,7 +353,7 @@ class PanelFigure:
         return scale_of(self._quantity, values, self._look, filled)
 
     def _layers(self, ax: Axes, recording: Trajectory) -> Iterator[Layer]:
-        """Generate the layers, from below."""
+        """Generate the layers, beginning with the lowest."""
         body, scale, style, grid = recording.body, self._scale, self._style, self._grid(ax)
         if style.filled and scale:
             yield PixelField(ax, body, grid, scale, style.alone)

@@ -34,7 +34,7 @@ COLOURS = "viridis"
 BODY = "#B0B0B0"
 """Colour of the body."""
 OLD = "#000000"
-"""Colour of bonds broken from the start."""
+"""Colour of bonds that are broken from the start."""
 NEW = "#D55E00"
 """Colour of broken bonds if all broke in the same step."""
 WIDE_IN = 5.0
@@ -50,22 +50,25 @@ LONG = 2.5
 SCALE_IN = 0.7
 """Height of a colour bar below the body in inches."""
 THIN = 0.08
-"""Ratio of the sides below which the shorter side has a single tick."""
+"""If the ratio of the shorter side to the longer side is smaller than this number, the shorter side
+has a single tick."""
 POINTS = 30_000
 """Maximum number of particles that are drawn."""
 DENSE = 100.0
 """Size of dots in points, multiplied by the square root of the number of particles."""
 APART = 1.5
-"""Distance between bonds of one crack, as a multiple of the bond length."""
+"""Maximum distance between neighbouring bonds of one crack, as a multiple of the rest length of
+bonds."""
 CRACKS = 50
-"""Maximum number of cracks that are measured, the largest first."""
+"""Maximum number of cracks that are measured. The cracks with the largest numbers of bonds are
+measured."""
 DIRECTIONS = 180
-"""Number of directions in which a crack is measured; the relative error of the length is below
-4e-5."""
+"""Number of directions in which a crack is measured. With this number the relative error of its
+length is below 4e-5."""
 
 
 def draw_crack(dataset: xarray.Dataset, kind: Kind, ax: Axes | None) -> Axes:
-    """Draw broken bonds as `pbdkit.plotting.crack` does."""
+    """Draw broken bonds in the same way as `pbdkit.plotting.crack`."""
     if kind not in KINDS:
         raise ExperimentError(
             f"'{kind}' is not a picture of a crack; use one of {', '.join(KINDS)}"
@@ -95,8 +98,8 @@ def draw_crack(dataset: xarray.Dataset, kind: Kind, ax: Axes | None) -> Axes:
 
 @dataclass(frozen=True)
 class CrackBonds:
-    """Broken bonds of the body in the order of breaking: `step`, the `ends` (bond, end, axis) and
-    the `middle` at rest."""
+    """Broken bonds of the body in the order of breaking. `step` is the step of breaking; `ends`,
+    (bond, end, axis), and `middle` are the positions of the ends and of the midpoints at rest."""
 
     step: Array
     ends: Array
@@ -134,8 +137,8 @@ def _broken(dataset: xarray.Dataset) -> CrackBonds:
 
 
 def _lengths(broken: CrackBonds) -> Array:
-    """Return the length of the longest crack after each bond has broken, (bond,). Bonds within
-    APART lengths of each other belong to one crack."""
+    """Return the length of the longest crack after each bond has broken, (bond,). Two bonds belong
+    to the same crack if the distance between their midpoints is at most APART rest lengths."""
     count = len(broken.middle)
     longest = np.linalg.norm(broken.ends[:, 1] - broken.ends[:, 0], axis=1).max()
     pairs = KDTree(broken.middle).query_pairs(APART * longest, output_type="ndarray")
@@ -200,8 +203,8 @@ def _is_long(body: Array) -> bool:
 
 
 def _axes_around(body: Array) -> Axes:
-    """Return the axes of a new figure. Their aspect ratio is that of the body, as far as the text
-    has enough room."""
+    """Return the axes of a new figure. They have the aspect ratio of the body, unless the text
+    would not have enough room."""
     wide, tall = np.maximum(np.ptp(body, axis=0), 1e-9)
     height = min(max(WIDE_IN * tall / wide, MIN_IN), TALLEST_IN)
     width = min(max(height * wide / tall, MIN_IN), WIDE_IN)
@@ -210,8 +213,8 @@ def _axes_around(body: Array) -> Axes:
 
 
 def _coloured(ax: Axes, broken: CrackBonds, *, below: bool) -> None:
-    """Add the bonds that broke during the run, coloured by step, with a colour bar beside or below
-    the body."""
+    """Add the bonds that broke during the run. They are coloured by step; a colour bar is placed
+    beside or below the body."""
     later = broken.step > 0
     scale = Normalize(broken.step[later].min(), broken.step[later].max())
     lines = LineCollection([*broken.ends[later]], cmap=COLOURS, norm=scale, linewidths=1.8)

@@ -1,7 +1,9 @@
-"""Curves and histories: one quantity over another or over the steps, with a line for each run.
+"""Curves and histories. They show one quantity over another quantity or over the steps, with a line
+for each run.
 
-Curves are force over displacement, stress over strain and energies; histories those of single
-particles and bonds. A dataset of a sweep has a line for each member.
+Curves are force over displacement, stress over strain, and energies. Histories are variables of
+single particles and bonds over the steps. For the dataset of a sweep, a line is drawn for each
+member.
 """
 
 from __future__ import annotations
@@ -42,18 +44,20 @@ NEEDED_FORCES = (
 
 @dataclass(frozen=True)
 class LoadCurve:
-    """Force as a function of displacement: two DataArrays along time, named with their axis."""
+    """Force as a function of displacement: two DataArrays along time. Their names contain the
+    axis."""
 
     displacement: Any
     force: Any
 
 
 def load_curve(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> LoadCurve:
-    """Return force and displacement of the chosen group, load or obstacle, or of the one with the
-    largest displacement, along its main axis.
+    """Return force and displacement of the chosen group, load or obstacle. If none is chosen, the
+    one with the largest displacement is used. Both are components along the axis with the largest
+    displacement.
 
-    Raises ExperimentError if the dataset has no such forces, or none of the chosen group, load or
-    obstacle.
+    Raises ExperimentError if the dataset contains no forces, or no force of the chosen group, load
+    or obstacle.
     """
     dim, moved = _moving(dataset, chosen)
     force, place = in_units(dataset[FORCE_OF[dim]]), chosen.get(CHOSEN_BY[dim])
@@ -77,8 +81,9 @@ def load_curve(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> Loa
 
 
 def _moving(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> tuple[str, Any]:
-    """Return the dimension of the forces, and the displacements along it: those of the chosen kind
-    (group, load or obstacle), otherwise of the first kind that moves."""
+    """Return the dimension of the forces, and the displacements along this dimension. It is the
+    dimension of the chosen kind (group, load or obstacle) or, if none is chosen, of the first kind
+    that moves."""
     requested = [dim for dim, argument in CHOSEN_BY.items() if chosen.get(argument) is not None]
     available = [dim for dim in requested or FORCE_OF if FORCE_OF[dim] in dataset.variables]
     candidates = [(dim, _displacements(dataset, dim)) for dim in available]
@@ -95,7 +100,7 @@ def _greatest(values: Any, dim: str) -> Floats:
 
 def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
     """Return the mean displacement, (time, group, axis), of the particles or obstacles that exert
-    the force, with units."""
+    the force. The result has units as an attribute."""
     if dim == "load":
         return in_units(dataset["load_displacement"])
     if extra_dims := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:
@@ -119,8 +124,8 @@ def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
 
 
 def _of_barriers(scene: Scene, step: int) -> Floats:
-    """Return the offset of each obstacle at a step, (obstacle, axis); after the last step of its
-    motion it keeps its last offset."""
+    """Return the offset of each obstacle at a step, (obstacle, axis). After the last step of its
+    motion an obstacle keeps its last offset."""
     offsets = []
     for barrier in scene.barriers:
         n = min(step, barrier.group.last(step)) - barrier.group.from_ + 1
@@ -129,7 +134,8 @@ def _of_barriers(scene: Scene, step: int) -> Floats:
 
 
 def _of_rows(dataset: xarray.Dataset, rows: NDArray[Any]) -> Floats:
-    """Return the mean displacement of some particles, (time, axis), some steps at a time."""
+    """Return the mean displacement of some particles, (time, axis). It is computed for some steps
+    at a time."""
     low, high = int(rows.min()), int(rows.max()) + 1
     reference = dataset["reference"].isel(particle=slice(low, high)).transpose("particle", "axis")
     position = dataset["position"].isel(particle=slice(low, high))
@@ -149,13 +155,13 @@ DPI = 200
 HUES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 """Colours of Okabe and Ito, without yellow, which is invisible on white."""
 MANY = "viridis"
-"""Colour map for more lines than there are colours."""
+"""Colour map that is used if there are more lines than colours."""
 MAX_LEGEND_LINES = 12
 """Maximum number of lines in a legend."""
 WITHIN = 4
-"""Maximum number of lines in a legend inside the panel."""
+"""Maximum number of lines for which the legend is inside the panel."""
 FEW_POINTS = 40
-"""Maximum number of points that have markers."""
+"""Maximum number of points of a line that is drawn with markers."""
 BROAD = 44
 """Characters per line of a label below the panel."""
 TALL = 34
@@ -167,13 +173,14 @@ QUICK = 20_000
 LEGEND_IN = 1.9
 """Width of a legend beside the panel in inches."""
 ROUND = [1, 2, 5, 10]
-"""Distances between ticks are multiples of one of these numbers, times a power of ten."""
+"""The distance between ticks is a multiple of one of these numbers, times a power of ten."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """Values `y` over `x`. Lines of one `hue`, a particle or a member of a sweep, share a colour,
-    which represents `value` where that is a number; a second component is `dashed`."""
+    """Values `y` over `x`. `hue` is the index of the particle or of the member of a sweep; lines
+    with the same `hue` have the same colour. If `value` is a number, it determines the position of
+    the colour in a colour map. The line of a second component is `dashed`."""
 
     x: Array
     y: Array
@@ -189,8 +196,8 @@ def new_axes(width: float = SIZE_IN[0], height: float = SIZE_IN[1]) -> Axes:
 
 
 def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
-    """Draw lines with a legend or, if they are too many for one, with a colour bar labelled
-    `hues`."""
+    """Draw lines with a legend. If there are too many lines for a legend, draw them with a colour
+    bar that has the label `hues`."""
     order = {hue: n for n, hue in enumerate(dict.fromkeys(line.hue for line in lines))}
     shares = _shares(lines, order)
     for line in lines:
@@ -259,14 +266,14 @@ def member_dims(values: Any) -> list[str]:
 
 
 def hues_of(values: Any) -> str:
-    """Return the label of the colours of members; empty for a single run."""
+    """Return the label of the colours of members. It is empty for a single run."""
     dims = member_dims(values)
     return dims[0] if len(dims) == 1 else "member of the sweep" if dims else ""
 
 
 def lines_of(dataset: xarray.Dataset, x: Any, y: Any) -> list[Line]:
-    """Return the lines of y over x, DataArrays with one dimension of a run in common. Each is named
-    by the parameters of its member, and contains no NaN."""
+    """Return the lines of y over x. x and y are DataArrays that have one dimension of a run in
+    common. The name of a line contains the parameters of its member. Lines contain no NaN."""
     across, drawn = xarray.broadcast(x, y)
     dims = member_dims(drawn)
     across, drawn = (values.transpose(*dims, ...) for values in (across, drawn))
@@ -292,7 +299,7 @@ def _label_of(dataset: xarray.Dataset, dim: str, place: int) -> str:
 
 
 def _number(dataset: xarray.Dataset, dim: str, place: int) -> float | None:
-    """Return the coordinate at an index where it is a number, else None."""
+    """Return the value of a coordinate at an index. Return None if it is not a number."""
     if f"{dim}{TEXT}" in dataset.coords or dim not in dataset.coords:
         return None
     value = dataset[dim].values[place]
@@ -314,7 +321,7 @@ NEEDED_DIAGNOSTICS = {
         "again"
     ),
 }
-"""Messages for results without the variables of a curve, by kind."""
+"""Messages for results that do not contain the variables of a curve, by kind of curve."""
 
 
 def draw_curve(
@@ -325,7 +332,8 @@ def draw_curve(
     chosen: dict[str, int | None],
     ax: Axes | None,
 ) -> Axes:
-    """Draw a curve as `pbdkit.plotting.curve` does, of the `chosen` group, load or obstacle."""
+    """Draw a curve in the same way as `pbdkit.plotting.curve`. `chosen` is the group, load or
+    obstacle."""
     if y is None:
         x, y = None, x
     if y is not None and kind is not None:
@@ -372,8 +380,8 @@ def _of_kind(
 
 
 def _energies(dataset: xarray.Dataset) -> list[str]:
-    """Return the energies that have the same unit: the strain energy if there is one, otherwise the
-    pseudo-energies."""
+    """Return the energies to draw, which all have the same unit. These are the strain energy or, if
+    it was not recorded, the pseudo-energies."""
     names = [name for name in ENERGIES if name in dataset]
     units = [dataset[name].attrs.get("units") for name in names]
     return [name for name, unit in zip(names, units, strict=True) if unit == units[0]]
@@ -411,7 +419,8 @@ def draw_history(
     bond: Sequence[int] | None,
     ax: Axes | None,
 ) -> Axes:
-    """Draw a variable of particles or of a bond over time as `pbdkit.plotting.history` does."""
+    """Draw a variable of particles or of a bond over time, in the same way as
+    `pbdkit.plotting.history`."""
     if not isinstance(name, str | None):
         raise ExperimentError(
             f"history: expected the name of a variable first, such as 'u', got {name!r}; a "
@@ -440,7 +449,7 @@ def draw_history(
 
 @dataclass(frozen=True)
 class Series:
-    """A series of a particle or bond: its name and number, and its `values`, a DataArray along
+    """Values of a particle or a bond: its name, its number, and `values`, a DataArray along
     time."""
 
     name: str
@@ -449,8 +458,8 @@ class Series:
 
 
 def _lines(dataset: xarray.Dataset, series: Series, n: int, alone: bool) -> Iterator[Line]:
-    """Generate a line for each component and member of a sweep. Colours distinguish particles, or
-    members where there is only one particle."""
+    """Generate a line for each component and each member of a sweep. Different particles have
+    different colours; if there is only one particle, different members have different colours."""
     along = "step" if "step" in series.values.dims else "time"
     vector = "axis" in series.values.dims
     parts = (
@@ -469,8 +478,8 @@ def _lines(dataset: xarray.Dataset, series: Series, n: int, alone: bool) -> Iter
 def _numbers(
     dataset: xarray.Dataset, particle: Numbers | None, i: int | None, j: int | None
 ) -> list[int] | None:
-    """Return the numbers of the requested particles, or None if none were requested, which only
-    `track` allows."""
+    """Return the numbers of the requested particles. Return None if no particle was requested,
+    which is only possible for `track`."""
     if particle is not None:
         if i is not None or j is not None:
             raise ExperimentError("select particles either by number or by i and j, not by both")
@@ -508,7 +517,7 @@ def _of_particles(dataset: xarray.Dataset, name: str, wanted: list[int] | None) 
 
 
 def _displacement(dataset: xarray.Dataset, position: Any, number: int) -> Any:
-    """Return positions of a particle, or a component of them, minus those at rest."""
+    """Return the positions of a particle, or one component of them, minus the position at rest."""
     reference = dataset["reference"].sel(particle=number)
     if "axis" not in position.dims:
         reference = reference.sel(axis=position["axis"])

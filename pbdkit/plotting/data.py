@@ -1,8 +1,8 @@
-"""Data of pictures: the body with its cells and outline, recorded steps, the quantity that is
-drawn, and variables by name for curves.
+"""Data of pictures. These are the body with its cells and its outline, the recorded steps, the
+quantity that is drawn and, for curves, variables by name.
 
-A field is drawn on the cells of the body at rest, which are quadrilaterals or triangles cut at the
-outline.
+A field is drawn on the cells of the body at rest. They are quadrilaterals or triangles, and are cut
+at the outline.
 """
 
 from __future__ import annotations
@@ -37,17 +37,18 @@ if TYPE_CHECKING:
 
 
 BRIDGE = 1.35
-"""Ratio to the median length above which the side of a triangle bridges a hole or notch."""
+"""The side of a triangle bridges a hole or a notch if the ratio of its length to the median length
+exceeds this number."""
 
 
 def cells_of(site: Array, reference: Array) -> Array:
-    """Return the rows of the corners of each cell in order around it, (cell, 4); in triangles the
-    last corner occurs twice.
+    """Return the rows of the corners of each cell, (cell, 4), in their order around the cell. In
+    triangles the last corner occurs twice.
 
-    `site` (particle, 2) are whole numbers. If the places of sites (i, j) repeat along i, as on
-    Bravais lattices, the cells are those of the Delaunay tessellation of the lattice: squares,
-    rectangles or triangles. Otherwise they are the Delaunay triangles of the particles without
-    those that bridge gaps. Returns None if all particles are collinear.
+    `site` (particle, 2) are whole numbers. If the positions of the sites (i, j) repeat along i, as
+    on Bravais lattices, the cells are the cells of the Delaunay tessellation of the lattice:
+    squares, rectangles or triangles. Otherwise they are the Delaunay triangles of the particles,
+    except triangles that bridge gaps. Returns None if all particles are collinear.
     """
     cells = _of_sites(site, reference) if len(site) else None
     if cells is None:
@@ -57,8 +58,8 @@ def cells_of(site: Array, reference: Array) -> Array:
 
 
 def triangles_of(reference: Array) -> Array:
-    """Return the Delaunay triangles, (triangle, 3), without those that bridge gaps; none if all
-    places are collinear."""
+    """Return the Delaunay triangles, (triangle, 3), except triangles that bridge gaps. There are
+    none if all places are collinear."""
     from scipy.spatial import Delaunay, QhullError
 
     try:
@@ -72,8 +73,9 @@ def triangles_of(reference: Array) -> Array:
 
 
 def _of_sites(site: Array, reference: Array) -> Array | None:
-    """Return the cells between sites (i, j), (i+1, j), (i+1, j+1), (i, j+1), whole or divided along
-    the shorter diagonal; None if the places of sites do not repeat."""
+    """Return the cells between the sites (i, j), (i+1, j), (i+1, j+1) and (i, j+1). They are
+    quadrilaterals, or are divided along the shorter diagonal. Return None if the positions of sites
+    do not repeat."""
     low = site.min(axis=0)
     shape = site.max(axis=0) - low + 1
     if shape.min() < 2 or shape.prod() > 20 * len(site):
@@ -83,7 +85,7 @@ def _of_sites(site: Array, reference: Array) -> Array | None:
     along, up = _steps(rows, reference, 0), _steps(rows, reference, 1)
     if (rows >= 0).sum() < len(site) or not len(along) or not len(up):
         return None
-    # On a Bravais lattice row j + 1 has the same shift against row j for all j.
+    # On a Bravais lattice the shift of row j + 1 relative to row j is the same for all j.
     j = np.nonzero((rows[:, :-1] >= 0) & (rows[:, 1:] >= 0))[1]
     of_row = np.full((shape[1] - 1, 2), np.nan)
     of_row[j] = up
@@ -102,14 +104,14 @@ def _of_sites(site: Array, reference: Array) -> Array | None:
     triangles = [np.stack([a, b, c, c], 1)[shorter], np.stack([a, c, d, d], 1)[shorter],
                  np.stack([a, b, d, d], 1)[longer], np.stack([b, c, d, d], 1)[longer]]  # fmt: skip
     cells = np.concatenate([quads, *triangles])
-    # -1 has the sign bit set.
+    # A missing corner is -1, which has the sign bit set.
     complete = np.bitwise_or.reduce([cells[:, k] for k in range(4)]) >= 0
     return cells if complete.all() else cells[complete]
 
 
 def _steps(rows: Array, reference: Array, axis: int) -> Array:
-    """Return the differences between consecutive sites along an index, (pair, 2), where both
-    exist."""
+    """Return the differences between the positions of consecutive sites along an index, (pair, 2).
+    Pairs in which a site does not exist are omitted."""
     count = rows.shape[axis]
     rows_from, rows_to = rows.take(range(count - 1), axis), rows.take(range(1, count), axis)
     both = (rows_from >= 0) & (rows_to >= 0)
@@ -117,8 +119,8 @@ def _steps(rows: Array, reference: Array, axis: int) -> Array:
 
 
 def whole(cells: Array, pairs: Array, particles: int) -> Array:
-    """Return a mask of the cells, (cell,), that have none of these pairs of rows, (pair, 2), as a
-    side or diagonal."""
+    """Return a mask, (cell,), of the cells in which none of the pairs of rows, (pair, 2), is a side
+    or a diagonal."""
     intact = np.ones(len(cells), np.bool_)
     if not len(pairs):
         return intact
@@ -133,7 +135,7 @@ def whole(cells: Array, pairs: Array, particles: int) -> Array:
 
 
 def outline(cells: Array, particles: int) -> Array:
-    """Return the sides that belong to one cell only, as pairs of rows, (side, 2)."""
+    """Return the sides that belong to only one cell, as pairs of rows, (side, 2)."""
     sides = np.concatenate([cells[:, [k, (k + 1) % 4]] for k in range(4)])
     sides = sides[sides[:, 0] != sides[:, 1]]
     codes, counts = np.unique(_codes(sides, particles), return_counts=True)
@@ -141,23 +143,25 @@ def outline(cells: Array, particles: int) -> Array:
 
 
 def _codes(pairs: Array, particles: int) -> Array:
-    """Return one number for each unordered pair."""
+    """Return a number for each pair. It does not depend on the order of the pair."""
     low, high = np.sort(pairs.astype(np.int64), axis=1).T
     return np.asarray(low * particles + high)
 
 
 PARTS = 8
-"""Parts of each side of a cut cell, in each of which the outline is straight."""
+"""Number of parts into which each side of a cut cell is divided. The outline is straight in each
+part of the cell."""
 MAX_POINTS = 400_000
-"""Maximum number of points at which the distance to the outline is evaluated. If more cells are
-cut, they are small on the page and have fewer parts."""
+"""Maximum number of points at which the distance from the outline is evaluated. If many cells are
+cut, the cells are small on the page and are divided into fewer parts."""
 ON_IT = 1e-6
-"""Tolerance relative to the cell's size for points on the outline."""
+"""Tolerance, relative to the size of a cell, within which a point counts as lying on the
+outline."""
 
 
 def shape_of(dataset: xarray.Dataset) -> Shape | None:
-    """Return the outline of the body in a dataset; None if it has none, and for a body of given
-    sites."""
+    """Return the outline of the body in a dataset. Return None if the dataset contains no outline,
+    or if the body is given by its sites."""
     try:
         shape: Shape = TypeAdapter(AnyBody).validate_python(
             json_attribute(dataset, "experiment")["body"]
@@ -177,10 +181,10 @@ def lattice_unit(dataset: xarray.Dataset) -> float:
 class CutCells:
     """The cells that are cut by an outline.
 
-    `row` (cell,) is the row of each cell in `distance`, -1 where it is not cut; `distance` (cut
-    cell, point, point) is the signed distance, positive outside the outline, at points along both
-    sides of the cell: the corners have the weights (1 - u)(1 - v), u(1 - v), uv, (1 - u)v at [v,
-    u].
+    `distance`, (cut cell, point, point), is the signed distance, positive outside the outline, at
+    points [v, u] of the cell. The coordinates u and v run from 0 to 1 along the sides of the cell;
+    a point is the mean of the four corners with the weights (1 - u)(1 - v), u(1 - v), uv and (1 -
+    u)v. `row`, (cell,), is the row of each cell in `distance`, and -1 if the cell is not cut.
     """
 
     row: Array
@@ -188,8 +192,8 @@ class CutCells:
 
     @classmethod
     def of(cls, shape: Shape, cells: Array, reference: Array, outside: Array) -> CutCells:
-        """Compute the cut cells among cells (cell, 4) at rest, given the corners `outside` the
-        outline."""
+        """Compute the cut cells among `cells`, (cell, 4), at rest. `outside` marks the particles
+        that lie outside the outline."""
         near = np.zeros(len(reference), bool)
         near[cells[outside[cells].any(axis=1)]] = True
         candidates = np.flatnonzero(near[cells].any(axis=1))
@@ -203,8 +207,8 @@ class CutCells:
         return cls(row, distance[is_cut].astype(np.float32))
 
     def outside(self, rows: Array, middles: Array) -> Array:
-        """Return a mask of the samples of some cut cells, at `middles` along both sides, that lie
-        outside the outline, (cell, v, u)."""
+        """Return a mask, (cell, v, u), of those samples of some cut cells that lie outside the
+        outline. The samples lie at `middles` along both sides of a cell."""
         points = np.linspace(0.0, 1.0, self.distance.shape[1])
         hats = np.maximum(0.0, 1.0 - np.abs(middles[:, None] - points) * (len(points) - 1))
         hats = hats.astype(np.float32)
@@ -212,7 +216,7 @@ class CutCells:
 
 
 def outline_at_rest(shape: Shape, cut: CutCells, cells: Array, reference: Array) -> Array:
-    """Return the segments (side, end, axis) of the outline of a body with cut cells."""
+    """Return the outline of a body with cut cells, as segments (side, end, axis)."""
     corners = reference[cells[cut.row >= 0]]
     return np.concatenate(
         [
@@ -223,8 +227,8 @@ def outline_at_rest(shape: Shape, cut: CutCells, cells: Array, reference: Array)
 
 
 def _through_cells(cut: CutCells, corners: Array) -> Array:
-    """Return the zero line of the distance as segments, one in each triangle that it crosses; two
-    triangles form a part of a cut cell."""
+    """Return the zero line of the distance as segments. There is one segment in each triangle that
+    the line crosses; each part of a cut cell is divided into two triangles."""
     at = between(corners, np.linspace(0.0, 1.0, cut.distance.shape[1]))
     low, high, segments = slice(None, -1), slice(1, None), []
     first, last = (low, low), (high, high)
@@ -243,7 +247,7 @@ def _through_cells(cut: CutCells, corners: Array) -> Array:
 
 
 def _along_cells(shape: Shape, sides: Array) -> Array:
-    """Return the parts of sides (side, end, axis) of the mesh boundary that are inside the
+    """Return those parts of the sides of the mesh boundary, (side, end, axis), that are inside the
     outline."""
     share = np.linspace(0.0, 1.0, PARTS + 1)[:, None]
     points = sides[:, :1] * (1.0 - share) + sides[:, 1:] * share
@@ -262,21 +266,22 @@ def between(corners: Array, along: Array) -> Array:
 
 
 def distance_from(shape: Shape, at: Array) -> Array:
-    """Return the signed distance of places (..., axis) to an outline."""
+    """Return the signed distance of places, (..., axis), from an outline."""
     nowhere = np.zeros(at.shape[:-1], int)
     distance: Array = shape.distance(Sites((nowhere, nowhere), Vector(at[..., 0], at[..., 1])))
     return distance
 
 
 PLACES = ("position", "reference", "number", "particle", "site", *INDICES)
-"""Variables with places or names of particles."""
+"""Variables that contain positions or numbers of particles."""
 
 
 @dataclass(frozen=True)
 class PlottedQuantity:
-    """A quantity with a value for each `owner` (particle or bond): component number `component` of
-    the variable `variable`, or the length of the vector if `component` is None. Values times
-    `factor` are in `units`. `words` holds the meanings of flag values."""
+    """A quantity with a value for each `owner`, which is particle or bond. The value is taken from
+    the variable `variable`. If this is a vector, the value is the component with the index
+    `component`, or the length of the vector if `component` is None. Values have to be multiplied by
+    `factor` to be in `units`. `words` contains the meanings of values that are integer codes."""
 
     variable: str
     owner: str
@@ -289,17 +294,18 @@ class PlottedQuantity:
 
     @property
     def is_place(self) -> bool:
-        """Return whether the quantity is a place or a number, for which zero is not special."""
+        """Return whether the quantity is a position or a particle number. For these zero has no
+        special meaning."""
         return self.variable.split("_")[0] in PLACES
 
     @property
     def is_signed(self) -> bool:
-        """Return whether zero is neutral, between values of both signs."""
+        """Return whether the quantity can have both signs, so that zero is neutral."""
         return not self.is_place and (self.component is not None or not self.vector)
 
     def values(self, part: xarray.Dataset) -> Array:
-        """Return the values, (time, owner), of a loaded dataset with time; NaN where there is
-        none."""
+        """Return the values, (time, owner), of a dataset that is loaded and has a time dimension.
+        Particles or bonds without a value have NaN."""
         variable = part[self.variable]
         values = np.asarray(variable.transpose("time", self.owner, "axis", missing_dims="ignore"))
         values = values.astype(float) if values.dtype.kind in "biu" else values
@@ -308,7 +314,7 @@ class PlottedQuantity:
             values = np.linalg.norm(values, axis=-1) if along is None else values[..., along]
         if "time" not in variable.dims:
             values = np.repeat(values[None], part.sizes["time"], axis=0)
-        # An intact bond has -1, also one that breaks in a later step.
+        # Bonds that are intact at a time have no value, including bonds that break in a later step.
         if self.variable == "broken_step":
             values = np.where(broken_by(values, part["time"].values[:, None]), values, np.nan)
         return values if self.factor == 1.0 else self.factor * values
@@ -335,8 +341,9 @@ def component_of(dataset: xarray.Dataset, name: str) -> tuple[str, int | None]:
 
 
 def quantity_of(dataset: xarray.Dataset, name: str) -> PlottedQuantity:
-    """Return the quantity of a name: a variable, the length of a vector, or `u_x`, the component
-    along x of a vector `u`. Raises ExperimentError for what cannot be drawn."""
+    """Return the quantity with a name. The name is that of a variable; for a vector `u` it means
+    the length, and `u_x` means the component along x. Raises ExperimentError if the variable cannot
+    be drawn."""
     if not isinstance(name, str):
         raise ExperimentError(
             f"color: expected the name of a variable, such as 'pe1' or 'u_x', got {name!r}; a "
@@ -368,8 +375,8 @@ def quantity_of(dataset: xarray.Dataset, name: str) -> PlottedQuantity:
 def refuse_color(
     name: str, dataset: xarray.Dataset, drawable: Iterable[str], axes: Iterable[str]
 ) -> None:
-    """Raise ExperimentError with a message that names the diagnostic that records the variable, or
-    the variables that can be drawn."""
+    """Raise ExperimentError. The message contains the diagnostic that records the variable or, if
+    there is none, the variables that can be drawn."""
     names = [n for n in drawable if n in dataset.data_vars]
     if makers := makers_of_missing(dataset, name):
         raise ExperimentError(
@@ -386,8 +393,9 @@ def refuse_color(
 
 
 def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
-    """Return the diagnostics that make the variable, or its vector, as an experiment names them;
-    none if it was recorded, or no diagnostic makes it."""
+    """Return the diagnostics that compute a variable, or the vector of which it is a component, as
+    they are written in experiments. Return none if the variable was recorded, or if no diagnostic
+    computes it."""
     vector, _, axis = name.rpartition("_")
     names = {name, vector} if axis in axes_of(dataset) else {name}
     recorded = [*map(str, dataset.variables)]
@@ -397,7 +405,7 @@ def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
 
 
 def _is_drawable(variable: xarray.Variable) -> bool:
-    """Return whether a variable has a number or vector for each particle, or a number for each
+    """Return whether a variable has a number or a vector for each particle, or a number for each
     bond."""
     shapes = ({"particle"}, {"particle", "axis"}, {"bond"})
     return {*variable.dims} - {"time"} in shapes and variable.dtype.kind in "biuf"
@@ -411,22 +419,24 @@ def _words(attributes: dict[Any, Any]) -> dict[int, str]:
 
 
 BLOCK_BYTES = 2**26
-"""Approximate number of bytes that are read from a file at a time."""
+"""Approximate number of bytes that are read from a file at once."""
 UNKNOWN = FRAME + 1
-"""Kind of a particle of the body where kinds were not recorded: it has no colour."""
+"""Kind of particles of the body if kinds were not recorded. It has no colour."""
 MEASURED = 50_000
-"""Maximum number of particles for which the spacing is measured instead of estimated from the
-area."""
+"""Maximum number of particles for which the spacing is measured. For more particles it is estimated
+from the area of the body."""
 
 
 @dataclass(frozen=True)
 class ReferenceBody:
-    """The constant data of a body: `reference` (particle, axis), `site` (particle, index), `number`
-    (particle,), whether a particle belongs to the body rather than the frame, `inside` (particle,),
-    the rows of both ends of each bond, `ends` (bond, 2), and the step in which it broke,
-    `broken_step` (bond,), -1 if intact. `outside` marks the corners of cut cells outside the
-    outline. The outline, `shape`, is in lattice units, and None if it is unknown or no such corners
-    exist. The length of a lattice unit is `unit` in the units of lengths."""
+    """The data of a body that do not change in time. `reference`, (particle, axis), are the
+    reference positions, `site`, (particle, index), the site indices, and `number`, (particle,), the
+    particle numbers. `inside`, (particle,), is true for particles of the body and false for frame
+    points. `ends`, (bond, 2), are the rows of both ends of each bond. `broken_step`, (bond,), is
+    the step in which the bond broke, and -1 if it is intact. `outside` marks the corners of cut
+    cells that lie outside the outline. `shape` is the outline in lattice units, and None if it is
+    unknown or there are no such corners. `unit` is the length of a lattice unit in the units of
+    lengths."""
 
     reference: Array
     site: Array
@@ -451,8 +461,8 @@ class ReferenceBody:
 
     @cached_property
     def spacing(self) -> float:
-        """Approximate distance between neighbouring particles at rest: for small bodies, the median
-        distance of some particles from their nearest neighbour."""
+        """Approximate distance between neighbouring particles at rest. For small bodies it is the
+        median of the distances of some particles from their nearest neighbours."""
         x = self.reference
         if 1 < len(x) <= MEASURED:
             few = np.linspace(0, len(x) - 1, 50).astype(int)
@@ -463,7 +473,7 @@ class ReferenceBody:
 
     @cached_property
     def cut(self) -> CutCells | None:
-        """The `cells` cut by the outline; None if there is no outline."""
+        """Data of those `cells` that are cut by the outline; None if there is no outline."""
         if self.shape is None:
             return None
         return CutCells.of(self.shape, self.cells, self.reference / self.unit, self.outside)
@@ -477,7 +487,7 @@ class ReferenceBody:
         return self.unit * outline_at_rest(self.shape, self.cut, self.cells, at_rest)
 
     def whole_cells(self, cells: Array, broken: Array) -> Array:
-        """Return the indices of the cells without a broken bond along a side."""
+        """Return the indices of the cells that have no broken bond along a side."""
         if not broken.any():
             return np.arange(len(cells))
         return np.flatnonzero(whole(cells, self.ends[broken], len(self.reference)))
@@ -485,8 +495,8 @@ class ReferenceBody:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One step: `position` (particle, axis), `kind` (particle,), `values` of the quantity, if any,
-    and whether bonds are `broken` (bond,)."""
+    """One step: `position`, (particle, axis), `kind`, (particle,), the `values` of the quantity if
+    there is one, and `broken`, (bond,), which is true for broken bonds."""
 
     step: float
     position: Array
@@ -496,8 +506,8 @@ class Snapshot:
 
 
 class Trajectory:
-    """Recorded steps of a dataset, with the quantity `color`, if any, in physical units if the
-    dataset defines their scale.
+    """Recorded steps of a dataset with the quantity `color`, if one is given. Values are in
+    physical units if the dataset defines their scale.
 
     Raises ExperimentError for a dataset of several runs, for a lattice in space, and for a quantity
     that cannot be drawn. Only the necessary data are read.
@@ -521,7 +531,7 @@ class Trajectory:
 
     @cached_property
     def _rows(self) -> Array:
-        """Rows of the particles that exist; concatenated runs may lack some."""
+        """Rows of the particles that exist. In concatenated runs some particles may be missing."""
         reference = self._dataset["reference"].transpose("particle", "axis").values
         return np.flatnonzero(np.isfinite(reference).all(axis=1))
 
@@ -550,8 +560,8 @@ class Trajectory:
         )
 
     def row(self, time: float | None) -> int:
-        """Return the index of a step; None is the last. Raises ExperimentError if it was not
-        recorded."""
+        """Return the index of a step; None means the last step. Raises ExperimentError if the step
+        was not recorded."""
         if time is None:
             return len(self.steps) - 1
         if not is_number(time):
@@ -585,7 +595,7 @@ class Trajectory:
             values = quantity.values(part) if quantity else None
             for n, row in enumerate(chosen):
                 step = float(self.steps[row])
-                # The fraction of a step at which a bond broke is known for the last step only.
+                # The fraction of a step at which a bond broke is only known for the last step.
                 is_last = row == len(self.steps) - 1
                 broken = broken_by(body.broken_step, math.ceil(step) if is_last else step)
                 yield Snapshot(
@@ -632,8 +642,8 @@ def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset with positions; where they were not recorded, with the positions at rest.
-    Raises ExperimentError if positions at rest are missing too."""
+    """Return the dataset with positions. If positions were not recorded, the positions at rest are
+    used. Raises ExperimentError if these are missing, too."""
     if "position" in dataset.variables:
         return dataset
     if "reference" not in dataset.variables or "role" not in dataset.variables:
@@ -650,16 +660,18 @@ def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
 
 Box = tuple[float, float, float, float]
 MARGIN = 0.015
-"""Margin around a body relative to its longer side; at least the distance of particles."""
+"""Margin around a body, relative to the longer side of the body. The margin is at least the
+distance between particles."""
 THINNEST = 40.0
 """Maximum aspect ratio of a panel."""
 
 
 @dataclass(frozen=True)
 class Extent:
-    """Extent of several steps: the bounding `box` (left, right, bottom, top), the lowest and
-    highest value in the body, the same including the frame, and the kinds and the classes of the
-    quantity that occur."""
+    """Extent of several steps. `box` is the bounding box (left, right, bottom, top). `of_body` are
+    the lowest and the highest value in the body, and `of_all` those in the body and the frame.
+    `kinds` are the kinds of particles that occur, and `classes` the classes of the quantity that
+    occur."""
 
     box: Box
     of_body: tuple[float, float]
@@ -669,8 +681,8 @@ class Extent:
 
 
 def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: PlotOptions) -> Extent:
-    """Compute the extent of steps of a recording, one after another. Raises ExperimentError if no
-    particle has a position."""
+    """Compute the extent of steps of a recording, which are processed one after the other. Raises
+    ExperimentError if no particle has a position."""
     body, quantity = recording.body, recording.quantity
     reference = body.reference if look.outline else np.empty((0, 2))
     low, high = [reference.min(axis=0, initial=np.inf)], [reference.max(axis=0, initial=-np.inf)]
@@ -715,37 +727,39 @@ def _no_thinner(xmin: float, xmax: float, ymin: float, ymax: float) -> Box:
 
 
 def _numbers(values: Array) -> set[int]:
-    """Return the small whole numbers that occur."""
+    """Return the whole numbers that occur in an array of small whole numbers."""
     integers = values[np.isfinite(values)].astype(int)
     return {int(low) for low in np.flatnonzero(np.bincount(integers))}
 
 
 def _range(values: Array) -> tuple[float, float]:
-    """Return the lowest and the highest value; NaN twice where there is none."""
+    """Return the lowest and the highest value. Both are NaN if there are no values."""
     finite = values[np.isfinite(values)]
     return (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
 
 
 def _joined(ranges: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Return the smallest range that contains several ranges; (0, 1) if none of them is finite."""
+    """Return the smallest range that contains several ranges. It is (0, 1) if none of them is
+    finite."""
     finite = [r for r in ranges if np.isfinite(r[0])]
     return (min(r[0] for r in finite), max(r[1] for r in finite)) if finite else (0.0, 1.0)
 
 
 SUM_BLOCK_BYTES = 2**25
-"""Approximate number of bytes that are summed at a time."""
+"""Approximate number of bytes that are summed at once."""
 SUMMED = ("pe1", "pe1_intact", "contact")
-"""Variables that are summed over particles; of all others the mean is drawn."""
+"""Variables that are summed over particles. For all other variables the mean is drawn."""
 CHOSEN_BY = {"leader_group": "group", "load": "load", "obstacle": "obstacle"}
-"""Dimensions from which one index is selected, and the arguments that select it."""
+"""Dimensions from which one index is selected, and the names of the arguments that select it."""
 OF_A_RUN = {"time", "step", "crack", "particle", "bond", "axis", "tracked", "end", *CHOSEN_BY}
 """Dimensions of one run; all others belong to a sweep."""
 
 
 def variable(dataset: xarray.Dataset, name: str) -> xarray.DataArray:
-    """Return a variable, or the component of `u` for `u_x`, without reading its values.
+    """Return a variable without reading its values. For a name such as `u_x` return the component
+    of `u`.
 
-    Raises ExperimentError if there is none of that name.
+    Raises ExperimentError if there is no variable of that name.
     """
     if not isinstance(name, str):
         raise ExperimentError(f"expected the name of a variable, such as 'pe1', got {name!r}")
@@ -775,11 +789,11 @@ def _unknown(dataset: xarray.Dataset, name: str, axes: list[str]) -> str:
 
 
 def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None]) -> Any:
-    """Return a DataArray along time and the dimensions of a sweep: the sum or mean over particles
-    or bonds, or the values of the `chosen` leader group, load or obstacle, in the units of the
-    variable.
+    """Return a DataArray along time and the dimensions of a sweep, in the units of the variable. It
+    is the sum or the mean over particles or bonds, or the values of the `chosen` leader group, load
+    or obstacle.
 
-    Raises ExperimentError if the result is not one number for each step.
+    Raises ExperimentError if there is not exactly one number for each step.
     """
     values = variable(dataset, name)
     if "axis" in values.dims:
@@ -803,7 +817,8 @@ def scalar(dataset: xarray.Dataset, name: str, chosen: Mapping[str, int | None])
 
 
 def in_units(values: xarray.DataArray) -> xarray.DataArray:
-    """Read the values and return them, in physical units if the variable defines the scale."""
+    """Read the values and return them. They are in physical units if the variable defines the
+    scale."""
     factor, units = in_its_units(values.attrs)
     attributes = {"long_name": values.attrs.get("long_name", str(values.name)), "units": units}
     converted = values.astype(float) * factor
@@ -824,7 +839,8 @@ def _one_of(values: xarray.DataArray, dim: str, argument: str, place: int | None
 
 
 def _over(values: xarray.DataArray, dataset: xarray.Dataset, dim: str) -> Any:
-    """Return the sum or mean over body particles or bonds, some steps at a time."""
+    """Return the sum or the mean over the particles of the body or over bonds. It is computed for
+    some steps at a time."""
     import xarray
 
     summed = values.name in SUMMED

@@ -1,7 +1,8 @@
-"""Figures with one or more panels that show a body; panels are as large as the texts permit.
+"""Figures with one or more panels that show a body. The panels are as large as the texts around
+them permit.
 
-The panels have the aspect ratio of the body, from 200 by 6 particles to 6 by 200. The figure is
-sized to fit its content: nothing is clipped, and nothing overlaps.
+The panels have the aspect ratio of the body, which may range from 200 by 6 particles to 6 by 200.
+The size of the figure depends on its content, so that nothing is clipped and nothing overlaps.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ PAGE_WIDTH_IN = 7.2
 PAGE_HEIGHT_IN = 8.0
 """Height of a page in inches."""
 SHORT_PAGE_HEIGHT_IN = 5.6
-"""Height of a page with 2 to `SHORT_PAGE_PANELS` panels, in inches."""
+"""Height, in inches, of a page with at least 2 and at most `SHORT_PAGE_PANELS` panels."""
 SHORT_PAGE_PANELS = 6
-"""Maximum number of panels on a page of that height."""
+"""Maximum number of panels on a page with the height `SHORT_PAGE_HEIGHT_IN`."""
 PANEL_AREA_IN2 = 20.0
 """Maximum area of one panel in square inches."""
 SMALLEST_PANEL_IN = 0.05
@@ -55,14 +56,14 @@ TITLE_IN = 0.26
 EDGE_IN = 0.08
 """Space at the edge of the page in inches."""
 SAME_PLACE_IN = 1e-9
-"""Difference in inches below which two places are the same: that of rounding."""
+"""Distance in inches below which two places count as the same, because it is only rounding."""
 BAR_LENGTH_IN = 3.4
 """Maximum length of a colour bar in inches."""
 BAR_WIDTH_IN = 0.14
 """Width of a colour bar in inches."""
 SIDE_BAR_HEIGHT_IN = 1.3
-"""Minimum height of the panels, in inches, for a colour bar beside them; otherwise it is below
-them."""
+"""Minimum height of the panels, in inches, for which the colour bar is beside them. Beside lower
+panels there is no room, and it is below them."""
 LABEL_LINES = 3
 """Maximum number of lines of the label of a colour bar beside the panels."""
 CHARACTERS_PER_IN = 14.5
@@ -80,7 +81,7 @@ PYPLOT = "matplotlib.pyplot"
 
 
 def new_figure(*, standalone: bool = False, **options: Any) -> Figure:
-    """Return a new figure of matplotlib, created with these options.
+    """Return a new figure of matplotlib, which is created with the given options.
 
     If pyplot is loaded, or the code runs in a notebook, pyplot manages the figure. A `standalone`
     figure is not managed; the caller shows or saves it.
@@ -90,14 +91,15 @@ def new_figure(*, standalone: bool = False, **options: Any) -> Figure:
         figure: Figure = pyplot.figure(**options)
         if hasattr(figure.canvas, "get_renderer"):
             return figure
-        pyplot.close(figure)  # The figure belongs to a backend that cannot measure text.
+        pyplot.close(figure)  # The backend of the figure cannot measure text.
     figure = Figure(**options)
     FigureCanvasAgg(figure)
     return figure
 
 
 def style_bar(bar: Any, scale: Scale) -> None:
-    """Label the ticks of a colour bar without the power of ten that is in its label."""
+    """Label the ticks of a colour bar. The power of ten, which is written in the label of the bar,
+    is omitted."""
     ten = 10.0**scale.exponent
     bar.formatter = lambda value, _: f"{value / ten + 0.0:.6g}".replace("-", "−")
     bar.update_ticks()
@@ -107,7 +109,7 @@ def style_bar(bar: Any, scale: Scale) -> None:
 
 
 def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
-    """Return the entries of a legend, a labelled dot for each class that is present."""
+    """Return the entries of a legend: a labelled dot for each class that is present."""
     return [
         handle(name, colour)
         for number, (name, colour) in reversed(palette.colours.items())
@@ -122,8 +124,8 @@ def handle(name: str, colour: str) -> Line2D:
 
 @dataclass(frozen=True)
 class Panels:
-    """The limits (left, right, bottom, top) of all panels, the longest title of each, the heading
-    of the figure, and the labels of both axes."""
+    """Texts and limits of panels: the limits (left, right, bottom, top) that all panels share, the
+    longest title of each panel, the heading of the figure, and the labels of both axes."""
 
     box: tuple[float, float, float, float]
     titles: list[str]
@@ -139,7 +141,8 @@ class Panels:
 
 @dataclass(frozen=True)
 class PanelGrid:
-    """Rows of panels: the size of each, and the distance from each to the next, in inches."""
+    """Rows of panels: the size of a panel, and the distance from one panel to the next, in
+    inches."""
 
     columns: int
     rows: int
@@ -155,7 +158,8 @@ class PanelGrid:
 
 
 class Page:
-    """A new figure with its axes, arranged again when its colour bar and legend are known.
+    """A new figure with its axes. It is arranged again when its colour bar and its legend are
+    known.
 
     `size` is the size of the figure in inches; if it is None, the figure is as large as its content
     requires. A `standalone` figure is not managed by pyplot.
@@ -170,10 +174,11 @@ class Page:
         self._labels = [self.figure.text(0, 0, text, fontsize=TEXT_PT) for text in panels.labels]
         self._heading = self.figure.text(0, 0, "", fontsize=HEADING_PT, ha="center", va="bottom")
         self._before, self._after = np.array((0.6, 0.5)), np.array((0.1, 0.4))
-        """Space between the panels and the edges of the figure: left and below; right and above."""
+        """Space between the panels and the edges of the figure: `_before` to the left and below,
+        `_after` to the right and above."""
         self._around, self._overhang = self._before + self._after, 0.1
-        """Space around the panels of a page, and length by which tick labels exceed a panel, in
-        inches."""
+        """Space around the panels of a page (`_around`), and length by which tick labels extend
+        beyond a panel (`_overhang`), in inches."""
         self._grid = self._best_grid(1.0)
 
     def _panel(self, title: str) -> Axes:
@@ -191,15 +196,17 @@ class Page:
         handles: list[Line2D] | None = None,
         larger: float = 1.0,
     ) -> None:
-        """Arrange the figure, with the colour bar of a scale and a legend.
+        """Arrange the figure with the colour bar of a scale and with a legend.
 
-        A figure without a given size is at most `larger` times as large as the page of a journal.
-        Raises ExperimentError if a given size leaves no room for the panels.
+        If no size is given, the figure is at most `larger` times as large as the page of a journal.
+        Raises ExperimentError if a given size is too small for the panels.
         """
         bar = self._bar(scale, text) if scale else None
         legend = self._legend(handles) if handles else None
         self._place(bar, legend, larger)
-        for _ in range(3):  # The space around the panels and their size depend on each other.
+        # The size of the panels depends on the space around them, and this space on the size of the
+        # panels.
+        for _ in range(3):
             before = self._space()
             self._measure(bar)
             if np.allclose(self._space(), before, rtol=0.0, atol=SAME_PLACE_IN):
@@ -207,13 +214,13 @@ class Page:
             self._place(bar, legend, larger)
 
     def _place(self, bar: Any, legend: Legend | None, larger: float) -> None:
-        """Place panels, texts, colour bar and legend with the present space around the panels."""
+        """Place panels, texts, colour bar and legend, given the current space around the panels."""
         self._grid = self._best_grid(larger)
         self._place_panels()
         self._place_keys(bar, legend)
 
     def _space(self) -> tuple[float, ...]:
-        """Return all measured lengths that the placement depends on."""
+        """Return all measured lengths on which the placement depends."""
         return (*self._before, *self._after, *self._around, self._overhang)
 
     def _best_grid(self, larger: float) -> PanelGrid:
@@ -263,8 +270,9 @@ class Page:
     def _place_texts(self, page: Any) -> None:
         block, y = self._block, self._panels.labels[1]
         middle = block.get_points().mean(axis=0)
-        # A panel with its ticks and the height of its title; the width of a title is not included.
-        # It is measured here only, as the ticks of many panels take the most time of a layout.
+        # The measured box contains the panel, its ticks and the height of its title, but not the
+        # width of the title. One panel is measured for all, because measuring the ticks of many
+        # panels would take most of the time of a layout.
         ticks = self._narrow = self._drawn(self.axes, for_layout_only=True)
         upright = block.height + 0.3 >= len(y) / CHARACTERS_PER_IN
         across, up = self._labels
@@ -285,7 +293,8 @@ class Page:
             artist.set_text(text)
 
     def _bar(self, scale: Scale, text: str) -> Any:
-        """Return the colour bar; it stands beside panels that are tall enough for its label."""
+        """Return the colour bar. It is placed beside the panels if they are tall enough for its
+        label."""
         width, height = self._grid.size
         broad = int(min(height, BAR_LENGTH_IN) * CHARACTERS_PER_IN)
         lines = textwrap.wrap(text, max(1, broad), break_long_words=False)
@@ -317,7 +326,8 @@ class Page:
         return legend
 
     def _place_keys(self, bar: Any, legend: Legend | None) -> None:
-        """Place the colour bar beside or below the panels, and the legend below all."""
+        """Place the colour bar beside or below the panels, and the legend below them and the colour
+        bar."""
         block, page = self._block, self.figure.get_size_inches()
         middle = block.get_points().mean(axis=0)
         low = min(self._narrow.y0, self._drawn([self._labels[0]]).y0) - 0.08
@@ -361,8 +371,8 @@ class Page:
 
 
 def _locator(low: float, high: float, length: float, distance: float) -> Locator:
-    """Return a locator that places ticks at a minimum distance in inches, or one tick on a short
-    axis."""
+    """Return a locator that places ticks with a minimum distance, in inches. On a short axis it
+    places one tick."""
     if length < SHORT_AXIS_IN:
         return FixedLocator([0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.1g}")])
     return MaxNLocator(max(1, int(length / distance)), steps=[1, 2, 5, 10])

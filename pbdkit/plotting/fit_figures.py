@@ -28,16 +28,17 @@ CURVE_IN = 2.5
 CURVES = 3
 """Number of panels in a row of curves."""
 WITHIN = 3.0
-"""Limit of the colours of residuals, in multiples of the noise."""
+"""Limit of the colour scale of residuals, in multiples of the noise."""
 
 
 def draw_fit(fitted: Fitted) -> Figure:
     """Draw each measurement of a fit.
 
-    A field has panels of ux and uy, measured and fitted, of the residual over the noise, and of the
-    sensitivity to each parameter; beside each other for wide bodies, and below each other
-    otherwise. Tracks and curves have the measured and fitted values, residual and sensitivity along
-    time or displacement. Raises ExperimentError if matplotlib is missing.
+    A field has panels with the measured and the fitted ux and uy, with the residual divided by the
+    noise, and with the sensitivity to each parameter. For wide bodies the panels are beside each
+    other, otherwise below each other. For tracks and curves, the measured and the fitted values,
+    the residual and the sensitivity are drawn over time or displacement. Raises ExperimentError if
+    matplotlib is missing.
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.figure_layout import new_figure
@@ -139,8 +140,9 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
 
 
 def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
-    """Return the factor of the values of tracks or a curve, the abscissa, and the labels of values
-    and abscissa, in the units of the experiment if it has units."""
+    """Return, for tracks or a curve, the factor by which values are multiplied, the abscissa, and
+    the labels of the values and of the abscissa. They are in the units of the experiment if it has
+    units."""
     numbers, observed = fitted.numbers(n), fitted.misfits[n]
     units = fitted.problem.observations[n].experiment.units
     if units is None:
@@ -152,7 +154,8 @@ def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
 
 
 def _line(joined: bool) -> dict[str, Any]:
-    """Return the style of a fitted curve; tracks of many points at one time are not joined."""
+    """Return the style of a fitted curve. Tracks of many points at the same time are not joined by
+    lines."""
     return (
         {"color": "C0", "linewidth": 1.2}
         if joined

@@ -26,21 +26,21 @@ if TYPE_CHECKING:
 SAMPLES = 2_000_000
 """Maximum number of samples that are evaluated at a time."""
 MAX_PIXELS = 60_000_000
-"""Maximum total number of samples. A body that is folded over itself many times has fewer samples
-than pixels."""
+"""Maximum total number of samples. Because of it, a body that is folded over itself many times may
+have fewer samples than pixels."""
 
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """Pixels of a picture: its `box` (left, right, bottom, top), and the numbers of pixels `across`
-    and `up`."""
+    """Pixels of a picture. `box` is the part of the plane that it shows (left, right, bottom, top);
+    `across` and `up` are the numbers of pixels."""
 
     box: tuple[float, float, float, float]
     across: int
     up: int
 
     def places(self, position: Array) -> Array:
-        """Return positions, (..., 2), in pixels from the lower left corner."""
+        """Convert positions, (..., 2), to pixels, counted from the lower left corner."""
         xmin, xmax, ymin, ymax = self.box
         scale = np.array([self.across / (xmax - xmin), self.up / (ymax - ymin)], np.float32)
         return np.asarray((position - np.array([xmin, ymin])).astype(np.float32) * scale)
@@ -48,9 +48,9 @@ class PixelGrid:
     def mean(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
         """Return the values at the pixels, (up, across), interpolated from `values` at the corners
         of cells, (cell, 4). `corners` are the positions of the corners in pixels, (cell, 4, 2). The
-        result is NaN outside all cells and in parts that are `cut` off, and the mean where cells
-        overlap. Samples are at most the width of a pixel apart, so that no pixel within a cell is
-        missed."""
+        result is NaN at pixels outside all cells and in parts of cells that are `cut` off. If cells
+        overlap, it is the mean. The distance of samples is at most the width of a pixel, so that no
+        pixel within a cell is missed."""
         sums, counts = np.zeros(self.across * self.up), np.zeros(self.across * self.up)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
@@ -64,9 +64,9 @@ class PixelGrid:
             return (sums / counts).reshape(self.up, self.across)
 
     def latest(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
-        """Return the values at the pixels like `mean`, for values that cannot be averaged: each
-        sample has the value of the nearest corner, and each pixel the largest value of its
-        samples."""
+        """Return the values at the pixels. The arguments are the same as those of `mean`, but the
+        values cannot be averaged. Each sample has the value of the nearest corner, and each pixel
+        the largest value of its samples."""
         largest = np.full(self.across * self.up, -np.inf)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
@@ -79,8 +79,8 @@ class PixelGrid:
         return largest.reshape(self.up, self.across)
 
     def _pixels(self, corners: Array, weights: Array, mask: Array | None) -> tuple[Array, Array]:
-        """Return the pixel of each sample and the indices of the samples within the picture and
-        `mask`."""
+        """Return the indices of the samples that lie within the picture and for which `mask` is
+        true, and the pixels of these samples."""
         x, y = ((corners[..., axis] @ weights.T).ravel() for axis in (0, 1))
         within_box = (x >= 0) & (x < self.across) & (y >= 0) & (y < self.up)
         inside = np.flatnonzero(within_box if mask is None else within_box & mask)
@@ -90,15 +90,15 @@ class PixelGrid:
 @dataclass(frozen=True)
 class OutlineCut:
     """The parts of cells that an outline cuts off. `row`, (cell,), is the row of each cell in the
-    table of cut `cells`, or -1 if the cell is not cut."""
+    table of cut `cells`, and -1 if the cell is not cut."""
 
     cells: CutCells
     row: Array
 
 
 def _within_outline(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
-    """Return a mask over the samples of some cells, (cell and sample,), false where the outline
-    cuts a sample off; None if all are kept."""
+    """Return a mask over the samples of some cells, (cell and sample,), which is false for samples
+    that the outline cuts off. Return None if no sample is cut off."""
     rows = cut.row[cells] if cut else np.empty(0, int)
     cut_cells = np.flatnonzero(rows >= 0)
     if cut is None or not len(cut_cells):
@@ -116,15 +116,16 @@ def _weights(middles: Array) -> Array:
 
 
 def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
-    """Generate groups of cells with the same number of samples: the rows of the cells, and the
-    relative positions of the samples along both sides of a cell, from 0 to 1."""
+    """Generate groups of cells with the same number of samples. A group consists of the rows of the
+    cells, and of the relative positions of the samples, from 0 to 1, along both sides of a cell."""
     a, b, c, d = (corners[:, k] for k in range(4))
     along = np.maximum(abs(b - a), abs(c - d)), np.maximum(abs(d - a), abs(c - b))
-    # The sum of the distances between samples along both sides is at most a pixel, so that no pixel
-    # is missed.
+    # The distance between samples along one side plus that along the other side is at most a pixel,
+    # so that no pixel is missed.
     finest = np.maximum(np.ceil(np.maximum(*(along[0] + along[1]).T)), 1.0)
     finest = np.maximum(finest * min(1.0, math.sqrt(MAX_PIXELS / max(1.0, (finest**2).sum()))), 1.0)
-    # The numbers are rounded up to powers of √2, which gives few groups and not many more samples.
+    # The numbers are rounded up to powers of √2. There are then few groups, and not many more
+    # samples.
     levels = np.ceil(2 * np.log2(finest) - 1e-6).astype(int)
     for level in np.unique(levels):
         count = math.ceil(2 ** (level / 2))
@@ -146,7 +147,8 @@ REST = "#888888"
 
 
 class Layer(ABC):
-    """Something drawn into axes. `artists` are those that change from step to step."""
+    """Part of a picture that is drawn into axes. `artists` are the artists that change from step to
+    step."""
 
     artists: list[Artist]
 
@@ -156,12 +158,12 @@ class Layer(ABC):
 
 
 class PixelField(Layer):
-    """A quantity of particles, drawn as pixels over the cells without a broken bond, up to the
-    outline.
+    """A quantity of particles. It is drawn as pixels on the cells that have no broken bond, up to
+    the outline.
 
-    Particles outside these cells are drawn as dots of a size in points, or as single pixels if dots
-    would be invisible. A corner outside the outline that has no value receives the mean of the
-    cells that meet there.
+    Particles outside these cells are drawn as dots with a size in points, or as single pixels if
+    dots would be invisible. A corner outside the outline may have no value; it receives the mean
+    over the cells that meet at it.
     """
 
     def __init__(
@@ -190,7 +192,7 @@ class PixelField(Layer):
 
 
 class BondField(Layer):
-    """A quantity of bonds, drawn as pixels where there are too many bonds for lines."""
+    """A quantity of bonds. It is drawn as pixels if there are too many bonds for lines."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale) -> None:
         self._body, self._grid, self._image = body, grid, _image(ax, grid, scale)
@@ -206,7 +208,7 @@ class BondField(Layer):
 
 
 class Classes(Layer):
-    """Classes of particles, drawn as pixels where there are too many particles for dots."""
+    """Classes of particles. They are drawn as pixels if there are too many particles for dots."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, grid: PixelGrid, palette: Palette) -> None:
         self._body, self._grid, self._palette = body, grid, palette
@@ -219,8 +221,8 @@ class Classes(Layer):
         self.artists = [self._image]
 
     def show(self, snapshot: Snapshot) -> None:
-        """Show the class of the nearest particle in each pixel, or the topmost of several
-        classes."""
+        """Show in each pixel the class of the nearest particle or, if there are several classes,
+        the topmost one."""
         body, ranks = self._body, self._palette.ranks(snapshot)
         chosen, has_class = (
             body.whole_cells(body.cells_with_frame, snapshot.broken),
@@ -229,15 +231,16 @@ class Classes(Layer):
         chosen = chosen[has_class[body.cells_with_frame[chosen]].all(axis=1)]
         alone = _alone(body.cells_with_frame[chosen], has_class & ~body.outside)
         cells = _with(body.cells_with_frame[chosen], alone)
-        # If cells are cut, the picture contains the body alone, so that the cells with frame points
-        # are the same as those without.
+        # If cells are cut, the picture contains only the body. Then there are no cells with frame
+        # points.
         cut = _cut(body, chosen, len(alone)) if body.inside.all() else None
         corners = self._grid.places(snapshot.position)[cells]
         self._image.set_data(self._grid.latest(corners, ranks[cells], cut))
 
 
 class Dots(Layer):
-    """A dot for each particle, in the colour of its value or class; none for `hidden` ones."""
+    """A dot for each particle, with the colour of its value or class. Particles that are `hidden`
+    have no dot."""
 
     def __init__(self, ax: Axes, size: float, colours: Scale | Palette, hidden: Array) -> None:
         self._colours, self._hidden = colours, hidden
@@ -248,8 +251,8 @@ class Dots(Layer):
         self.artists = [self._dots]
 
     def show(self, snapshot: Snapshot) -> None:
-        """Draw the dots in the order of their classes; leaders cover followers, and followers the
-        frame."""
+        """Draw the dots in the order of their classes, so that leaders cover followers, and
+        followers cover the frame."""
         palette = self._colours if isinstance(self._colours, Palette) else OF_KINDS
         ranks = palette.ranks(snapshot)
         order = np.argsort(ranks, kind="stable")
@@ -264,7 +267,7 @@ class Dots(Layer):
 
 
 class BondLines(Layer):
-    """Lines of intact bonds or, with `broken`, of broken ones."""
+    """Lines of intact bonds or, with `broken`, of broken bonds."""
 
     def __init__(
         self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False
@@ -284,7 +287,7 @@ class BondLines(Layer):
 
 
 class BondValues(Layer):
-    """A quantity of bonds, as the colours of lines; bonds without a value are not drawn."""
+    """A quantity of bonds, shown by the colours of lines. Bonds without a value are not drawn."""
 
     def __init__(self, ax: Axes, body: ReferenceBody, width: float, scale: Scale) -> None:
         self._body = body
@@ -303,14 +306,14 @@ class BondValues(Layer):
 
 
 def draw_outline(ax: Axes, sides: Array) -> None:
-    """Draw static segments, (side, end, axis)."""
+    """Draw segments, (side, end, axis), that do not change from step to step."""
     lines = LineCollection(list(sides), colors=REST, linewidths=0.7, zorder=2.5)
     ax.add_collection(lines, autolim=False)
 
 
 def draw_numbers(ax: Axes, numbers: Array, snapshot: Snapshot, size: float) -> None:
-    """Write the numbers of particles to the upper right of dots of a size in points, except where
-    they would overlap."""
+    """Write the numbers of particles to the upper right of their dots, which have a size in points.
+    Numbers that would overlap are omitted."""
     places, font = ax.transData.transform(snapshot.position), 6.0
     point = figure_of(ax).dpi / 72
     occupied: set[tuple[int, int]] = set()
@@ -338,9 +341,9 @@ def _image(ax: Axes, grid: PixelGrid, scale: Scale) -> AxesImage:
 
 
 def _filled(values: Array, cells: Array, outside: Array) -> Array:
-    """Return the values after replacement of missing ones at particles `outside` the outline. Such
-    a particle receives the mean over the cells that meet there, where the value of a cell is the
-    mean of its finite corners."""
+    """Return the values, in which missing values at particles `outside` the outline are replaced.
+    Such a particle receives the mean over the cells that meet at it; the value of a cell is the
+    mean over its corners with finite values."""
     finite = np.isfinite(values)
     mixed = cells[(outside & ~finite)[cells].any(axis=1) & finite[cells].any(axis=1)]
     means = np.nanmean(values[mixed], axis=1)
@@ -352,15 +355,15 @@ def _filled(values: Array, cells: Array, outside: Array) -> Array:
 
 
 def _cut(body: ReferenceBody, chosen: Array, alone: int) -> OutlineCut | None:
-    """Return the parts that the outline cuts off a list of cells: the chosen cells, followed by as
-    many uncut cells as `alone` states."""
+    """Return the parts that the outline cuts off from a list of cells. The list contains the
+    `chosen` cells, followed by `alone` cells that are not cut."""
     if body.cut is None:
         return None
     return OutlineCut(body.cut, np.append(body.cut.row[chosen], np.full(alone, -1)))
 
 
 def _alone(cells: Array, chosen: Array) -> Array:
-    """Return the rows of the chosen particles that are in none of the cells."""
+    """Return the rows of those chosen particles that belong to none of the cells."""
     alone = chosen.copy()
     alone[cells] = False
     return np.flatnonzero(alone)

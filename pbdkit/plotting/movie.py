@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Show = Callable[[str, float], None]
 Frame = NDArray[np.uint8]
-"""Pixels, (row, column, red green blue)."""
+"""Pixels, (row, column, colour), with the colours red, green and blue."""
 FORMATS = (".mp4", ".gif")
 """File name extensions of movies."""
 WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
@@ -52,7 +52,7 @@ FASTEST_GIF = 50
 FINER = 0.6
 """Number of pixels of a field per pixel of the movie, along each axis; fields are interpolated."""
 NEARLY_WHITE = 240
-"""Brightness from which a colour of a palette counts as white."""
+"""Brightness above which a colour of a palette counts as white."""
 FRAMES = 60
 """Maximum number of steps in an animation for notebooks."""
 
@@ -250,8 +250,8 @@ def animation(
 
 
 def refuse_no_movie(path: Path) -> None:
-    """Raise ExperimentError if the suffix is not that of a movie, or its writer is not installed,
-    and StorageError if the folder does not exist."""
+    """Raise ExperimentError if the suffix is not the suffix of a movie, or if the library that
+    writes such movies is not installed. Raise StorageError if the folder does not exist."""
     if path.suffix not in FORMATS:
         raise ExperimentError(f"{path}: the name of a movie must end in {' or '.join(FORMATS)}")
     writer = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
@@ -300,7 +300,7 @@ class MovieFigure:
         return [*self._panel.artists, self._heading]
 
     def frames(self, rows: Sequence[int], show: Show = silent) -> Iterator[Frame]:
-        """Generate the pixels of each step; the numbers of pixels across and up are even."""
+        """Generate the pixels of each step. The numbers of rows and of columns are even."""
         figure = self.sheet.figure
         pixels = np.ceil(figure.get_size_inches() * figure.dpi / 2 - 1e-9) * 2
         figure.set_size_inches(*(pixels / figure.dpi))
@@ -328,7 +328,8 @@ def _with_progress(
 
 
 def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
-    """Encode the frames by ffmpeg in a separate process, into a file that all players support."""
+    """Encode the frames with ffmpeg, in a separate process. All players support the format of the
+    file."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     first = next(frames)
@@ -344,7 +345,7 @@ def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
                 with suppress(BrokenPipeError), ffmpeg.stdin as pipe:
                     for frame in chain([first], frames):
                         pipe.write(frame.tobytes())
-            # After an interrupt `with` would not wait for the end of the process.
+            # After an interrupt, `with` alone would not wait for the end of the process.
             except BaseException:
                 ffmpeg.kill()
                 ffmpeg.wait()
@@ -356,15 +357,15 @@ def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
 
 
 def _write_gif(file: NewFile, few: Frame, frames: Iterator[Frame], fps: float) -> None:
-    """Write the frames with one palette, so that static parts do not flicker. The palette is
-    determined from `few`, a picture of several frames."""
+    """Write the frames with one palette, so that parts that do not change do not flicker. The
+    palette is determined from `few`, a picture that contains several frames."""
     from PIL import Image
 
     palette = Image.fromarray(few).quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
     colours = np.reshape(palette.getpalette() or [], (-1, 3))
-    colours[colours.min(axis=1) > NEARLY_WHITE] = 255  # The page remains white.
+    colours[colours.min(axis=1) > NEARLY_WHITE] = 255  # The background remains white.
     palette.putpalette(colours.astype(np.uint8).tobytes())
-    target: Any = file  # Pillow needs no further methods of the file.
+    target: Any = file  # Pillow needs no other methods of the file.
     drawn = (Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames)
     next(drawn).save(
         target, "GIF", save_all=True, append_images=drawn, duration=round(1000 / fps), loop=0,

@@ -1,4 +1,5 @@
-"""HTML representations of experiments, analyses and identities for notebooks, without scripts."""
+"""HTML representations of experiments, analyses and identities for notebooks. They contain no
+scripts."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ TableRows = Iterable[tuple[str, str]]
 
 
 def experiment_html(experiment: Experiment) -> str:
-    """Return a picture of the scene and, if they are computed fast, the results of `pbdkit
-    check`."""
+    """Return a picture of the scene. If the results of `pbdkit check` can be computed quickly, they
+    are added."""
     try:
         scene = build_scene(experiment)
     except PbdkitError as error:

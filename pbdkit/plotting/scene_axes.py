@@ -23,8 +23,8 @@ POINTS = 0.75
 
 
 class AxesCanvas:
-    """Axes as a canvas, with constant limits and coordinates in `unit` per lattice unit. Shapes are
-    drawn in the order in which they are added."""
+    """Axes as a canvas with constant limits. A lattice unit has the length `unit` in the
+    coordinates of the axes. Shapes are drawn in the order in which they are added."""
 
     def __init__(self, ax: Axes, unit: float) -> None:
         self._ax, self._unit, self._order = ax, unit, 1
@@ -48,13 +48,14 @@ class AxesCanvas:
         self._plot(places, color=colour, ms=POINTS * size, alpha=opacity, **style)
 
     def line(self, places: Floats, colour: str, width: float, dashes: str = "") -> None:
-        """Draw a polyline; `dashes` as in SVG."""
+        """Draw a polyline. `dashes` has the same form as in SVG."""
         lengths = [float(part) / width for part in dashes.split()]
         style: Any = (0.0, lengths) if lengths else "-"
         self._plot(places, color=colour, lw=POINTS * width, ls=style)
 
     def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
-        """Fill the area between closed outlines: an inner one is a hole."""
+        """Fill the area between closed outlines. An outline inside another one is the edge of a
+        hole."""
         turned = [line[:: 1 if n == 0 else -1] for n, line in enumerate(outlines)]
         path = Path.make_compound_path(
             *(Path(self._unit * o, closed=False) for o in map(_closed, turned))
@@ -62,7 +63,7 @@ class AxesCanvas:
         self._ax.add_patch(PathPatch(path, fc=fill, ec=edge, lw=POINTS, zorder=self._next))
 
     def arrow(self, tail: Floats, vector: Floats, colour: str) -> None:
-        """Draw an arrow from a place, by a vector in pixels, y up."""
+        """Draw an arrow that starts at a place. `vector` is in pixels, with y upward."""
         if not np.any(vector):
             return
         tip = self._unit * (np.asarray(tail) + np.asarray(vector) / self.scale)

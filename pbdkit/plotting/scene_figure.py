@@ -1,6 +1,6 @@
 """Pictures of a scene before it runs: the body, its supports, loads, obstacles, cracks and cuts.
 
-Shapes are drawn on a canvas: the SVG of a notebook, or axes of matplotlib.
+Shapes are drawn on a canvas, which is the SVG picture of a notebook or axes of matplotlib.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from pbdkit.scene.scene import Scene
 from pbdkit.scene.selection import spacing
 
 HEAD = 7.0
-"""Length of an arrow's head in pixels."""
+"""Length of the head of an arrow in pixels."""
 
 
 class Svg:
     """SVG picture of the region from the corner `low` to the corner `high`, with a `margin` around
-    it, of a size within `limits`. Margin and limits are in pixels.
+    it. The width and the height are at most `limits`. Margin and limits are in pixels.
 
     The whole picture extends from `self.low` to `self.high`, with y upward. Shapes are drawn in the
     order in which they are added.
@@ -59,7 +59,8 @@ class Svg:
         square: bool = False,
         opacity: float = 1.0,
     ) -> None:
-        """Draw dots of one size in pixels, as one path: many elements would be slow."""
+        """Draw dots of one size, in pixels. They are drawn as one path, because many elements would
+        be slow."""
         path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in self.at(places))
         cap = "square" if square else "round"
         style = f'stroke="{colour}" stroke-width="{size:.2f}" stroke-linecap="{cap}"'
@@ -111,8 +112,8 @@ class Svg:
 
 
 def extreme(motion: Motion, reference: Floats, steps: int) -> Floats:
-    """Return the largest displacement of a motion, (particle or 1, axis), among the moments at
-    which it changes; for a rotation that of its first step."""
+    """Return the largest displacement of a motion, (particle or 1, axis), at the steps at which the
+    motion changes. For a rotation, return the displacement in its first step."""
     if isinstance(motion, Rotation):
         return np.atleast_2d(motion.offset(1, reference))
     if isinstance(motion, Oscillation):
@@ -131,7 +132,8 @@ def greatest(force: Any) -> float:
 
 
 def force_of(load: Load) -> Floats:
-    """Return the largest force of a load, (axis,), in total or per unit of area."""
+    """Return the largest force of a load, (axis,). It is the total force, or the force per unit of
+    area."""
     return np.array([greatest(f) for f in load.force or load.body_force or ()])
 
 
@@ -166,11 +168,11 @@ DRIVEN = "#404040"
 TINTS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
 """Colours of the regions of a body."""
 DOTS = 3000
-"""Maximum number of particles for which all are drawn."""
+"""Maximum number of particles of a body for which all particles are drawn."""
 TINTED = 1500
-"""Maximum number of dots of a region."""
+"""Maximum number of dots that are drawn in a region."""
 ARROWS = 5
-"""Maximum number of arrows of a group."""
+"""Maximum number of arrows that are drawn for a group."""
 BEYOND = 0.35
 """Margin for obstacles, relative to the size of the body."""
 Rows = NDArray[np.intp]
@@ -181,9 +183,9 @@ SceneLegend = tuple[tuple[str, str], ...]
 
 
 class Canvas(Protocol):
-    """Surface on which a scene is drawn. Places are in lattice units; sizes and widths are in
-    pixels, `scale` of which are a lattice unit. The picture extends from the corner `low` to
-    `high`."""
+    """Surface on which a scene is drawn. Places are in lattice units. Sizes and widths are in
+    pixels; `scale` is the number of pixels in a lattice unit. The picture extends from the corner
+    `low` to the corner `high`."""
 
     scale: float
     low: Floats
@@ -206,14 +208,14 @@ class Canvas(Protocol):
 
 @dataclass(frozen=True)
 class Picture:
-    """SVG element and the meanings of its colours: (colour, text)."""
+    """SVG element, and the meanings of its colours as pairs (colour, text)."""
 
     svg: str
     legend: SceneLegend
 
 
 def picture_of(scene: Scene) -> Picture | None:
-    """Return the picture of a scene in a plane as SVG; None in space."""
+    """Return the picture of a scene in the plane as SVG. Return None for a scene in space."""
     if scene.axes != 2:
         return None
     svg = Svg(*corners(scene), WITHIN, MARGIN)
@@ -222,8 +224,8 @@ def picture_of(scene: Scene) -> Picture | None:
 
 
 def draw_scene(scene: Scene, canvas: Canvas) -> SceneLegend:
-    """Draw a scene in a plane, and return the meanings of its colours. The lengths of arrows show
-    the ratios of displacements or forces to each other, not to the size of the body."""
+    """Draw a scene in the plane, and return the meanings of its colours. The lengths of arrows are
+    proportional to displacements or forces, but have no relation to the size of the body."""
     drawing = _Drawing(scene, canvas)
     drawing.draw()
     return tuple(drawing.legend)
@@ -240,14 +242,14 @@ def _is_small(scene: Scene) -> bool:
 
 
 def _shown(scene: Scene) -> Floats:
-    """Return the particles to draw: body and frame if the body is small, otherwise the body
-    alone."""
+    """Return the particles to draw. These are body and frame if the body is small, otherwise only
+    the body."""
     X = scene.raster.reference()
     return X if _is_small(scene) else X[scene.raster.table_kind == FOLLOWER]
 
 
 class _Drawing:
-    """State of the drawing of one picture."""
+    """State while one picture is drawn."""
 
     def __init__(self, scene: Scene, canvas: Canvas) -> None:
         self.scene, self.canvas, self.legend = scene, canvas, list[tuple[str, str]]()
@@ -355,8 +357,8 @@ class _Drawing:
             self._note(ACTS, "body force" if loading.load.body_force else "force")
 
     def _arrows(self, at: Floats, vectors: Floats, longest: float, colour: str) -> None:
-        """Draw arrows at some of the places. An arrow starts at its place or, if it would then
-        point into the body, ends there."""
+        """Draw arrows at some of the places. An arrow starts at its place. If it would then point
+        into the body, it ends at its place instead."""
         extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
         count = min(max(int(extent / APART), 1), ARROWS)
         ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])
@@ -369,7 +371,8 @@ class _Drawing:
 
 
 def _pixels(vector: Floats, longest: float) -> Floats:
-    """Return the arrow of a displacement, the longest being ARROW pixels long; zero for none."""
+    """Return the vector of an arrow for a displacement, in pixels. The longest arrow has ARROW
+    pixels. Without displacement the result is zero."""
     length = float(np.hypot(*vector))
     if length <= 1e-12 * longest or longest == 0.0:
         return np.zeros(2)
@@ -377,7 +380,8 @@ def _pixels(vector: Floats, longest: float) -> Floats:
 
 
 def edge_of(raster: Raster) -> Rows:
-    """Return the rows of the body's particles without all four neighbours in their sublattice."""
+    """Return the rows of those particles of the body that do not have all four neighbours in their
+    sublattice."""
     places = []
     for kinds in raster.kind == FOLLOWER:
         around = np.pad(kinds, 1)
@@ -391,7 +395,7 @@ def edge_of(raster: Raster) -> Rows:
 def _with_obstacles(
     barriers: Iterable[Barrier], low: Floats, high: Floats
 ) -> tuple[Floats, Floats]:
-    """Extend the corners of the picture to nearby obstacles."""
+    """Extend the corners of the picture so that nearby obstacles are included."""
     room = BEYOND * float((high - low).max())
     for barrier in barriers:
         box = barrier.start.box
@@ -401,7 +405,7 @@ def _with_obstacles(
 
 
 def _outlines(outline: Outline, low: Floats, high: Floats) -> list[Floats]:
-    """Return closed outlines of an obstacle; a half-plane is cropped at the picture."""
+    """Return closed outlines of an obstacle. A half-plane is cropped at the edge of the picture."""
     if outline.kind == HALF_PLANE:
         point, normal = outline.points[0], outline.points[1] - outline.points[0]
         along, far = np.array([-normal[1], normal[0]]), 2.0 * float(np.hypot(*(high - low)))

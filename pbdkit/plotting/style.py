@@ -1,4 +1,4 @@
-"""Figures, labels and options common to all pictures."""
+"""Figures, labels and options that all pictures have in common."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def figure_of(ax: Axes) -> Figure:
 
 
 def renderer_of(figure: Figure) -> RendererBase:
-    """Return the renderer, which measures text; figures made here use Agg."""
+    """Return the renderer of a figure, which measures text. Figures that pbdkit creates use Agg."""
     canvas: Any = figure.canvas
     renderer: RendererBase = canvas.get_renderer()
     return renderer
@@ -55,8 +55,8 @@ def signed(units: str) -> str:
 
 
 def in_its_units(attributes: Mapping[Any, Any]) -> tuple[float, str]:
-    """Return the factor that converts a variable to its physical units, and those units, if its
-    attributes define them; otherwise 1 and its own units."""
+    """Return the factor that converts a variable to its physical units, and these units. If the
+    attributes of the variable do not define them, return 1 and the units of the variable."""
     if UNITS in attributes and FACTOR in attributes:
         return float(attributes[FACTOR]), str(attributes[UNITS])
     return 1.0, str(attributes.get("units", ""))
@@ -65,8 +65,9 @@ def in_its_units(attributes: Mapping[Any, Any]) -> tuple[float, str]:
 def label(
     meaning: object, units: object = "", exponent: int = 0, *, width: int | None = None
 ) -> str:
-    """Return the label of an axis: quantity and units, with a power of ten for its tick labels.
-    With a `width` in characters it is wrapped, with the units on a separate line if necessary."""
+    """Return the label of an axis. It contains the quantity, its units, and the power of ten by
+    which the tick labels have to be multiplied. With a `width` in characters the label is wrapped;
+    if necessary, the units are on a separate line."""
     text, unit_text = plain(meaning), signed(plain(units))
     ten = f"10{str(exponent).translate(RAISED)}" if exponent else ""
     unit_text = " ".join(filter(None, (ten, unit_text)))
@@ -78,7 +79,7 @@ def label(
 
 
 def _even(text: str, width: int) -> str:
-    """Wrap a text into as few lines as possible, of about the same length."""
+    """Wrap a text into as few lines as possible. The lines have about the same length."""
     lines = len(textwrap.wrap(text, width))
     every = (textwrap.wrap(text, length) for length in range(1, width + 1))
     return "\n".join(next((wrapped for wrapped in every if len(wrapped) == lines), []))
@@ -94,7 +95,8 @@ LARGEST_DPI = 2400
 
 @dataclass(frozen=True)
 class PlotOptions:
-    """Options of `plot`, `compare` and `animate`, with the same names.
+    """Options of `plot`, `compare` and `animate`. They have the same names as the arguments of
+    these functions.
 
     Raises ExperimentError for values that are not possible.
     """
