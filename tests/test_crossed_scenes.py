@@ -17,11 +17,20 @@ from scene_laws import LAWS, run
 import pbdkit
 
 SCENES = tuple(covering())
-CASES = [
-    (n, law) for n in range(len(SCENES)) for m, law in enumerate(LAWS) if (n // 4 + m) % 2 == 0
-]
-"""Half of the laws are tried on each scene, in turn; `reliability/scene_laws_at_length.py` tries
-all."""
+
+
+def first_meetings(scenes, cases):
+    """Return further cases, such that each law is tried on each feature."""
+    tried = {(feature, law) for n, law in cases for feature in scenes[n]}
+    missing = {(feature, law) for feature in FEATURES for law in LAWS} - tried
+    first = {f: next(n for n, features in enumerate(scenes) if f in features) for f in FEATURES}
+    return {(first[feature], law) for feature, law in missing}
+
+
+IN_TURN = {(n, law) for n in range(len(SCENES)) for m, law in enumerate(LAWS) if (n + m) % 4 == 0}
+CASES = sorted(IN_TURN | first_meetings(SCENES, IN_TURN))
+"""A quarter of the laws is tried on each scene, in turn, and each law on each feature;
+`reliability/scene_laws_at_length.py` tries all."""
 REFUSED = sorted(tuple(sorted(pair)) for pair in PAIRS if refusal_of(pair))
 
 

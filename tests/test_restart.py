@@ -129,7 +129,7 @@ def test_run_in_parts_equals_the_whole_run(
     whole, parts = tmp_path / "whole.nc", tmp_path / "parts.nc"
     record(Simulation.of_scene(scene_of(given)), NetcdfSink(whole))
     random = np.random.default_rng(len(change))
-    looks = (int(random.integers(0, 2 + n)) for n in count())
+    looks = (int(random.integers(0, 2 + 4 * n)) for n in count())
     assert run_in_parts(given, parts, looks) > 0
     assert_same(whole, parts)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["parts.nc", "whole.nc"]
