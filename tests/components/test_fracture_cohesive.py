@@ -93,10 +93,12 @@ def strain_of_uniaxial(rule, normal):
 
 
 LATTICES = {
-    "square": (0, 90, 45, 135),
+    "square": (0, 45),
     "rectangular": (0, 90),
-    "hexagonal": (30, 90, 150),
+    "hexagonal": (30, 90),
 }
+"""Directions of the strain in degrees; `test_law_is_invariant_under_rotation_and_reflection` is
+about the others."""
 RULES = {
     "springs": SPRINGS,
     "elastic": ELASTIC,
@@ -118,7 +120,7 @@ def test_cell_has_onset_strength_and_fracture_energy(lattice, rule):
     at onset times the modulus along its normal, and its work on the band is energy · E."""
     onset, energy = 1e-3, 6e-6
     fracture = {"type": "cohesive", "energy": energy, "onset": onset}
-    for degrees in LATTICES[lattice][: 2 if rule == "orthotropic" else None]:
+    for degrees in (0, 90) if rule == "orthotropic" else LATTICES[lattice]:
         given = Strained(rule=RULES[rule], lattice=lattice, fracture=fracture)
         normal = along(degrees)
         uniaxial, modulus = strain_of_uniaxial(given.scene.experiment.rule, normal)
@@ -242,15 +244,15 @@ def test_bond_breaks_if_both_cells_are_broken():
 
 TORN = {
     "body": {"type": "grid", "columns": 9, "rows": 7},
-    "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 30}],
+    "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 10}],
     "leaders": [
         HOLD,
         {
             "select": {"edge": "top"},
-            "motion": {"type": "velocity", "velocity": [4e-4, 1e-3], "steps": 150},
+            "motion": {"type": "velocity", "velocity": [1.2e-3, 3e-3], "steps": 50},
         },
     ],
-    "steps": 160,
+    "steps": 54,
     "diagnostics": [{"type": "displacement"}],
 }
 
