@@ -58,10 +58,12 @@ COARSER = {
 profiles are tested in `fitting/`."""
 FEWER = {
     "animate": ["--every", "20"],
+    "sweep": ["--workers", "1"],
+    "run paper/f2": ["--set", "steps=60"],
     "run material/dogbone": ["--set", "steps=240", "--set", "fracture.failure=0.002"],
 }
-"""Options of commands that take long: movies of fewer steps, which draw all of them alike, and a
-specimen that breaks in the first steps."""
+"""Options of commands that take long: movies of fewer steps, which draw all of them alike; sweeps
+in this process; runs of the first steps; and a specimen that breaks in these."""
 
 
 def is_sweep(code):
