@@ -798,7 +798,7 @@ class CurveObservation(RunObservation):
 
     @property
     def names(self) -> tuple[str, str, bool]:
-        """Return labels of the numbers and of their abscissa, and whether they are one curve."""
+        """Return labels of the values and of the abscissa, and whether the values are one curve."""
         over = "time (step)" if self.at_times else f"displacement of group {self.group}"
         return f"force on group {self.group}", over, True
 
@@ -1096,7 +1096,7 @@ class TracksObservation(RunObservation):
 
     @property
     def names(self) -> tuple[str, str, bool]:
-        """Return labels of the numbers and of their abscissa, and whether they are one curve."""
+        """Return labels of the values and of the abscissa, and whether the values are one curve."""
         return "displacements (lattice unit)", "time (step)", False
 
     def places(self) -> Floats:

@@ -1,7 +1,7 @@
 """Shapes of bodies, by the signed distance from an outline.
 
-A site belongs to a body if its signed distance is at most 1e-9 of a lattice constant, so that sites
-on the outline are included in spite of rounding (docs/model.md, section 3).
+A site belongs to a body if its signed distance is at most 1e-9 lattice constants. Sites on the
+outline are therefore included in spite of rounding errors (docs/model.md, section 3).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Sites:
-    """Sites by `index` (i, j) and position `at`, as arrays of one shape."""
+    """Sites, given by arrays of the `index` (i, j) and the position `at`, which have one shape."""
 
     index: Sequence[NDArray[np.signedinteger[Any]]]
     at: Sequence[Floats]
@@ -56,9 +56,9 @@ class Body(Component):
 
     @abstractmethod
     def distance(self, sites: Sites) -> Floats:
-        """Return the signed distance from the outline, negative inside.
+        """Return the signed distance from the outline, which is negative inside.
 
-        Only the sign and the values near zero need to be exact.
+        Far from the outline only the sign must be right.
 
         Parameters
         ----------
@@ -72,7 +72,7 @@ class Body(Component):
 
 
 CORNER = dict.fromkeys(("centre", "center"), "`origin` is its lower left corner")
-"""Hints for keys of bodies that are placed by their lower left corner."""
+"""Hints for keys of bodies of which the position is given by the lower left corner."""
 
 
 class Grid(Body):
@@ -109,8 +109,10 @@ class Rectangle(Body):
         return [Box((x, y), (x + self.width, y + self.height))]
 
     def distance(self, sites: Sites) -> Floats:
-        """Return the larger of the distances from the two centre lines, each minus half the length
-        of a side."""
+        """Return the larger of the signed distances along x and y.
+
+        Along each axis it is the distance from the centre minus half the length of a side.
+        """
         (x, y), (left, low), w, h = sites.at, self.origin, self.width / 2, self.height / 2
         return np.asarray(np.maximum(np.abs(x - (left + w)) - w, np.abs(y - (low + h)) - h))
 
@@ -198,8 +200,8 @@ class Polygon(Body):
 class Dogbone(Body):
     """Tensile specimen along x.
 
-    Heads of `width`, a gauge of `gauge_length` × `gauge_width` in the middle, and fillets of
-    `radius` between them. `origin` is the lower left corner of the specimen.
+    It has heads of the width `width`, a gauge of `gauge_length` × `gauge_width` in the middle, and
+    fillets of `radius` between heads and gauge. `origin` is the lower left corner of the specimen.
     """
 
     type: Literal["dogbone"] = "dogbone"
@@ -245,7 +247,7 @@ class Dogbone(Body):
         return distance
 
     def exaggerates(self) -> bool:
-        """Return True: distances are measured along y, also at steep fillets."""
+        """Return True, because distances are measured along y even where fillets are steep."""
         return True
 
 
@@ -310,7 +312,7 @@ class Intersection(Composed):
 
 
 class Difference(Composed):
-    """First body without the others; sites on the outline of the others remain."""
+    """First body without all others. Sites on the outline of the others belong to it."""
 
     type: Literal["difference"] = "difference"
 

@@ -154,8 +154,10 @@ Axes = Annotated[tuple[Literal["x", "y"], ...], Field(strict=False, min_length=1
 
 
 class Driven(Strict):
-    """Base class of leader groups and obstacles, which move by a motion from step `from` to step
-    `until`, both included."""
+    """Base class of leader groups and obstacles.
+
+    They have a motion from step `from` to step `until`, both included.
+    """
 
     motion: AnyMotion
     from_: Annotated[int, Field(ge=1, alias="from")] = 1
@@ -176,10 +178,10 @@ class Driven(Strict):
         return steps if self.until is None else min(self.until, steps)
 
     def next_change(self, step: int, precomputable: bool = False) -> float:
-        """Return the first step after `step` in which the motion begins, ends or, unless it is
-        `precomputable`, continues; infinity if there is none.
+        """Return the first step after `step` in which the motion changes, or infinity.
 
-        A motion by Newton's law is not precomputable.
+        It changes in the step in which it begins or ends. A motion that is not `precomputable`,
+        such as that by Newton's law, changes in every step.
         """
         last = math.inf if self.until is None else self.until
         if step < self.from_:
@@ -193,7 +195,8 @@ class Driven(Strict):
         return last + 1
 
     def events(self, steps: int) -> list[int]:
-        """Return the steps of a run in which the motion begins, comes to rest and has ended."""
+        """Return the steps of a run in which the motion begins or comes to rest, or after which it
+        ends."""
         first, last = self.from_, self.last(steps)
         if first > steps:
             return []
@@ -202,12 +205,12 @@ class Driven(Strict):
 
 
 class LeaderGroup(Driven):
-    """Particles that lead from step `from` to step `until`, both included, and follow otherwise.
+    """Particles that are leaders from step `from` to step `until`, both included.
 
-    The motion counts its steps from `from` and starts at the current positions of the particles.
-    With `axes` the particles lead along these axes only, and follow along the others. Leaders that
-    are `clamped` have prescribed directions, which rotate with the motion; otherwise directions are
-    free.
+    In all other steps they are followers. The steps of the motion are counted from `from`, and it
+    starts at the current positions of the particles. With `axes` the motion is prescribed along
+    these axes only; along all others the particles are followers. Leaders that are `clamped` have
+    prescribed directions, which rotate with the motion. Otherwise directions are free.
     """
 
     select: Selection
@@ -222,7 +225,7 @@ class LeaderGroup(Driven):
 
     @model_serializer(mode="wrap")
     def _as_written(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Serialize without `axes` if the group leads along all axes."""
+        """Omit `axes` from the serialised group if it prescribes the motion along all axes."""
         result: dict[str, Any] = serialize(self)
         if self.axes is None:
             result.pop("axes", None)
@@ -232,10 +235,11 @@ class LeaderGroup(Driven):
 class Load(Strict):
     """Forces on selected particles from step `from` to step `until`, both included.
 
-    `force` is the total force, in units of Young's modulus, thickness and lattice unit. Particles
-    on a line share it by tributary length, other particles equally. `body_force` is a force per
-    area, in units of Young's modulus and thickness over lattice unit. Either can be time-dependent.
-    Loads act on followers; leaders transmit them to their support.
+    `force` is the total force; its unit is Young's modulus times thickness times lattice unit. It
+    is distributed to particles on a line by tributary length, and to other particles equally.
+    `body_force` is a force per area; its unit is Young's modulus times thickness divided by lattice
+    unit. Either can be time-dependent. Loads move followers only; on leaders they change the
+    reaction.
     """
 
     select: Selection
@@ -257,7 +261,7 @@ class Load(Strict):
         return self
 
     def force_at(self, moment: float) -> NDArray[np.float64]:
-        """Return the total force, or the force per area, at a moment, (axis,)."""
+        """Return the total force, or the force per area, at a time in steps, (axis,)."""
         forces = [at(component, moment) for component in self.force or self.body_force or ()]
         return 0.0 + self.amplitude(moment) * np.array(forces)
 
@@ -268,7 +272,7 @@ class Load(Strict):
         return [component for component in forces if isinstance(component, TimeDependent)]
 
     def amplitude(self, moment: float) -> float:
-        """Return the fraction of the force at the end of a step, or at a moment within it.
+        """Return the fraction of the force that acts at the end of a step, or within it.
 
         It is linear in time within the steps in which the load begins and ends.
         """
@@ -292,7 +296,7 @@ NO_OBSTACLES = {
     "intersection": "an intersection cannot be an obstacle; use a polygon along its outline",
     "difference": "a difference cannot be an obstacle; use a polygon along its outline",
 }
-"""Messages for shapes that cannot be obstacles, by type."""
+"""Messages about shapes that cannot be obstacles, by type."""
 
 
 class HalfPlane(Strict):
@@ -338,7 +342,8 @@ AnyShape = Annotated[
 class Obstacle(Driven):
     """Rigid obstacle that exists from step `from` to step `until`, both included.
 
-    Its motion counts steps from `from` and starts at the position of the shape.
+    The steps of its motion are counted from `from`, and the motion starts at the position of the
+    shape.
     """
 
     shape: AnyShape

@@ -1,5 +1,7 @@
-"""Experiment: a validated description of a scene and of its run, and the checks that involve
-several parts."""
+"""Experiment: a validated description of a scene and of its run.
+
+This module also contains the checks that concern several parts of an experiment.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,7 @@ Key = str | tuple[str, ...]
 
 
 def clashes_of(experiment: Any) -> Iterator[tuple[Key, str]]:
-    """Generate the fields at which parts of an experiment are incompatible, each with a message."""
+    """Yield a field and a message for each incompatibility between parts of an experiment."""
     yield from ((key, text) for key, clashes, text in _checks(experiment) if clashes)
     for field in ("rule", "fracture"):
         for name, region, text in unknown_regions(getattr(experiment, field), experiment.regions):
@@ -98,7 +100,7 @@ def _checks(experiment: Any) -> Iterator[tuple[Key, bool, str]]:
 
 
 def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
-    """Check parts that require permanent bonds."""
+    """Check that parts that require permanent bonds are not used with re-evaluated neighbours."""
     reevaluates = experiment.neighbours.nearness() is not None
     jumps = not experiment.solver.makes_steps
     ends_at_convergence = experiment.stepping.settle is not None
@@ -121,7 +123,11 @@ def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
 
 
 def _event_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
-    """Check events after the last step, and components with limits that depend on the steps."""
+    """Check steps of events, and that components are compatible with the solver.
+
+    Records and cuts must not be later than the last step. A component of which the state depends on
+    previous steps cannot be combined with some settings of the solver.
+    """
     last = max(experiment.record.at or (0,))
     last_cut = max((cut.at for cut in experiment.cuts), default=0)
     jumps, ends_at_convergence = (
@@ -153,7 +159,7 @@ def _event_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
 
 
 def _force_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
-    """Check the requirements of masses and loads."""
+    """Check that the rule and the solver support the masses and loads of an experiment."""
     rests = not experiment.solver.makes_steps or experiment.stepping.settle is not None
     masses = any(isinstance(group.motion, Newton) for group in experiment.leaders)
     has_forces, rule = material_of(experiment.rule) is not None, experiment.rule
@@ -212,14 +218,14 @@ RegionName = Annotated[str, AfterValidator(_region)]
 
 
 SLACK = 1e-9
-"""Rounding error of the extent of a body, relative to the spacing."""
+"""Tolerance for rounding errors of the extent of a body, relative to the lattice constant."""
 
 
 def sampled(part: TakesFields, lattice: Lattice, body: Body, seed: int, field: str) -> Any:
-    """Replace functions and random fields of a component by values on a grid of half the spacing.
+    """Replace functions and random fields of a component by values on a grid.
 
-    On the square and the rectangular lattice, particles and the midpoints of bonds and of cells are
-    points of the grid.
+    The distance of grid points is half the lattice constant. On the square and the rectangular
+    lattice, particles and the midpoints of bonds and of cells are points of the grid.
 
     Parameters
     ----------
@@ -257,7 +263,7 @@ def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:
     Raises
     ------
     ValueError
-        If the grid has more points than a parameter can have values.
+        If the number of points exceeds the maximum number of values of a parameter.
     """
     cell = lattice.cell()
     steps = np.array(cell.vectors) / np.array(cell.period)[:, None]
@@ -320,7 +326,7 @@ def announce(retired: Iterable[Retired], source: Source, fields: Mapping[str, An
 
 
 def _numbered(fields: Mapping[str, Any]) -> Iterator[tuple[str | int, ...]]:
-    """Generate the fields that select particles by number."""
+    """Yield the fields that select particles by number."""
     for field in ("leaders", "loads"):
         for n, group in enumerate(fields[field]):
             if group.select.numbers:
@@ -354,8 +360,8 @@ def _each(field: str, parts: Any) -> list[Any]:
 
 
 def _default(part: str, description: str) -> Any:
-    # The value is written as in a file, so that it is resolved in the same way and `--set` can
-    # start from it.
+    # The value is written as in a file. It is therefore read in the same way, and `--set` can
+    # change a part of it.
     return Field(default={"type": part}, description=description)
 
 
@@ -548,8 +554,9 @@ class Experiment(Strict):
         Parameters
         ----------
         settings : mapping, or iterable of str
-            ``{"steps": 20, "rule": {"relaxation": 0.3}}`` changes these values only; a map with a
-            `type` replaces the whole part. ``["steps=20"]`` is equivalent.
+            ``{"steps": 20, "rule": {"relaxation": 0.3}}`` or ``["steps=20",
+            "rule.relaxation=0.3"]`` changes these values only. A map with a `type` replaces the
+            whole part.
 
         Returns
         -------
@@ -577,8 +584,10 @@ class Experiment(Strict):
 
     @property
     def is_as_validated(self) -> bool:
-        """True if all parts are those that were validated; `model_copy` replaces parts without
-        validation."""
+        """True if all parts are those that were validated.
+
+        It is false for a copy by `model_copy` with other parts, which are not validated.
+        """
         return all(self._validated.get(name) is part for name, part in self.__dict__.items())
 
     def refuse_unvalidated(self) -> None:
@@ -588,7 +597,7 @@ class Experiment(Strict):
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
-        """Return the default parts, as a file would contain them, before the rule is known."""
+        """Return the default parts as in a file. They do not depend on the rule."""
         fields = cls.model_fields.items()
         parts = {name: f.default for name, f in fields if isinstance(f.default, dict)}
         return parts | {"frame": _default_frame({})}
@@ -601,22 +610,24 @@ class Experiment(Strict):
 
     @property
     def parts_bonds(self) -> bool:
-        """True if bonds can be torn by fracture, or cut."""
+        """True if bonds can break by fracture or cuts."""
         return self.fracture.can_break or bool(self.cuts)
 
     @property
     def shows_bonds(self) -> bool:
-        """True if the dataset has a table of bonds, for fracture, cuts or a diagnostic."""
+        """True if the dataset has a table of bonds, because of fracture, cuts or a diagnostic."""
         return self.parts_bonds or any("bonds" in d.needs for d in self.diagnostics)
 
     def materials(self) -> dict[str, Experiment]:
-        """Return the experiment with each combination of spatially varying parameters of the rule.
+        """Return uniform experiments, one for each combination of values of varying parameters.
+
+        The parameters are the spatially varying parameters of the rule.
 
         Returns
         -------
         dict of str to Experiment
-            Uniform experiments by label; the experiment itself with an empty label if no parameter
-            varies.
+            Uniform experiments by label. If no parameter varies, it contains only the experiment
+            itself, with an empty label.
         """
         fields = self.rule.varying
         result: dict[str, Experiment] = {}
@@ -628,9 +639,9 @@ class Experiment(Strict):
 
     @property
     def time_dependent(self) -> dict[tuple[str, str], TimeDependent[float]]:
-        """Time-dependent parameters, by part and parameter, without those of loads.
+        """Time-dependent parameters, by part and parameter, except for those of loads.
 
-        The fields of the experiment have the values at the end.
+        The fields of the experiment contain the last values.
         """
         parts = {"rule": self.rule, "fracture": self.fracture, "solver": self.solver}
         return {
@@ -638,7 +649,7 @@ class Experiment(Strict):
         }
 
     def at(self, moment: float) -> Experiment:
-        """Return the experiment with its parameters at the end of a step, or within it."""
+        """Return the experiment with the values of its parameters at a time, in steps."""
         return self.model_copy(
             update={f: getattr(self, f).at(moment) for f, _ in self.time_dependent}
         )
@@ -648,7 +659,7 @@ class Experiment(Strict):
         return str(import_module("pbdkit.plotting.notebook").experiment_html(self))
 
     def components(self) -> list[Component]:
-        """Return the parts of open interfaces."""
+        """Return the components: the parts for which plugins can provide classes."""
         return [part for field in INTERFACES for part in _each(field, getattr(self, field))]
 
     def distributions(self) -> dict[str, str]:
@@ -658,8 +669,8 @@ class Experiment(Strict):
     def as_written(self) -> Source:
         """Return the data from which the experiment can be created again.
 
-        With `units` these are the original data, in which lengths may have units, if they consist
-        of plain values; otherwise all parts in lattice units.
+        If the experiment has `units` and its original data consist of plain values, these data are
+        returned; lengths in them may have units. Otherwise all parts are returned in lattice units.
         """
         if self.units and self._source.data is not None and self.is_as_validated:
             with suppress(TypeError, ValueError):
@@ -668,7 +679,7 @@ class Experiment(Strict):
         return Source(self.name, self.model_dump(mode="json", by_alias=True))
 
     def located(self, error: ExperimentError) -> ExperimentError:
-        """Return the error with the place of its field in the file."""
+        """Return the error with the place of its field in the file added to the message."""
         if error.located:
             return error
         result = type(error)(self._source.message(error.where, str(error)), error.where)

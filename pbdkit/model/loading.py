@@ -1,5 +1,7 @@
-"""Load experiments from a file, a shipped name, a dict of parts, or an object; and the base
-experiment of a sweep or a fit, which is a field of its file."""
+"""Load experiments from a file, a shipped name, a dict of parts, or an object.
+
+The file of a sweep or a fit has a field with its base experiment, which is loaded here too.
+"""
 
 from __future__ import annotations
 
@@ -41,8 +43,7 @@ def load_experiment(
     *,
     allow_outside: bool = False,
 ) -> Experiment:
-    """Return the experiment in a file, or the shipped experiment of that name, with settings
-    applied.
+    """Return the experiment in a file, or a shipped experiment, and apply settings.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def load_experiment(
 def experiment_of_source(
     source: Source, settings: Settings = (), components: ComponentClasses = ()
 ) -> Experiment:
-    """Return the validated experiment of a source that was read, with settings applied."""
+    """Apply settings to a source that has been read, and return the validated experiment."""
     return Experiment.build(with_settings(source, settings, Experiment.defaults()), components)
 
 
@@ -106,7 +107,7 @@ def as_experiment(
 
 
 def but_got(value: Any) -> str:
-    """Return the end of a message: the value given as an experiment, and the remedy."""
+    """Return the end of a message, with the value in place of an experiment and the remedy."""
     if _is_dataset(value):
         return (
             "got a dataset, which is a result: `pbdkit.rerun(ds)` runs its experiment again, and "
@@ -156,7 +157,7 @@ def base_source(path: Path, base: Any, source: Source) -> Source:
     Raises
     ------
     ExperimentError
-        If there is no such experiment, or the file cannot be read.
+        If the experiment does not exist, or the file cannot be read.
     """
     if isinstance(base, dict):
         inner = {w[1:]: p for w, p in source.places.items() if w[:1] == ("experiment",)}

@@ -33,7 +33,7 @@ MAX_LINE = 2**16
 
 
 def names_or_file(*names: str) -> Callable[[dict[str, Any]], None]:
-    """Return an update of a JSON Schema that requires the fields `names` or `file`."""
+    """Return an update of a JSON Schema that requires either the fields `names` or `file`."""
 
     def either(schema: dict[str, Any]) -> None:
         schema["required"] = [name for name in schema.get("required", ()) if name not in names]
@@ -45,7 +45,7 @@ def names_or_file(*names: str) -> Callable[[dict[str, Any]], None]:
 def in_place_of(
     parameters: Any, info: ValidationInfo, columns: Sequence[str], names: Sequence[str]
 ) -> tuple[dict[str, Any], list[list[float]]] | None:
-    """Read the columns of `file` if one is given in place of fields.
+    """Read the columns of `file` if it is given and replaces other fields.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def in_place_of(
     Returns
     -------
     tuple or None
-        The other parameters and the rows of the columns; None if no file is given.
+        The parameters without `file`, and the rows of the columns. None if no file is given.
     """
     if not isinstance(parameters, dict) or parameters.get("file") is None:
         return None
@@ -79,7 +79,8 @@ def read_columns(file: Any, info: ValidationInfo, names: Sequence[str]) -> list[
     Raises
     ------
     PydanticCustomError
-        For the key `file`, with the place and the remedy, if the file cannot be read.
+        If the file cannot be read. The error refers to the key `file` and contains the place and
+        the remedy.
     """
     try:
         path = file_resolver(info).path(file, "CSV")
@@ -144,7 +145,7 @@ def _separators(header: list[str]) -> str:
 
 
 def _number(cell: list[str], name: str, place: str) -> float:
-    """Return the number in a cell, which is empty if the row is too short."""
+    """Return the number in a cell of the table. A cell that is missing is empty."""
     text = "".join(cell)
     try:
         number = math.nan if "_" in text else float(text)  # Python would read 1_0 as 10.
@@ -161,13 +162,14 @@ Steps = Annotated[int, Field(ge=1, le=2**62)]
 
 
 class Motion(Component):
-    """Prescribed motion, relative to the position at its start."""
+    """Prescribed motion, given by displacements from the position at its start."""
 
     rests: ClassVar[bool] = True
-    """True if the motion ends, at the last of its knots."""
+    """True if the displacement is constant after the last of the knots."""
 
     of_reference: ClassVar[bool] = False
-    """True if `start` is the reference position rather than the current position."""
+    """True if displacements are measured from the reference position and not from the current
+    one."""
 
     @abstractmethod
     def offset(self, n: float, start: Floats) -> Floats:
@@ -176,7 +178,7 @@ class Motion(Component):
         Parameters
         ----------
         n
-            Number of the step. At least 1 in steps; load stepping also uses fractions, n > 0.
+            Number of the step of the motion, from 1. Load stepping also uses fractions, n > 0.
         start
             Positions at the start of the motion, (particle, axis).
 
@@ -187,15 +189,15 @@ class Motion(Component):
         """
 
     def knots(self) -> tuple[int, ...]:
-        """Return the steps n that divide the motion into parts, in each of which the displacement
-        is a single formula in n.
+        """Return the steps n that divide the motion into parts.
 
-        There are none by default: the displacement is a single formula for all n.
+        Within each part the displacement is a single formula in n. By default there are no such
+        steps, because one formula holds for all n.
         """
         return ()
 
     def turned(self, n: float) -> float:
-        """Return the rotation angle at the end of the n-th step, radians."""
+        """Return the rotation angle at the end of the n-th step, in radians."""
         return 0.0
 
     def rests_after(self) -> int | None:
@@ -206,18 +208,20 @@ class Motion(Component):
 Pairs = Annotated[tuple[Place, ...], Field(strict=False, min_length=2, max_length=MAX_ROWS)]
 """Type of the points or displacements of a measurement."""
 EDGE_RTOL = 1e-7
-"""Distance up to which a place outside counts as on the edge, relative to the size of a triangle or
-the length of the line."""
+"""Distance up to which a place outside is treated as lying on the edge.
+
+It is relative to the size of a triangle or the length of the line.
+"""
 
 
 class Measured(Motion):
     """Moves each particle by the displacement measured at its reference position, within `ramp`
     steps.
 
-    Displacements are linear on the Delaunay triangles of the points, or along the line through all
-    points. Particles outside the points are an error if `outside` is `refuse`; otherwise they have
-    the value of the nearest point. `file` is a CSV file with the columns x, y, ux, uy, which
-    replaces `points` and `displacements`.
+    Displacements are interpolated linearly on the Delaunay triangles of the points, or along the
+    line through all points. If `outside` is `refuse`, particles outside the region of the points
+    are an error; otherwise they have the value of the nearest point. `file` is a CSV file with the
+    columns x, y, ux, uy, which replaces `points` and `displacements`.
     """
 
     model_config = ConfigDict(json_schema_extra=names_or_file("points", "displacements"))
@@ -271,7 +275,7 @@ class Measured(Motion):
 
     @cached_property
     def _cache(self) -> dict[bytes, Floats]:
-        """Displacements of the last call."""
+        """Cache with the displacements of the last call."""
         return {}
 
     @cached_property
@@ -328,9 +332,9 @@ class Newton(Motion):
 
     mass · a = (fraction of `force`) + (force of the neighbours) - damping · v.
 
-    Forces are over Young's modulus and thickness, in lattice units; `mass` and `damping` are those
-    of each particle. The equation is integrated by the symplectic Euler method, v += a, u += v,
-    with the forces at the end of the last step.
+    Forces are divided by Young's modulus and thickness, in lattice units. `mass` and `damping` are
+    values of a single particle. The equation is integrated by the symplectic Euler method, v += a,
+    u += v, with the forces at the end of the previous step.
     """
 
     type: Literal["newton"] = "newton"
@@ -341,7 +345,7 @@ class Newton(Motion):
     velocity: Place = (0.0, 0.0)
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """Return zeros; the motion is not known before the run."""
+        """Return zeros, because the motion cannot be computed before the run."""
         return np.zeros(start.shape[1])
 
     def faster(self, step: int, velocity: Floats, pull: Floats, share: Floats) -> Floats:
@@ -352,7 +356,7 @@ class Newton(Motion):
         step
             Number of the step.
         velocity
-            Velocities at its start, (particle, axis).
+            Velocities at the start of the step, (particle, axis).
         pull
             Forces of the neighbours, (particle, axis).
         share
@@ -365,7 +369,8 @@ class Newton(Motion):
     def lightest(self, stiffness: float) -> float:
         """Return the mass below which a particle on a spring of this stiffness is unstable.
 
-        Steps are stable for k ≤ 4 m - 2 c, which without damping is ω ≤ 2.
+        With the stiffness k, the mass m and the damping c, steps are stable for k ≤ 4 m - 2 c.
+        Without damping this is ω ≤ 2.
         """
         return stiffness / 4.0 + self.damping / 2.0
 
@@ -381,7 +386,7 @@ class Hold(Motion):
 
 
 class Velocity(Motion):
-    """Moves by `velocity` in each of `steps` steps, then holds."""
+    """Moves by `velocity` in each of `steps` steps, and is at rest afterwards."""
 
     type: Literal["velocity"] = "velocity"
     velocity: Place
@@ -397,7 +402,7 @@ class Velocity(Motion):
 
 
 class Displace(Motion):
-    """Moves by `displacement` in the first step, then holds."""
+    """Moves by `displacement` in the first step, and is at rest afterwards."""
 
     type: Literal["displace"] = "displace"
     displacement: Place
@@ -412,9 +417,10 @@ class Displace(Motion):
 
 
 class Tabulated(Motion):
-    """Displacement of `displacements[k]` from the start at step `steps[k]` of the motion.
+    """At step `steps[k]` of the motion the displacement from the start is `displacements[k]`.
 
-    Linear between these steps, from zero at step 0; the last displacement is kept.
+    It is zero at step 0, interpolated linearly between these steps, and constant after the last
+    one.
     """
 
     steps: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=MAX_ROWS)]
@@ -449,15 +455,18 @@ class Tabulated(Motion):
 
 
 class Path(Tabulated):
-    """Moves along `displacements` at the steps `steps` of the motion."""
+    """Has the displacements `displacements` at the steps `steps` of the motion.
+
+    They are interpolated linearly.
+    """
 
     type: Literal["path"] = "path"
 
 
 class Table(Tabulated):
-    """Moves along displacements from a `file`, a CSV with columns step, ux, uy.
+    """Has displacements that are read from a CSV `file` with the columns step, ux, uy.
 
-    The content of the file replaces `steps` and `displacements`.
+    The columns replace `steps` and `displacements` of the motion `path`.
     """
 
     model_config = ConfigDict(json_schema_extra=names_or_file("steps", "displacements"))
@@ -473,7 +482,7 @@ class Table(Tabulated):
         if content is None:
             return parameters
         rest, rows = content
-        if rows[0] == [0.0, 0.0, 0.0]:  # The start of every motion.
+        if rows[0] == [0.0, 0.0, 0.0]:  # Every motion starts with a displacement of zero.
             del rows[0]
         if wrong := [row[0] for row in rows if row[0] < 1 or row[0] % 1]:
             text = f"{parameters['file']}: expected whole numbers from 1 as steps, got {wrong[0]:g}"
@@ -508,7 +517,7 @@ class Rotation(Motion):
 
 
 class Oscillation(Motion):
-    """Oscillates around the start, without an end: amplitude · sin(2πn / period)."""
+    """Oscillates about the start without end: amplitude · sin(2πn / period)."""
 
     type: Literal["oscillation"] = "oscillation"
     rests: ClassVar[bool] = False

@@ -1,8 +1,9 @@
-"""Read and write experiment files: YAML 1.2 with the position of every value, and changes by path,
-as in `--set` and sweeps.
+"""Read, change and write experiment files in YAML 1.2.
 
-Size, depth, aliases, merge keys and tags, which could make YAML dangerous and which experiments do
-not require, are limited at the level of parser events, before any object is created.
+The position of every value is stored for messages. Values are changed by their path, as in `--set`
+and sweeps. The size and depth of files are limited, and aliases, merge keys and tags are refused,
+because they could make YAML dangerous and are not needed. These limits are applied to the events of
+the parser, before any object is created.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 
 ALLOW_OUTSIDE = "PBDKIT_ALLOW_OUTSIDE"
-"""Environment variable that allows files outside the folder unless it is empty."""
+"""Environment variable that, unless it is empty, permits files outside the folder."""
 ALLOW = (
     "allow it with --allow-outside (in Python pbdkit.load(..., allow_outside=True), or "
     f"{ALLOW_OUTSIDE}=1)"
@@ -55,11 +56,11 @@ class FileResolver:
     Parameters
     ----------
     folder
-        The folder; None for an experiment that cannot refer to files, as in a result, which has the
-        contents of files instead.
+        The folder. None for an experiment that cannot refer to files; for example, an experiment in
+        a result contains the contents of its files instead.
     outside
-        Whether files outside the folder are allowed, as for a dict in a Python program. The
-        environment variable `ALLOW_OUTSIDE` allows them, too.
+        Whether files outside the folder are permitted, as for a dict in a Python program. The
+        environment variable `ALLOW_OUTSIDE` permits them too.
     """
 
     folder: Path | None = None
@@ -78,8 +79,8 @@ class FileResolver:
         Raises
         ------
         ValueError
-            If it is not a file name, lies outside the folder without permission (links are
-            followed), or does not exist.
+            If the name is not a file name, or if the file does not exist or, after links are
+            resolved, lies outside the folder without permission.
         """
         if not isinstance(name, str) or not name or "\0" in name:
             raise ValueError(f"expected the name of a {what} file, got {name!r:.40}")
@@ -104,7 +105,9 @@ class FileResolver:
         return path
 
     def holds(self, path: Path) -> bool:
-        """Return whether a path lies in the folder after links are resolved, or may lie outside.
+        """Return whether a path is permitted.
+
+        It must lie in the folder after links are resolved, unless files outside are permitted.
 
         Raises
         ------
@@ -162,8 +165,9 @@ class Source:
     files: FileResolver = field(default_factory=FileResolver)
 
     def message(self, where: Sequence[str | int], text: str) -> str:
-        """Return ``file:line:column: field: text``; for an absent field with the place of its
-        parent.
+        """Return ``file:line:column: field: text``.
+
+        For a field that does not exist it contains the place of the parent.
         """
         path = tuple(where)
         while path and path not in self.places:
@@ -178,7 +182,7 @@ def read_file(path: Path) -> Source:
     Raises
     ------
     ExperimentError
-        If the file cannot be read, with the place and the remedy.
+        If the file cannot be read. The message contains the place and the remedy.
     """
     try:
         with path.open("rb") as file:
@@ -218,7 +222,7 @@ def read_text(text: str, name: str) -> Source:
     Raises
     ------
     ExperimentError
-        If the text is not a valid experiment file, with the place and the remedy.
+        If the text is not a valid experiment file. The message contains the place and the remedy.
     """
     source = Source(name)
     source.data = parsed(text, source)
@@ -275,8 +279,11 @@ def _remedy(error: YAMLError) -> str:
 
 
 class _Scanner(Scanner):
-    """Scanner that stores no keys beyond the maximum depth. The standard scanner compares every
-    character with all stored keys."""
+    """Scanner that stores no keys beyond the maximum depth.
+
+    The standard scanner compares every character with all stored keys, which takes too long for
+    deeply nested text.
+    """
 
     def save_possible_simple_key(self) -> None:
         """Store a possible key up to the maximum depth."""
@@ -355,8 +362,10 @@ class _Reading:
         return result
 
     def _inner(self) -> Iterator[Any]:
-        """Generate the events in a collection up to its end. The caller consumes the events of
-        nested collections."""
+        """Yield the events in a collection up to its end.
+
+        The caller must read the events of nested collections itself.
+        """
         while not isinstance(event := next(self._events), CollectionEndEvent):
             yield event
 
@@ -369,7 +378,7 @@ class _Reading:
 
 
 COMMON_KEYS = {"version", "name", "seed", "units", "steps", "record"}
-"""Keys of experiments that other files may have too."""
+"""Keys of experiments that files of sweeps and fits may have too."""
 PARTS = COMMON_KEYS | {
     *("lattice", "body", "regions", "neighbours", "rule", "frame", "fracture", "cuts", "initial"),
     *("leaders", "loads", "obstacles", "operations", "diagnostics", "solver"),
@@ -384,7 +393,10 @@ FIT = "a fit"
 
 
 def kind_of(data: Mapping[str, Any]) -> str:
-    """Return the kind of a file by its keys, or an empty string; misspelt keys do not matter."""
+    """Return the kind of a file, determined from its keys, or an empty string.
+
+    Misspelt keys are ignored.
+    """
     if "unknown" in data and "measured" in data:
         return FIT
     if data.keys() & {"lattice", "body", "rule"}:
@@ -395,7 +407,7 @@ def kind_of(data: Mapping[str, Any]) -> str:
 
 
 def command_for(kind: str, name: str) -> str:
-    """Return the command for a file of a kind."""
+    """Return the command of pbdkit that reads files of a kind."""
     if kind == SWEEP:
         return f"`pbdkit sweep {name}` runs it"
     if kind == EXPERIMENT:
@@ -409,7 +421,7 @@ def of_kind(required: str, source: Source) -> Source:
     Raises
     ------
     ExperimentError
-        If it is of another kind.
+        If the source is of another kind.
     """
     kind, name = kind_of(source.data), source.name
     if kind == required:
@@ -444,9 +456,9 @@ def with_settings(source: Source, settings: Settings, defaults: Mapping[str, Any
     source : Source
         Raw data.
     settings : mapping, str, or iterable of str
-        A map changes its keys at any depth: ``{"rule": {"relaxation": 0.3}}`` or
-        ``{"rule.relaxation": 0.3}``; a map with a `type` replaces the whole part. Text is
-        ``path=value``.
+        A map changes the values of its keys at any depth, for example ``{"rule": {"relaxation":
+        0.3}}`` or ``{"rule.relaxation": 0.3}``. A map with a `type` replaces the whole part. A text
+        has the form ``path=value``.
     defaults : mapping
         Initial values of parts that the source does not have.
 
@@ -470,7 +482,7 @@ def with_settings(source: Source, settings: Settings, defaults: Mapping[str, Any
 
 
 def _leaves(data: Any, changes: Mapping[Any, Any], where: Where) -> Iterator[tuple[Where, Any]]:
-    """Generate the values to set, each with its path."""
+    """Yield the values to set, each with its path."""
     for key, value in changes.items():
         parts, current = str(key).split("."), data
         path = (*where, *parts)
@@ -486,8 +498,8 @@ def _leaves(data: Any, changes: Mapping[Any, Any], where: Where) -> Iterator[tup
 
 def plain(value: Any) -> Any:
     """Convert arrays and components to the values that a file would contain."""
-    # The methods are called without importing pydantic or numpy, so that a mistyped name is refused
-    # quickly.
+    # The methods are called without importing pydantic or numpy, so that an error in a name is
+    # reported quickly.
     if hasattr(value, "model_dump") and not isinstance(value, type):
         return value.model_dump(mode="json", by_alias=True)
     if hasattr(value, "tolist") and not isinstance(value, type):
@@ -524,8 +536,9 @@ def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> S
 def with_value(
     source: Source, path: str, value: Any, label: str, defaults: Mapping[str, Any]
 ) -> Source:
-    """Return a copy of the source with the value at a dotted path set; `label` is its place in
-    messages.
+    """Return a copy of the source with another value at a dotted path.
+
+    `label` is the place of the value in messages.
     """
     where = tuple(map(_position, path.split(".")))
     places = {k: place for k, place in source.places.items() if k[: len(where)] != where}
@@ -569,7 +582,7 @@ WIDTH = 88
 
 
 def yaml_text(parts: dict[str, Any]) -> str:
-    """Return the parts as YAML, in order; numbers are written with all digits."""
+    """Return the parts as YAML, in their order and with all digits of numbers."""
     yaml: Any = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False

@@ -18,7 +18,7 @@ from pbdkit.plugin.registry import Registry
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """Dialect of the schema."""
 SECTIONS = re.compile(r"\n\n[A-Z]\w+\n-+\n")
-"""Start of the sections of a docstring, which are for Python users."""
+"""Beginning of the sections of a docstring. They are meant for Python users and are omitted."""
 
 
 def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:
@@ -29,7 +29,8 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
     registry
         Components.
     installed
-        Whether to include installed components; otherwise only the built-in ones.
+        Whether to include installed components. Otherwise the schema contains the built-in ones
+        only.
     """
     offered = {
         field: registry.spellings(interface, installed=installed)

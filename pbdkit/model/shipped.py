@@ -21,7 +21,7 @@ FOLDER = Path(__file__).parent.parent / "experiments"
 SUFFIX = ".yaml"
 """Suffix of experiment files."""
 MAX_TITLE = 100
-"""Number of characters above which a title is shortened at its colon."""
+"""Number of characters above which a title is cut off at its colon."""
 
 
 def shipped_names() -> list[str]:
@@ -51,7 +51,7 @@ def shipped_data(name: str) -> list[Path]:
 
 
 def shipped_title(name: str) -> str:
-    """Return the first sentence of the file, shortened at its colon if it is long."""
+    """Return the first sentence of the file. A long sentence is cut off at its colon."""
     lines = takewhile(lambda line: line.startswith("#"), shipped_text(name).splitlines())
     text = " ".join(line.removeprefix("#").strip() for line in lines)
     sentence = re.split(r"\.(?=\s|$)", text, maxsplit=1)[0]

@@ -1,4 +1,4 @@
-"""Settings of the solver (stepping or equilibrium), and of what is recorded."""
+"""Settings of the solver (stepping or equilibrium), and of recording."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Steps = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, m
 class Record(Strict):
     """Recorded steps: every n-th, or a list; time 0 and the last step are always recorded.
 
-    Under `solver: {type: equilibrium}` each of these steps is an equilibrium; `increments` also
-    records the equilibria computed between them. `dtype` is that of recorded positions and
-    diagnostics and does not affect the run. `compression` is that of the file: zlib reduces its
-    size, and writing is slower.
+    With `solver: {type: equilibrium}` an equilibrium is computed and recorded for each of these
+    steps; with `increments` equilibria between them are recorded too. `dtype` is the data type of
+    recorded positions and diagnostics and does not affect the computation. `compression` is the
+    compression of the file: zlib makes the file smaller and writing slower.
     """
 
     every: Annotated[int, Field(ge=1)] = 1
@@ -77,7 +77,7 @@ class Record(Strict):
 
 
 def _form_of(value: object) -> str:
-    """Return the form of a value that is a number, a schedule or a word."""
+    """Return the form of a value: a number, a time-dependent number, or the word `auto`."""
     return WORD if isinstance(value, str) else form_of(value)
 
 
@@ -116,8 +116,9 @@ Memory = Annotated[
 
 
 class SteadyStateCriterion(Strict):
-    """Settings that end a run early, once the distance of every follower from equilibrium is below
-    a tolerance.
+    """Settings that end a run before its last step if it has converged.
+
+    A run has converged if the distance of every follower from equilibrium is below a tolerance.
 
     `tolerance` is relative to the largest prescribed displacement.
     """
@@ -133,12 +134,12 @@ class Solver(Component):
 
     @property
     def stepping(self) -> Stepping:
-        """Settings of a single step; the defaults unless this solver is `stepping`."""
+        """Settings of a single step. They are the defaults unless this solver is `stepping`."""
         return _stepping()
 
     @property
     def equilibrium(self) -> Equilibrium:
-        """Settings of an equilibrium; the defaults unless this solver is `equilibrium`."""
+        """Settings of an equilibrium. They are the defaults unless this solver is `equilibrium`."""
         return _equilibrium()
 
     @property
@@ -160,12 +161,12 @@ def _equilibrium() -> Equilibrium:
 class Stepping(Solver):
     """Compute one step after the other.
 
-    `relaxation` w and `memory` b apply to the move of any rule, for followers only: x(t+1) = m + w
-    · move + b · (x(t) - x(t-1)); both can be time-dependent. `auto` selects the values for which
-    the slowest mode of the scene decays fastest; results contain the numbers. `engine`: numpy,
-    compiled, gpu, or the fastest of numpy and compiled (auto); `precision` is that of the run;
-    `threads` are those of the compiled engine. With `settle` the run ends when it has converged, at
-    the latest after `steps`.
+    `relaxation` w and `memory` b modify the move of any rule, for followers only: x(t+1) = m + w ·
+    move + b · (x(t) - x(t-1)). Both can be time-dependent. With `auto` the values are chosen for
+    which the slowest mode of the scene decays fastest; results contain these values. `engine` is
+    numpy, compiled or gpu; `auto` selects the faster one of numpy and compiled. `precision` is the
+    precision of the computation, and `threads` the number of threads of the compiled engine. With
+    `settle` the run ends when it has converged, at the latest after `steps`.
     """
 
     type: Literal["stepping"] = "stepping"
@@ -199,7 +200,7 @@ class Stepping(Solver):
         return {name: value for name, value in settings.items() if isinstance(value, TimeDependent)}
 
     def at(self, moment: float) -> Stepping:
-        """Return the settings with the values of a moment."""
+        """Return the settings with the values of their parameters at a time, in steps."""
         values = {
             f"{name}_setting": number.at(moment) for name, number in self.time_dependent.items()
         }
@@ -207,7 +208,7 @@ class Stepping(Solver):
 
     @property
     def relaxation(self) -> float:
-        """Relaxation w at the end of its time dependence.
+        """Last value of the relaxation w.
 
         Raises
         ------
@@ -218,7 +219,7 @@ class Stepping(Solver):
 
     @property
     def memory(self) -> float:
-        """Momentum coefficient b at the end of its time dependence.
+        """Last value of the momentum coefficient b.
 
         Raises
         ------
@@ -243,12 +244,12 @@ def _number(setting: Literal["auto"] | float | TimeDependent[float], name: str) 
 class Equilibrium(Solver):
     """Compute the limit of the steps directly, with leaders at their last prescribed positions.
 
-    Roles are those of the last step. `tolerance` is the largest distance from equilibrium, relative
-    to the largest prescribed displacement. If bonds can break, the motion of the leaders is divided
-    into `increments`, also within steps, with an equilibrium for each; under nonlinear rules the
-    number of increments is adaptive. `method` solves the linear systems: lu, multigrid (as the
-    preconditioner of an iteration), conjugate-gradients without preconditioner, or a choice by size
-    (auto).
+    Particles are leaders or followers as in the last step. `tolerance` is the largest distance from
+    equilibrium, relative to the largest prescribed displacement. If bonds can break, the motion of
+    the leaders is divided into `increments`, which can be shorter than a step, and an equilibrium
+    is computed for each. With nonlinear rules the number of increments is adaptive. `method` is the
+    method for linear systems: lu, multigrid (as the preconditioner of an iteration) or
+    conjugate-gradients (without preconditioner); auto selects a method by the size of the system.
     """
 
     makes_steps: ClassVar[bool] = False

@@ -1,7 +1,7 @@
-"""Validate the parts of an experiment with pydantic, and read spatially varying parameters from
-files.
+"""Validate the parts of an experiment with pydantic.
 
-Each error is reported with place, field, cause and the nearest valid value.
+Spatially varying parameters are read from files. The message of an error contains the place, the
+field, the cause and the nearest valid value.
 """
 
 from __future__ import annotations
@@ -69,7 +69,10 @@ def read_field(value: dict[str, Any], files: FileResolver) -> Gridded:
 
 @lru_cache(maxsize=4)
 def _read(path: Path, variable: str, size: int, changed_ns: int) -> Gridded:
-    """Read a file of this size and modification time; cached for members of a sweep."""
+    """Read a file with this size and modification time.
+
+    The result is cached for members of a sweep.
+    """
     try:
         content = read_apart(path, variable, str(MAX_VALUES))
     except StorageError as error:
@@ -80,12 +83,12 @@ def _read(path: Path, variable: str, size: int, changed_ns: int) -> Gridded:
         return Gridded(x, y, values)
     except MemoryError:
         raise
-    except Exception as error:  # Invalid attributes, for which libraries raise various errors.
+    except Exception as error:  # Libraries raise various errors for invalid attributes.
         raise FieldFileError(f"{path}: '{variable}': {one_line(str(error))}") from None
 
 
 def _decoded(name: str, arrays: Any) -> Any:
-    """Return an array, unpacked and masked according to its attributes."""
+    """Return an array after its attributes for packing and missing values have been applied."""
     from xarray import Variable
     from xarray.conventions import decode_cf_variable
 
@@ -108,7 +111,7 @@ PLAIN = {
     "too_short": "should have at least {min_length} item(s), got {actual_length}",
     "model_type": "should be a map of keys, got {got}",
 }
-"""Messages in terms of experiment files, by the type of a pydantic error."""
+"""Messages that use the terms of experiment files, by the type of a pydantic error."""
 _LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20})[-\d.]+")
 """Pattern of a bound with many digits, which pydantic writes without an exponent, for example
 1e-100."""
@@ -166,7 +169,7 @@ def _meant_number(text: str) -> str:
 
 
 def _decimal_commas(fault: Any) -> str:
-    """Return a hint if there are twice as many integers as numbers, as in ``[0,01, 0,0]``."""
+    """Return a hint if a list has twice as many integers as expected, as in ``[0,01, 0,0]``."""
     items, maximum = fault["input"], fault.get("ctx", {}).get("max_length")
     if fault["type"] != "too_long" or not isinstance(items, (list, tuple)):
         return ""
@@ -179,8 +182,11 @@ def _bound(context: Any) -> float:
 
 
 def _follows(fault: Any, faults: list[Any]) -> bool:
-    """Return whether a list is too short only because some of its items are invalid, or a default
-    is unknown only because a part on which it depends is invalid."""
+    """Return whether a fault is only a consequence of other faults.
+
+    For example, a list is too short because some of its items are invalid, or a default is not
+    available because a part on which it depends is invalid.
+    """
     where = fault["loc"]
     if fault["type"] != "too_short":
         return bool(fault["type"] == "default_factory_not_called")
@@ -194,10 +200,10 @@ Finder = Callable[[str], type[Component]]
 
 
 def open_part(interface: type[Component]) -> BeforeValidator:
-    """Validate a component of an open interface.
+    """Validate a component of an interface that plugins can implement.
 
-    The class is looked up in the registry of the validation context, which includes components
-    passed as Python objects.
+    Its class is found in the registry of the validation context, which includes components that
+    were passed as Python objects.
     """
 
     def build(value: Any, info: ValidationInfo) -> Any:
@@ -214,7 +220,7 @@ def open_part(interface: type[Component]) -> BeforeValidator:
 
 
 def closed_part(base: type[Component], *members: type[Component]) -> BeforeValidator:
-    """Validate an object of one of a fixed list of classes, distinguished by `type`."""
+    """Validate an object that belongs to one of a fixed list of classes, selected by `type`."""
     by_name = {member.type_name(): member for member in members}
 
     def find(name: str) -> type[Component]:
@@ -282,14 +288,15 @@ def _component_error(
 
 
 def fault(text: str, **where: Any) -> PydanticCustomError:
-    """Return an error for pydantic with a text for the user, and a key if a key of the value is
-    wrong.
+    """Return an error for pydantic with a text for the user.
+
+    If a key of the value is wrong, the error contains this key.
     """
     return PydanticCustomError("fault", "{text}", {"text": text, **where})
 
 
 def brief(value: Any) -> str:
-    """Return the value as users wrote it, shortened if it is long."""
+    """Return the value as it is written in the file, shortened if it is long."""
     if isinstance(value, (dict, list, tuple)) and len(value) > 4:
         return f"a {'map' if isinstance(value, dict) else 'list'} of {len(value)}"
     if isinstance(value, int) and abs(value) > 10**20:
