@@ -236,14 +236,16 @@ class AnswerError(TypeError):
     """A function returned an object of the wrong kind. The message contains the correct kind."""
 
 
-LONGEST_LINE = 400
+MAX_QUOTED_CHARACTERS = 400
 """Maximum number of characters of a message that is quoted."""
 
 
 def one_line(text: str) -> str:
     """Return the printable words of a text in one line, shortened if it is long."""
     words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
-    return words if len(words) <= LONGEST_LINE else words[: LONGEST_LINE - 3] + "..."
+    return (
+        words if len(words) <= MAX_QUOTED_CHARACTERS else words[: MAX_QUOTED_CHARACTERS - 3] + "..."
+    )
 
 
 def refuse_without(library: str, extra: str, reason: str) -> None:

@@ -117,7 +117,7 @@ class Driver(ABC):
         """Restore the result of `state_dict`, before the first state is generated."""
 
 
-LONGEST_CALL_S = 0.2
+MAX_CALL_S = 0.2
 """Maximum duration of one call of an engine in seconds.
 
 Progress is shown and interruptions are handled between calls.
@@ -235,7 +235,7 @@ class SteppingDriver(Driver):
 
     def _steps_in(self, seconds_a_step: float) -> int:
         """Return the number of steps in one call of the engine."""
-        return max(1, min(MAX_STEPS_A_CALL, int(LONGEST_CALL_S / max(seconds_a_step, 1e-9))))
+        return max(1, min(MAX_STEPS_A_CALL, int(MAX_CALL_S / max(seconds_a_step, 1e-9))))
 
     def _current_state(self) -> Iterator[State]:
         """Yield the current state, and raise the error of the recorder if there is one."""
@@ -391,7 +391,7 @@ DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
 """Driver of each solver."""
 FAILED = ("diverged", "unconverged", "separated")
 """Statuses of runs that reach neither their last step nor equilibrium."""
-LARGEST = 50_000
+MAX_DIAGNOSED_PARTICLES = 50_000
 """Maximum number of particles for which the diagnostics are evaluated once before the run."""
 
 
@@ -943,7 +943,7 @@ def record(simulation: Simulation, sink: Sink, *, recorder: Recorder | None = No
 def rehearse(scene: Scene) -> None:
     """Evaluate the diagnostics for the initial state, so that their errors are raised before the
     run."""
-    if not scene.experiment.diagnostics or scene.raster.count > LARGEST:
+    if not scene.experiment.diagnostics or scene.raster.count > MAX_DIAGNOSED_PARTICLES:
         return
     recorder = Recorder(scene, MemorySink())
     with _located(scene), suppress(FloatingPointError):  # Such a run diverges in its first step.

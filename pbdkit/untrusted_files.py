@@ -35,23 +35,23 @@ if TYPE_CHECKING:
     import xarray
 
 
-DENSEST = 1100
+MAX_COMPRESSION_RATIO = 1100
 """Largest ratio of declared to stored bytes of a compressed variable.
 
 The largest ratio of deflate is 1032.
 """
-SPARSEST = 16
+MAX_FILE_RATIO = 16
 """Largest ratio of the declared size of a variable to the size of the file.
 
 It also limits variables of which parts have not been written.
 """
 EMPTY = 2**20
 """Number of bytes that a variable may declare in a file of any size."""
-LARGEST_CHUNK = 2**26
+MAX_CHUNK_BYTES = 2**26
 """Number of bytes that a chunk may declare in a file of any size."""
 MAX_OBJECTS = 10_000
 """Maximum number of objects in a file, of links in a file, and of attributes of an object."""
-LARGEST_TEXTS = 2**28
+MAX_TEXT_BLOCK_BYTES = 2**28
 """Maximum number of bytes of a block of texts that is checked."""
 FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32"}
 """Filters of HDF5 that are applied; all others would be loaded as programs."""
@@ -115,7 +115,7 @@ def _check_attribute(attribute: Any, size: int) -> None:
     text."""
     if _is_ragged(attribute.get_type()):
         count = math.prod(attribute.shape or ())
-        if count > max(64, LARGEST_TEXTS // size):
+        if count > max(64, MAX_TEXT_BLOCK_BYTES // size):
             raise StorageError(f"its attribute '{_text(attribute.name)}' has {count} elements")
 
 
@@ -143,13 +143,13 @@ def _check_dataset(dataset: Any, name: str, size: int) -> None:
         return
     shape, stored = dataset.shape or (), dataset.get_storage_size()
     declared = math.prod(shape) * kind.get_size()
-    if declared > max(DENSEST * stored, SPARSEST * size) + EMPTY:
+    if declared > max(MAX_COMPRESSION_RATIO * stored, MAX_FILE_RATIO * size) + EMPTY:
         raise StorageError(
             f"its size is too small for the {declared:.3g} bytes that '{name}' declares"
         )
     if properties.get_layout() == h5d.CHUNKED:
         chunk = math.prod(properties.get_chunk()) * kind.get_size()
-        if chunk > DENSEST * stored + LARGEST_CHUNK:
+        if chunk > MAX_COMPRESSION_RATIO * stored + MAX_CHUNK_BYTES:
             raise StorageError(
                 f"its size is too small for the chunks of {chunk:.3g} bytes of '{name}'"
             )
@@ -187,7 +187,7 @@ def _blocks(texts: Any, size: int) -> Iterator[Any]:
     if not texts.shape or not texts.size:
         return
     row_size = size * math.prod(texts.shape[1:])
-    step = max(1, LARGEST_TEXTS // row_size)
+    step = max(1, MAX_TEXT_BLOCK_BYTES // row_size)
     for start in range(0, len(texts), step):
         yield texts[start : start + step]
 
@@ -306,7 +306,7 @@ def _read(path: Path) -> None:
     library = import_module(MODULE)
     bound_time()
     check_hdf5(path)
-    limit = DENSEST * path.stat().st_size + EMPTY
+    limit = MAX_COMPRESSION_RATIO * path.stat().st_size + EMPTY
     with library.Dataset(path) as file:
         for owner in (file, *file.variables.values()):
             for name in owner.ncattrs():
@@ -335,7 +335,7 @@ def _bound_memory() -> None:
 
 VALUES = "values"
 """Name of the values in the output."""
-SHOWN = 10
+MAX_SHOWN = 10
 """Maximum number of names in a message."""
 PACKING = ("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned")
 """Attributes that change the meaning of stored numbers (CF conventions)."""
@@ -373,7 +373,7 @@ def _print(path: Path, variable: str, most_values: str) -> None:
 
 def _field(file: Any, variable: str, most_values: int) -> Any:
     if variable not in file.variables:
-        names = ", ".join(islice(file.variables, SHOWN)) or "none"
+        names = ", ".join(islice(file.variables, MAX_SHOWN)) or "none"
         raise StorageError(f"has no variable '{variable}'; it has: {names}")
     field = file.variables[variable]
     if {*field.dimensions} != {"x", "y"} or not {"x", "y"} <= {*file.variables}:

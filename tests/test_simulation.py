@@ -103,7 +103,7 @@ def test_convergence_depends_only_on_data(
 ) -> None:
     """A run that is stopped, and continued from its state, guard and pace, has the same end."""
     # Calls are not cut short where the machine is busy.
-    monkeypatch.setattr("pbdkit.simulation.LONGEST_CALL_S", 1e6)
+    monkeypatch.setattr("pbdkit.simulation.MAX_CALL_S", 1e6)
     given = tensile | {"solver": SOLVERS["settle"], "steps": 5000, "record": {"at": [0]}}
     whole, left = Simulation.of_scene(scene_of(given)), Simulation.of_scene(scene_of(given))
     steps = [state.step for state in whole]

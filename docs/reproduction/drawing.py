@@ -20,7 +20,7 @@ from runs import Floats, Sheet
 
 from pbdkit.plotting.colours import KINDS
 from pbdkit.plotting.data import Trajectory, triangles_of, whole
-from pbdkit.plotting.layers import INK, LINE
+from pbdkit.plotting.layers import BOND_COLOUR, DOT_COLOUR
 
 FOLDER = Path(__file__).parent.parent / "pictures" / "reproduction"
 DPI, PAGE_IN, COLOURS = 130, 7.4, 128
@@ -90,7 +90,7 @@ def configurations(
         ax.set_title(f"time {time} (step {time - 1})", fontsize=8.5)
         ax.tick_params(labelsize=7)
     handles = [
-        Line2D([], [], ls="", marker="o", ms=4, mfc=colour, mec=INK, mew=0.4, label=kind)
+        Line2D([], [], ls="", marker="o", ms=4, mfc=colour, mec=DOT_COLOUR, mew=0.4, label=kind)
         for kind, colour in reversed(KINDS.values())
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
@@ -115,10 +115,10 @@ def _configuration(ax: Axes, shot: Shot, color: str) -> None:
     if len(shot.kind) > DETAILED:
         return
     ends = list(shot.position[shot.bonds])
-    ax.add_collection(LineCollection(ends, colors=LINE, linewidths=0.35, zorder=0.5))
+    ax.add_collection(LineCollection(ends, colors=BOND_COLOUR, linewidths=0.35, zorder=0.5))
     for kind, (_, colour) in KINDS.items():
         here = shot.position[shot.kind == kind]
-        ax.scatter(*here.T, 7, colour, edgecolors=INK, lw=0.3, zorder=2)
+        ax.scatter(*here.T, 7, colour, edgecolors=DOT_COLOUR, lw=0.3, zorder=2)
 
 
 def abreast(
@@ -152,7 +152,7 @@ def numbered(sheet: Sheet, name: str) -> str:
     kinds = sheet.ds["kind"].values[0]
     place = sheet.position[0]
     for kind, (label, colour) in KINDS.items():
-        ax.scatter(*place[kinds == kind].T, 26, colour, edgecolors=INK, lw=0.4, label=label)
+        ax.scatter(*place[kinds == kind].T, 26, colour, edgecolors=DOT_COLOUR, lw=0.4, label=label)
     for number, (x, y) in zip(sheet.ds["number"].values, place, strict=True):
         bold = "bold" if number == 67 else "normal"
         ax.annotate(str(number), (x, y), (3, 3), textcoords="offset points", size=6.5, weight=bold)

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from drawing import FOLDER, INK, LINES, save
+from drawing import DOT_COLOUR, FOLDER, LINES, save
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
@@ -39,8 +39,8 @@ def main(folder: Path | None) -> None:
     xs, ys = np.linspace(w[0], w[-1], FINE), np.linspace(b[0], b[-1], FINE)
     fine = np.array([[known.stable_at(x, y) for x in xs] for y in ys], float)
     ax.contour(xs, ys, fine, [0.5], colors=[LINES[5]], linewidths=1.2)
-    ax.text(0.5, 0.25, "settled", color=INK, fontsize=8)
-    ax.text(1.5, -0.5, "grew, or diverged", color=INK, fontsize=8)
+    ax.text(0.5, 0.25, "settled", color=DOT_COLOUR, fontsize=8)
+    ax.text(1.5, -0.5, "grew, or diverged", color=DOT_COLOUR, fontsize=8)
     ax.set(xlabel="relaxation w", ylabel="memory b", title="40 × 40 runs, and the prediction")
     save(figure, "stability-map.png", FOLDER.parent)
 

@@ -56,7 +56,7 @@ from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import FAILED, Simulation
 from pbdkit.stepping.state import State, initial_state
 
-STRAIGHT = 1e-6
+MAX_LINE_DEVIATION = 1e-6
 """Largest distance of a particle of a group from the line of the group, relative to the length."""
 
 
@@ -161,7 +161,7 @@ def _polynomials(points: Floats, modes: int, n: int) -> Floats:
     """Return Legendre polynomials along a line, (particle, mode)."""
     middle = points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(points - middle, full_matrices=False)
-    if sizes[1] > STRAIGHT * sizes[0]:
+    if sizes[1] > MAX_LINE_DEVIATION * sizes[0]:
         raise ExperimentError(
             "the particles of a measured boundary must lie on a line, along which their "
             "displacement is a polynomial",

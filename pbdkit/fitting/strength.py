@@ -58,7 +58,7 @@ from pbdkit.stepping.state import State, initial_state, unmoved_state
 
 PARTS = 4
 """Number of load increments after each of which displacements must be proportional to the load."""
-PROPORTION = 1e-6
+MAX_NONPROPORTIONALITY = 1e-6
 """Largest deviation from proportionality, relative to the largest displacement."""
 
 ALIKE = 1e-9
@@ -297,7 +297,7 @@ def _refuse_out_of_proportion(displacements: list[Floats], last: Floats, linear:
     for u in displacements:
         share = float((u * last).sum() / (last * last).sum())
         deviation = float(np.abs(u - share * last).max()) / size
-        if deviation > PROPORTION or share < last_share:
+        if deviation > MAX_NONPROPORTIONALITY or share < last_share:
             raise ExperimentError(
                 f"displacements are not proportional to the load ({deviation:.2g} off): "
                 + NOT_PROPORTIONAL
@@ -305,7 +305,7 @@ def _refuse_out_of_proportion(displacements: list[Floats], last: Floats, linear:
         last_share = share
 
 
-LOST = 0.5
+FAILURE_FRACTION = 0.5
 """Fraction of its peak force below which a specimen has failed."""
 
 
@@ -392,7 +392,10 @@ class Specimens:
                 if reading.displacement > (first or reading).displacement
                 else peak
             )
-            if reading.force < LOST * peak.force and reading.displacement >= peak.displacement:
+            if (
+                reading.force < FAILURE_FRACTION * peak.force
+                and reading.displacement >= peak.displacement
+            ):
                 return Specimen(peak, first, True)
             last = reading
             if limits is not None:

@@ -31,7 +31,7 @@ FULL = "the disk is full; free some space, or record fewer steps"
 """Message for a full disk."""
 FULL_BYTES = 2**20
 """Number of free bytes below which a disk counts as full."""
-TRIES = 10
+MAX_ATTEMPTS = 10
 """Number of attempts to lock a file."""
 PAUSE_S = 0.02
 """Pause between two attempts, in seconds."""
@@ -75,7 +75,7 @@ def open_locked(path: Path) -> io.FileIO | None:
     Several attempts are made, because a process that only tests the lock holds it for a short time.
     Raises OSError.
     """
-    for _ in range(TRIES):
+    for _ in range(MAX_ATTEMPTS):
         file = io.FileIO(path, "r+b")
         # The file may have been replaced or removed in the meantime.
         with suppress(FileNotFoundError):

@@ -26,7 +26,7 @@ TEXT = "_text"
 the coordinate of the dimension itself contains only their numbers."""
 PARAMETER = "parameter"
 """Attribute of a coordinate that contains the path of its parameter in the experiment."""
-SHOWN = 6
+MAX_SHOWN = 6
 """Maximum number of values in messages."""
 
 
@@ -82,8 +82,8 @@ def choices(dataset: xarray.Dataset) -> str:
     """Return the parameters and their values as text: ``steel: 1, 2, 3; rule: barycentre``."""
     parts = []
     for dim in map(str, dataset[STATUS].dims):
-        words = [_word(value) for value in _labels(dataset, dim)[:SHOWN]]
-        ellipsis = ", ..." if dataset.sizes[dim] > SHOWN else ""
+        words = [_word(value) for value in _labels(dataset, dim)[:MAX_SHOWN]]
+        ellipsis = ", ..." if dataset.sizes[dim] > MAX_SHOWN else ""
         parts.append(f"{dim}: {', '.join(words)}{ellipsis}")
     return "; ".join(parts)
 
@@ -114,7 +114,7 @@ def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
     labels = _labels(dataset, name)
     rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, value)]
     if not rows:
-        near = ", ".join(map(_word, labels.tolist()[:SHOWN]))
+        near = ", ".join(map(_word, labels.tolist()[:MAX_SHOWN]))
         raise ExperimentError(f"{name}={value}: no member has this value; there are {near}")
     return dims[name], rows[0]
 

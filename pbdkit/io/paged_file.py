@@ -29,7 +29,7 @@ LAYOUT = struct.Struct("<8s16sQ")
 HEADER_BYTES = LAYOUT.size + 8
 """Length of the header with its digest. In the finished file the header is replaced by the
 superblock of HDF5, which is longer. Until then the superblock is stored in a page."""
-TRIES = 3
+MAX_ATTEMPTS = 3
 """Number of attempts to read a header that is being written."""
 PAUSE_S = 0.02
 """Pause between two attempts, in seconds."""
@@ -60,7 +60,7 @@ def read_header(file: io.FileIO) -> Header | None:
 
     Raises StorageError if the file begins with other bytes, and OSError if it cannot be read.
     """
-    for _ in range(TRIES):
+    for _ in range(MAX_ATTEMPTS):
         file.seek(0)
         data = file.read(HEADER_BYTES)
         if not data.strip(b"\0"):

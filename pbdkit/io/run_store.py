@@ -62,7 +62,7 @@ IDENTITY_BYTES = 16
 """Number of bytes of the random number."""
 PART_BYTES = 2**20
 """Maximum number of bytes of a piece of an array."""
-LONGEST = 2**26
+MAX_VALUE_BYTES = 2**26
 """Maximum number of bytes of a value that is read from the file."""
 JOURNAL_MARK = bytes.fromhex("d9d505f920a163d7")
 """Last bytes of a journal of SQLite that refers to another journal."""
@@ -189,7 +189,7 @@ class RunStore:
                 raise StorageError(f"{self.path}: cannot be read: {error}") from None
         else:
             self._file = self._closing.enter_context(closing(connect(self.path, mode)))
-        self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
+        self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
         if mode == "rwc":
             self._make()
             return
@@ -494,7 +494,7 @@ def remove_store(output: Path) -> None:
 
 EXTENT = np.dtype([("start", "<u8"), ("stop", "<u8"), ("digest", "<u8")])
 """Data type of the extents of the records."""
-LARGEST_ARRAY = 2**40
+MAX_ARRAY_ENTRIES = 2**40
 """Maximum number of entries of an array that is read."""
 PAGES = "page/"
 """Prefix of the keys of pages."""
@@ -633,7 +633,7 @@ class UnfinishedRun:
         try:
             for name, (dtype, shape) in facts["arrays"].items():
                 kind = np.dtype(dtype)
-                if kind.kind not in "fiub" or np.prod(shape, dtype=float) > LARGEST_ARRAY:
+                if kind.kind not in "fiub" or np.prod(shape, dtype=float) > MAX_ARRAY_ENTRIES:
                     raise ValueError(dtype)
                 stored = StoredArray(self._store, ARRAYS + name, kind, tuple(shape))
                 waits = not on_disk or name.startswith("waiting.")

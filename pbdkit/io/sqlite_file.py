@@ -12,7 +12,7 @@ from pbdkit.io.atomic_file import is_local
 
 BEGINNING = b"SQLite format 3\0"
 """First bytes of a SQLite database."""
-SMALLEST_PAGE = 512
+MIN_PAGE_BYTES = 512
 """Smallest size of a page in bytes."""
 PATIENCE_S = 60.0
 """Time in seconds to wait for another program that has locked the file."""
@@ -48,10 +48,10 @@ def is_database(path: Path) -> bool:
     """
     try:
         with path.open("rb") as file:
-            head = file.read(SMALLEST_PAGE)
+            head = file.read(MIN_PAGE_BYTES)
     except (FileNotFoundError, NotADirectoryError):
         return False
-    return len(head) == SMALLEST_PAGE and head.startswith(BEGINNING)
+    return len(head) == MIN_PAGE_BYTES and head.startswith(BEGINNING)
 
 
 def connect(path: Path, mode: str) -> sqlite3.Connection:

@@ -152,15 +152,15 @@ def difference_of(
     return dataset.assign_attrs(title=title), name
 
 
-ROOMY_PT = 8.0
+MIN_DOT_SPACING_PT = 8.0
 """Distance of particles on the page, in points, above which dots are drawn on a field."""
-LINED_PT = 5.0
+MIN_LINE_SPACING_PT = 5.0
 """Distance of particles above which bonds are single lines."""
-CROWDED_PT = 2.4
+MAX_PIXEL_SPACING_PT = 2.4
 """Distance of particles below which particles are pixels."""
-DETAILED = 50_000
+MAX_DOTS = 50_000
 """Maximum number of particles that are drawn as dots."""
-MANY_BONDS = 200_000
+MAX_BOND_LINES = 200_000
 """Maximum number of bonds that are drawn as lines."""
 
 
@@ -202,12 +202,12 @@ def choose_style(
 ) -> RenderStyle:
     """Choose the rendering style. Given options are followed; all other choices depend on
     legibility. Raises ExperimentError for an option that is impossible or takes too long."""
-    crowded = len(body.reference) > DETAILED or distance < CROWDED_PT
+    crowded = len(body.reference) > MAX_DOTS or distance < MAX_PIXEL_SPACING_PT
     of_bonds, filled = quantity.owner == "bond", _is_filled(body, quantity, look, distance)
     if quantity.words:
         dots = "" if crowded else "classes"
     elif filled or of_bonds:
-        dots = "kinds" if distance >= ROOMY_PT and not crowded else ""
+        dots = "kinds" if distance >= MIN_DOT_SPACING_PT and not crowded else ""
     else:
         dots = "values"
     return RenderStyle(
@@ -218,7 +218,7 @@ def choose_style(
 def _is_filled(
     body: ReferenceBody, quantity: PlottedQuantity, look: PlotOptions, distance: float
 ) -> bool:
-    is_large = len(body.reference) > DETAILED
+    is_large = len(body.reference) > MAX_DOTS
     possible, requested = (
         quantity.owner == "particle" and not quantity.words,
         look.contours or look.filled,
@@ -230,9 +230,11 @@ def _is_filled(
         )
     if look.filled is False and is_large:
         raise ExperimentError(
-            f"{len(body.reference)} particles are too many for dots; at most {DETAILED} are drawn"
+            f"{len(body.reference)} particles are too many for dots; at most {MAX_DOTS} are drawn"
         )
-    wanted = requested or (look.filled is None and possible and (is_large or distance < ROOMY_PT))
+    wanted = requested or (
+        look.filled is None and possible and (is_large or distance < MIN_DOT_SPACING_PT)
+    )
     if wanted and not len(body.cells):
         if requested or is_large:
             raise ExperimentError("contours require particles that do not lie on one line")
@@ -243,7 +245,7 @@ def _is_filled(
 def _is_lined(
     body: ReferenceBody, of_bonds: bool, filled: bool, look: PlotOptions, distance: float
 ) -> bool:
-    requested, is_large = look.bonds or look.broken, len(body.ends) > MANY_BONDS
+    requested, is_large = look.bonds or look.broken, len(body.ends) > MAX_BOND_LINES
     if requested and not len(body.ends):
         raise ExperimentError(
             "the dataset has no bonds to draw; run the experiment with fracture, a cut, or a "
@@ -251,16 +253,16 @@ def _is_lined(
         )
     if requested and is_large:
         raise ExperimentError(
-            f"{len(body.ends)} bonds are too many to draw; at most {MANY_BONDS} are drawn"
+            f"{len(body.ends)} bonds are too many to draw; at most {MAX_BOND_LINES} are drawn"
         )
     if look.bonds is not None:
         return look.bonds
-    return not is_large and (of_bonds or (not filled and distance >= LINED_PT))
+    return not is_large and (of_bonds or (not filled and distance >= MIN_LINE_SPACING_PT))
 
 
-NUMBERED_PT = 20.0
+MIN_NUMBER_SPACING_PT = 20.0
 """Distance of particles on the page, in points, above which numbers are legible."""
-LARGEST = 2.5
+MAX_ENLARGEMENT = 2.5
 """Maximum factor by which the page is enlarged to make numbers legible."""
 
 
@@ -313,7 +315,9 @@ class PanelFigure:
         if self._page:
             self._page.arrange()
             if look.numbers:
-                self._larger = min(max(1.0, NUMBERED_PT / self._spacing()), LARGEST)
+                self._larger = min(
+                    max(1.0, MIN_NUMBER_SPACING_PT / self._spacing()), MAX_ENLARGEMENT
+                )
                 self._page.arrange(larger=self._larger)
         else:
             self._label_axes(panels)
@@ -364,7 +368,7 @@ class PanelFigure:
         if self._look.broken:
             yield BondLines(ax, body, style.line, broken=True)
         if self._quantity.owner == "bond" and scale:
-            is_large = len(body.ends) > MANY_BONDS
+            is_large = len(body.ends) > MAX_BOND_LINES
             width = 2.0 * style.line
             yield (
                 BondField(ax, body, grid, scale) if is_large else BondValues(ax, body, width, scale)
@@ -379,7 +383,7 @@ class PanelFigure:
         """Return the pixels of a field, which are finer than those of the picture unless there are
         many cells."""
         extent = ax.get_window_extent()
-        finer = 1 if len(self._body.reference) > DETAILED else self._finer
+        finer = 1 if len(self._body.reference) > MAX_DOTS else self._finer
         across, up = (max(2, round(finer * side)) for side in (extent.width, extent.height))
         return PixelGrid(self._extent.box, across, up)
 

@@ -29,37 +29,37 @@ if TYPE_CHECKING:
 Kind = Literal["map", "length", "bonds"]
 KINDS: tuple[Kind, ...] = ("map", "length", "bonds")
 """Kinds of pictures of cracks."""
-COLOURS = "viridis"
+CMAP = "viridis"
 """Colour map of the steps of breaking."""
-BODY = "#B0B0B0"
+BODY_COLOUR = "#B0B0B0"
 """Colour of the body."""
-OLD = "#000000"
+INITIAL_CRACK_COLOUR = "#000000"
 """Colour of bonds that are broken from the start."""
-NEW = "#D55E00"
+BROKEN_BOND_COLOUR = "#D55E00"
 """Colour of broken bonds if all broke in the same step."""
-WIDE_IN = 5.0
+MAX_WIDTH_IN = 5.0
 """Maximum width of a map in inches."""
 MIN_IN = 1.8
 """Minimum width and height of a map in inches."""
-TALLEST_IN = 6.0
+MAX_HEIGHT_IN = 6.0
 """Maximum height of a map in inches."""
-BESIDE_IN = 1.3
+TEXT_SPACE_IN = 1.3
 """Space for text around a map in inches."""
-LONG = 2.5
+MAX_ASPECT = 2.5
 """Ratio of width to height above which the colour bar is below the body."""
 SCALE_IN = 0.7
 """Height of a colour bar below the body in inches."""
-THIN = 0.08
+MIN_TICK_ASPECT = 0.08
 """If the ratio of the shorter side to the longer side is smaller than this number, the shorter side
 has a single tick."""
-POINTS = 30_000
+MAX_PARTICLES = 30_000
 """Maximum number of particles that are drawn."""
-DENSE = 100.0
+DOT_SIZE_PT = 100.0
 """Size of dots in points, multiplied by the square root of the number of particles."""
-APART = 1.5
+MAX_BOND_DISTANCE = 1.5
 """Maximum distance between neighbouring bonds of one crack, as a multiple of the rest length of
 bonds."""
-CRACKS = 50
+MAX_CRACKS = 50
 """Maximum number of cracks that are measured. The cracks with the largest numbers of bonds are
 measured."""
 DIRECTIONS = 180
@@ -141,11 +141,11 @@ def _lengths(broken: CrackBonds) -> Array:
     to the same crack if the distance between their midpoints is at most APART rest lengths."""
     count = len(broken.middle)
     longest = np.linalg.norm(broken.ends[:, 1] - broken.ends[:, 0], axis=1).max()
-    pairs = KDTree(broken.middle).query_pairs(APART * longest, output_type="ndarray")
+    pairs = KDTree(broken.middle).query_pairs(MAX_BOND_DISTANCE * longest, output_type="ndarray")
     near = coo_array((np.ones(len(pairs)), tuple(pairs.T)), (count, count))
     labels = connected_components(near, directed=False)[1]
     lengths = np.zeros(count)
-    for number in np.argsort(-np.bincount(labels))[:CRACKS]:
+    for number in np.argsort(-np.bincount(labels))[:MAX_CRACKS]:
         rows = np.flatnonzero(labels == number)
         until = np.searchsorted(rows, np.arange(count), side="right") - 1
         grown = _extents(broken.middle[rows])[np.maximum(until, 0)]
@@ -166,13 +166,15 @@ def _extents(middle: Array) -> Array:
 def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | None) -> Axes:
     body = dataset["reference"].values[dataset["role"].values == OF_BODY]
     is_new, ax = ax is None, ax or _axes_around(body)
-    dots = body[:: 1 + len(body) // POINTS]
-    size = min(max(DENSE / np.sqrt(len(body)), 1.2), 6.0)
-    ax.plot(*dots.T, ".", color=BODY, ms=size, mew=0.0, rasterized=len(dots) > 5000, zorder=0)
+    dots = body[:: 1 + len(body) // MAX_PARTICLES]
+    size = min(max(DOT_SIZE_PT / np.sqrt(len(body)), 1.2), 6.0)
+    ax.plot(
+        *dots.T, ".", color=BODY_COLOUR, ms=size, mew=0.0, rasterized=len(dots) > 5000, zorder=0
+    )
     later = np.unique(broken.step[broken.step > 0])
-    groups = {"broken from the start": (broken.step == 0, OLD)}
+    groups = {"broken from the start": (broken.step == 0, INITIAL_CRACK_COLOUR)}
     if len(later) == 1:
-        groups[f"broken in step {later[0]}"] = (broken.step > 0, NEW)
+        groups[f"broken in step {later[0]}"] = (broken.step > 0, BROKEN_BOND_COLOUR)
     for name, (rows, colour) in groups.items():
         if rows.any():
             lines = LineCollection([*broken.ends[rows]], colors=colour, linewidths=1.6)
@@ -186,7 +188,7 @@ def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | Non
     ax.margins(0.04)
     low, sides = body.min(axis=0), np.ptp(body, axis=0)
     for axis, first, side in zip((ax.xaxis, ax.yaxis), low, sides, strict=True):
-        if side < THIN * sides.max():
+        if side < MIN_TICK_ASPECT * sides.max():
             axis.set_ticks([round(float(first), 6)])
     if ax.get_legend_handles_labels()[1]:
         style: dict[str, Any] = {"frameon": False, "fontsize": "small"}
@@ -199,17 +201,17 @@ def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | Non
 
 def _is_long(body: Array) -> bool:
     wide, tall = np.ptp(body, axis=0)
-    return bool(wide > LONG * tall)
+    return bool(wide > MAX_ASPECT * tall)
 
 
 def _axes_around(body: Array) -> Axes:
     """Return the axes of a new figure. They have the aspect ratio of the body, unless the text
     would not have enough room."""
     wide, tall = np.maximum(np.ptp(body, axis=0), 1e-9)
-    height = min(max(WIDE_IN * tall / wide, MIN_IN), TALLEST_IN)
-    width = min(max(height * wide / tall, MIN_IN), WIDE_IN)
+    height = min(max(MAX_WIDTH_IN * tall / wide, MIN_IN), MAX_HEIGHT_IN)
+    width = min(max(height * wide / tall, MIN_IN), MAX_WIDTH_IN)
     below = SCALE_IN if _is_long(body) else 0.0
-    return new_axes(width + BESIDE_IN, height + BESIDE_IN + below)
+    return new_axes(width + TEXT_SPACE_IN, height + TEXT_SPACE_IN + below)
 
 
 def _coloured(ax: Axes, broken: CrackBonds, *, below: bool) -> None:
@@ -217,10 +219,10 @@ def _coloured(ax: Axes, broken: CrackBonds, *, below: bool) -> None:
     beside or below the body."""
     later = broken.step > 0
     scale = Normalize(broken.step[later].min(), broken.step[later].max())
-    lines = LineCollection([*broken.ends[later]], cmap=COLOURS, norm=scale, linewidths=1.8)
+    lines = LineCollection([*broken.ends[later]], cmap=CMAP, norm=scale, linewidths=1.8)
     lines.set_array(broken.step[later])
     ax.add_collection(lines, autolim=False)
     ticks = MaxNLocator(6, integer=True)
     position: Any = {"location": "bottom" if below else "right", "aspect": 40 if below else 25}
-    bar = ax.figure.colorbar(ScalarMappable(scale, COLOURS), ax=ax, ticks=ticks, **position)
+    bar = ax.figure.colorbar(ScalarMappable(scale, CMAP), ax=ax, ticks=ticks, **position)
     bar.set_label(label("time of breaking", "step", width=TALL))

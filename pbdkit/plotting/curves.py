@@ -154,11 +154,11 @@ DPI = 200
 """Resolution of a figure."""
 HUES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 """Colours of Okabe and Ito, without yellow, which is invisible on white."""
-MANY = "viridis"
+LINE_CMAP = "viridis"
 """Colour map that is used if there are more lines than colours."""
 MAX_LEGEND_LINES = 12
 """Maximum number of lines in a legend."""
-WITHIN = 4
+MAX_INNER_LEGEND_LINES = 4
 """Maximum number of lines for which the legend is inside the panel."""
 FEW_POINTS = 40
 """Maximum number of points of a line that is drawn with markers."""
@@ -202,7 +202,7 @@ def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
     shares = _shares(lines, order)
     for line in lines:
         few = len(order) <= len(HUES)
-        colour = HUES[order[line.hue]] if few else colormaps[MANY](shares[line.hue])
+        colour = HUES[order[line.hue]] if few else colormaps[LINE_CMAP](shares[line.hue])
         ax.plot(
             line.x, line.y, color=colour, lw=1.2, ls="--" if line.dashed else "-", ms=3.0,
             marker="o" if len(line.x) <= FEW_POINTS else None, label=_wrapped(line.name),
@@ -225,7 +225,7 @@ def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
 def _legend(ax: Axes, lines: Sequence[Line], hues: str) -> None:
     style: dict[str, Any] = {"frameon": False, "fontsize": "small", "title_fontsize": "small"}
     style["title"] = label(hues, width=NAMED)
-    if len(lines) <= WITHIN and sum(len(line.x) for line in lines) < QUICK:
+    if len(lines) <= MAX_INNER_LEGEND_LINES and sum(len(line.x) for line in lines) < QUICK:
         ax.legend(loc="best", **style)
         return
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **style)
@@ -255,7 +255,7 @@ def _range(lines: Sequence[Line], order: dict[int, int]) -> tuple[float, float]:
 
 
 def _scale(ax: Axes, lines: Sequence[Line], order: dict[int, int], hues: str) -> None:
-    cmap = ListedColormap(colormaps[MANY](np.linspace(0.0, 0.9, 256)))
+    cmap = ListedColormap(colormaps[LINE_CMAP](np.linspace(0.0, 0.9, 256)))
     colours = ScalarMappable(Normalize(*_range(lines, order)), cmap)
     ax.figure.colorbar(colours, ax=ax, aspect=25).set_label(label(hues, width=BROAD))
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-BRIDGE = 1.35
+MAX_SIDE_RATIO = 1.35
 """The side of a triangle bridges a hole or a notch if the ratio of its length to the median length
 exceeds this number."""
 
@@ -69,7 +69,7 @@ def triangles_of(reference: Array) -> Array:
     corners = reference[triangles]
     sides = corners - np.roll(corners, 1, axis=1)
     longest = np.hypot(sides[..., 0], sides[..., 1]).max(axis=1)
-    return np.asarray(triangles[longest <= BRIDGE * np.median(longest)])
+    return np.asarray(triangles[longest <= MAX_SIDE_RATIO * np.median(longest)])
 
 
 def _of_sites(site: Array, reference: Array) -> Array | None:
@@ -154,7 +154,7 @@ part of the cell."""
 MAX_POINTS = 400_000
 """Maximum number of points at which the distance from the outline is evaluated. If many cells are
 cut, the cells are small on the page and are divided into fewer parts."""
-ON_IT = 1e-6
+OUTLINE_RTOL = 1e-6
 """Tolerance, relative to the size of a cell, within which a point counts as lying on the
 outline."""
 
@@ -200,7 +200,7 @@ class CutCells:
         parts = int(min(PARTS, max(1.0, math.sqrt(MAX_POINTS / max(1, len(candidates))) - 1.0)))
         at = between(reference[cells[candidates]], np.linspace(0.0, 1.0, parts + 1))
         size = np.ptp(reference[cells[candidates]], axis=1).max(initial=0.0)
-        distance = distance_from(shape, at) - ON_IT * size
+        distance = distance_from(shape, at) - OUTLINE_RTOL * size
         is_cut = (distance > 0.0).any(axis=(1, 2))
         row = np.full(len(cells), -1, np.int32)
         row[candidates[is_cut]] = np.arange(np.count_nonzero(is_cut))
@@ -252,7 +252,7 @@ def _along_cells(shape: Shape, sides: Array) -> Array:
     share = np.linspace(0.0, 1.0, PARTS + 1)[:, None]
     points = sides[:, :1] * (1.0 - share) + sides[:, 1:] * share
     size = np.ptp(sides, axis=1).max(initial=0.0)
-    inside = distance_from(shape, points) <= ON_IT * size
+    inside = distance_from(shape, points) <= OUTLINE_RTOL * size
     whole = inside.all(axis=1)
     pieces = np.stack([points[~whole, :-1], points[~whole, 1:]], axis=2)
     return np.concatenate([sides[whole], pieces[inside[~whole, :-1] & inside[~whole, 1:]]])
@@ -422,7 +422,7 @@ BLOCK_BYTES = 2**26
 """Approximate number of bytes that are read from a file at once."""
 UNKNOWN = FRAME + 1
 """Kind of particles of the body if kinds were not recorded. It has no colour."""
-MEASURED = 50_000
+MAX_MEASURED_PARTICLES = 50_000
 """Maximum number of particles for which the spacing is measured. For more particles it is estimated
 from the area of the body."""
 
@@ -464,7 +464,7 @@ class ReferenceBody:
         """Approximate distance between neighbouring particles at rest. For small bodies it is the
         median of the distances of some particles from their nearest neighbours."""
         x = self.reference
-        if 1 < len(x) <= MEASURED:
+        if 1 < len(x) <= MAX_MEASURED_PARTICLES:
             few = np.linspace(0, len(x) - 1, 50).astype(int)
             squares = np.array([np.sort(((x - x[k]) ** 2).sum(axis=1))[1] for k in few])
             return float(np.sqrt(np.median(squares))) or 1.0

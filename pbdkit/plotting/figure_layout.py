@@ -24,7 +24,7 @@ from matplotlib.transforms import Bbox
 
 from pbdkit.errors import ExperimentError
 from pbdkit.plotting.colours import Palette, Scale
-from pbdkit.plotting.layers import INK
+from pbdkit.plotting.layers import DOT_COLOUR
 from pbdkit.plotting.style import renderer_of
 from pbdkit.progress import in_notebook
 
@@ -119,7 +119,7 @@ def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
 
 def handle(name: str, colour: str) -> Line2D:
     """Return an entry of a legend: a dot, labelled with a name."""
-    return Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)
+    return Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=DOT_COLOUR, mew=0.5, label=name)
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,9 @@ MARGIN_IN = 0.75
 """Space above and below a panel in inches."""
 CURVE_IN = 2.5
 """Height of the panel of a curve in inches."""
-CURVES = 3
+CURVES_PER_ROW = 3
 """Number of panels in a row of curves."""
-WITHIN = 3.0
+COLOUR_LIMIT = 3.0
 """Limit of the colour scale of residuals, in multiples of the noise."""
 
 
@@ -70,7 +70,7 @@ def _field_size(fitted: Fitted, n: int, count: int) -> tuple[float, float]:
 
 
 def _curve_size(count: int) -> tuple[float, float]:
-    return 2 * PANEL_IN, CURVE_IN * math.ceil(count / CURVES)
+    return 2 * PANEL_IN, CURVE_IN * math.ceil(count / CURVES_PER_ROW)
 
 
 def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
@@ -93,7 +93,12 @@ def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
                 (measured.min(), measured.max()),
                 "viridis",
             ),
-            (f"{name} residual / noise", residual / (factor * noise), (-WITHIN, WITHIN), "RdBu_r"),
+            (
+                f"{name} residual / noise",
+                residual / (factor * noise),
+                (-COLOUR_LIMIT, COLOUR_LIMIT),
+                "RdBu_r",
+            ),
         ]
         for path, sensitivity in information.items():
             share = sensitivity.reshape(2, -1)[column] / largest
@@ -111,7 +116,7 @@ def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
 def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
     numbers, information = fitted.numbers(n), fitted.information(n)
     count = 3 + len(information)
-    grid = figure.subplots(math.ceil(count / CURVES), CURVES, squeeze=False)
+    grid = figure.subplots(math.ceil(count / CURVES_PER_ROW), CURVES_PER_ROW, squeeze=False)
     axes = grid.ravel()
     for ax in axes[count:]:
         ax.remove()

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 
-SAMPLES = 2_000_000
+MAX_SAMPLES_AT_ONCE = 2_000_000
 """Maximum number of samples that are evaluated at a time."""
 MAX_PIXELS = 60_000_000
 """Maximum total number of samples. Because of it, a body that is folded over itself many times may
@@ -131,18 +131,18 @@ def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
         count = math.ceil(2 ** (level / 2))
         middles = (np.arange(count, dtype=np.float32) + 0.5) / count
         cells = np.flatnonzero(levels == level)
-        block = max(1, SAMPLES // count**2)
+        block = max(1, MAX_SAMPLES_AT_ONCE // count**2)
         for start in range(0, len(cells), block):
             yield cells[start : start + block], middles
 
 
-INK = "#404040"
+DOT_COLOUR = "#404040"
 """Colour of dots without values."""
-LINE = "#B0B0B0"
+BOND_COLOUR = "#B0B0B0"
 """Colour of intact bonds."""
-TORN = "#CC3311"
+BROKEN_BOND_COLOUR = "#CC3311"
 """Colour of broken bonds."""
-REST = "#888888"
+OUTLINE_COLOUR = "#888888"
 """Colour of the outline."""
 
 
@@ -171,7 +171,9 @@ class PixelField(Layer):
     ) -> None:
         self._body, self._grid = body, grid
         self._image = _image(ax, grid, scale)
-        self._alone = ax.scatter([], [], size**2, zorder=2, edgecolors=INK, linewidths=0.08 * size)
+        self._alone = ax.scatter(
+            [], [], size**2, zorder=2, edgecolors=DOT_COLOUR, linewidths=0.08 * size
+        )
         self._alone.set(cmap=scale.colours, norm=scale.norm)
         self.artists = [self._image, self._alone]
 
@@ -244,7 +246,7 @@ class Dots(Layer):
 
     def __init__(self, ax: Axes, size: float, colours: Scale | Palette, hidden: Array) -> None:
         self._colours, self._hidden = colours, hidden
-        edge: dict[str, Any] = {"edgecolors": INK, "linewidths": 0.08 * size}
+        edge: dict[str, Any] = {"edgecolors": DOT_COLOUR, "linewidths": 0.08 * size}
         self._dots: PathCollection = ax.scatter([], [], size**2, zorder=3, **edge)
         if isinstance(colours, Scale):
             self._dots.set(cmap=colours.colours, norm=colours.norm)
@@ -273,9 +275,14 @@ class BondLines(Layer):
         self, ax: Axes, body: ReferenceBody, width: float, *, broken: bool = False
     ) -> None:
         self._body, self._broken = body, broken
-        style: dict[str, Any] = {"colors": LINE, "zorder": 1}
+        style: dict[str, Any] = {"colors": BOND_COLOUR, "zorder": 1}
         if broken:
-            style = {"colors": TORN, "zorder": 2, "linestyles": (0, (2.5, 2.0)), "alpha": 0.7}
+            style = {
+                "colors": BROKEN_BOND_COLOUR,
+                "zorder": 2,
+                "linestyles": (0, (2.5, 2.0)),
+                "alpha": 0.7,
+            }
         self._lines = LineCollection([], linewidths=width, **style)
         ax.add_collection(self._lines, autolim=False)
         self.artists = [self._lines]
@@ -307,7 +314,7 @@ class BondValues(Layer):
 
 def draw_outline(ax: Axes, sides: Array) -> None:
     """Draw segments, (side, end, axis), that do not change from step to step."""
-    lines = LineCollection(list(sides), colors=REST, linewidths=0.7, zorder=2.5)
+    lines = LineCollection(list(sides), colors=OUTLINE_COLOUR, linewidths=0.7, zorder=2.5)
     ax.add_collection(lines, autolim=False)
 
 

@@ -41,19 +41,19 @@ WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
 """Distributions of the modules that write movies."""
 DPI = 120
 """Resolution of a movie."""
-GIF_COLOURS = 128
+MAX_GIF_COLOURS = 128
 """Maximum number of colours of a GIF."""
-SLOWEST = 0.1
+MIN_FRAME_RATE = 0.1
 """Minimum frame rate in 1/s."""
-FASTEST = 240
+MAX_FRAME_RATE = 240
 """Maximum frame rate in 1/s."""
-FASTEST_GIF = 50
+MAX_GIF_FRAME_RATE = 50
 """Maximum frame rate of a GIF in 1/s."""
-FINER = 0.6
+FIELD_RESOLUTION = 0.6
 """Number of pixels of a field per pixel of the movie, along each axis; fields are interpolated."""
 NEARLY_WHITE = 240
 """Brightness above which a colour of a palette counts as white."""
-FRAMES = 60
+MAX_NOTEBOOK_FRAMES = 60
 """Maximum number of steps in an animation for notebooks."""
 
 
@@ -153,9 +153,9 @@ def animate(
 
 def _refuse_speed(path: Path, fps: float, every: int) -> None:
     """Raise ExperimentError for a frame rate or step interval outside the supported range."""
-    fastest = FASTEST_GIF if path.suffix == ".gif" else FASTEST
-    if not SLOWEST <= fps <= fastest:
-        raise ExperimentError(f"fps: {fps:g} is not between {SLOWEST:g} and {fastest}")
+    fastest = MAX_GIF_FRAME_RATE if path.suffix == ".gif" else MAX_FRAME_RATE
+    if not MIN_FRAME_RATE <= fps <= fastest:
+        raise ExperimentError(f"fps: {fps:g} is not between {MIN_FRAME_RATE:g} and {fastest}")
     if every < 1:
         raise ExperimentError(f"every: {every} is below 1; 1 shows all recorded steps")
 
@@ -240,7 +240,9 @@ def animation(
     )  # fmt: skip
     recording = Trajectory(dataset, color or "kind")
     last = len(recording.steps) - 1
-    rows = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int)).tolist()
+    rows = np.unique(
+        np.linspace(0, last, min(MAX_NOTEBOOK_FRAMES, last + 1)).round().astype(int)
+    ).tolist()
     moving = MovieFigure(recording, rows, look, silent, standalone=False)
     snapshots = [*recording.snapshots(rows)]
     return FuncAnimation(
@@ -283,7 +285,7 @@ class MovieFigure:
         extent: Extent = extent_of(recording, looked_at, look)
         title = self._title(as_step(recording.steps[-1]))
         self.sheet: PanelFigure = PanelFigure(
-            [recording], [title], "", extent, look, finer=FINER, standalone=standalone
+            [recording], [title], "", extent, look, finer=FIELD_RESOLUTION, standalone=standalone
         )
         (self._panel,) = self.sheet.panels
         self._heading = self._panel.ax.title
@@ -361,7 +363,7 @@ def _write_gif(file: NewFile, few: Frame, frames: Iterator[Frame], fps: float) -
     palette is determined from `few`, a picture that contains several frames."""
     from PIL import Image
 
-    palette = Image.fromarray(few).quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
+    palette = Image.fromarray(few).quantize(MAX_GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
     colours = np.reshape(palette.getpalette() or [], (-1, 3))
     colours[colours.min(axis=1) > NEARLY_WHITE] = 255  # The background remains white.
     palette.putpalette(colours.astype(np.uint8).tobytes())

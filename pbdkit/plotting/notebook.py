@@ -15,7 +15,7 @@ from pbdkit.stability.analysis import Analysis, verdict_of
 from pbdkit.stability.forecast import Forecast, forecast
 from pbdkit.stability.relaxation import tuned
 
-LARGEST = 100_000
+MAX_ANALYSED_PARTICLES = 100_000
 """Maximum number of particles of bodies that are analysed automatically."""
 STRAIGHT = "computes the equilibrium directly; steps would converge to it"
 """Description of a run of the solver `equilibrium`."""
@@ -59,7 +59,7 @@ def _properties(scene: Scene) -> tuple[list[tuple[str, str]], list[str]]:
         ("rule", f"{experiment.rule.type}, frame {experiment.frame.type}"),
         ("steps", f"{experiment.steps}, recorded {records} times"),
     ]
-    if count > LARGEST:
+    if count > MAX_ANALYSED_PARTICLES:
         why = f"not computed for {count} particles; pbdkit.analyse(experiment) computes it"
         return [*rows, ("particles", str(count)), ("stability", why)], list(scene.warnings)
     prediction = forecast(tuned(scene))

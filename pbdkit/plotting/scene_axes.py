@@ -13,7 +13,7 @@ from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.model.experiment import Experiment
 from pbdkit.plotting.figure_layout import Page, Panels, handle
-from pbdkit.plotting.scene_figure import MARGIN, WITHIN, SceneLegend, corners, draw_scene
+from pbdkit.plotting.scene_figure import MARGIN, MAX_SIZE_PX, SceneLegend, corners, draw_scene
 from pbdkit.plotting.style import PlotOptions, figure_of, label, plain
 from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.scene import build_scene
@@ -98,7 +98,7 @@ def draw_experiment(experiment: Experiment, look: PlotOptions, ax: Axes | None) 
     unit, words = (units.scale(LENGTH), LENGTH.unit) if units else (1.0, LENGTH.lattice)
     low, high = corners(scene)
     size = np.maximum(high - low, 1e-9 * max(1.0, *np.abs(high), *np.abs(low)))
-    margin = MARGIN / ((np.array(WITHIN) - 2.0 * MARGIN) / size).min()
+    margin = MARGIN / ((np.array(MAX_SIZE_PX) - 2.0 * MARGIN) / size).min()
     (xmin, ymin), (xmax, ymax) = unit * (low - margin), unit * (high + margin)
     title, labels = plain(experiment.name), (label("x", words), label("y", words))
     if ax is not None:

@@ -23,7 +23,7 @@ from pbdkit.scene.obstacles import CIRCLES, HALF_PLANE, Barrier, Outline
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.selection import spacing
 
-HEAD = 7.0
+ARROW_HEAD_PX = 7.0
 """Length of the head of an arrow in pixels."""
 
 
@@ -86,9 +86,12 @@ class Svg:
         if length < 1e-9:
             return
         ux, uy = dx / length, dy / length
-        tip, neck = (x + dx, y + dy), max(length - HEAD, 0.0)
+        tip, neck = (x + dx, y + dy), max(length - ARROW_HEAD_PX, 0.0)
         a, b = (
-            (tip[0] - HEAD * ux + s * 0.5 * HEAD * uy, tip[1] - HEAD * uy - s * 0.5 * HEAD * ux)
+            (
+                tip[0] - ARROW_HEAD_PX * ux + s * 0.5 * ARROW_HEAD_PX * uy,
+                tip[1] - ARROW_HEAD_PX * uy - s * 0.5 * ARROW_HEAD_PX * ux,
+            )
             for s in (1.0, -1.0)
         )
         shaft = f"M{x:.1f} {y:.1f}L{x + neck * ux:.1f} {y + neck * uy:.1f}"
@@ -137,43 +140,43 @@ def force_of(load: Load) -> Floats:
     return np.array([greatest(f) for f in load.force or load.body_force or ()])
 
 
-WITHIN = (480.0, 400.0)
+MAX_SIZE_PX = (480.0, 400.0)
 """Maximum width and height of the picture in pixels."""
 MARGIN = 44.0
 """Margin around the body in pixels."""
-ARROW = 34.0
+MAX_ARROW_PX = 34.0
 """Length of the longest arrow in pixels."""
-LEAST = 14.0
+MIN_ARROW_PX = 14.0
 """Length of the shortest arrow in pixels."""
-APART = 14.0
+ARROW_SPACING_PX = 14.0
 """Distance between arrows in pixels."""
-BODY = "#0072B2"
+BODY_COLOUR = "#0072B2"
 """Colour of the body."""
-OUTLINE = "#5A87A8"
+OUTLINE_COLOUR = "#5A87A8"
 """Colour of the edge of the body."""
-FRAME_POINT = "#DCCB2E"
+FRAME_COLOUR = "#DCCB2E"
 """Colour of frame points."""
-LEADS = "#D55E00"
+LEADER_COLOUR = "#D55E00"
 """Colour of moving leaders."""
-HELD = "#7A3300"
+HOLD_COLOUR = "#7A3300"
 """Colour of leaders that are held in place."""
-ACTS = "#007A5A"
+LOAD_COLOUR = "#007A5A"
 """Colour of the arrows of loads."""
-CUT = "#C2185B"
+CRACK_COLOUR = "#C2185B"
 """Colour of cracks and cuts."""
-STANDS = "#9A9A9A"
+OBSTACLE_COLOUR = "#9A9A9A"
 """Colour of the outlines of obstacles."""
-DRIVEN = "#404040"
+OBSTACLE_ARROW_COLOUR = "#404040"
 """Colour of the arrows of moving obstacles."""
-TINTS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
+REGION_COLOURS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
 """Colours of the regions of a body."""
-DOTS = 3000
+MAX_PARTICLES = 3000
 """Maximum number of particles of a body for which all particles are drawn."""
-TINTED = 1500
+MAX_REGION_DOTS = 1500
 """Maximum number of dots that are drawn in a region."""
-ARROWS = 5
+MAX_ARROWS = 5
 """Maximum number of arrows that are drawn for a group."""
-BEYOND = 0.35
+OBSTACLE_MARGIN = 0.35
 """Margin for obstacles, relative to the size of the body."""
 Rows = NDArray[np.intp]
 
@@ -218,7 +221,7 @@ def picture_of(scene: Scene) -> Picture | None:
     """Return the picture of a scene in the plane as SVG. Return None for a scene in space."""
     if scene.axes != 2:
         return None
-    svg = Svg(*corners(scene), WITHIN, MARGIN)
+    svg = Svg(*corners(scene), MAX_SIZE_PX, MARGIN)
     legend = draw_scene(scene, svg)
     return Picture(svg.text(f"the scene of {scene.experiment.name}"), legend)
 
@@ -238,7 +241,7 @@ def corners(scene: Scene) -> tuple[Floats, Floats]:
 
 
 def _is_small(scene: Scene) -> bool:
-    return int(np.count_nonzero(scene.raster.table_kind == FOLLOWER)) <= DOTS
+    return int(np.count_nonzero(scene.raster.table_kind == FOLLOWER)) <= MAX_PARTICLES
 
 
 def _shown(scene: Scene) -> Floats:
@@ -265,10 +268,10 @@ class _Drawing:
         self._obstacles()
         if self.few:
             self._draw_named(
-                self.canvas.dots, self.X[~self.body], 0.6 * self.dot, FRAME_POINT, "frame"
+                self.canvas.dots, self.X[~self.body], 0.6 * self.dot, FRAME_COLOUR, "frame"
             )
         rows = self.body if self.few else edge_of(self.scene.raster)
-        colour, text = (BODY, "body") if self.few else (OUTLINE, "edge of the body")
+        colour, text = (BODY_COLOUR, "body") if self.few else (OUTLINE_COLOUR, "edge of the body")
         self._draw_named(self.canvas.dots, self.X[rows], self.dot, colour, text)
         self._cuts()
         self._leaders()
@@ -288,27 +291,29 @@ class _Drawing:
         at = self.X[self.body]
         for n, (name, shape) in enumerate(self.scene.experiment.regions.items()):
             inside = at[signed_distance(shape, cell, *at.T) <= 0.0]
-            step = 1 + len(inside) // TINTED
+            step = 1 + len(inside) // MAX_REGION_DOTS
             size = spacing(self.scene.raster) * self.canvas.scale * math.sqrt(step)
-            colour = TINTS[n % len(TINTS)]
+            colour = REGION_COLOURS[n % len(REGION_COLOURS)]
             self.canvas.dots(inside[::step], size, colour, square=True, opacity=0.45)
             self._note(colour, f"region {name}")
 
     def _obstacles(self) -> None:
         for barrier in self.scene.barriers:
             self.canvas.filled(
-                _outlines(barrier.start, self.canvas.low, self.canvas.high), "#E3E3E3", STANDS
+                _outlines(barrier.start, self.canvas.low, self.canvas.high),
+                "#E3E3E3",
+                OBSTACLE_COLOUR,
             )
-            self._note(STANDS, "obstacle")
+            self._note(OBSTACLE_COLOUR, "obstacle")
 
     def _cuts(self) -> None:
         experiment = self.scene.experiment
         for crack in getattr(experiment.fracture, "cracks", ()):
-            self.canvas.line(np.array(crack), CUT, 2.2)
-            self._note(CUT, "crack")
+            self.canvas.line(np.array(crack), CRACK_COLOUR, 2.2)
+            self._note(CRACK_COLOUR, "crack")
         for cut in experiment.cuts:
-            self.canvas.line(np.array(cut.segment), CUT, 2.2, "5 4" if cut.at else "")
-            self._note(CUT, f"cut at step {cut.at}" if cut.at else "cut")
+            self.canvas.line(np.array(cut.segment), CRACK_COLOUR, 2.2, "5 4" if cut.at else "")
+            self._note(CRACK_COLOUR, f"cut at step {cut.at}" if cut.at else "cut")
 
     @property
     def _longest(self) -> float:
@@ -325,10 +330,12 @@ class _Drawing:
             vector = extreme(barrier.group.motion, barrier.reference, self.scene.experiment.steps)
             ring = np.concatenate(_outlines(barrier.start, self.canvas.low, self.canvas.high))
             nearest = ring[np.argmin(np.hypot(*(ring - self.middle).T))]
-            self._arrows(nearest[None], vector.mean(axis=0, keepdims=True), longest, DRIVEN)
+            self._arrows(
+                nearest[None], vector.mean(axis=0, keepdims=True), longest, OBSTACLE_ARROW_COLOUR
+            )
         for leading in self.scene.leading:
             motion, is_fixed = leading.group.motion, isinstance(leading.group.motion, Hold)
-            colour = HELD if is_fixed else LEADS
+            colour = HOLD_COLOUR if is_fixed else LEADER_COLOUR
             text = "mass" if isinstance(motion, Newton) else "held" if is_fixed else "led"
             if leading.group.axes:
                 text += f" along {' and '.join(leading.group.axes)}"
@@ -343,7 +350,7 @@ class _Drawing:
             if isinstance(motion, Newton):
                 force = np.array([greatest(f) for f in motion.force])
                 self._arrows(
-                    leading.reference, force + 0.0 * vectors, float(np.hypot(*force)), ACTS
+                    leading.reference, force + 0.0 * vectors, float(np.hypot(*force)), LOAD_COLOUR
                 )
 
     def _loads(self) -> None:
@@ -353,14 +360,14 @@ class _Drawing:
         for loading, force in forces:
             at = self.X[loading.rows]
             at = at.mean(axis=0, keepdims=True) if loading.load.body_force else at
-            self._arrows(at, np.tile(force, (len(at), 1)), longest, ACTS)
-            self._note(ACTS, "body force" if loading.load.body_force else "force")
+            self._arrows(at, np.tile(force, (len(at), 1)), longest, LOAD_COLOUR)
+            self._note(LOAD_COLOUR, "body force" if loading.load.body_force else "force")
 
     def _arrows(self, at: Floats, vectors: Floats, longest: float, colour: str) -> None:
         """Draw arrows at some of the places. An arrow starts at its place. If it would then point
         into the body, it ends at its place instead."""
         extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
-        count = min(max(int(extent / APART), 1), ARROWS)
+        count = min(max(int(extent / ARROW_SPACING_PX), 1), MAX_ARROWS)
         ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])
         selection = np.unique(ends.round().astype(int))
         for place, vector in zip(at[selection], vectors[selection], strict=True):
@@ -376,7 +383,7 @@ def _pixels(vector: Floats, longest: float) -> Floats:
     length = float(np.hypot(*vector))
     if length <= 1e-12 * longest or longest == 0.0:
         return np.zeros(2)
-    return np.asarray(vector / length * max(ARROW * length / longest, LEAST))
+    return np.asarray(vector / length * max(MAX_ARROW_PX * length / longest, MIN_ARROW_PX))
 
 
 def edge_of(raster: Raster) -> Rows:
@@ -396,7 +403,7 @@ def _with_obstacles(
     barriers: Iterable[Barrier], low: Floats, high: Floats
 ) -> tuple[Floats, Floats]:
     """Extend the corners of the picture so that nearby obstacles are included."""
-    room = BEYOND * float((high - low).max())
+    room = OBSTACLE_MARGIN * float((high - low).max())
     for barrier in barriers:
         box = barrier.start.box
         low = np.minimum(low, np.maximum(box[:2], low - room))

@@ -34,7 +34,7 @@ def renderer_of(figure: Figure) -> RendererBase:
     return renderer
 
 
-LONGEST = 200
+MAX_TEXT = 200
 """Maximum number of characters of a title or name."""
 RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 """Translation of digits to superscripts."""
@@ -44,7 +44,7 @@ SIGNS = {"^2": "²", "^3": "³", " * ": " × "}
 
 def plain(text: object) -> str:
     """Return a short text that matplotlib does not interpret as a formula."""
-    return one_line(str(text)[:LONGEST]).replace("$", r"\$")
+    return one_line(str(text)[:MAX_TEXT]).replace("$", r"\$")
 
 
 def signed(units: str) -> str:
@@ -85,11 +85,11 @@ def _even(text: str, width: int) -> str:
     return "\n".join(next((wrapped for wrapped in every if len(wrapped) == lines), []))
 
 
-LARGEST_IN = 100.0
+MAX_SIZE_IN = 100.0
 """Maximum width and height of a figure in inches."""
-SMALLEST_DPI = 10
+MIN_DPI = 10
 """Minimum resolution, in dots per inch."""
-LARGEST_DPI = 2400
+MAX_DPI = 2400
 """Maximum resolution, in dots per inch."""
 
 
@@ -117,15 +117,13 @@ class PlotOptions:
         self._check_limits()
         if self.figsize is not None:
             sizes = [s for s in np.atleast_1d(self.figsize) if is_number(s)]
-            if len(sizes) != 2 or not all(0.0 < s <= LARGEST_IN for s in sizes):
+            if len(sizes) != 2 or not all(0.0 < s <= MAX_SIZE_IN for s in sizes):
                 raise ExperimentError(
                     "figsize: expected a width and a height in inches, each above 0 and at most "
-                    f"{LARGEST_IN:g}; got {self.figsize!r}"
+                    f"{MAX_SIZE_IN:g}; got {self.figsize!r}"
                 )
-        if not SMALLEST_DPI <= self.dpi <= LARGEST_DPI:
-            raise ExperimentError(
-                f"dpi: {self.dpi} is not between {SMALLEST_DPI} and {LARGEST_DPI}"
-            )
+        if not MIN_DPI <= self.dpi <= MAX_DPI:
+            raise ExperimentError(f"dpi: {self.dpi} is not between {MIN_DPI} and {MAX_DPI}")
         if self.contours and self.filled is False:
             raise ExperimentError("contours require filled=True, got filled=False")
 

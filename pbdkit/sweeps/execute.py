@@ -78,7 +78,7 @@ HEARTBEAT_S = 0.2
 """Maximum time in seconds between two looks at the progress of workers."""
 MAX_LOSSES = 3
 """A member has failed once it has been lost this many times with a process that ran it alone."""
-AHEAD = 2
+CHUNKS_PER_WORKER = 2
 """Number of chunks that a worker has at a time, so that it does not wait for the next."""
 WAIT_FOR_WORKERS_S = 30.0
 """Maximum time in seconds to wait for the first worker of a cluster."""
@@ -208,7 +208,7 @@ class ClusterExecutor(Executor):
         queue = Queue(deque(jobs), 1)
         while (out or queue.jobs) and not stopping():
             queue.workers = max(1, sum(self._client.nthreads().values()))
-            while queue.jobs and len(out) < AHEAD * queue.workers and not stopping():
+            while queue.jobs and len(out) < CHUNKS_PER_WORKER * queue.workers and not stopping():
                 chunk = queue.chunk()
                 out[self._client.submit(run_members, chunk, pure=False)] = chunk
             try:
@@ -473,7 +473,9 @@ class ProcessExecutor(Executor):
                     wait([f for worker in workers for f in worker.chunks], GRACE_S)
                     queue.jobs.clear()
                 for worker in workers:
-                    while queue.jobs and len(worker.chunks) < AHEAD and worker.take(queue):
+                    while (
+                        queue.jobs and len(worker.chunks) < CHUNKS_PER_WORKER and worker.take(queue)
+                    ):
                         pass
                 if not _any_done(workers):
                     yield None

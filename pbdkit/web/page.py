@@ -90,7 +90,7 @@ def _finite(value: Any) -> Any:
 
 KINDS = {"f4": "<f4", "f8": "<f8", "i4": "<i4", "u1": "<u1"}
 """Data types of arrays by their names in JavaScript."""
-LARGEST = 1e30
+MAX_NUMBER = 1e30
 """Largest magnitude of a number in a page. WebGL cannot draw larger numbers."""
 
 
@@ -103,7 +103,7 @@ def packed(values: ArrayLike, kind: str) -> dict[str, Any]:
     """
     array = np.asarray(values)
     if kind[0] == "f":
-        array = np.where(np.abs(array) > LARGEST, np.nan, array)
+        array = np.where(np.abs(array) > MAX_NUMBER, np.nan, array)
     array = np.ascontiguousarray(array, KINDS[kind])
     by_place = array.reshape(-1, 1).view(np.uint8).T.tobytes()
     data = b64encode(compress(by_place, 6, mtime=0)).decode()

@@ -35,7 +35,7 @@ from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source, yaml_text
 from pbdkit.plotting.data import cells_of, distance_from, lattice_unit, shape_of, triangles_of
-from pbdkit.plotting.style import LONGEST, in_its_units, signed
+from pbdkit.plotting.style import MAX_TEXT, in_its_units, signed
 from pbdkit.plugin.discovery import retired_parts
 from pbdkit.plugin.fracture_model import breaking_order
 from pbdkit.scene.scene import Scene
@@ -170,7 +170,7 @@ MIN_STEPS = 60
 """Minimum number of steps of a run that are shown, if at least that number is recorded."""
 MAX_PARTICLES = 50_000
 """Maximum number of particles that a browser can draw smoothly in motion, with their bonds."""
-FEW_LEADERS = 200
+MAX_SHOWN_LEADERS = 200
 """Number of leaders up to which all leaders are shown, because they cause the motion."""
 
 
@@ -231,7 +231,7 @@ def thinned(
     while selection.sum() > limit and stride < 1000:
         stride += 1
         selection = _on_sublattice(dataset, stride)
-    with_leaders = bool(0 < leaders.sum() <= FEW_LEADERS)
+    with_leaders = bool(0 < leaders.sum() <= MAX_SHOWN_LEADERS)
     rows = np.flatnonzero(selection | leaders if with_leaders else selection)
     return Thinning(steps, rows, stride, with_leaders, recorded, count)
 
@@ -245,7 +245,7 @@ def _on_sublattice(dataset: xarray.Dataset, stride: int) -> NDArray[np.bool_]:
     return np.asarray((indices[0] % stride == 0) & (indices[1] % stride == 0))
 
 
-LISTED = 300
+MAX_LISTED = 300
 """Maximum number of broken bonds in the table of a page."""
 STATES = ("intact", "broken", "cut", "broken from the start", "cannot break")
 """Names of the states of bonds."""
@@ -315,7 +315,7 @@ class BondArrays:
 
     def ledger(self) -> dict[str, Any]:
         """Return the table of broken bonds in the order of breaking; long tables are truncated."""
-        listed = self.order[:LISTED]
+        listed = self.order[:MAX_LISTED]
         counts = np.bincount(self.state, minlength=len(STATES)).tolist()
         return {
             "model": self.model,
@@ -414,10 +414,10 @@ def _states(steps: Array, cut: Array, spared: Array) -> Array:
     return np.where(steps < 0, whole, broken)
 
 
-AT_ONCE = 2**28
+MAX_BYTES_AT_ONCE = 2**28
 """A variable with at most this number of bytes is read at once. Larger variables are read step by
 step."""
-FAR = 20.0
+MAX_EXTENT_RATIO = 20.0
 """If the ratio of the extent of all positions to the extent of the body at rest exceeds this
 number, the run counts as diverged, and the view is not extended to its positions."""
 
@@ -449,7 +449,7 @@ def read(variable: xarray.DataArray, steps: Rows) -> Iterator[Array]:
         yield in_units(variable.values, factor)
         return
     variable = variable.transpose("time", "particle", ...)
-    if variable.nbytes <= AT_ONCE:
+    if variable.nbytes <= MAX_BYTES_AT_ONCE:
         each = iter(variable.values[steps])
     else:
         each = (variable.isel(time=row).values for row in steps.tolist())
@@ -567,7 +567,7 @@ def _box(reference: Array, places: Array) -> list[float]:
     positions extend far beyond the body at rest, return the bounds of the body at rest."""
     low, high = np.nanmin(places, axis=(0, 2)), np.nanmax(places, axis=(0, 2))
     rest = np.nanmin(reference, axis=0), np.nanmax(reference, axis=0)
-    if not (np.ptp([low, high], axis=0) < FAR * np.ptp(rest, axis=0).max()).all():
+    if not (np.ptp([low, high], axis=0) < MAX_EXTENT_RATIO * np.ptp(rest, axis=0).max()).all():
         low, high = rest
     return [*low.tolist(), *high.tolist()]
 
@@ -679,7 +679,7 @@ def _same(brief: dict[str, Any], parts: dict[str, Any]) -> bool:
 
 def title_of(dataset: xarray.Dataset) -> str:
     """Return the title of the page."""
-    return str(dataset.attrs.get("title", ""))[:LONGEST] or "a result without a title"
+    return str(dataset.attrs.get("title", ""))[:MAX_TEXT] or "a result without a title"
 
 
 def file_name(title: str) -> str:
@@ -687,10 +687,10 @@ def file_name(title: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", title).strip("-")[:60] or "experiment"
 
 
-LARGEST = 20_000
+MAX_PREDICTED_PARTICLES = 20_000
 """Maximum number of particles for which the page contains a prediction of stability. For larger
 bodies the prediction would take too long."""
-FEWEST = 8
+MIN_MOVES = 8
 """Minimum number of moves from which a decay is measured."""
 MAX_MOVES = 800
 """Maximum number of moves from which a decay is measured."""
@@ -720,7 +720,7 @@ class MoveHistory:
     def decay(self) -> float | None:
         """Return the factor by which the moves finally decrease in each step."""
         rows = self.fitted
-        if len(rows) < FEWEST:
+        if len(rows) < MIN_MOVES:
             return None
         return float(np.exp(np.polyfit(self.steps[rows], np.log(self.move[rows]), 1)[0]))
 
@@ -741,7 +741,7 @@ def moves_of(dataset: xarray.Dataset) -> MoveHistory | None:
     intervals = np.diff(times)
     if len(intervals) and intervals[-1] != intervals[0]:
         steps, times, intervals = steps[:-1], times[:-1], intervals[:-1]
-    if len(times) < FEWEST or "kind" not in dataset or (intervals != intervals[0]).any():
+    if len(times) < MIN_MOVES or "kind" not in dataset or (intervals != intervals[0]).any():
         return None
     name = "u" if "u" in dataset else "position"
     move, event = [], 0
@@ -767,17 +767,17 @@ def convergence(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
         }
     if not scene.experiment.solver.makes_steps:
         return _error_bound_table(dataset)
-    if scene.raster.count > LARGEST:
+    if scene.raster.count > MAX_PREDICTED_PARTICLES:
         return {
             "notes": [
                 (
-                    f"There is no prediction for more than {LARGEST} particles on this page; "
-                    "`pbdkit check` computes one."
+                    f"There is no prediction for more than {MAX_PREDICTED_PARTICLES} particles on "
+                    "this page; `pbdkit check` computes one."
                 )
             ]
         }
     analysis, moves = Analysis(tuned(scene)), moves_of(dataset)
-    decaying = moves if moves and len(moves.move) - moves.free >= FEWEST else None
+    decaying = moves if moves and len(moves.move) - moves.free >= MIN_MOVES else None
     content: dict[str, Any] = {
         "rows": _rows(dataset, analysis, decaying),
         "notes": _notes(analysis),
@@ -851,7 +851,7 @@ def _curve(analysis: Analysis, moves: MoveHistory) -> dict[str, Any]:
     logs[~np.isfinite(logs)] = np.nan
     series = [{"name": "observed", "values": packed(logs, "f8")}]
     radius, rows = analysis.spectral_radius, moves.fitted
-    if radius and len(rows) >= FEWEST:
+    if radius and len(rows) >= MIN_MOVES:
         middle = rows[len(rows) // 2]
         line = logs[middle] + (moves.steps - moves.steps[middle]) * np.log10(radius)
         line[: moves.free] = np.nan
@@ -1045,7 +1045,7 @@ MIN_STEPS_OF_MEMBER = 6
 """Minimum number of steps of each member that are shown, if at least that number is recorded."""
 MIN_POINTS = 50
 """Minimum number of points in the curves of each member, if at least that number is recorded."""
-POINTS = 100_000
+MAX_CURVE_POINTS = 100_000
 """Maximum number of points in the curves of all members together."""
 
 
@@ -1075,7 +1075,7 @@ class SweepContent:
         """Return the content. The data of the moving lattices of all members together have about
         `budget` bytes before packing."""
         each = self._members
-        points = max(MIN_POINTS, POINTS // len(each))
+        points = max(MIN_POINTS, MAX_CURVE_POINTS // len(each))
         successful = [str(member[STATUS].item()) in STORED_STATUSES for member in each]
         if "position" not in each[0] or not any(successful):
             note = "No lattices are shown: no member is complete, or `position` was not kept."
@@ -1251,9 +1251,9 @@ ratio depends on the motion and is not known before."""
 MAX_PAGE_BYTES = 80_000_000
 """Maximum number of bytes of the lattice's data, before compression, with which a browser draws
 smoothly."""
-ATTEMPTS = 4
+MAX_ATTEMPTS = 4
 """Maximum number of attempts."""
-SMALL = 0.6
+REBUILD_FRACTION = 0.6
 """If steps or particles were omitted and the page is smaller than this fraction of the maximum
 size, the page is built again with more of them."""
 
@@ -1311,13 +1311,15 @@ def report_text(dataset: xarray.Dataset, measured: dict[str, Any] | None = None)
     """Return the page as text. `measured` is a table of a benchmark, as returned by `speed`."""
     content = (SweepContent if SWEEP in dataset.attrs else RunContent)(dataset)
     budget, best = FIRST, ""
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_ATTEMPTS):
         data = content.within(budget)
         text = page(data | {"speed": measured})
         fits = len(text) <= BUDGET
         if not best or (fits and len(text) > len(best)) or len(best) > BUDGET:
             best = text
-        enough = not data["thinned"] or len(text) > SMALL * BUDGET or budget == MAX_PAGE_BYTES
+        enough = (
+            not data["thinned"] or len(text) > REBUILD_FRACTION * BUDGET or budget == MAX_PAGE_BYTES
+        )
         if fits and enough:
             break
         budget = min(int(0.9 * budget * BUDGET / len(text)), MAX_PAGE_BYTES)

@@ -11,13 +11,13 @@ from pbdkit.errors import ExperimentError, printable
 from pbdkit.plugin.component import Strict
 from pbdkit.web.session import Session
 
-LONGEST = 4096
+MAX_COMMAND_BYTES = 4096
 """Maximum length of a command in bytes."""
-FARTHEST = 1e12
+MAX_COORDINATE = 1e12
 """Largest coordinate in lattice units. It is limited so that squares and differences of coordinates
 are finite."""
 Step = Annotated[int, Field(ge=0, lt=2**31)]
-Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 Place = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 """Position (x, y) in the plane of the page."""
 
@@ -125,8 +125,8 @@ def command_of(message: str | bytes | dict[str, Any]) -> Command:
     """Parse the command in a message. Raises ExperimentError if the message is not a command."""
     try:
         if not isinstance(message, dict):
-            if len(message) > LONGEST:
-                raise ExperimentError(f"a command has at most {LONGEST} bytes")
+            if len(message) > MAX_COMMAND_BYTES:
+                raise ExperimentError(f"a command has at most {MAX_COMMAND_BYTES} bytes")
             message = json.loads(message)
         return _COMMANDS.validate_python(message)
     except ValidationError as error:

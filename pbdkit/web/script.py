@@ -455,7 +455,7 @@ def _with_key(parts: Parts, key: str, values: list[Any]) -> Parts:
     return rest | ({key: values} if values else {})
 
 
-INLINE = 500
+MAX_INLINE_KNOTS = 500
 """Maximum number of knots of a path that is written in the experiment. Longer paths are written to
 a table."""
 COMMENT = "# Written by pbdkit live: `pbdkit run` repeats the session bit for bit.\n"
@@ -514,7 +514,7 @@ def _tables(parts: dict[str, Any], path: FilePath) -> dict[FilePath, str]:
     tables = {}
     for n, group in enumerate(parts["leaders"]):
         motion = group["motion"]
-        if motion.get("type") == "path" and len(motion["steps"]) > INLINE:
+        if motion.get("type") == "path" and len(motion["steps"]) > MAX_INLINE_KNOTS:
             table = _table(path, n)
             rows = zip(motion["steps"], motion["displacements"], strict=True)
             out = io.StringIO()

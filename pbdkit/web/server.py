@@ -32,7 +32,14 @@ from websockets.http11 import Request, Response
 
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.web.page import script, source
-from pbdkit.web.requests import LONGEST, Command, PictureReceived, Rewind, command_of, execute
+from pbdkit.web.requests import (
+    MAX_COMMAND_BYTES,
+    Command,
+    PictureReceived,
+    Rewind,
+    command_of,
+    execute,
+)
 from pbdkit.web.session import Judge, Judgement, Message, Session, static_message, status_message
 from pbdkit.web.view_frames import ViewFrame
 
@@ -83,7 +90,7 @@ class Access:
         return [f"{name}:{self.port}" for name in NAMES]
 
 
-SHORTEST_S = 1 / 60
+MIN_PICTURE_INTERVAL_S = 1 / 60
 """Minimum time in seconds between two pictures."""
 CLOSE_S = 1.0
 """Time in seconds to wait until the thread of the session ends."""
@@ -163,7 +170,7 @@ class Conductor:
                 self._do(viewer, what)
             steps = self._session.next_steps
             if steps and monotonic() >= due and not self._closed:
-                due = monotonic() + SHORTEST_S
+                due = monotonic() + MIN_PICTURE_INTERVAL_S
                 self._try(None, lambda steps=steps: self._session.advance(steps))
             self._try(None, self._publish)
 
@@ -331,7 +338,7 @@ class SessionServer:
 
     async def _started(self) -> Server:
         server = await serve(
-            self._talk, HOST, self._port, process_request=self._answer, max_size=LONGEST,
+            self._talk, HOST, self._port, process_request=self._answer, max_size=MAX_COMMAND_BYTES,
             max_queue=64, compression=None, server_header=None, logger=_silent(),
             create_connection=self._connection(),
         )  # fmt: skip

@@ -40,9 +40,9 @@ from pbdkit.stepping.state import State, initial_state, unmoved_state
 from pbdkit.web.script import NEVER, Displacement, LeaderScript, Saved, Script, save_script
 from pbdkit.web.view_frames import COLOURS, Camera, ViewFrame
 
-LARGEST = 4000
+MAX_PARTICLES = 4000
 """Maximum number of particles for which the spectrum is computed in about a second."""
-SLOW = 2000
+SLOW_STEPS = 2000
 """Number of steps to a relative distance of 1e-3 above which convergence is called slow."""
 
 
@@ -59,8 +59,8 @@ def judged(experiment: Experiment) -> Judgement:
     """Analyse the stability of the body in its initial state."""
     try:
         scene = build_scene(experiment)
-        if scene.raster.count > LARGEST:
-            size = f"the body has more than {LARGEST} particles"
+        if scene.raster.count > MAX_PARTICLES:
+            size = f"the body has more than {MAX_PARTICLES} particles"
             return Judgement("unknown", f"{size}; use `pbdkit check` for larger ones")
         analysis = Analysis(scene)
         return _worded(analysis)
@@ -85,7 +85,7 @@ def _worded(analysis: Analysis) -> Judgement:
     if steps is None:
         return Judgement("slow", "a mode neither grows nor decays: it is not constrained")
     decay = f"the slowest mode decays to 1/1000 in {steps} steps"
-    if steps <= SLOW:
+    if steps <= SLOW_STEPS:
         return Judgement("stable", decay)
     best = analysis.best_memory
     memory = analysis.scene.experiment.stepping.memory
@@ -130,7 +130,7 @@ class Judge:
             self._report(judged(experiment))
 
 
-SMALL = 20_000
+MAX_NUMPY_PARTICLES = 20_000
 """Number of particles up to which steps are made with numpy. With compiled kernels, some changes of
 parameters would require compiling again, which takes seconds."""
 
@@ -186,7 +186,7 @@ def stepped(experiment: Experiment) -> Scene:
         for relaxation in (1.0, "auto")
     )
     with suppress(ExperimentError):
-        if scene.raster.count <= LARGEST:
+        if scene.raster.count <= MAX_PARTICLES:
             return tuned(build_scene(best))
     return build_scene(plain)
 
@@ -204,7 +204,7 @@ def _led(scene: Scene, groups: Sequence[LeaderScript]) -> tuple[Leading, ...]:
 
 
 def _chosen(scene: Scene) -> Choice:
-    if scene.experiment.stepping.engine == "auto" and scene.raster.count <= SMALL:
+    if scene.experiment.stepping.engine == "auto" and scene.raster.count <= MAX_NUMPY_PARTICLES:
         return Choice("numpy", 1, "the body is small")
     return choose(scene)
 
@@ -223,9 +223,9 @@ def fitted(state: State, scene: Scene) -> State:
     return replace(state, **bonds)
 
 
-ROOM = 256 * 2**20
+MAX_STATE_BYTES = 256 * 2**20
 """Maximum memory of kept states in bytes."""
-FEWEST = 4
+MIN_STATES = 4
 """Minimum number of kept states."""
 MAX_STATES = 200
 """Maximum number of kept states."""
@@ -269,7 +269,9 @@ class History:
 
     def _fits(self) -> bool:
         count = len(self._states)
-        return count <= FEWEST or (count <= MAX_STATES and sum(map(_size, self._states)) <= ROOM)
+        return count <= MIN_STATES or (
+            count <= MAX_STATES and sum(map(_size, self._states)) <= MAX_STATE_BYTES
+        )
 
     def _thin(self) -> None:
         states = self._states[:1]
@@ -287,7 +289,7 @@ def _size(state: State) -> int:
 
 SAMPLES = 64
 """Number of points at which a line is mapped to the body at rest."""
-NEAR = 0.25
+LINE_TOLERANCE = 0.25
 """Tolerance with which a line is replaced by a polyline, in units of the spacing."""
 ALONG = 0.29
 """Position along a bond, as a fraction of its length, at which it is cut. It is not in the middle,
@@ -309,7 +311,7 @@ def at_rest(line: Segment, positions: Floats, reference: Floats, spacing: float)
         return []
     _, nearest = KDTree(positions[near]).query(places)
     places = places + (reference[near] - positions[near])[nearest]
-    corners = _straightened(places, NEAR * spacing)
+    corners = _straightened(places, LINE_TOLERANCE * spacing)
     points = [(float(x), float(y)) for x, y in places[corners]]
     return [(a, b) for a, b in pairwise(points) if a != b]
 
@@ -342,9 +344,9 @@ def _straightened(places: Floats, tolerance: float) -> list[int]:
     return corners[:-1] + [worst + n for n in _straightened(places[worst:], tolerance)]
 
 
-LONGEST_S = 0.25
+MAX_PICTURE_INTERVAL_S = 0.25
 """Maximum time in seconds between pictures at any speed."""
-REPLAY_S = 0.5
+MAX_REPLAY_S = 0.5
 """Maximum time in seconds for replaying steps from a kept state."""
 
 
@@ -425,7 +427,7 @@ class Session:
         """Return the number of steps until the next picture. It is 0 while stepping is stopped."""
         if not (self.running or self.due_steps):
             return 0
-        limit = max(1, int(LONGEST_S / self.step_s)) if self.step_s else 1
+        limit = max(1, int(MAX_PICTURE_INTERVAL_S / self.step_s)) if self.step_s else 1
         return min(limit, self.speed if self.running else self.due_steps)
 
     def rewind(self, step: int) -> None:
@@ -434,7 +436,7 @@ class Session:
         self.running, self.due_steps, self.grabbed = False, 0, None
         step = min(step, self.end)
         snapshot = self.history.before(step)
-        if (step - snapshot.step) * self.step_s > REPLAY_S:
+        if (step - snapshot.step) * self.step_s > MAX_REPLAY_S:
             step = snapshot.step
         self._replay(step)
 

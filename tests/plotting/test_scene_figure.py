@@ -179,7 +179,7 @@ def test_large_bodies_give_small_pages():
 
 
 def test_omitted_slow_analyses_are_reported(monkeypatch):
-    monkeypatch.setattr(notebook, "LARGEST", 10)
+    monkeypatch.setattr(notebook, "MAX_ANALYSED_PARTICLES", 10)
     assert "not computed for" in pbdkit.load("paper/a")._repr_html_()
 
 

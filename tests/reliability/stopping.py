@@ -91,7 +91,7 @@ def resumed_otherwise(
 ) -> tuple[list[str], int]:
     """Return the differences of the run, stopped and resumed several times, from the uninterrupted
     one; and the number of stops."""
-    own, often_enough = list(own), drivers.LONGEST_CALL_S
+    own, often_enough = list(own), drivers.MAX_CALL_S
     whole, output = folder / "whole.nc", folder / "out.nc"
     for path in (whole, output):
         path.unlink(missing_ok=True)
@@ -107,7 +107,7 @@ def resumed_otherwise(
     most = min(2**60 - counting.left, parts["steps"]) + 1
     often(0.0 if draw.random() < 0.5 else 1e9)
     if draw.random() < 0.5:
-        drivers.LONGEST_CALL_S = 0.0  # a look each step
+        drivers.MAX_CALL_S = 0.0  # a look each step
         most = parts["steps"] + 1
     stops = 0
     try:
@@ -117,7 +117,7 @@ def resumed_otherwise(
             watch = Looks(draw.randint(1, most) if stops < MOST_STOPS else 2**60)
             report = gone_on(output, own, watch, draw.choice(engines))
     finally:
-        drivers.LONGEST_CALL_S = often_enough
+        drivers.MAX_CALL_S = often_enough
     del report
     found = [d for d in differences(whole, output) if d != "attributes ['experiment']"]
     left = sorted(p.name for p in folder.iterdir() if p not in (whole, output))

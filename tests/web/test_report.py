@@ -202,7 +202,7 @@ def test_click_on_a_bond_shows_its_events(page, torn):
 
 
 def test_list_has_the_broken_bonds_in_order(page, torn, monkeypatch, tmp_path):
-    monkeypatch.setattr(bonds, "LISTED", 3)
+    monkeypatch.setattr(bonds, "MAX_LISTED", 3)
     dataset, _ = torn
     opened(page, written(dataset, tmp_path))
     section = page.locator("section").filter(has_text="Fracture model")

@@ -28,7 +28,7 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation
 from pbdkit.web import script as saving, session as history, session as stage
 from pbdkit.web.command_line import live
-from pbdkit.web.requests import FARTHEST, LONGEST, command_of, execute
+from pbdkit.web.requests import MAX_COMMAND_BYTES, MAX_COORDINATE, command_of, execute
 from pbdkit.web.server import Access, Conductor, SessionServer, SocketViewer
 from pbdkit.web.session import Session, judged, static_message, status_message
 from pbdkit.web.widget import LiveWidget
@@ -126,7 +126,7 @@ def test_part_of_a_session_is_saved(tmp_path):
 
 
 def test_kernels_reproduce_the_session(interpreted, tmp_path, monkeypatch):
-    monkeypatch.setattr(stage, "SMALL", 0)
+    monkeypatch.setattr(stage, "MAX_NUMPY_PARTICLES", 0)
     session, _ = session_of("paper/a", tmp_path, ["solver.engine=compiled"])
     assert session.stage.choice.engine == "compiled"
     at_random(session, 3)
@@ -249,7 +249,7 @@ def test_one_bond_is_cut_without_crossing_ones(tmp_path):
 
 
 def test_long_mouse_paths_are_stored_in_a_table(tmp_path, monkeypatch):
-    monkeypatch.setattr(saving, "INLINE", 10)
+    monkeypatch.setattr(saving, "MAX_INLINE_KNOTS", 10)
     session, said = session_of("paper/a", tmp_path)
     do(session, do="grab", row=int(session.stage.scene.leading[0].rows[0]))
     for n in range(20):
@@ -398,7 +398,7 @@ def test_number_of_stored_states_is_bounded(tmp_path, monkeypatch):
         assert len(kept.steps) <= 16
     assert kept.steps[0] == 0
     assert kept.steps[-1] > 900
-    monkeypatch.setattr(history, "ROOM", 7 * history._size(session.state))
+    monkeypatch.setattr(history, "MAX_STATE_BYTES", 7 * history._size(session.state))
     kept.keep(replace(session.state, step=5000))
     assert len(kept.steps) <= 7
 
@@ -647,9 +647,9 @@ def test_coordinates_out_of_range_are_refused(command):
 
 def test_cuts_at_the_coordinate_limits_are_safe(tmp_path):
     session, _ = session_of("paper/d1", tmp_path)
-    for end in ([FARTHEST, FARTHEST], [-FARTHEST, 0.0], [0.0, 0.0]):
+    for end in ([MAX_COORDINATE, MAX_COORDINATE], [-MAX_COORDINATE, 0.0], [0.0, 0.0]):
         with suppress(pbdkit.ExperimentError):
-            do(session, do="cut", **{"from": [FARTHEST, -FARTHEST], "to": end})
+            do(session, do="cut", **{"from": [MAX_COORDINATE, -MAX_COORDINATE], "to": end})
     session.advance(2)
     assert np.isfinite(session.state.u).all()
 
@@ -669,7 +669,7 @@ def test_invalid_messages_are_answered_and_the_session_continues(address):
         ):
             page.socket.send(nonsense)
             assert "invalid command" in page.hear("error")["text"]
-        other.socket.send("x" * (LONGEST + 1))
+        other.socket.send("x" * (MAX_COMMAND_BYTES + 1))
         with pytest.raises(ConnectionClosed, match="1009"):
             other.hear("nothing")
         page.do(do="seen")
