@@ -238,8 +238,9 @@ class ShortDefault(str):
 
 
 def parameter_of(name: str, field: Any) -> inspect.Parameter:
-    """Return a field of a model as a keyword."""
-    default = field.get_default(call_default_factory=True)
+    """Return a field of a model as a keyword; a default that depends on other fields is `...`."""
+    by_others = field.default_factory_takes_validated_data
+    default = ShortDefault("...") if by_others else field.get_default(call_default_factory=True)
     if field.is_required():
         default = inspect.Parameter.empty
     elif isinstance(default, BaseModel):
