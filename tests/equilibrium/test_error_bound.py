@@ -410,7 +410,8 @@ def test_command_prints_the_final_distance_from_equilibrium(tmp_path, monkeypatc
     assert "settled: 144 particles, 878 steps in " in done.output
     assert "of equilibrium (0.001 of the largest prescribed displacement), by the" in done.output
     assert "engine: numpy" in done.output
-    figures = CliRunner().invoke(program, [*call, "--json", "--force"])
+    loose = [*call[:3], "solver.settle.tolerance=0.1", *call[4:]]
+    figures = CliRunner().invoke(program, [*loose, "--json", "--force"])
     assert json.loads(figures.stdout)["status"] == "settled"
     short = CliRunner().invoke(program, [*call[:4], "--force", "--set", "steps=40"])
     assert short.exit_code == 0

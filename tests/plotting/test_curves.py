@@ -8,7 +8,7 @@ import pytest
 from property_cases import experiment, pull_right
 
 import pbdkit
-from pbdkit.plotting import data as series
+from pbdkit.plotting import curves, data as series
 from pbdkit.plotting.style import label
 
 plt = pytest.importorskip("matplotlib.pyplot")
@@ -150,13 +150,21 @@ def test_lines_of_particles_have_colours_and_a_colorbar_if_many(torn):
     assert many.figure.axes[1].get_ylabel() == "number of the particle"
 
 
+SHORT = [
+    "solver.increments=1",
+    "body.columns=13",
+    "cuts=[{from: [-1.0, 5.5], to: [3.25, 5.5]}]",
+]
+"""Settings of a shorter double cantilever."""
+
+
 def test_bonds_have_a_history(torn):
     a, b = torn.bond_ends.values[torn.broken_step.values > 0][0]
     (line,) = drawn(torn.pbd.history(bond=(b, a)))
     x = torn.position.sel(particle=[a, b]).diff("particle").squeeze("particle")
     np.testing.assert_allclose(line[1], np.hypot(*x.values.T) - 1.0, atol=1e-12)
     damaged = pbdkit.run(
-        pbdkit.load("modelling/double-cantilever", settings=["solver.increments=1"]), progress=False
+        pbdkit.load("modelling/double-cantilever", settings=SHORT), progress=False
     )
     row = int(np.flatnonzero(damaged.broken_step > 0)[0])
     (line,) = drawn(damaged.pbd.history("damage_left", bond=damaged.bond_ends.values[row]))
@@ -483,6 +491,7 @@ def test_labels_are_wrapped_outside_formulas():
 
 
 def test_one_command_draws_all_of_them(call, tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "DPI", 40)  # fewer pixels take less time to write
     monkeypatch.chdir(tmp_path)
     assert call("run", "paper/d1", "--set", "steps=20", "-o", "d.nc", "--quiet").code == 0
     named = {
