@@ -163,9 +163,7 @@ def test_bonds_have_a_history(torn):
     (line,) = drawn(torn.pbd.history(bond=(b, a)))
     x = torn.position.sel(particle=[a, b]).diff("particle").squeeze("particle")
     np.testing.assert_allclose(line[1], np.hypot(*x.values.T) - 1.0, atol=1e-12)
-    damaged = pbdkit.run(
-        pbdkit.load("modelling/double-cantilever", settings=SHORT), progress=False
-    )
+    damaged = pbdkit.run(pbdkit.load("modelling/double-cantilever", settings=SHORT), progress=False)
     row = int(np.flatnonzero(damaged.broken_step > 0)[0])
     (line,) = drawn(damaged.pbd.history("damage_left", bond=damaged.bond_ends.values[row]))
     np.testing.assert_array_equal(line[1], damaged.damage_left.isel(bond=row))
