@@ -335,7 +335,8 @@ def sweep(**options: Any) -> int | None:
 @outside_option
 @quiet_option
 def fit(**options: Any) -> None:
-    """Fit parameters to measured fields, or strengths to repeated tests, with their errors."""
+    """Fit parameters to measured fields, or strengths to repeated tests, and estimate their
+    errors."""
     call("sweep:fit", **options)
 
 

@@ -119,7 +119,8 @@ def _show(summary: Summary) -> None:
 
 
 def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet: bool) -> None:
-    """Fit parameters to measured fields, or strengths to repeated tests, with their errors."""
+    """Fit parameters to measured fields, or strengths to repeated tests, and estimate their
+    errors."""
     path = output or Path(Path(file).name or "fit").with_suffix(".json")
     refuse_output(path, force=force, experiment=Path(file))
     if picture:

@@ -201,8 +201,8 @@ def breaking_kernel_of(scene: Scene, tolerance: float, watch: Watch) -> Breaking
     """Return the kernel of a scene with a linear rule.
 
     Returns None if compiling would take longer than numpy, if nothing can be compiled, or if the
-    method of the solver is not direct. The result depends on the experiment alone, so that a
-    resumed run continues by the same method.
+    method of the solver is not direct. The result depends only on the experiment, so that a resumed
+    run continues with the same method.
     """
     solver = scene.experiment.solver.equilibrium
     direct = solver.method == "lu" or (

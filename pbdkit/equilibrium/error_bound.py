@@ -311,12 +311,12 @@ NEVER = 2**62
 class Pace:
     """Schedule of the checks for a steady state.
 
-    If the step operator is symmetric and all its eigenvalues are at most ρ, the displacements of
-    successive steps decay at a rate of at least -ln ρ, which decreases during the run. The distance
-    is extrapolated from two checks: distance ≈ ρ / (1 - ρ) · ‖last step‖, where ρ is determined
-    from the ratio of the sizes of two steps. The extrapolated distance is too small as long as
-    several modes remain, and exact for a single mode. Checks are therefore early rather than late.
-    The estimate determines when a bound is computed, and not the value of the bound.
+    Let the step operator be symmetric, with eigenvalues of at most ρ. Then the displacements of
+    successive steps decay at a rate of at least -ln ρ. The rate decreases during the run. The
+    distance is extrapolated from two checks: distance ≈ ρ / (1 - ρ) · ‖last step‖, where ρ is
+    determined from the ratio of the sizes of two steps. The extrapolated distance is too small as
+    long as several modes remain, and exact for a single mode. Checks are therefore early rather
+    than late. The estimate determines when a bound is computed, and not the value of the bound.
     """
 
     next_look: int

@@ -230,7 +230,7 @@ class LatticeSystem(System):
             self._grids.grid().field(np.float64),
         )
         negative_inverse = inverses(-self._matrix.scale.reshape(-1, 2, 2)).reshape(-1, 4)
-        # Kernels are compiled for contiguous arrays alone.
+        # Kernels are compiled only for contiguous arrays.
         inverse = np.ascontiguousarray(negative_inverse)
         kernels().scaled(self._solver.matrix, tuple(inverse[0].tolist()), inverse, pull, out)
         return self._planes(out)

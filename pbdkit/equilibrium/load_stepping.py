@@ -196,9 +196,9 @@ def increments(
     finder: Finder | None = None,
     stops: Sequence[int] = (),
 ) -> EquilibriumPath:
-    """Move a scene, in place, from its initial state, or from its state at the moment `since`, to
-    the equilibrium of its last step, and yield the states on the way. These include the equilibria
-    at the steps `stops`, which are earlier than the last step.
+    """Move a scene, in place, to the equilibrium of its last step, and yield the states on the way.
+    The path begins at the initial state or, if `since` is given, at the state of this moment. These
+    include the equilibria at the steps `stops`, which are earlier than the last step.
 
     Before each change of roles or loads the body is moved to equilibrium. Floating parts, and
     particles that become leaders later, are then at the positions to which slow loading moves them.

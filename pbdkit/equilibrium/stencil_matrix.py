@@ -202,9 +202,9 @@ class StencilMatrix:
 def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> StencilMatrix | None:
     """Assemble the matrix at a state with the roles of a step.
 
-    Returns None if the matrix cannot be stored as stencils. This is so in space, on lattices with
-    several sites in a primitive cell, if bonds extend beyond adjacent primitive cells, for nested
-    rules, and if frame points follow distant particles.
+    Returns None if the matrix cannot be stored as stencils. This is so in space, and on lattices
+    with several sites in a primitive cell. It is also so if bonds extend beyond adjacent primitive
+    cells, if rules are nested, or if frame points follow distant particles.
     """
     grid = PrimitiveRaster.of(scene)
     if grid is None or scene.inner or scene.experiment.neighbours.nearness():

@@ -161,8 +161,8 @@ class Strip:
     """Rows that a process stores of a grid of `count` rows, given by their indices in the grid. The
     arrays of the process start at row `low`. It owns the rows `begin` to `end`, and has the
     stencils of the rows `first` to `last`. If the next coarser grid has half the rows, `low` is
-    even, so that row n of that grid coincides with row 2n - 1 also if rows are counted from the
-    start of the arrays. This is so for `depth` coarser grids."""
+    even. Row n of that grid then coincides with row 2n - 1 of this grid, also if rows are counted
+    from the start of the arrays. This is so for `depth` coarser grids."""
 
     count: int
     low: int
@@ -284,8 +284,8 @@ TURNS = 4
 
 
 PUSH = 1e-10
-"""A load on a floating part is ignored if its ratio to the moves is at most this number, since
-moves may have an error of this size, for instance if they are computed by differences."""
+"""A load on a floating part is ignored if its ratio to the moves is at most this number. The reason
+is that moves may have an error of this size, for instance if they are computed by differences."""
 
 
 class StagnationError(Exception):

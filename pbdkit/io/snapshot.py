@@ -280,8 +280,8 @@ class Tables:
 
 FLAT = 0.1
 """Each corner of a cell is moved to the mean of the centres of the cells around it. If the area of
-the cell is then smaller than this fraction of its area at rest, these points are nearly collinear,
-as in a body with a single row of cells, and no slope can be computed."""
+the cell is then smaller than this fraction of its area at rest, these points are nearly collinear
+and no slope can be computed. This is so in a body with a single row of cells."""
 
 
 def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]) -> Floats:

@@ -230,8 +230,9 @@ def wave_bound(scene: Scene) -> Bound | None:
     """Compute the bound of plane waves for the scene's rule at rest.
 
     Return None for rules that depend on the place or do not accept scalars. Also return None if
-    neighbours are searched at every step, if there are more than about 300 neighbours, or if the
-    frame has a delay, because a delay can cause growth of modes that are not plane waves.
+    neighbours are searched at every step, or if there are more than about 300 neighbours. Return
+    None, too, if the frame has a delay, because a delay can cause growth of modes that are not
+    plane waves.
     """
     if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MAX_EVALUATIONS:
         return None

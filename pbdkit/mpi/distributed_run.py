@@ -40,8 +40,8 @@ class PartitionScheme(NamedTuple):
     """Partition of a scene for a solver.
 
     `subdomains` divides the scene. `widest` returns an upper bound of the number of rows of the
-    halo. Its arguments are the number of rows that a step reads, the number of rows that neighbours
-    reach, the minimum number of rows of a part, and the number of parts.
+    halo. Its first two arguments are the numbers of rows that a step reads and that neighbours
+    reach. The others are the minimum number of rows of a part, and the number of parts.
     """
 
     subdomains: Callable[[Scene, int], list[partition.Subdomain]]
@@ -423,8 +423,8 @@ class DistributedExecution(Execution):
         return _tuned(self.communicator, scene)
 
     def by_root(self, work: Callable[[], int]) -> int:
-        """Return the result of work that the root does alone; the other processes sleep
-        meanwhile."""
+        """Return the result of work that only the root does. The other processes sleep until it is
+        done."""
         return self.communicator.by_root(work)
 
     def run(self, scene: Scene, watch: Watch) -> Simulation:

@@ -429,14 +429,14 @@ from the area of the body."""
 
 @dataclass(frozen=True)
 class ReferenceBody:
-    """The data of a body that do not change in time. `reference`, (particle, axis), are the
-    reference positions, `site`, (particle, index), the site indices, and `number`, (particle,), the
-    particle numbers. `inside`, (particle,), is true for particles of the body and false for frame
-    points. `ends`, (bond, 2), are the rows of both ends of each bond. `broken_step`, (bond,), is
-    the step in which the bond broke, and -1 if it is intact. `outside` marks the corners of cut
-    cells that lie outside the outline. `shape` is the outline in lattice units, and None if it is
-    unknown or there are no such corners. `unit` is the length of a lattice unit in the units of
-    lengths."""
+    """The data of a body that do not change in time. For each particle, `reference` (particle,
+    axis) is the reference position, `site` (particle, index) are the site indices, and `number`
+    (particle,) is the particle number. `inside`, (particle,), is true for particles of the body and
+    false for frame points. `ends`, (bond, 2), are the rows of both ends of each bond.
+    `broken_step`, (bond,), is the step in which the bond broke, and -1 if it is intact. `outside`
+    marks the corners of cut cells that lie outside the outline. `shape` is the outline in lattice
+    units, and None if it is unknown or there are no such corners. `unit` is the length of a lattice
+    unit in the units of lengths."""
 
     reference: Array
     site: Array
@@ -495,8 +495,9 @@ class ReferenceBody:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One step: `position`, (particle, axis), `kind`, (particle,), the `values` of the quantity if
-    there is one, and `broken`, (bond,), which is true for broken bonds."""
+    """Data of one step. `position` (particle, axis) and `kind` (particle,) belong to particles.
+    `broken` (bond,) is true for broken bonds. `values` are those of the quantity, if there is
+    one."""
 
     step: float
     position: Array

@@ -105,9 +105,9 @@ def locking(
 ) -> Iterator[str]:
     """Generate a warning about cells that lock in bending.
 
-    A material that is almost inextensible along the diagonals of the lattice is stiff in shear and
-    under equal biaxial strain, and compliant under extension along one axis with contraction along
-    the other. Bending requires hourglass modes of the cells. The shear stiffness of the cells
+    Consider a material that is almost inextensible along the diagonals of the lattice. It is stiff
+    in shear and under equal biaxial strain. It is compliant if one axis is extended and the other
+    contracted. Bending requires hourglass modes of the cells. The shear stiffness of the cells
     resists these modes (locking).
     """
     rule = experiment.rule

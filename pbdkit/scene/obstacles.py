@@ -313,8 +313,7 @@ def contact_correction(
 
     The displacement is (w_x, w_y); it is zero if the particle is outside. The nearest place is
     determined in the metric of the particle. `code` is 0 for a particle that is free along both
-    axes, 1 for a particle that is led along x, 2 for one that is led along y, and 3 for one that is
-    led along both axes.
+    axes, 1 if it is led along x only, 2 if it is led along y only, and 3 if it is led along both.
     """
     count, n = 0, 0
     for w in range(len(kinds)):

@@ -1,10 +1,10 @@
 """Stability analysis of an experiment. It computes the spectrum of the step operator, the rate of
 convergence, and the reasons why steps do not converge.
 
-If the step operator is too large to be stored as a matrix, the slowest mode is computed by inverse
-iteration on finer and finer grids, with multigrid on the lattice's stencils. The result 1 - λ has
-an accuracy of 1 %. The smallest eigenvalue is then taken from plane waves, although edges without a
-frame may cause smaller eigenvalues.
+The step operator may be too large to be stored as a matrix. Then the slowest mode is computed by
+inverse iteration on finer and finer grids, with multigrid on the lattice's stencils. The result 1 -
+λ has an accuracy of 1 %. The smallest eigenvalue is then taken from plane waves, although edges
+without a frame may cause smaller eigenvalues.
 """
 
 from __future__ import annotations

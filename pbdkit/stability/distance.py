@@ -1,7 +1,7 @@
 """Distance of a body from its equilibrium while leaders move at a steady speed.
 
 In a step the leaders move first, then the followers. During a step, frame points have the
-displacements from the end of the step before. Frame points that follow leaders therefore have the
+displacements from the end of the previous step. Frame points that follow leaders therefore have the
 displacements that the leaders had at that time or, with frame delay, one step earlier. Let L be the
 influence of leaders on followers, and S the part of L that acts by means of frame points. Then
 

@@ -4,10 +4,10 @@ onto its outline.
 A rule moves a particle by S⁻¹ · force, where S is a 2 × 2 matrix of the particle. For calibrated
 rules S is the stiffness of the force that restores the particle if its neighbours stay; for springs
 it is a multiple of the identity. A particle is projected onto the nearest point outside all
-obstacles in the metric S. With the normal n at that point the displacement is proportional to S⁻¹
-n, or to a combination of S⁻¹ n for several normals where obstacles meet, so that the remaining
-force in equilibrium is along the normals. If S is a multiple of the identity, the projection is
-orthogonal. A guided particle is moved along its free axis only.
+obstacles in the metric S. If n is the normal at that point, the displacement is proportional to S⁻¹
+n. Where obstacles meet, it is a combination of S⁻¹ n for several normals. In equilibrium the
+remaining force is therefore along the normals. If S is a multiple of the identity, the projection
+is orthogonal. A guided particle is moved along its free axis only.
 """
 
 from __future__ import annotations

@@ -318,7 +318,7 @@ ALONE = 4096
 class GpuKernel:
     """Source of a kernel.
 
-    `names` are those of its arrays, and `alone` is true if it runs in a single block.
+    `names` are the names of its arrays, and `alone` is true if it runs in a single block.
     """
 
     plan: Plan

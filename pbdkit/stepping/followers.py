@@ -316,8 +316,9 @@ class MoveFollowers(Operation):
         return [knot for number, *span in spans for knot in number.breakpoints_within(*span)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if neighbours are re-evaluated, because their lists are computed on the
-        host in every step, or if parameters depend on time in a way that kernels do not support."""
+        """Return a reason if neighbours are re-evaluated, because lists of neighbours are computed
+        on the host in every step. Also return a reason if parameters depend on time in a way that
+        kernels do not support."""
         if self.scene.experiment.neighbours.nearness():
             changing = "parameters are time-dependent, and neighbours are re-evaluated"
             reasons = {

@@ -329,8 +329,8 @@ class Surroundings:
         return summed((function(d, u_own, to), to.present) for d, to in parts)
 
     def _weigh_cells(self, cells: WeighedCells) -> None:
-        """Multiply the weights of each slot by the area fractions of the cells beside it, and add
-        the weights of cells that have a stiffness other than that of the rule."""
+        """Multiply the weights of each slot by the area fractions of the cells beside it. Add the
+        weights of cells that have a stiffness other than that of the rule."""
         precision = self._scene.experiment.stepping.precision
         beside = cells.beside_each(self.slots, self.where, precision)
         self._weights = [

@@ -1,9 +1,9 @@
 """Report of a dataset as a single self-contained page of HTML (``pbdkit.report`` and `pbdkit
 report`).
 
-The sections of this file are names and units, curves, selection of steps and particles within a
-maximum size, bonds, the moving lattice, the experiment, convergence, the page of a run, statistics
-of sweep members, the page of a sweep, and benchmark tables.
+The file begins with names and units, curves, and the selection of steps and particles within a
+maximum size. Bonds, the moving lattice, the experiment and convergence follow, and then the page of
+a run. The last sections are statistics of sweep members, the page of a sweep, and benchmark tables.
 """
 
 from __future__ import annotations
@@ -418,8 +418,8 @@ MAX_BYTES_AT_ONCE = 2**28
 """A variable with at most this number of bytes is read at once. Larger variables are read step by
 step."""
 MAX_EXTENT_RATIO = 20.0
-"""If the ratio of the extent of all positions to the extent of the body at rest exceeds this
-number, the run counts as diverged, and the view is not extended to its positions."""
+"""A run counts as diverged if the ratio of the extent of all positions to the extent of the body at
+rest exceeds this number. The view is then not extended to its positions."""
 
 
 def shown_variables(dataset: xarray.Dataset) -> list[str]:

@@ -164,11 +164,11 @@ def _stacked(rows: Sequence[dict[str, Any]], real: np.dtype[Any]) -> Arrays:
 
 
 def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
-    """Return the data of a slot by name: its rest offset and weights, the sign by which d is
-    multiplied at the owner of a bond, which is the end at which the bond is stored, and index
-    offsets in flat arrays. There is an offset from a particle to its neighbour (`away`), to the
-    entry of their bond (`bonds_away`), and to the area fractions of the cells beside the slot
-    (`cells_away`)."""
+    """Return the data of a slot by name: its rest offset and weights (`rests`, `weights...`), a
+    sign (`signs`), and index offsets in flat arrays. The owner of a bond is the end at which it is
+    stored; the sign is the factor of d there. There is an offset from a particle to its neighbour
+    (`away`), to the entry of their bond (`bonds_away`), and to the area fractions of the cells
+    beside the slot (`cells_away`)."""
     scene, shape = plan.scene, plan.scene.raster.shape
     away, (plane, is_owner) = slot_step(shape, slot), scene.neighbourhood.owner[slot]
     owner = plane - (slot.source if is_owner else slot.target)

@@ -203,10 +203,10 @@ class MotionExtent:
 
 
 def _rests_by_construction(levels: Sequence[Level]) -> bool:
-    """Return whether the reference configuration is certainly an equilibrium. This is so if every
-    neighbour is present, all initial displacements are zero, no bond is broken or breaks at rest,
-    the moves of the rules at rest are zero, and neither particles nor bonds have state
-    variables."""
+    """Return whether the reference configuration is certainly an equilibrium. This requires that
+    every neighbour is present and all initial displacements are zero, that no bond is broken or
+    breaks at rest, and that the moves of the rules at rest are zero. Neither particles nor bonds
+    may have state variables."""
     scene = levels[-1].scene
     experiment, raster, fracture = scene.experiment, scene.raster, scene.experiment.fracture
     cracked = (isinstance(fracture, StartsCracked) and fracture.segments()) or experiment.cuts

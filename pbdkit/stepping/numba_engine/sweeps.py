@@ -3,9 +3,9 @@
 For particles that have all their neighbours the code is written slot by slot. Rest offsets, index
 offsets and weights are literals in it, so that the compiler removes terms that cancel. For all
 other particles the code is a loop over slots. These are particles with missing neighbours or cut
-cells, of which there are few, and they are computed one after the other. If there are too many
-slots to write code for each of them, up to thousands, the loop over slots is used for all
-particles, and all particles of a row are computed slot after slot.
+cells, of which there are few, and they are computed one after the other. There may be thousands of
+slots, too many to write code for each of them. Then the loop over slots is used for all particles,
+and all particles of a row are computed slot after slot.
 
 If the rule computes the forces of torn cells, the few particles next to damaged cells are marked in
 an array. The sweep moves all other particles as if no bond could break, and then computes the
@@ -217,10 +217,10 @@ def stress_lines(plan: Plan, owner: str) -> list[str]:
 
 def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
     """Return the tables that the lines of `stress_lines` read. They have entries for each plane of
-    bonds and each side of a bond. `corner_steps` contains the index offsets, in flat arrays, from
-    the end at which a bond is stored to the corners of the cell, and `body_steps` the index offset
-    to the area fraction of the cell. `corner_rates` contains the weights of the corners in the
-    displacement gradient."""
+    bonds and each side of a bond. Index offsets in flat arrays begin at the end at which a bond is
+    stored: `corner_steps` are those to the corners of the cell, and `body_steps` that to the area
+    fraction of the cell. `corner_rates` contains the weights of the corners in the displacement
+    gradient."""
     assert scene.cells is not None
     stresses, shape = CellStresses(scene), scene.raster.shape
     steps, rates, shares = [], [], []
@@ -772,8 +772,8 @@ def _slot_lines(
         Owner.FIXED_BOND: words.limit,
     }
     c = f"Constants({values(level.seen.bond, bond)})"
-    # At both ends the bond is evaluated with the signs that d and r have at the end at which it is
-    # stored, so that the results at both ends agree to the last bit.
+    # At both ends of a bond, d and r are used with the signs that they have at the end at which the
+    # bond is stored. The results at both ends then agree to the last bit.
     _, is_owner = plan.scene.neighbourhood.owner[slot]
     arguments = f"d, {plan.literal(slot.rest)}" if is_owner else f"-d, {plan.literal(-slot.rest)}"
     literal = level.scene.constants.weights[slot]._asdict()

@@ -2,7 +2,7 @@
 steps can be made in a pass.
 
 Step s of a pass follows step s - 1 through the lattice at a distance. A particle is moved in step s
-only after all particles on which its move depends have been moved in step s - 1, and a value is
+only after all particles on which its move depends have been moved in step s - 1. A value is
 overwritten only after all earlier steps have read it. Both conditions hold if the distance is the
 reach of the operations. The results are the same as those of separate steps, because only the order
 in which particles are computed differs.
