@@ -39,7 +39,8 @@ LARGEST_COUPLED_LU = 200_000
 """Number of unknowns up to which `auto` selects an LU factorisation if the axes are coupled."""
 WIDEST_BAND = 120
 """Largest half-bandwidth that is factorised as a band. For wider bands, the band factors of a
-square body need more memory than sparse factors and, for slightly wider ones, also more time."""
+square body need more memory than sparse factors. If the bands are still wider, they also need more
+time."""
 PIVOT_THRESHOLD = 0.1
 """A diagonal entry is used as a pivot if it is at least this fraction of the largest entry of its
 column."""

@@ -369,7 +369,7 @@ class _Assembly:
 
 
 def _number(offset: Any) -> Any:
-    """Return the index in a stencil of the place at `way`, (row, place), from the centre."""
+    """Return the index in a stencil of the place at the offset (row, place) from its centre."""
     return 3 * (offset[0] + 1) + offset[1] + 1
 
 

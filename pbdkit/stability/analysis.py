@@ -98,7 +98,8 @@ class Spectra:
 
     @property
     def left_out(self) -> list[str]:
-        """Return a message about results that would take too long, with the reason."""
+        """Return a message about results that are not computed because they would take too long. It
+        contains the reason."""
         if self.spectrum:
             return []
         reason, excess_size = self.estimate.obstacle, excess(self.scene)
@@ -267,7 +268,8 @@ class Analysis:
 
     @property
     def left_out(self) -> list[str]:
-        """Return messages about results that would take too long, with the reason."""
+        """Return messages about results that are not computed because they would take too long.
+        They contain the reason."""
         messages, solver = self.spectra.left_out, self.scene.experiment.stepping
         if types := dict.fromkeys(f"'{part.operation.type}'" for part in self.scene.operations):
             messages.append(

@@ -313,7 +313,7 @@ class Passes:
 
 
 class PlanWriter(KernelWriter):
-    """Writer of the kernel of a plan into a function."""
+    """Writer that adds the lines of a plan's kernel to a function."""
 
     def __init__(self, plan: Plan, out: Function, passes: Passes) -> None:
         self.plan, self.out, self.passes = plan, out, passes
