@@ -124,11 +124,11 @@ def test_momentum_is_bounded_by_1(memory, stable):
 
 def growth_of(**parts):
     """Return the growth of small noise in the second half of the steps in which the slowest mode
-    changes by 1e4: some hundred, or one over it. The first half is for the modes to separate: a
+    changes by 900: some thirty, or one over it. The first half is for the modes to separate: a
     start at rest has little of those that alternate."""
     scene = scene_of(**parts)
     radius = pbdkit.analyse(experiment(**parts)).spectral_radius
-    half = math.ceil(math.log(1e2) / abs(math.log(radius)))
+    half = math.ceil(math.log(30.0) / abs(math.log(radius)))
     u = advanced(scene, 1e-9 * noise_of(scene), 2 * half)
     return np.abs(u[-1]).max() / np.abs(u[half]).max()
 

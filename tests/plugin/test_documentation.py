@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import zlib
 import types
 from contextlib import nullcontext
 from pathlib import Path
@@ -106,8 +107,10 @@ def test_a_page_gives_the_signatures(interface):
 
 def reports_on(interface, code, tmp_path, monkeypatch):
     """Return the example's own run, and the report of the suite about its component."""
-    module = f"page_of_{interface.__name__.lower()}_{len(sys.modules)}"
+    # The same name in each session, so that the compiled kernels are found again.
+    module = f"page_of_{interface.__name__.lower()}_{zlib.crc32(code.encode()):x}"
     (tmp_path / f"{module}.py").write_text(code)
+    monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.syspath_prepend(tmp_path)
     page = importlib.import_module(module)
     found = vars(page).values()

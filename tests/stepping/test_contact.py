@@ -160,7 +160,8 @@ def test_corner_between_obstacles_constrains_both_normals(rule: Any, slant: floa
     found = []
     for order in ((0, 1), (1, 0)):
         given = {"rule": rule, "obstacles": [plane([0.0, 0.0], normals[n]) for n in order]}
-        for solver in ({"solver": EQUILIBRIUM | {"tolerance": 1e-10}}, stepping(0.9, 0.85, 350)):
+        found_by = [{"solver": EQUILIBRIUM | {"tolerance": 1e-10}}, stepping(0.9, 0.85, 350)]
+        for solver in found_by if order == (0, 1) else found_by[:1]:
             ds = at_rest(**INTO_A_CORNER, **given, **solver)
             np.testing.assert_allclose(moved(ds)[0], 0.0, atol=1e-12)
             depth = -(ds.position.values[ds.kind.values == 1] @ np.array(normals).T)

@@ -8,7 +8,14 @@ from hypothesis import assume, given, strategies as st
 from interpreted_kernels import interpreting
 from property_cases import HOLD_LEFT, pull_right
 from remembering_parts import Vanes
-from scene_strategies import calibrated_experiments, experiments, pulled_apart, samples
+from scene_strategies import (
+    AT_LENGTH,
+    calibrated_experiments,
+    experiments,
+    in_turn,
+    pulled_apart,
+    samples,
+)
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
@@ -135,22 +142,24 @@ WITH_MORE = {
 }
 
 
-@pytest.mark.parametrize("parts", WITH_MORE.values(), ids=WITH_MORE)
-@pytest.mark.parametrize("pieces", [1, 3])
-def test_further_events_during_steps(parts, pieces):
+EVENTS = [(name, pieces) for name in WITH_MORE for pieces in ((1, 3) if AT_LENGTH else (3,))]
+
+
+@pytest.mark.parametrize(("name", "pieces"), EVENTS)
+def test_further_events_during_steps(name, pieces):
     with small_passes(order=backwards):
-        scene = scene_of(**LONG | parts)
+        scene = scene_of(**LONG | WITH_MORE[name])
         engine = CompiledStepper(scene, pieces)
         assert_bitwise_equal(scene, engine, calls=(1, 13, 2))
 
 
-WITHOUT_LEADERS = {name: p for name, p in IN_ONE_PASS.items() if "leaders" not in p}
+WITHOUT_LEADERS = [name for name, parts in IN_ONE_PASS.items() if "leaders" not in parts]
 
 
-@pytest.mark.parametrize("parts", WITHOUT_LEADERS.values(), ids=WITHOUT_LEADERS)
-def test_every_component_in_pieces(parts):
+@pytest.mark.parametrize("name", in_turn(WITHOUT_LEADERS, 2))
+def test_every_component_in_pieces(name):
     with small_passes(deep=9):
-        scene = scene_of(**LONG | parts)
+        scene = scene_of(**LONG | IN_ONE_PASS[name])
         assert_bitwise_equal(scene, CompiledStepper(scene, 2), calls=(1, 11))
 
 
