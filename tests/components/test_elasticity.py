@@ -189,8 +189,9 @@ def test_springs_rotate_exactly_with_their_leaders(parts):
         "rule": {"type": "springs"},
         "frame": NATURAL,
         "leaders": [turn("left"), turn("right")],
-        "steps": 3000,
-        "record": {"every": 3000},
+        "solver": {"type": "stepping", "memory": 0.8},
+        "steps": 900,
+        "record": {"every": 900},
     }
     dataset = pbdkit.run(experiment, progress=False)
     x, y = dataset.reference.values.T

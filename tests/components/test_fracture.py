@@ -115,11 +115,11 @@ def test_damaged_bond_is_weighted_by_its_damage(placement):
 def test_a_bar_softens_at_its_weakest_bond(extension, way):
     """In series the forces are the same: F = (1 - D) ε = o (f - ε) / (f - o) in the weakest bond
     once it softens, and F = ε in the others."""
-    bonds, steps = 4, 1200
+    bonds, steps = 4, 600
     fracture = {"type": "damage", "onset": 0.15, "failure": 1.2, "scatter": 0.2}
     straight = {"type": "equilibrium", "tolerance": 1e-10, "increments": 10}
     solver = straight if way == "equilibrium" else {"type": "stepping", "engine": "numpy"}
-    ds = run(bar(bonds + 1, pulled(extension / 600, 600), fracture, steps=steps, solver=solver,
+    ds = run(bar(bonds + 1, pulled(extension / 300, 300), fracture, steps=steps, solver=solver,
                  record={"every": steps}, seed=8))  # fmt: skip
     o, f = (ds[f"{name}_strain"].values for name in ("onset", "failure"))
     np.testing.assert_allclose(f / o, 8.0)

@@ -8,8 +8,8 @@ import re
 import shlex
 import subprocess
 import sys
-import zlib
 import types
+import zlib
 from contextlib import nullcontext
 from pathlib import Path
 from typing import ClassVar, get_origin

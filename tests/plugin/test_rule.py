@@ -92,7 +92,10 @@ def membrane_moves(scene, u):
 
 @pytest.mark.parametrize("frame", FRAMES)
 def test_steps_converge_to_the_equilibrium(frame):
-    stepped = pbdkit.run(plate(frame, *SMALL, "steps=4000", "record.at=[0, 4000]"), progress=False)
+    stepped = pbdkit.run(
+        plate(frame, *SMALL, "solver.memory=0.8", "steps=1200", "record.at=[0, 1200]"),
+        progress=False,
+    )
     straight = pbdkit.run(
         plate(frame, *SMALL, "steps=20", "solver={type: equilibrium}"), progress=False
     )

@@ -64,7 +64,7 @@ def test_a_chain_with_a_weak_bond_follows_the_exact_law(extension, way):
     # The others would soften later: the weak one leads from the peak on.
     model = Weakest(onset=ONSET * 1.2, weak=1 / 1.2, failure=FAILURE)
     solver = STRAIGHT if way == "equilibrium" else {"type": "stepping", "engine": "numpy"}
-    steps = 1_000
+    steps = 600
     ds = run(
         chain(BONDS, fracture=model, leaders=[LEFT, pulled(extension, steps // 2)], steps=steps,
               solver=solver, record={"every": steps})
