@@ -1,5 +1,4 @@
-"""Combine the results of runs, or of the members of a sweep, into one dataset with the parameters
-as dimensions."""
+"""Combine the results of runs, or of the members of a sweep, into one dataset."""
 
 from __future__ import annotations
 
@@ -35,9 +34,11 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     Returns
     -------
     xarray.Dataset
-        Each parameter in which the experiments differ is a coordinate along `dim`, named as in a
-        sweep, and so is each attribute that differs; ``pbdkit.rerun(whole.isel(run=0))`` works.
-        Variables that no run changes, usually `reference`, are included once. All others are
+        All runs along the dimension `dim`. Each parameter in which the experiments differ is a
+        coordinate along this dimension, with the same name as in a sweep. Each attribute that
+        differs is a coordinate too, so that a single run can be repeated, as by
+        ``pbdkit.rerun(whole.isel(run=0))``. Variables that do not change during a run, usually
+        `reference`, are included once if all runs have the same values. All other variables are
         aligned by their labels, with NaN for missing values.
 
     Raises
@@ -87,10 +88,10 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
 
 
 def _differences(parts: list[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, list[Any]]]:
-    """Yield the path of each difference between parts, with the value in every part. Parts are
-    compared recursively as far as their structures agree.
+    """Yield the path of each difference between parts, with the value in every part.
 
-    The path of a `type` is that of its part.
+    Parts are compared recursively as far as their structures agree. If the types of a part differ,
+    the path is that of the part.
     """
     if all(part == parts[0] for part in parts):
         return
@@ -107,7 +108,7 @@ def _differences(parts: list[Any], path: tuple[str, ...] = ()) -> Iterator[tuple
 
 
 def _numbers(values: list[Any]) -> tuple[Any, ...]:
-    """Replace missing values by NaN if all others are numbers."""
+    """Replace missing values by NaN if all other values are numbers."""
     are_numbers = all(value is None or type(value) in (int, float) for value in values)
     return tuple(np.nan if value is None and are_numbers else value for value in values)
 
@@ -128,9 +129,9 @@ def combine_members(
 ) -> xarray.Dataset:
     """Combine the results of members into a dataset without attributes.
 
-    Values are aligned by time, particle number and the other labels of their dimensions. Missing
-    values are NaN, or the fill value. Variables that are known before the first step and equal in
-    all members are included once.
+    Values are aligned by time, particle number and the labels of all other dimensions. Missing
+    values are NaN; missing integers are the fill value. Variables that have their values before the
+    first step and are equal in all members are included once.
 
     Raises
     ------
@@ -163,8 +164,10 @@ def combine_members(
 
 
 class _Layout:
-    """Layout of the variables of all members: labels of each dimension, and which variables
-    vary."""
+    """Layout of the variables of all members.
+
+    It contains the labels of each dimension, and the variables that differ between members.
+    """
 
     def __init__(self) -> None:
         self._first: dict[str, MemberVariable] = {}
@@ -209,16 +212,16 @@ class _Layout:
 
     @property
     def coordinates(self) -> list[str]:
-        """Return the names of the runs' coordinates."""
+        """Return the names of the variables that are coordinates."""
         return [name for name, variable in self._first.items() if variable.coordinate]
 
     def arrays(self, shape: tuple[int, ...], dims: tuple[str, ...]) -> dict[str, Array]:
-        """Return an array of missing values for each variable, and the labels.
+        """Return an array of missing values for each variable, and the labels of its dimensions.
 
         Raises
         ------
         ExperimentError
-            If they do not fit into memory.
+            If the arrays do not fit into memory.
         """
         for name, labels in self._labels.items():
             ordered = sorted(labels) if self._dtypes[name].kind in "iuf" else labels
@@ -266,7 +269,10 @@ class _Layout:
                 arrays[name][target][np.ix_(*rows) if dims else ...] = values
 
     def _varies(self, name: str) -> bool:
-        """Return whether members have separate values; labels of a dimension are merged instead."""
+        """Return whether members have separate values of a variable.
+
+        Labels of a dimension are merged and have no separate values.
+        """
         digests = self._digests.get(name, [])
         is_constant = len(set(digests)) == 1 and len(digests) == self._members
         return name not in self._labels and not is_constant

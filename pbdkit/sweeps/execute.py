@@ -1,5 +1,8 @@
-"""Execute the members of a sweep that have no stored result: in this process, in worker processes,
-which are replaced if they are killed, or on a dask cluster."""
+"""Execute the members of a sweep that have no stored result.
+
+They are run in this process, in worker processes or on a dask cluster. A worker process that is
+killed is replaced.
+"""
 
 from __future__ import annotations
 
@@ -72,14 +75,20 @@ if TYPE_CHECKING:
 CHUNK_S = 0.25
 """Duration of a chunk of members in seconds."""
 MAX_AT_ONCE = 16
-"""Maximum number of members in a chunk. A chunk must fit into the pipe to a worker that has been
-killed."""
+"""Maximum number of members in a chunk.
+
+A chunk must fit into the pipe to a worker, so that sending it to a killed worker does not block.
+"""
 HEARTBEAT_S = 0.2
-"""Maximum time in seconds between two looks at the progress of workers."""
+"""Maximum time in seconds between two checks of the progress of workers."""
 MAX_LOSSES = 3
-"""A member has failed once it has been lost this many times with a process that ran it alone."""
+"""Number of losses after which a member has failed.
+
+A member is lost if the process that runs it is killed. Only losses of processes that ran no other
+member are counted.
+"""
 CHUNKS_PER_WORKER = 2
-"""Number of chunks that a worker has at a time, so that it does not wait for the next."""
+"""Number of chunks that a worker has at a time, so that it need not wait for the next one."""
 WAIT_FOR_WORKERS_S = 30.0
 """Maximum time in seconds to wait for the first worker of a cluster."""
 
@@ -89,16 +98,16 @@ class Executor(ABC):
 
     @abstractmethod
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
-        """Yield a report for each job, and None at intervals while there is none.
+        """Yield a report for each job, and None at intervals while there is no report.
 
-        No further job is started once `stopping` returns true. Closing the iterator ends the
-        workers.
+        After `stopping` has returned true, no further job is started. When the iterator is closed,
+        the workers are ended.
         """
 
 
 @dataclass
 class Queue:
-    """Queue of members, with their duration and the number of times that each was lost."""
+    """Queue of members, with the duration of members and the number of losses of each."""
 
     jobs: deque[Job]
     workers: int
@@ -110,8 +119,8 @@ class Queue:
     def chunk(self) -> list[Job]:
         """Return the next members for one worker.
 
-        A chunk contains a single member until durations are known, or if the member was lost
-        before.
+        A chunk contains only one member if no duration has been measured yet, or if the member was
+        lost before.
         """
         if not self._count or self.jobs[0].key in self._losses:
             return [self.jobs.popleft()]
@@ -123,14 +132,16 @@ class Queue:
         return chunk
 
     def reported(self, reports: list[MemberReport]) -> Iterator[MemberReport]:
-        """Count the reports and pass them on."""
+        """Count the reports, and return them."""
         for report in reports:
             self._seconds, self._count = self._seconds + report.seconds, self._count + 1
             yield report
 
     def lost(self, chunk: list[Job], reason: str) -> Iterator[MemberReport]:
-        """Put the members of a lost worker back into the queue. A member that was lost too often
-        while it was run alone has failed."""
+        """Put the members of a lost worker back into the queue.
+
+        A member that was lost too often while it was the only one in a chunk has failed.
+        """
         retries = []
         for job in chunk:
             losses = self._losses.get(job.key, 0) + (len(chunk) == 1)
@@ -144,7 +155,7 @@ class Queue:
 
 
 class SerialExecutor(Executor):
-    """Run members in this process, with component classes from Python."""
+    """Run members in this process. Component classes can be passed as Python objects."""
 
     def __init__(self, components: tuple[type[Component], ...] = ()) -> None:
         self._components = components
@@ -158,16 +169,22 @@ class SerialExecutor(Executor):
 
 
 class ClusterExecutor(Executor):
-    """Run members on the workers of a dask cluster. Clients of a cluster can execute any code on
-    it."""
+    """Run members on the workers of a dask cluster.
+
+    Any client of a cluster can execute arbitrary code on it.
+    """
 
     def __init__(self, client: Any) -> None:
         self._client = client
 
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
-        """Run chunks as tasks, a few more than there are threads; pending tasks are cancelled if
-        the work ends early. Raises ExperimentError if the cluster has no worker, and StorageError
-        if the scheduler is lost."""
+        """Run chunks as tasks.
+
+        The number of tasks at a time is slightly larger than that of threads.
+
+        If the work ends early, pending tasks are cancelled. ExperimentError is raised if the
+        cluster has no worker, and StorageError if the scheduler is lost.
+        """
         out: dict[Any, list[Job]] = {}
         try:
             yield from self._with_workers(stopping)
@@ -232,14 +249,16 @@ def _reports(future: Any, chunk: list[Job], queue: Queue) -> Iterator[MemberRepo
 SHAPING = ("lattice", "body", "neighbours", "frame", "fracture", "diagnostics", "units")
 """Parts of an experiment that determine the shape of its dataset, apart from the recorded steps."""
 SHARE = 0.5
-"""Fraction of the memory of this machine that the dataset of a sweep may take."""
+"""Fraction of the memory of this machine that the dataset of a sweep may occupy."""
 TEXT = 8
 """Approximate size of a text in bytes."""
 
 
 class SizeEstimate:
-    """Estimate of the size of the dataset from the experiments of all members. The scene of each
-    distinct body is built."""
+    """Estimate of the size of the dataset, from the experiments of all members.
+
+    For each distinct body one scene is built.
+    """
 
     def __init__(self, keep: Keep, count: int) -> None:
         self._keep, self._count = keep, count
@@ -249,8 +268,11 @@ class SizeEstimate:
         self._times: set[tuple[int, tuple[int, ...] | None, int, int]] = set()
 
     def look(self, experiment: Experiment, words: str) -> None:
-        """Include a member; `words` describe it in messages. Raises ExperimentError and PluginError
-        if its scene cannot be built, or if its dataset lacks a variable to keep."""
+        """Include a member in the estimate; `words` describe it in messages.
+
+        ExperimentError or PluginError is raised if the scene of the member cannot be built, or if
+        its dataset would lack a variable that the sweep selects.
+        """
         steps, record = experiment.steps, experiment.record
         between = experiment.record_count - record.count(steps)
         self._times.add((steps, record.at, record.every, between))
@@ -274,8 +296,10 @@ class SizeEstimate:
         self._sizes["step"] = max(steps + 1, self._sizes.get("step", 0))
 
     def refuse_too_large(self) -> None:
-        """Raise ExperimentError if the dataset does not fit into memory, or if no member reaches a
-        step to keep."""
+        """Raise ExperimentError if the dataset does not fit into memory.
+
+        It is also raised if no member reaches a step that the sweep selects.
+        """
         keep, last = self._keep, max(steps for steps, *_ in self._times)
         if isinstance(keep.times, tuple) and min(keep.times) > last:
             text = f"keep.times: {min(keep.times)} exceeds the last step of all members, {last}"
@@ -318,9 +342,11 @@ Show = Callable[[str, float], None]
 class Summary:
     """Outcome of a sweep.
 
-    `members` are all members; `ends` contains, by key, the status and message of each member that
-    has ended; `run` is the number of members that were run, `faults` are messages about damage, and
-    `path` is the path of the dataset, None if the sweep was stopped.
+    - `members` are all members.
+    - `ends` contains, by key, the status and the message of each member that has ended.
+    - `run` is the number of members that were run.
+    - `faults` are messages about damage.
+    - `path` is the path of the dataset; None if the sweep was stopped.
     """
 
     members: list[Member]
@@ -340,10 +366,11 @@ class Summary:
 def carry_out(
     plan: SweepPlan, folder: Path, executor: Executor, stopping: Callable[[], bool], show: Show
 ) -> Summary:
-    """Validate all members, run those that the folder does not hold, and write the dataset.
+    """Validate all members, run those without a result in the folder, and write the dataset.
 
-    Raises ExperimentError and PluginError before anything runs, and StorageError. `stopping` is
-    called continually; once it returns True, completed members are kept and no dataset is written.
+    `stopping` is called continually. After it has returned True, no further member is run; results
+    of completed members remain in the folder, and no dataset is written. ExperimentError and
+    PluginError are raised before the first member runs. StorageError can be raised at any time.
     """
 
     def show_unless_stopped(what: str, share: float) -> None:
@@ -387,7 +414,7 @@ class _StoppedError(Exception):
 def _reported(
     reports: Iterator[MemberReport | None], members: int, todo: int, show: Show
 ) -> Iterator[MemberReport | None]:
-    """Yield the reports of all but interrupted members, and show progress meanwhile."""
+    """Yield the reports of members except for interrupted ones, and show the progress."""
     run = failed = 0
     for report in reports:
         if report is not None and report.status == INTERRUPTED:
@@ -412,7 +439,7 @@ def validated(plan: SweepPlan, show: Show) -> tuple[list[Dimension], list[Member
     Raises
     ------
     ExperimentError, PluginError
-        With the parameters of an invalid member.
+        If a member is invalid. The message contains the parameters of the member.
     """
     base = plan.experiment()
     grid, outlook = plan.grid(base), SizeEstimate(plan.sweep.keep, plan.sweep.count)
@@ -446,19 +473,24 @@ def _attributes(plan: SweepPlan, versions: dict[str, str]) -> dict[str, str]:
 
 
 GRACE_S = 1.0
-"""Time in seconds for members to end after the sweep is stopped."""
+"""Time in seconds in which running members can end after the sweep has been stopped."""
 MAX_STARTS = 10
-"""Maximum number of workers in succession that end while they start."""
+"""Maximum number of successive workers that end while they start."""
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
-"""Environment variables that limit linear algebra to one thread if they are set before it is
-loaded. The threads of kernels are limited by the settings of each member."""
+"""Environment variables that limit libraries of linear algebra to one thread.
+
+They must be set before the libraries are loaded. The threads of kernels are limited by the settings
+of each member.
+"""
 
 
 class ProcessExecutor(Executor):
-    """Run members in worker processes, each in a pool of its own, so that a killed process affects
-    no other."""
+    """Run members in worker processes.
+
+    Each process has its own pool, so that a killed process does not affect the others.
+    """
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
@@ -489,13 +521,13 @@ class ProcessExecutor(Executor):
 
 
 def _any_done(workers: list[_Worker]) -> bool:
-    """Return whether a chunk is done, now or after a short wait."""
+    """Return whether a chunk is done, now or after a short waiting time."""
     futures = [future for worker in workers for future in worker.chunks]
     return bool(wait(futures, HEARTBEAT_S, FIRST_COMPLETED).done)
 
 
 class _Worker:
-    """One worker process and its chunks; the first is running."""
+    """One worker process and its chunks, of which the first one is running."""
 
     def __init__(self) -> None:
         self.chunks: dict[Future[list[MemberReport]], list[Job]] = {}
@@ -503,8 +535,10 @@ class _Worker:
         self._processes: set[BaseProcess] = set()
 
     def take(self, queue: Queue) -> bool:
-        """Return whether the next chunk can be passed to the worker. A killed worker receives none
-        until its end has been reported."""
+        """Give the next chunk to the worker, and return whether it was possible.
+
+        A killed worker receives no chunk until its end has been reported.
+        """
         chunk = queue.chunk()
         for _ in range(1 + (not self.chunks)):
             try:
@@ -518,8 +552,11 @@ class _Worker:
         return False
 
     def reports(self, queue: Queue) -> Iterator[MemberReport]:
-        """Return the reports of finished chunks; the first chunk was running if the process was
-        killed."""
+        """Return the reports of finished chunks.
+
+        If the process was killed, the first unfinished chunk was running at that time, and its
+        members are lost.
+        """
         for future in [future for future in self.chunks if future.done()]:
             chunk = self.chunks.pop(future, None)
             if chunk is None:
@@ -575,8 +612,8 @@ class _Worker:
 def _spawning() -> Iterator[None]:
     """Set up the environment of processes that are started in the block.
 
-    They use one thread of linear algebra, Ctrl-C is blocked until they ignore it, and they do not
-    run the script of the caller again.
+    They use one thread for linear algebra and do not run the script of the caller again. Ctrl-C is
+    blocked until they ignore it.
     """
     blocks: Any = getattr(signal, "pthread_sigmask", None)
     mask = blocks(signal.SIG_BLOCK, {signal.SIGINT}) if blocks else None
@@ -604,7 +641,7 @@ def called(
     client: Any,
     progress: bool,
 ) -> xarray.Dataset:
-    """Return the dataset of a sweep, loaded into memory unless a folder keeps it."""
+    """Return the dataset of a sweep. It is loaded into memory unless a folder contains it."""
     base = replace(experiment.as_written(), name="")
     if base.files.folder is None:
         base.files = OF_PROGRAM
@@ -631,7 +668,7 @@ def called(
                 f"is {status}"
             )
             warn_caller(f"{text}: {member.words}: {message}", SweepWarning)
-        assert summary.path is not None  # Only an exception can stop the sweep.
+        assert summary.path is not None  # The sweep can be stopped by an exception only.
         dataset = open_result(summary.path)
         if folder is None:
             with dataset:

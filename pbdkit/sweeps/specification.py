@@ -1,5 +1,7 @@
-"""Sweep files: an experiment, the parameters that vary, the variables and steps to keep of each
-run, and the members, identified by a digest."""
+"""Sweep files: an experiment, the parameters that vary, and the selected variables and steps.
+
+Members of the sweep are identified by a digest of all data on which their result depends.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +36,16 @@ from pbdkit.plugin.units import TEXT as WITH_UNIT, Quantity
 from pbdkit.seeds import replicate_seeds
 
 MAX_MEMBERS = 100_000
-"""Largest number of members. Each takes about a millisecond for validation, and some kilobytes
-during the sweep."""
+"""Largest number of members.
+
+The validation of a member takes about a millisecond, and a member occupies some kilobytes of memory
+during the sweep.
+"""
 DIGITS = 15
-"""Number of significant digits of evenly spaced values: 0.6 instead of 0.6000000000000001."""
+"""Number of significant digits of evenly spaced values.
+
+They are rounded, so that a value is 0.6 and not 0.6000000000000001.
+"""
 
 
 class Range(Strict):
@@ -55,7 +63,10 @@ class Range(Strict):
         return self
 
     def values(self) -> list[int | float]:
-        """Return the values, integers if both ends and all values between are integers."""
+        """Return the values.
+
+        They are integers if both ends and all values between are whole numbers.
+        """
         space = np.linspace if self.scale == "linear" else np.geomspace
         numbers = space(float(self.from_), float(self.to), self.count)
         values = [float(f"{value:.{DIGITS}g}") for value in numbers.tolist()]
@@ -93,18 +104,24 @@ Times = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, m
 
 
 class Keep(Strict):
-    """Selection of the variables and steps of each run that are kept: `variables` are names, by
-    default all; `times` are `all` recorded steps, the `last`, or a list of steps, which are then
-    recorded."""
+    """Selection of the variables and steps of each run that the dataset contains.
+
+    `variables` are names of variables, by default all. `times` are `all` recorded steps, the `last`
+    step, or a list of steps, which are then recorded.
+    """
 
     variables: Annotated[tuple[str, ...] | None, Field(strict=False, min_length=1)] = None
     times: Literal["all", "last"] | Times = "all"
 
 
 class Sweep(Strict):
-    """An experiment with varied parameters. Members are the product of the values in `vary`, of the
-    lists in `together`, which are traversed together, and of the replicates, which differ in their
-    seed. `names` maps paths of parameters to their names in the dataset."""
+    """An experiment with varied parameters.
+
+    The members are all combinations of the values in `vary`, of the entries of the lists in
+    `together`, and of the replicates. Entries with the same position in all lists of `together`
+    belong together; replicates differ in their seed. `names` maps paths of parameters to their
+    names in the dataset.
+    """
 
     version: Version = 1
     experiment: Base
@@ -161,7 +178,7 @@ def checked(data: Any, source: Source) -> Sweep:
     Raises
     ------
     ExperimentError
-        With the place in the source if the data are invalid.
+        If the data are invalid. The message contains the place in the source.
     """
     try:
         return Sweep.model_validate(data)
@@ -208,8 +225,10 @@ REPLICATE = "replicate"
 MESSAGE = "message"
 """Variable with the message of each member."""
 UNNAMED_ENDS = (".otherwise", ".type")
-"""Ends of paths that are not part of a name: the value outside all regions, and the type of a
-part."""
+"""Ends of paths that are not used in names.
+
+They denote the value outside all regions, and the type of a part.
+"""
 
 
 class MemberSetting(NamedTuple):
@@ -234,9 +253,9 @@ class Dimension:
     Parameters
     ----------
     name
-        Its name.
+        Name of the dimension.
     settings
-        Settings at each place.
+        Settings at each position along the dimension.
     coordinates
         Coordinates by name.
     """
@@ -257,7 +276,7 @@ def dimensions(sweep: Sweep, experiment: Experiment, reserved: Set[str]) -> list
     Raises
     ------
     ExperimentError
-        If a name in the sweep file is among `reserved`.
+        If `reserved` contains a name of the sweep file.
     """
     names = _names(sweep, {*reserved, CASE, REPLICATE, STATUS, MESSAGE})
     result = []
@@ -284,7 +303,10 @@ def dimensions(sweep: Sweep, experiment: Experiment, reserved: Set[str]) -> list
 
 
 def _names(sweep: Sweep, reserved: Set[str]) -> dict[str, str]:
-    """Return the names of all parameters: those in the sweep file, and automatic ones."""
+    """Return the names of all parameters.
+
+    A name that the sweep file lacks is made automatically.
+    """
     for path, name in sweep.names.items():
         if name in reserved:
             text = f"names: {path}: '{name}' has another meaning in results; choose another name"
@@ -294,7 +316,7 @@ def _names(sweep: Sweep, reserved: Set[str]) -> dict[str, str]:
 
 
 def places(grid: list[Dimension]) -> Iterator[tuple[tuple[int, ...], tuple[MemberSetting, ...]]]:
-    """Yield every place on the grid with its settings; the last dimension varies fastest."""
+    """Yield every position on the grid with its settings; the last dimension varies fastest."""
     for place in product(*(range(len(dimension.settings)) for dimension in grid)):
         groups = (dimension.settings[index] for dimension, index in zip(grid, place, strict=True))
         yield place, tuple(setting for group in groups for setting in group)
@@ -311,8 +333,8 @@ def describe(settings: tuple[MemberSetting, ...]) -> str:
 def names_of(paths: list[str], reserved: Set[str]) -> dict[str, str]:
     """Return a name for each path: its last word, preceded by further words until it is unique.
 
-    Words are joined by `_`. `otherwise` and `type` at the end are ignored, and a name does not
-    start with a position in a list.
+    Words are joined by `_`. `otherwise` and `type` at the end of a path are ignored. A name does
+    not begin with an index of a list.
 
     Parameters
     ----------
@@ -352,8 +374,11 @@ def _tails(path: str) -> list[str]:
 def _coordinates(
     name: str, path: str, values: tuple[Any, ...], experiment: Experiment
 ) -> dict[str, Coordinate]:
-    """Return numbers unchanged. Other values are numbered from 0, with an additional coordinate for
-    their text."""
+    """Return the coordinates of the values of a parameter.
+
+    Numbers are unchanged. Other values are numbered from 0, with an additional coordinate for their
+    text.
+    """
     texts = coordinate(path, values, experiment)
     if texts.values.dtype.kind != "U":
         return {name: texts}
@@ -362,9 +387,9 @@ def _coordinates(
 
 
 def coordinate(path: str, values: tuple[Any, ...], experiment: Experiment) -> Coordinate:
-    """Return the values of a parameter with its path, and its unit if that is known.
+    """Return the values of a parameter with its path and, if it has one, its unit.
 
-    Texts that are numbers of one unit become numbers.
+    If all values are texts with numbers of the same unit, they are converted to numbers.
     """
     attributes = {"long_name": path, PARAMETER: path}
     parts = [WITH_UNIT.fullmatch(value) if isinstance(value, str) else None for value in values]
@@ -404,18 +429,18 @@ def values_along(values: tuple[Any, ...]) -> Array:
 
 
 class Job(NamedTuple):
-    """Everything that is needed to run a member.
+    """Data that are needed to run a member.
 
     Parameters
     ----------
     key
         Digest of all other fields.
     experiment
-        Experiment as JSON, without records and diagnostics that are not kept.
+        Experiment as JSON, without records and diagnostics that the sweep does not select.
     variables
-        Names of the variables to keep; None for all.
+        Names of the selected variables; None for all.
     times
-        Recorded steps to keep.
+        Selected recorded steps.
     versions
         Versions of pbdkit and of plugins.
     """
@@ -434,9 +459,9 @@ class Member:
     Parameters
     ----------
     place
-        Its place on the grid.
+        Position of the member on the grid.
     words
-        Its parameters as text.
+        Parameters of the member as text.
     job
         The run.
     """
@@ -457,7 +482,7 @@ class SweepPlan:
     base, source
         Sources of the experiment and of the sweep.
     components
-        Component classes from Python that the experiment names.
+        Component classes that were passed as Python objects and that the experiment uses.
     """
 
     sweep: Sweep
@@ -498,7 +523,7 @@ class SweepPlan:
         Raises
         ------
         ExperimentError, PluginError
-            With the parameters of the member.
+            If a member is invalid. The message contains the parameters of the member.
         """
         installed, count = version("pbdkit"), self.sweep.count
         for n, (place, settings) in enumerate(places(grid)):
@@ -529,8 +554,8 @@ def named(member: str) -> Iterator[None]:
 def job_of(experiment: Experiment, keep: Keep, versions: dict[str, str]) -> Job:
     """Return the job of an experiment.
 
-    Records and diagnostics that are not kept are removed. The run uses one thread unless the
-    experiment sets a number, since members run in parallel.
+    Records and diagnostics that the sweep does not select are removed. Because members run in
+    parallel, a run uses one thread unless the experiment gives a number of threads.
     """
     data = experiment.model_dump(mode="json", by_alias=True)
     steps = experiment.steps

@@ -1,5 +1,6 @@
-"""Store of the results of members: a SQLite database in the sweep's folder, with files for large
-results.
+"""Store of the results of members, in the folder of the sweep.
+
+It is a SQLite database, with separate files for large results.
 
 Only the process of the sweep writes to it.
 """
@@ -50,12 +51,17 @@ DAMAGED_FOLDER = "set-aside"
 NEW = DATABASE + ".new"
 """File name of a database that is being created."""
 TEMPORARY = re.compile(r"\..+\.\d+\.[0-9a-f]{32}(\.nc)?")
-"""File names of results that are being written: host, process, random number."""
+"""Pattern of file names of results that are being written.
+
+They consist of the names of host and process, and a random number.
+"""
 LARGE_BYTES = 2**20
 """Results above this size are stored as files."""
 COMMIT_S = 1.0
-"""Interval between commits in seconds. At most the results of one interval are lost if the machine
-stops."""
+"""Interval between commits in seconds.
+
+If the machine stops, at most the results of one interval are lost.
+"""
 APPLICATION = 0x70626473
 """SQLite's application_id of a store."""
 
@@ -76,7 +82,7 @@ Row = tuple[Any, ...]
 
 
 class Store:
-    """Results of members by key; a context manager.
+    """Results of members by key. The store is used as a context manager.
 
     A damaged database is moved aside, and its intact rows are copied into a new one.
 
@@ -88,13 +94,13 @@ class Store:
     Attributes
     ----------
     faults
-        Messages about damage, and how it was repaired.
+        Messages about damage and its repair.
 
     Raises
     ------
     StorageError
-        If another sweep uses the folder, if it contains no store of this version, and for errors of
-        the file system or SQLite.
+        If another sweep uses the folder, if the store in it has another version, or if the file
+        system or SQLite reports an error.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -120,7 +126,7 @@ class Store:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        """Commit all results, also after an exception."""
+        """Commit all results, even after an exception."""
         with self._closing:
             if not isinstance(raised[1], StorageError):
                 self.commit()
@@ -131,7 +137,7 @@ class Store:
                 self.commit()
 
     def held(self) -> dict[str, tuple[str, str]]:
-        """Return status and message of all intact results by key.
+        """Return the status and the message of each intact result, by key.
 
         Damaged results are removed, with a message in `faults`.
         """
@@ -152,7 +158,7 @@ class Store:
         return results
 
     def put(self, report: MemberReport) -> None:
-        """Store a report, which is on the disk after the next commit."""
+        """Store a report. It is on the disk after the next commit."""
         is_large = len(report.content) > LARGE_BYTES
         with self._report_errors():
             if is_large:
@@ -166,7 +172,7 @@ class Store:
         self.commit_if_due()
 
     def commit_if_due(self) -> None:
-        """Commit about once a second, since each commit waits for the disk."""
+        """Commit if the last commit is about a second ago, because a commit waits for the disk."""
         if time.monotonic() >= self._due:
             self.commit()
 
@@ -185,7 +191,7 @@ class Store:
         Raises
         ------
         StorageError
-            If it is missing or damaged.
+            If the result is missing or damaged.
         """
         with self._report_errors():
             query = f"SELECT {COLUMNS} FROM member WHERE key = ?"
@@ -231,7 +237,7 @@ class Store:
             )
 
     def _verified(self, row: Row) -> MemberReport | str:
-        """Return the report in a row, or its fault."""
+        """Return the report in a row of the table, or a message if it is damaged."""
         fault = "has changed since it was written"
         key, status, message, is_large, digest, content = row or (None,) * 6
         if not re.fullmatch("[0-9a-f]{32}", str(key)):
@@ -249,7 +255,7 @@ class Store:
         return self._folder / LARGE_FOLDER / f"{key}.member"
 
     def _write(self, report: MemberReport) -> None:
-        """Write to a name that no other process uses, then rename."""
+        """Write a report to a file with a name that no other process uses, and rename the file."""
         path = self._file(report.key)
         path.parent.mkdir(exist_ok=True)
         temporary = path.with_name(f".{socket.gethostname()}.{os.getpid()}.{uuid.uuid4().hex}")
@@ -264,7 +270,10 @@ class Store:
             raise
 
     def _clear(self) -> None:
-        """Remove temporary files of killed sweeps; none is running, since this one has the lock."""
+        """Remove temporary files of killed sweeps.
+
+        No other sweep is running in the folder, because this one holds the lock.
+        """
         for folder in (self._folder, self._folder / LARGE_FOLDER):
             for path in folder.glob(".*"):
                 if TEMPORARY.fullmatch(path.name):
@@ -273,7 +282,7 @@ class Store:
     def _repair(self) -> None:
         """Create the database, or a new one with the intact rows of a damaged one.
 
-        It gets its final name when it is complete.
+        The database is renamed to its final name when it is complete.
         """
         new, count = self._folder / NEW, self._member_count()
         if new.exists() and not self._path.exists():  # A sweep was killed between both renames.
@@ -303,8 +312,9 @@ class Store:
         sync_folder(self._folder)
 
     def _fault(self, count: int) -> str | None:
-        """Return the reason why the database cannot be used: empty if it was never completed, None
-        if it can be used.
+        """Return the reason for which the database cannot be used, or None if it can be used.
+
+        The reason is empty if the database was never completed.
 
         Raises
         ------
@@ -352,7 +362,10 @@ class Store:
         return StorageError(f"{self._path}: is not a store of a sweep that this pbdkit can read")
 
     def _intact_rows(self) -> Iterator[Row]:
-        """Yield the intact rows of a damaged database, read from both of its ends."""
+        """Yield the intact rows of a damaged database.
+
+        It is read from its beginning and from its end, each up to the damage.
+        """
         for order in ("", "ORDER BY rowid DESC"):
             with suppress(sqlite3.Error), ExitStack() as stack:
                 if not is_database(self._path):
@@ -376,7 +389,7 @@ class Store:
         return folder
 
     def _member_count(self) -> int:
-        """Return the number of stored members after the last commit; 0 if it is unknown."""
+        """Return the number of members that were stored at the last commit; 0 if it is unknown."""
         self._lock.seek(0)
         try:
             return int(self._lock.read(20))
@@ -422,7 +435,7 @@ def _may_become_database(path: Path) -> bool:
     Raises
     ------
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     if not path.exists():
         return True

@@ -1,5 +1,8 @@
-"""Run one member of a sweep and return a report; exceptions become reports, too. Kept results are
-bytes: names and shapes as JSON, then the values."""
+"""Run one member of a sweep, and return a report.
+
+An exception is returned as a report too. The results of a member are bytes: names and shapes of the
+variables as JSON, followed by the values.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,7 @@ LENGTH = 8
 
 
 class MemberVariable(NamedTuple):
-    """One variable of a run; `fixed` is true if it was known before the first step."""
+    """One variable of a run; `fixed` is true if it has its values before the first step."""
 
     dims: tuple[str, ...]
     values: NDArray[Any]
@@ -58,7 +61,7 @@ def packed(variables: dict[str, MemberVariable]) -> bytes:
 
 
 def unpacked(content: bytes) -> dict[str, MemberVariable]:
-    """Deserialise variables; their values are views of the bytes."""
+    """Deserialise variables. Their values are views of the bytes."""
     begin = LENGTH + int.from_bytes(content[:LENGTH], "little")
     variables = {}
     for name, entry in json.loads(content[LENGTH:begin]).items():
@@ -74,8 +77,11 @@ def unpacked(content: bytes) -> dict[str, MemberVariable]:
 
 
 STORED_STATUSES = (*WHOLE, "separated")
-"""Status of members with values in the dataset. A run that ended because its body came apart under
-an equilibrium solver ("separated") has the values recorded before that."""
+"""Status of members with values in the dataset.
+
+A run with the status "separated" ended because its body separated into parts in the equilibrium
+solver. It has the values that were recorded before.
+"""
 FAILED = "failed"
 """Status of members that cannot be run."""
 INTERRUPTED = "interrupted"
@@ -83,14 +89,18 @@ INTERRUPTED = "interrupted"
 LOST = "lost"
 """Status of members that were lost with their process."""
 _one_at_a_time = threading.Lock()
-"""Lock between the threads of one process, for example of a dask worker: warnings and the number of
-threads of linear algebra are global."""
+"""Lock by which only one thread of a process, for example of a dask worker, runs a member.
+
+The reason is that warnings and the number of threads of linear algebra are global.
+"""
 
 
 class MemberReport(NamedTuple):
-    """Result of a member: `message` is the reason of a failure, or the warnings of its run.
-    `digest` covers all other fields; `lasting` is False if a second attempt could have a different
-    result."""
+    """Result of a member.
+
+    `message` is the reason of a failure, or contains the warnings of the run. `digest` is computed
+    from all other fields. `lasting` is False if a second attempt could have a different result.
+    """
 
     key: str
     status: str
@@ -117,19 +127,21 @@ def digest_of(key: str, status: str, message: str, content: bytes) -> bytes:
 
 
 class SelectiveSink(MemorySink):
-    """Sink that keeps some variables of a run, at all recorded steps, the last one or selected
-    ones."""
+    """Sink that stores selected variables of a run.
+
+    They are stored at all recorded steps, at the last one, or at selected steps.
+    """
 
     def __init__(self, variables: Iterable[str] | None, times: str | tuple[int, ...]) -> None:
         self._variables = None if variables is None else set(variables)
         self._times = times
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Begin with the columns that are kept, and the coordinates of their dimensions."""
+        """Select the columns to be stored, and store the coordinates of their dimensions."""
         super().begin(selected_columns(columns, self._variables), sizes, planned)
 
     def put(self, values: Values) -> None:
-        """Keep the values of those columns."""
+        """Store the values of the selected columns at a recorded step."""
         super().put({name: value for name, value in values.items() if name in self._entries})
 
     def content(self) -> bytes:
@@ -146,8 +158,10 @@ class SelectiveSink(MemorySink):
 
 
 def selected_columns(columns: list[Column], variables: set[str] | None) -> list[Column]:
-    """Return the columns of these variables and the coordinates of their dimensions; for variables
-    of particles the reference positions, too."""
+    """Return the columns of these variables, and the coordinates of their dimensions.
+
+    For variables of particles the reference positions are included too.
+    """
     chosen = [c for c in columns if variables is None or c.name in variables]
     dims = {dim for column in chosen for dim in column.dims}
     if "particle" in dims:
@@ -156,8 +170,10 @@ def selected_columns(columns: list[Column], variables: set[str] | None) -> list[
 
 
 def begin_worker() -> None:
-    """Prepare a worker process: it ignores Ctrl-C, which the sweep handles, and ends with the
-    process of the sweep."""
+    """Prepare a worker process.
+
+    It ignores Ctrl-C, which the process of the sweep handles, and ends when this process ends.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     assert parent is not None
@@ -179,11 +195,11 @@ def run_member(
     components: Iterable[type[Component]] = (),
     stopping: Callable[[], bool] = lambda: False,
 ) -> MemberReport:
-    """Run a member on one thread; an exception becomes a report with the status `failed`."""
+    """Run a member on one thread. An exception is returned as a report with the status `failed`."""
     start, sink = time.perf_counter(), SelectiveSink(job.variables, job.times)
     content, lasting = b"", False
     with _one_at_a_time, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Warnings of a run are in its message.
+        warnings.simplefilter("ignore")  # the message contains them
         try:
             experiment = Experiment.build(Source(data=json.loads(job.experiment)), components)
             _refuse_other_versions(job, experiment)
