@@ -1,16 +1,17 @@
-"""Elastic constants of a rule from its long-wave expansion, and whether they exist.
+"""Elastic constants of a rule from its expansion for long waves, if they exist.
 
-To second order a step moves a body by Q_abcd ∂_c ∂_d u_b. The rule is elastic if there is a
-symmetric positive definite B, the inverse of the mobility, with
+To second order a step changes the displacement u_a by Q_abcd ∂_c ∂_d u_b. The rule is elastic if
+there is a symmetric positive definite matrix B, the inverse of the mobility, with
 
     B_ae Q_ebcd = (C_acbd + C_adbc) / 2
 
-where C are the elastic constants. Six linear equations determine the three numbers of B: the left
-side is symmetric in a and b (an energy exists), and in two dimensions Huang's relations hold,
-Γ_xxyy = Γ_yyxx, Γ_xxxy = Γ_xyxx, Γ_yyxy = Γ_xyyy (a rigid rotation costs no energy). B = 1 except
-for rules in which x and y approach the same equilibrium at different rates. C is determined up to a
-factor, which depends on the time that a step represents. See Born and Huang, Dynamical Theory of
-Crystal Lattices, section 27.
+where C are the elastic constants. The three components of B are determined by six linear equations
+for the left side Γ. Three equations require that Γ is symmetric in a and b, because an energy
+exists. The other three are Huang's relations in two dimensions, Γ_xxyy = Γ_yyxx, Γ_xxxy = Γ_xyxx
+and Γ_yyxy = Γ_xyyy, because a rigid rotation has no energy. B = 1 except for rules in which x and y
+approach the same equilibrium at different rates. C is determined up to a factor, which depends on
+the time that a step represents. See Born and Huang, Dynamical Theory of Crystal Lattices, section
+27.
 
 Harmonics of C by direction follow Vannucci, Anisotropic Elasticity, chapter 4.
 """
@@ -139,10 +140,10 @@ class Elasticity:
         return -transverse / longitudinal if longitudinal else None
 
     def _strains(self, degrees: float) -> tuple[float, float]:
-        """Compute the strains along and across a bar under tension, times det C. A strain along the
-        bar that is a rounding error is returned as 0.
+        """Compute the strains along and across a bar under tension, times det C.
 
-        They are computed from the minors of C, so that they exist for a singular C, too.
+        They are computed from the minors of C, so that they exist for a singular C too. A strain
+        along the bar that is only a rounding error is returned as 0.
         """
         rows = self.stiffness
         compliance = np.cross(rows[[1, 2, 0]], rows[[2, 0, 1]]).T
@@ -178,8 +179,10 @@ def second_order(along_x: Floats, along_y: Floats, along_both: Floats) -> Floats
 
 
 def diffusion(q: Floats) -> Floats | None:
-    """Return D_cd if Q_abcd = δ_ab D_cd, so that x and y diffuse separately and equally; else
-    None."""
+    """Return D_cd if Q_abcd = δ_ab D_cd, else None.
+
+    In this case x and y diffuse separately and equally.
+    """
     mean = (q[0, 0] + q[1, 1]) / 2
     remainder = q - np.einsum("ab,cd->abcd", np.eye(2), mean)
     return mean if np.abs(remainder).max() < SAME * np.abs(q).max() else None
@@ -214,8 +217,11 @@ def _apply(inverse: Floats, q: Floats) -> Floats:
 
 
 def _asymmetries(g: Floats) -> list[float]:
-    """Return the asymmetry of Γ in its first two axes, for each pair of the others, and the errors
-    of Huang's relations."""
+    """Return the six quantities that are zero for an elastic rule.
+
+    They are the asymmetry of Γ in its first two axes, for each pair of the last two, and the errors
+    of Huang's relations.
+    """
     coupling = [g[0, 1][p] - g[1, 0][p] for p in PAIRS]
     return coupling + [g[p][q] - g[q][p] for p, q in HUANG]
 

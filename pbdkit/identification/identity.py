@@ -1,4 +1,7 @@
-"""The physical identity of a rule on its lattice and neighbours: a verdict, notes and a table."""
+"""The physical identity of a rule on its lattice and neighbours.
+
+It consists of a verdict, notes and a table of constants.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,9 @@ from pbdkit.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Identity:
-    """Physical identity of a rule on its lattice and neighbourhood. The rule is linearised at rest,
-    which is exact for linear rules.
+    """Physical identity of a rule on its lattice and neighbourhood.
+
+    The rule is linearised at rest, which is exact for linear rules.
 
     Parameters
     ----------
@@ -34,7 +38,7 @@ class Identity:
     turns : bool
         Whether a finite rotation of the neighbours rotates the move.
     symmetric : bool
-        Whether particle j has the same weight in the rule of k as k has in the rule of j.
+        Whether particle j has the same weight in the move of k as k has in the move of j.
     rests_at_edges : bool
         Whether a particle at rest does not move if neighbours are missing.
     stencil : Primitive
@@ -70,7 +74,7 @@ class Identity:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """A summary: what the rule is, its constants, and notes on them."""
+        """A summary with the verdict on the rule, its constants, and notes."""
         title = f"{self.name}: {self.rule}, {self.lattice} lattice, {self.neighbours}"
         rows = [*rows_of(self), *(("note", note) for note in self.notes)]
         width = max(len(name) for name, _ in rows)
@@ -82,8 +86,10 @@ class Identity:
 
     @property
     def symmetry(self) -> str | None:
-        """Symmetry: isotropic, anisotropic (diffusion), square, orthotropic, or general; None for
-        neither."""
+        """Symmetry: isotropic, anisotropic (diffusion), square, orthotropic, or general.
+
+        It is None if the rule is neither diffusion nor elasticity.
+        """
         if self.long is None or self.kind == NEITHER:
             return None
         if self.kind == DIFFUSION:
@@ -100,8 +106,10 @@ class Identity:
 
     @property
     def body(self) -> Elasticity | None:
-        """Elastic body; away from free edges isotropic diffusion is equivalent to an elastic body,
-        too."""
+        """Elastic body that is equivalent to the rule.
+
+        Away from free edges isotropic diffusion is also equivalent to an elastic body.
+        """
         is_elastic = self.kind == ELASTICITY or (self.kind == DIFFUSION and self.isotropic)
         return self.long.elasticity if self.long and is_elastic else None
 

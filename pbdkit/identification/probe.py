@@ -1,5 +1,7 @@
-"""Identify a rule by evaluating its functions at rest, for small and finite displacements, and for
-plane waves."""
+"""Identify a rule by evaluating its functions.
+
+They are evaluated at rest, for small and for finite displacements, and for plane waves.
+"""
 
 from __future__ import annotations
 
@@ -89,8 +91,10 @@ class RuleProperties:
 
 
 def probe(scene: Scene, spacing: float) -> RuleProperties:
-    """Evaluate the scene's rule in the middle and, if it depends on the place, in the corners of
-    the body."""
+    """Evaluate the rule of a scene in the middle of the body.
+
+    If the rule depends on the position, it is also evaluated in the corners of the body.
+    """
     stencils = {place: linearised(scene, place) for place in _places(scene)}
     half = tuple(_half_neighbourhood(slots) for slots in scene.neighbourhood.slots)
     cases = [(rule, place) for rule in _single_rules(scene) for place in stencils]
@@ -124,8 +128,7 @@ def _reasons(
 
 
 def _single_rules(scene: Scene) -> list[Scene]:
-    """Return scenes with a single rule: one with the scene's own rule, and one with each inner
-    rule."""
+    """Return scenes with the rule of a scene alone, and with each of its inner rules alone."""
     inner = _single_rules(scene.inner) if scene.inner else []
     return [replace(scene, inner=None), *inner]
 
@@ -157,7 +160,7 @@ def _move_at_rest(scene: Scene, at: Here, slots: tuple[Slots, ...]) -> float:
 
 
 def _is_linear(scene: Scene, at: Here, size: float, tolerance: float) -> bool:
-    """Return whether the rule's move is Σ W d for random differences d of a given size."""
+    """Return whether the move is linear, Σ W d, for random differences d of a given size."""
     stencil = linearised(scene, at)
     for slots, d in _random(scene, size, seed=0):
         change = _move(scene, slots, d, at) - _move(scene, slots, {}, at)

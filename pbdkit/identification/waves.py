@@ -1,5 +1,7 @@
-"""Response of a rule to plane waves u = exp(i k·r), its expansion for long waves, and the
-dispersion of slow waves by direction and length.
+"""Response of a rule to plane waves u = exp(i k·r).
+
+It is expanded for long waves, and the dispersion of slow waves is computed by direction and
+wavelength.
 
 With L(k) = -(W_0 + Σ W exp(i k·r)), where W_0 is the derivative with respect to the displacement of
 the particle itself, a step multiplies a wave by 1 - L(k). If a cell has several sites, L couples
@@ -17,18 +19,20 @@ rectangular cell with two sites. If a translation maps sites onto one another, a
 are equal, they are treated as one site. The remaining ones are the sublattices of a lattice with a
 basis.
 
-The rate z of a wave is the fraction of it that a step removes. For long waves z = d k² (1 + λ² k²),
-with the diffusivity d and the square λ² of the fourth-order length. Both depend on the direction,
-and differ between the faster and the slower wave. In gradient elasticity, u'' - l² u'''', λ² is l²;
-a lattice alone has λ² < 0. Along the normal of a family of lattice rows, h apart, interactions with
-the next row alone give z = d s, s = (2 sin(kh/2) / h)², hence λ² = -h²/12. This part is due to the
-discreteness of the lattice; the rest,
+The rate z of a wave is the fraction of its amplitude that a step removes. For long waves z = d k²
+(1 + λ² k²), with the diffusivity d and the square λ² of the fourth-order length. Both depend on the
+direction, and differ between the faster and the slower wave. In gradient elasticity, u'' - l²
+u'''', λ² is l²; on a lattice without such a gradient term λ² is negative. Consider waves along the
+normal of a family of lattice rows with the distance h. If only adjacent rows interact, z = d s with
+s = (2 sin(kh/2) / h)², so that λ² = -h²/12. This part is due to the discreteness of the lattice.
+The rest,
 
     l² = λ² + h²/12
 
-is the contribution of rows beyond the next, and a property of the material. It is exactly c D for a
-rule (1 - P) u + c (1 - P)² u if P couples adjacent rows. If rows beyond the next attract it is
-negative, the wrong sign for gradient elasticity.
+is the contribution of interactions with rows beyond the adjacent ones, and a property of the
+material. It is exactly c D for a rule (1 - P) u + c (1 - P)² u if P couples adjacent rows only. If
+rows beyond the adjacent ones attract, l² is negative, which is the wrong sign for gradient
+elasticity.
 """
 
 from __future__ import annotations
@@ -55,8 +59,10 @@ ALIKE = 1e-8
 
 @dataclass(frozen=True)
 class Primitive:
-    """Stencil on the smallest repeat cell: move_s = centre_s u_s + Σ matrix_e u_target_e over the
-    entries e with source_e = s.
+    """Stencil on the smallest repeat cell.
+
+    The move of site s is centre_s u_s + Σ matrix_e u_target_e, summed over the entries e with
+    source_e = s.
 
     Parameters
     ----------
@@ -95,7 +101,7 @@ def spacing_of(cell: Cell) -> float:
 
 
 def primitive(cell: Cell, stencil: Stencil) -> Primitive:
-    """Return the stencil with sites that are translated copies of one another merged."""
+    """Return the stencil in which sites that are translated copies of one another are merged."""
     spacing = spacing_of(cell)
     positions = np.array([site.at for site in cell.sites]) / spacing
     vectors = np.array(cell.vectors) / spacing
@@ -121,8 +127,10 @@ def primitive(cell: Cell, stencil: Stencil) -> Primitive:
 
 
 def _image(positions: Floats, vectors: Floats, shift: Floats) -> NDArray[np.intp] | None:
-    """Return the site onto which a shift maps each site, or None if the image of some site is not a
-    site."""
+    """Return the site to which a shift maps each site.
+
+    The result is None if a site is mapped to a position without a site.
+    """
     differences = positions[:, None, :] + shift - positions[None, :, :]
     cells = differences @ np.linalg.inv(vectors)
     misses = np.linalg.norm((cells - np.rint(cells)) @ vectors, axis=-1)
@@ -131,8 +139,10 @@ def _image(positions: Floats, vectors: Floats, shift: Floats) -> NDArray[np.intp
 
 
 def _is_invariant(stencil: Primitive, image: NDArray[np.intp]) -> bool:
-    """Return whether every site has the stencil of its image, tested by its response to some
-    waves."""
+    """Return whether every site has the same stencil as its image.
+
+    This is tested by the response to some waves.
+    """
     wave_vectors = np.random.default_rng(0).uniform(-np.pi, np.pi, (8, 2))
     response = operator(stencil, wave_vectors).reshape(8, stencil.sites, 2, stencil.sites, 2)
     error = np.abs(response[:, image][:, :, :, image] - response).max()
@@ -140,7 +150,10 @@ def _is_invariant(stencil: Primitive, image: NDArray[np.intp]) -> bool:
 
 
 def _shortest(vectors: Floats, shifts: Floats) -> Floats:
-    """Return the shortest two independent translations among shifts + cells: a reduced basis."""
+    """Return a reduced basis: the two shortest independent translations.
+
+    The translations are sums of shifts and cell vectors.
+    """
     a, b = sorted(vectors, key=lambda v: v @ v)
     # The reduction of Lagrange and Gauss limits the search to few cells.
     while multiple := np.rint(a @ b / (a @ a)):
@@ -228,7 +241,10 @@ def slow_waves(stencil: Primitive) -> SlowWaves | str:
 
 
 def operator(stencil: Primitive, k: Floats) -> Complex:
-    """Return L(k) for waves k, (wave, axis), as (wave, 2S, 2S). A step multiplies by 1 - L(k)."""
+    """Return L(k) for waves k, (wave, axis), as matrices (wave, 2S, 2S) for S sites.
+
+    A step multiplies a wave by 1 - L(k).
+    """
     return -_coupled(stencil, np.exp(1j * k @ stencil.rest.T), 1.0)
 
 
@@ -294,7 +310,7 @@ class Gradient:
     rows_apart
         Distance between the rows.
     total
-        λ², spacing².
+        λ² of both waves, in units of the squared spacing.
     material
         l² = λ² + rows_apart²/12, the part of the material.
     """
@@ -349,7 +365,7 @@ class WaveSpectrum:
     imaginary
         Largest modulus of the imaginary part.
     largest_stable_relaxation
-        Bound of stable relaxations, None if there is none.
+        Upper bound of stable relaxations; None if there is no bound.
     """
 
     smallest: float
@@ -361,7 +377,7 @@ class WaveSpectrum:
 def ranges(q: Floats) -> tuple[DirectionalRange, DirectionalRange]:
     """Return the ranges of the diffusivities of the fast and of the slow long wave.
 
-    Real parts are taken if they are complex.
+    If they are complex, their real parts are used.
     """
 
     def extreme(wave: int, sign: float) -> tuple[float, float]:
@@ -437,15 +453,15 @@ def minimum(
 ) -> tuple[Floats, float]:
     """Minimise a periodic function of (point, axis) between low and high.
 
-    The best point of a grid is refined on ever finer grids around it. The minimum is exact up to
-    rounding if a point of the first grid lies in the valley of the minimum.
+    The best point of a grid is the centre of the next, finer grid. If a point of the first grid
+    lies in the valley of the minimum, the result is exact except for rounding errors.
 
     Returns
     -------
     where : (axis,)
         Place of the minimum.
     least
-        Value there.
+        Value at the minimum.
     """
     grid, half = _grid(low, high, points), (high - low) / points
     where, best = low, np.inf

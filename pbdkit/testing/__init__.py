@@ -6,8 +6,8 @@ In the tests of a plugin one line is enough::
 
     test_conformance = conformance(MyRule())
 
-`examine` returns the same as a report, and `pbdkit plugins check DISTRIBUTION` tests all components
-of a distribution. docs/extending/testing.md lists the properties.
+`examine` tests the same properties and returns a report. `pbdkit plugins check DISTRIBUTION` tests
+all components of a distribution. docs/extending/testing.md lists the properties.
 """
 
 from pbdkit.testing.conformance import (

@@ -1,8 +1,8 @@
-"""Properties of components by themselves: parameters, lattices, neighbour metrics, the scenes that
-they take part in, and the results of their functions.
+"""Properties of components that are tested without whole steps.
 
-Functions are called with whole arrays, single numbers and probes; their results depend on their
-arguments alone.
+They concern parameters, lattices, neighbour metrics, the scenes that can be built with a component,
+and the results of its functions. Functions are called with whole arrays and with single numbers;
+their results must depend on their arguments only.
 """
 
 from __future__ import annotations
@@ -188,8 +188,11 @@ def has_a_sound_cell(subject: Subject) -> None:
 
 
 def _refuse_miscounted(cell: Cell) -> None:
-    """Raise PropertyError if `primitive` counts equal steps differently, equal sites twice, or
-    steps between which there is no site."""
+    """Raise PropertyError if the primitive indices of a cell are inconsistent.
+
+    They are inconsistent if equal steps have different indices, if two sites have the same index,
+    or if there is no site at an index between others.
+    """
     if np.linalg.det(cell.primitive) == 0.0:
         raise PropertyError(f"the cell vectors {cell.primitive} of `primitive` are parallel")
     for (m, site), (n, other_site) in combinations(enumerate(cell.sites), 2):
@@ -217,8 +220,8 @@ def _refuse_miscounted(cell: Cell) -> None:
 
 @property_of(Lattice)
 def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
-    """The `origin` moves the lattice but does not change its cell: the results of a run do not
-    depend on the position of the body, to the last digit."""
+    """The `origin` moves the lattice but does not change its cell: the position of the body does
+    not change the results of a run, not even their last digit."""
     moved = subject.component.model_copy(update={"origin": (1000.3, -77.1)})
     if moved.cell() != subject.component.cell():
         raise PropertyError("`cell` depends on the origin; remove `self.origin` from it")
@@ -237,7 +240,8 @@ def is_mutual(subject: Subject) -> None:
 
 @property_of(NeighbourMetric)
 def takes_offsets_of_the_cell(subject: Subject) -> None:
-    """Every offset is one of those that the cell defines, with the same values of all fields."""
+    """Every offset that the metric selects is one of the offsets of the cell: all its fields, such
+    as the difference of site indices, equal those of `cell.offset`."""
     for where, cell, s, shells in _tried(subject):
         for offset in chain(*shells):
             if offset != cell.offset(s, offset.target, offset.cell):
@@ -274,8 +278,9 @@ def finds_the_same_anew(subject: Subject) -> None:
 
 
 def _tried(subject: Subject) -> Iterator[tuple[str, Cell, int, Sequence[Sequence[Offset]]]]:
-    """Yield each basis site of the tested lattices for which the metric raises no ExperimentError,
-    as (place, cell, sublattice, shells).
+    """Yield each basis site of the tested lattices, as (place, cell, sublattice, shells).
+
+    Lattices for which the metric raises an ExperimentError are skipped.
     """
     metric = subject.component
     experiments = experiments_with(metric, subject.parts)
@@ -288,7 +293,7 @@ def _tried(subject: Subject) -> Iterator[tuple[str, Cell, int, Sequence[Sequence
 
 
 def _sites(offsets: Iterable[Offset]) -> set[tuple[int, ...]]:
-    """Return the steps between sites."""
+    """Return the differences of repeat cell and sublattice of offsets."""
     return {offset.site for offset in offsets}
 
 
@@ -518,8 +523,10 @@ def _content(value: Any) -> bytes:
 
 
 ROUNDING = 1e-12
-"""Relative tolerance of several thousand roundings; the last digit of numpy functions may depend on
-the position in an array."""
+"""Relative tolerance, equal to several thousand rounding errors.
+
+It is needed because the last digit of a numpy function may depend on the position in an array.
+"""
 
 
 @property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
@@ -606,11 +613,11 @@ def takes_particles_in_any_order(subject: Subject) -> None:
 
 
 class Alike(np.random.Generator):
-    """Generator that returns the same number in every draw, so that results differ only by the
-    arguments."""
+    """Generator that returns the same number in every call, so that results depend on arguments
+    only."""
 
     def __getattribute__(self, name: str) -> Any:
-        """Return a method that draws again at each call and repeats its first number."""
+        """Return a method that generates numbers and returns the first one repeatedly."""
         if name.startswith("_") or not callable(getattr(np.random.Generator, name)):
             return super().__getattribute__(name)
 
@@ -697,7 +704,8 @@ CLOSE = 1e-9
 @property_of(FractureModel, is_needed=True)
 def is_seen_alike_from_both_ends(subject: Subject) -> None:
     """A bond breaks for both ends or for none: `breaks` and `update` return the same for (-d, -r)
-    as for (d, r), and `constants` for a slot and its opposite; they are called for one end only."""
+    as for (d, r), and `constants` returns the same for a slot and for its opposite, because these
+    functions are called for one end only."""
     model, scene = subject.component, subject.scene
     for plane in scene.neighbourhood.planes:
         constants, opposite = model.constants(plane.slot), model.constants(plane.opposite)
@@ -727,7 +735,10 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
 
 
 def _from_the_other_end(names: list[str]) -> list[int]:
-    """Return the index of each number as seen from the other end of a bond: left for right."""
+    """Return the index of each state variable as seen from the other end of a bond.
+
+    From the other end left and right are exchanged.
+    """
     turned = {"_left": "_right", "_right": "_left"}
     swapped = [
         next((n.removesuffix(a) + b for a, b in turned.items() if n.endswith(a)), n) for n in names
@@ -773,8 +784,9 @@ def breaks_beyond_its_strain(subject: Subject) -> None:
 
 @property_of(ParticleOperation)
 def rests_as_declared(subject: Subject) -> None:
-    """With `rests`, a particle that the rule does not move stays exactly where it is, and any other
-    moves: equilibria are those of the rule alone."""
+    """With `rests`, a particle that the rule does not move has exactly the same position after the
+    operation, and any other particle moves: the operation does not change the equilibria of the
+    rule."""
     if not subject.component.rests:
         raise NotApplicableError("it does not declare `rests`")
     (call,) = subject.calls()
@@ -792,8 +804,8 @@ def rests_as_declared(subject: Subject) -> None:
 
 @property_of(FramePolicy)
 def takes_every_point_alone(subject: Subject) -> None:
-    """The particles that a frame point follows do not depend on the other points: ranks and probes
-    compute points separately."""
+    """The particles that a frame point follows do not depend on the other frame points, because
+    ranks and tests compute frame points separately."""
     policy, reason = subject.component, "it has no points"
     for scene in subject.scenes:
         frame = sites_of_frame(scene.raster, scene.experiment.rule)
@@ -823,8 +835,8 @@ def takes_every_point_alone(subject: Subject) -> None:
 
 @property_of(FramePolicy)
 def follows_nearby_particles(subject: Subject) -> None:
-    """Points of a `local` frame follow the particles nearest to them, or particles at an index
-    distance of at most twice the number of layers."""
+    """Points of a `local` frame follow only particles near them: the nearest ones, or those of
+    which the site index differs by at most twice the number of layers."""
     policy = subject.component
     if not policy.local:
         raise NotApplicableError("it does not declare itself `local`")

@@ -61,7 +61,7 @@ class Outcome:
     state : {"held", "failed", "skipped"}
         Result of the property.
     reason : str
-        Fault, or reason for which it was skipped.
+        Fault of the component, or reason for which the property was skipped.
     """
 
     property: str
@@ -123,8 +123,10 @@ class Report:
 
 
 def _outcomes(component: Component, parts: Mapping[str, Any]) -> Iterator[Outcome]:
-    """Yield the outcome of each property in order; if a property that others require fails, the
-    others are skipped."""
+    """Yield the outcome of each property in order.
+
+    If a property that others require fails, the others are skipped.
+    """
     subject, failed = Subject(component, parts), ""
     for tested in properties_of(type(component)):
         if failed:
@@ -154,7 +156,7 @@ def examine(component: Component | type[Component], **parts: Any) -> Report:
     Parameters
     ----------
     component : Component or type
-        Component, or a class, of which the first example is tested.
+        Component, or a class. Of a class the first example is tested.
     **parts : object
         Parts of experiments, ``lattice``, ``neighbours`` and others, that replace the usual ones,
         for a component that requires them.
@@ -192,7 +194,7 @@ def examine(component: Component | type[Component], **parts: Any) -> Report:
 def examine_all(components: Sequence[type[Component]]) -> Iterator[Report]:
     """Yield a report for each example of each class.
 
-    A component that takes part in none of the usual scenes is tested on the lattices and with the
+    If no usual scene can be built with a component, it is tested on the lattices and with the
     neighbour metrics among the classes.
 
     Parameters
@@ -234,13 +236,13 @@ def _made(component: type[Component]) -> list[Component]:
 def conformance(*components: Component | type[Component], **parts: Any) -> Any:
     """Return a test function of pytest with a case for each property of each component.
 
-    Skipped properties are skipped in pytest with their reason. After the last property of a
-    component a line summarises what ran.
+    Skipped properties are skipped tests of pytest and have a reason. After the last property of a
+    component a line with the number of tests, failures and skipped tests is printed.
 
     Parameters
     ----------
     *components : Component or type
-        Components, or classes, of which all examples are tested.
+        Components, or classes. Of a class all examples are tested.
     **parts : object
         Parts of experiments, ``lattice``, ``neighbours`` and others, that replace the usual ones.
 

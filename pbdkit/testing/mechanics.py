@@ -1,9 +1,14 @@
 """Laws of mechanics: the deviation of a scene from each law, relative to the largest stiffness.
 
-A rigid motion of a body stores no energy; the stiffness is symmetric (Maxwell and Betti); no
-deformation has a negative energy; a broken bond increases no stiffness. All follow from the
-stiffness matrix K = -∂force/∂u of the particles of the body, including leaders, which is computed
-from the forces of the stepper, for small solids with free edges.
+There are four laws:
+
+- a rigid motion of a body stores no energy;
+- the stiffness is symmetric (Maxwell and Betti);
+- no deformation has a negative energy;
+- a broken bond increases no stiffness.
+
+They are tested by the stiffness matrix K = -∂force/∂u of the particles of the body, including
+leaders. It is computed from the forces of the stepper, for small solids with free edges.
 """
 
 from __future__ import annotations
@@ -40,8 +45,10 @@ from pbdkit.testing.states import displacements, state_with
 SHARE_BROKEN = 0.2
 """Fraction of bonds that are broken at random."""
 NUDGE = 1e-5
-"""Displacement of central differences for nonlinear rules, relative to the spacing; their error is
-its square."""
+"""Displacement of central differences for nonlinear rules, relative to the lattice constant.
+
+The error is of the order of its square.
+"""
 
 
 def whole_state(scene: Scene) -> State:
@@ -64,18 +71,19 @@ def torn_state(scene: Scene, seed: int, initial: State) -> State:
 
 
 def softened_state(scene: Scene, seed: int) -> State:
-    """Return the scene at rest after a random displacement and back, with further bonds broken.
+    """Return the state at rest after a random displacement that has been reversed.
 
-    Bonds have broken and softened according to its fracture model.
+    During the displacement bonds have broken and softened according to the fracture model. Further
+    bonds are broken at random.
     """
     state = Stepper(scene).advance(state_with(scene, displacements(scene, seed, share=0.3)), 1)
     return torn_state(scene, seed, state)
 
 
 def stiffness(scene: Scene, state: State) -> Floats:
-    """Return K divided by Young's modulus and thickness, at rest, with the bonds of a state.
+    """Return K at rest, divided by Young's modulus and thickness, with the bonds of a state.
 
-    The shape is (2 particles of the body, 2 particles): x of the first, y of the first, ...
+    The matrix has two rows and two columns for each particle of the body, for x and y.
     """
     followers, raster = SlotFollowers(scene), scene.raster
     place = raster.place_of(raster.body_rows)
@@ -109,8 +117,8 @@ def stiffness(scene: Scene, state: State) -> Floats:
 def pulls_at_rest(scene: Scene, state: State) -> bool:
     """Return whether particles at rest exert forces.
 
-    They do if fictitious points are displaced. These points rotate with the body, so that a
-    rotation changes the forces.
+    They exert forces if fictitious points are displaced. These points rotate with the body, so that
+    a rotation changes the forces.
     """
     u = np.zeros_like(state.u, dtype=float)
     return bool(np.abs(SlotFollowers(scene).forces(u, state)).max() > 0.0)
@@ -151,7 +159,7 @@ def energy_given_back(K: Floats) -> float:
 
 
 def stiffening(K: Floats, K_damaged: Floats) -> float:
-    """Return the largest eigenvalue of the increase of the stiffness by damage."""
+    """Return the largest eigenvalue of the damaged stiffness minus the original stiffness."""
     increase = K_damaged - K
     return _share(np.linalg.eigvalsh((increase + increase.T) / 2)[-1], K)
 
@@ -263,7 +271,10 @@ def _experiments(component: Component, around: Mapping[str, Any]) -> Iterator[Ex
 
 
 def _parts(component: Component) -> list[dict[str, Any]]:
-    """Return rule, frame and fracture for the tests of a component, those with fracture first."""
+    """Return combinations of rule, frame and fracture for the tests of a component.
+
+    Combinations with fracture come first.
+    """
     if isinstance(component, FollowerRule):
         if material_of(component) is None:
             raise NoSolidError("it defines no forces")
@@ -278,8 +289,9 @@ def _parts(component: Component) -> list[dict[str, Any]]:
 
 
 def _is_tied(scene: Scene) -> bool:
-    """Return whether a fictitious neighbour is fixed in space, so that translations of the body
-    change forces.
+    """Return whether fictitious neighbours are fixed in space.
+
+    Translations of the body then change forces.
     """
     model, slot = scene.experiment.fracture, scene.neighbourhood.slots[0][0]
     u, p = vector([0.1] * scene.axes), scene.constants.fracture

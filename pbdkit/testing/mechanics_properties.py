@@ -1,5 +1,6 @@
-"""Properties under a change of units, reflection and rotation, and properties of the stiffness of a
-body, whole and with bonds broken at random.
+"""Properties of steps under a change of units, reflection and rotation, and of the stiffness.
+
+The stiffness of a body is tested with all bonds and with bonds broken at random.
 """
 
 from __future__ import annotations
@@ -192,8 +193,10 @@ def _images(X: Floats, matrix: Floats) -> Any:
 LINEAR = 1e-11
 """Tolerance relative to the largest stiffness for linear rules."""
 NEARLY = 1e-8
-"""Tolerance relative to the largest stiffness for other rules, with a stiffness from differences of
-forces."""
+"""Tolerance relative to the largest stiffness for nonlinear rules.
+
+Their stiffness is computed from differences of forces.
+"""
 
 
 @property_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)

@@ -1,5 +1,8 @@
-"""States for tests, the results of a few steps, values of state variables, and moments with
-permuted rows."""
+"""States for tests, and quantities that are computed from them.
+
+These are the results of a few steps, values of state variables, and the input of diagnostics with
+permuted rows.
+"""
 
 from __future__ import annotations
 
@@ -41,16 +44,19 @@ def spacing(scene: Scene) -> float:
 
 
 def displacements(scene: Scene, seed: int, share: float = 0.2) -> Floats:
-    """Return random displacements of the body, (particle, axis), up to a share of the spacing."""
+    """Return random displacements of the body, (particle, axis).
+
+    They are at most a fraction `share` of the lattice constant.
+    """
     size = share * spacing(scene)
     return np.random.default_rng(seed).uniform(-size, size, (len(scene.raster.body_rows), 2))
 
 
 def state_with(scene: Scene, u: Any) -> State:
-    """Return the state of step 1 at rest with displacements u of the body, (particle, axis).
+    """Return a state with displacements u of the body, (particle, axis), and no velocity.
 
-    The frame follows by its map. It is not the state of step 0, which engines may replace by the
-    experiment's initial state.
+    The frame follows by its map. The step of the state is 1 and not 0, because engines may replace
+    the state of step 0 by the initial state of the experiment.
     """
     state = initial_state(scene)
     raster, flat = scene.raster, state.u.reshape(2, -1)
@@ -84,8 +90,10 @@ def numbers_of(part: Component, scene: Scene) -> tuple[Remembered, ...]:
 
 
 def owners(part: Component, scene: Scene) -> Bonds | Particles:
-    """Return the bonds or particles that have the state variables of a component, as passed to
-    `draw`."""
+    """Return the bonds or particles that have the state variables of a component.
+
+    They are in the form in which `draw` receives them.
+    """
     return (describe_particles if isinstance(part, FollowerRule) else describe_bonds)(scene)
 
 
@@ -100,8 +108,10 @@ def differences(scene: Scene, seed: int, share: float = 0.3) -> list[Vector]:
 
 
 def stressed(model: Component, seed: int) -> tuple[Any, ...]:
-    """Return the cells to the left and right of some bonds, with state variables for their stress,
-    for a model that softens cells."""
+    """Return the stress of the cells to the left and right of some bonds, and state variables.
+
+    They are arguments of a model that softens cells.
+    """
     rng, count = np.random.default_rng(seed), 2 * isinstance(model, SoftensCells)
     return tuple(
         (*rng.uniform(-0.2, 0.5, (3, *SHAPE)), rng.integers(0, 2, SHAPE).astype(float))
@@ -135,7 +145,7 @@ def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ..
 
 
 def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
-    """Return the move that follows from the sums of contributions."""
+    """Return the move that the rule computes from the sums of contributions."""
     return Evaluator(scene).move(summed((c, None) for c in contributions), here_of(scene, **at))
 
 
@@ -146,8 +156,11 @@ def here_of(scene: Scene, u: Any, X: Any, own: Any) -> Here:
 
 
 def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
-    """Return state variables of a component for some particles or intact bonds, initially or after
-    two steps. Variables of one owner are kept together."""
+    """Return state variables of a component for some particles or intact bonds.
+
+    They are initial values or values after two steps. All variables of a particle or bond belong to
+    the same time.
+    """
     numbers = numbers_of(part, scene)
     if not numbers:
         return ()
@@ -165,8 +178,11 @@ def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
 
 
 def shared(scene: Scene, own: tuple[Any, ...]) -> list[Any]:
-    """Return the state variables of particle and neighbour along each slot of the first sublattice,
-    for rules that read both; the neighbour is another of the particles."""
+    """Return the state variables of particle and neighbour along each slot of the first sublattice.
+
+    The result is empty unless the rule reads both. For slot n the variables of the neighbour are
+    those of the particle that is n places away in the arrays.
+    """
     if not shares_particles(scene.experiment.rule):
         return []
     slots = range(1, len(scene.neighbourhood.slots[0]) + 1)
@@ -174,7 +190,7 @@ def shared(scene: Scene, own: tuple[Any, ...]) -> list[Any]:
 
 
 def moment_of(scene: Scene, seed: int) -> StateMoment:
-    """Return the scene two steps after a random start, in which bonds may have broken."""
+    """Return the input of diagnostics two steps after a random state. Bonds may have broken."""
     state = state_with(scene, displacements(scene, seed, share=0.6))
     return StateMoment(Stepper(scene).advance(state, 2), Tables(scene))
 

@@ -55,7 +55,7 @@ from pbdkit.testing.subject import (
 )
 
 LOAD_ROUNDING = 1e-9
-"""Tolerance relative to the largest number; sums cancel."""
+"""Tolerance relative to the largest number. Terms of the sums cancel, which increases errors."""
 
 
 @property_of(FollowerRule)
@@ -213,7 +213,10 @@ def superposes(subject: Subject) -> None:
 
 
 def _apart(state: Floats, reference: Floats, states: Floats) -> float:
-    """Return the distance of two states, relative to the largest displacement in the history."""
+    """Return the largest difference between two states, relative to the largest displacement.
+
+    The largest displacement is that of all given states.
+    """
     return float(np.abs(state - reference).max() / max(1e-300, np.abs(states).max()))
 
 

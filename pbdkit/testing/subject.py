@@ -1,8 +1,9 @@
-"""Properties, and their subject: a component in small scenes, on every lattice with every
-neighbourhood, and calls of its functions.
+"""Properties, and the subject to which they are applied.
 
-A `FunctionCall` keeps its arguments, so that it can be repeated with others. Arguments and results
-are trees: arrays and numbers in vectors, tuples, lists and dicts; results also in dataclasses.
+A subject is a component in small scenes, on every lattice with every neighbourhood, and contains
+calls of its functions. A `FunctionCall` contains its arguments, so that the call can be repeated
+with changed ones. Arguments and results are trees of arrays and numbers in vectors, tuples, lists
+and dicts; results can also contain dataclasses.
 """
 
 from __future__ import annotations
@@ -131,7 +132,7 @@ class FunctionCall:
 
 @singledispatch
 def calls_of(component: Component, scene: Scene, seed: int) -> list[FunctionCall]:
-    """Return the calls of the functions of a component that its interface permits."""
+    """Return calls of all functions that the interface of a component defines."""
     raise TypeError(f"{type(component).__name__} does not implement an interface")
 
 
@@ -332,9 +333,9 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     """Yield small experiments with a component.
 
     Rules, frames and fracture models are combined with each of the five lattices and each of four
-    neighbourhoods, lattices with all of these neighbourhoods and neighbour metrics with all of
-    these lattices, each with two rules. Components that work cell by cell are combined with frames
-    or rules that do.
+    neighbourhoods. Lattices are combined with all of these neighbourhoods, and neighbour metrics
+    with all of these lattices, each with two rules. Components that sum over cells are combined
+    with frames or rules for cells.
 
     Parameters
     ----------
@@ -410,12 +411,14 @@ class Subject:
 
     @cached_property
     def scenes(self) -> list[Scene]:
-        """Scenes with the component; it may refuse some by an ExperimentError.
+        """Scenes with the component.
+
+        Scenes that the component refuses by an ExperimentError are omitted.
 
         Raises
         ------
         PropertyError
-            If it refuses all.
+            If the component refuses all scenes.
         """
         scenes: list[Scene] = []
         refusals: list[ExperimentError] = []
@@ -504,8 +507,8 @@ def property_of(
 def examples_of(component: type[Component]) -> list[Component]:
     """Return examples of a component class.
 
-    The first has the first example of each parameter without default; each further example of a
-    parameter gives a further component, with all other parameters unchanged.
+    The first component has the first example of each parameter without default. Each further
+    example of a parameter gives a further component, of which all other parameters are unchanged.
 
     Parameters
     ----------
