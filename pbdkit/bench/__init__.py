@@ -41,8 +41,9 @@ def _sizes(context: click.Context, option: click.Parameter, text: str | None) ->
 @click.option("--plot", "picture", type=PATH, help="PNG, SVG or PDF.")
 @set_option
 def bench(experiment: str, settings: tuple[str, ...], steps: int | None, **options: Any) -> None:
-    """Measure speed against error, at one or several sizes: engines, precisions and threads; with
-    the solver `equilibrium`, its methods and steps, over tolerances."""
+    """Measure speed against error, at one or several sizes. Engines, precisions and numbers of
+    threads are compared or, with the solver `equilibrium`, its methods and steps at several
+    tolerances."""
     changes = (*settings, *([f"steps={steps}"] if steps else ()))
     loaded = load_experiment(experiment, changes)
     show = import_object("pbdkit.bench.work_precision:show_work_precision")

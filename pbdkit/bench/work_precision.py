@@ -571,7 +571,7 @@ def show_work_precision(
 
 Task = dict[str, Any]
 REPEATS = 7
-"""Maximum number of repetitions of a measurement, of which the fastest is used."""
+"""Maximum number of repetitions of a measurement. The fastest repetition is used."""
 MAX_REPEATING_S = 2.0
 """Maximum duration of all repetitions in seconds."""
 MAX_SOLVING_S = 60.0

@@ -413,8 +413,8 @@ def _bonds(plan: Plan, pattern: str) -> list[str]:
 
 
 def _write_mark(plan: Plan) -> Function:
-    """Write the function that marks followers if their bonds, or those of the cells around them,
-    have changed since the last call."""
+    """Write the function that marks followers. A follower is marked if its bonds, or bonds of the
+    cells around it, have changed since the last call."""
     out = Function(plan.shared, "mark")
     differs = _bonds(plan, " or flat_bond#[owner] != flat_known#[owner]")
     out.add(0, "cells = broken.size // len(ends)", "for n in range(len(ends)):")

@@ -284,8 +284,8 @@ class EquilibriumPredictor:
             return None, str(error).partition("; ")[0] + "; constrain it with a leader group"
 
     def _is_linear(self, state: State, system: System) -> bool:
-        """Return whether the moves at random displacements, of the size of those of the body, agree
-        with the linearisation at rest."""
+        """Return whether moves agree with the linearisation at rest. They are tested at random
+        displacements of the same size as the displacements of the body."""
         size = float(np.abs(state.u).max()) or spacing_of(self._scene)
         probe, steps = random_displacements(self._scene, size), self._scene.experiment.steps
         moves, moved = (

@@ -475,8 +475,8 @@ def relax(grid, b, x, row, weight, start, upwards):
 
 @njit(**FAST)
 def restrict(grid, b, x, halved, code, out):
-    """Compute out = Pᵀ (b - K x) at the free places of the next grid, those with a `code` of at
-    least 0."""
+    """Compute out = Pᵀ (b - K x) at the free places of the next grid, where `code` is at least
+    0."""
     half, width, across = x.dtype.type(0.5), code.shape[1], x.shape[2]
     odd, even = np.zeros((2, across), x.dtype), np.zeros((2, across), x.dtype)
     sums = np.zeros((2, 2 * width + 2), x.dtype)

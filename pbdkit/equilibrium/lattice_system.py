@@ -389,8 +389,8 @@ def lattice_system(
     leaders do not hold the body.
 
     At a state that is not at rest the matrix is assembled by differences of compiled `moves`. If
-    the lattice is distributed among processes, `rows` are those of this process, and the system is
-    the one at rest.
+    the lattice is distributed among processes, `rows` are the rows of this process, and the system
+    is linearised at rest.
     """
     if moves and moves.is_compiled and state.u.any():
         matrix = differenced_matrix(scene, state, step, moves)

@@ -45,8 +45,8 @@ PIVOT_THRESHOLD = 0.1
 """A diagonal entry is used as a pivot if it is at least this fraction of the largest entry of its
 column."""
 PATTERN_ASYMMETRY = 1.2
-"""Largest ratio of the number of nonzeros of A + Aᵀ to that of A for which the pattern counts as
-nearly symmetric."""
+"""The pattern of A counts as nearly symmetric if A + Aᵀ has at most this number times as many
+nonzeros as A."""
 SYMMETRY_RTOL = 1e-12
 """Relative difference up to which a matrix counts as symmetric."""
 FEWEST = 1000

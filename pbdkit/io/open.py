@@ -135,8 +135,8 @@ def _unfinished(output: Path) -> xarray.Dataset:
 
 
 def _output_of(file: Path) -> Path | None:
-    """Return the output of the unfinished run to which a path refers. The path may be that of the
-    output or that of the store."""
+    """Return the output of the unfinished run to which a path refers. The path may lead to the
+    output or to the store."""
     if file.name.endswith(STORE) and file.is_file():
         return file.with_name(file.name.removesuffix(STORE))
     return file if not file.exists() and has_committed(file) else None

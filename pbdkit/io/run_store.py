@@ -331,9 +331,9 @@ def _digest_of_all(listed: dict[str, bytes]) -> str:
 
 
 STORE = ".run"
-"""Suffix of the name of the store, after that of the output."""
+"""Suffix that is added to the name of the output to obtain the name of the store."""
 RECORDS = ".run-records"
-"""Suffix of the name of the file of large values, after that of the output."""
+"""Suffix that is added to the name of the output to obtain the name of the file of large values."""
 
 
 def store_of(output: Path) -> Path:

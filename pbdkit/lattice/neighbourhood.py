@@ -271,8 +271,8 @@ class _ExactVectors:
         return number, False, self._known[number]
 
     def _key(self, v: Vector[float]) -> Index:
-        """Return the point of a grid, the spacing of which is much larger than rounding errors, in
-        which v lies."""
+        """Round v to the points of a grid. The spacing of the grid is much larger than rounding
+        errors."""
         unit = 1e-6 * math.hypot(*(self._known[0] if self._known else v))
         return tuple(math.floor(component / unit) for component in v)
 

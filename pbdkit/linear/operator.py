@@ -88,7 +88,7 @@ class Guiding:
         rows, places
             Row and flat place of each block.
         numbers
-            Two numbers for each block: that of its unknown, and that of its prescribed
+            Two indices for each block: the number of its unknown, and the number of its prescribed
             displacement.
         blocks : (entry, axis, axis)
             ∂move/∂u.

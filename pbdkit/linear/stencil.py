@@ -133,7 +133,8 @@ def _derivatives(scene: Scene, slots: Sequence[Slot], at: Here) -> Floats:
 
 
 def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
-    """Return the stencil of the scene's rule, composed with that of an inner rule if there is one.
+    """Return the stencil of the scene's rule. If there is an inner rule, both stencils are
+    composed.
 
     Parameters
     ----------

@@ -380,8 +380,8 @@ class PanelFigure:
             yield Dots(ax, style.dot, colours or OF_KINDS, body.outside & style.filled)
 
     def _grid(self, ax: Axes) -> PixelGrid:
-        """Return the pixels of a field, which are finer than those of the picture unless there are
-        many cells."""
+        """Return the pixels of a field. They are smaller than the pixels of the picture, unless
+        there are many cells."""
         extent = ax.get_window_extent()
         finer = 1 if len(self._body.reference) > MAX_DOTS else self._finer
         across, up = (max(2, round(finer * side)) for side in (extent.width, extent.height))

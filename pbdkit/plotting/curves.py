@@ -33,7 +33,7 @@ from pbdkit.plotting.style import in_its_units, label, plain
 from pbdkit.scene.scene import Scene
 
 FORCE_OF = {"load": "load_resultant", "obstacle": "contact_force", "leader_group": "reaction"}
-"""Variables of forces, by the dimension of the bodies that exert them."""
+"""Variables of forces, by the dimension of the groups, loads or obstacles that exert them."""
 NEEDED_FORCES = (
     "a force-displacement curve requires a diagnostic of forces: add {type: load-displacement, "
     "youngs_modulus: ...} for loads, {type: contact, ...} for obstacles or {type: reaction, ...} "

@@ -34,11 +34,11 @@ COLOUR_LIMIT = 3.0
 def draw_fit(fitted: Fitted) -> Figure:
     """Draw each measurement of a fit.
 
-    A field has panels with the measured and the fitted ux and uy, with the residual divided by the
-    noise, and with the sensitivity to each parameter. For wide bodies the panels are beside each
-    other, otherwise below each other. For tracks and curves, the measured and the fitted values,
-    the residual and the sensitivity are drawn over time or displacement. Raises ExperimentError if
-    matplotlib is missing.
+    A field has panels with ux and uy, measured and fitted. Further panels contain the residual,
+    divided by the noise, and the sensitivity to each parameter. For wide bodies the panels are
+    beside each other, otherwise below each other. For tracks and curves, the measured and the
+    fitted values, the residual and the sensitivity are drawn over time or displacement. Raises
+    ExperimentError if matplotlib is missing.
     """
     refuse_no_matplotlib()
     from pbdkit.plotting.figure_layout import new_figure

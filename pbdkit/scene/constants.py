@@ -75,8 +75,7 @@ def _declared(part: FollowerRule | FractureModel, field: str) -> Declared:
 
 
 def remembered_names(experiment: Experiment) -> dict[str, str]:
-    """Return the field of the component that declares each state variable, by the name of the
-    variable.
+    """Return for each state variable, by its name, the field of the component that declares it.
 
     Raises
     ------

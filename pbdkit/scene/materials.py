@@ -28,8 +28,8 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import Values, kinds_of, named_weights, signed_distance, values_at
 
 ACROSS = [0, 2]
-"""Indices, among the components (normal, tangential, shear), of those with the same stress in all
-layers."""
+"""Indices of the components with the same stress in all layers. The components are (normal,
+tangential, shear)."""
 ALONG = [1]
 """Indices of the components with the same strain in all layers."""
 ISOTROPY_RTOL = 1e-6
@@ -123,7 +123,8 @@ def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Flo
 
 
 def _pieces(c: Floats) -> tuple[Any, Any, Any]:
-    """Return the terms of a material that are averaged over the layers, in the axes of the layers.
+    """Return the terms of a material of which the mean over the layers is computed. They are given
+    in the axes of the layers.
 
     The terms are C_nn⁻¹, C_nn⁻¹ C_nt and C_tt - C_tn C_nn⁻¹ C_nt. The index n stands for the
     components across the layers, and t for the component along them.

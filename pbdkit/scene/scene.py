@@ -273,8 +273,8 @@ class Scene:
         return replace(self, barriers=(), operations=())
 
     def restrict(self, to: Restriction) -> Scene:
-        """Return the scene restricted to some rows of the lattice, by the method `restrict` of each
-        feature."""
+        """Return the scene restricted to some rows of the lattice. The method `restrict` of each
+        feature is called."""
         values = {each.name: _restricted(getattr(self, each.name), to) for each in fields(self)}
         return replace(self, **values | {"raster": to.part})
 
@@ -310,7 +310,7 @@ class Scene:
 
     @property
     def axes(self) -> int:
-        """Number of axes of space, that of the lattice."""
+        """Number of axes of space, which is the number of axes of the lattice."""
         return len(self.raster.cell.vectors)
 
     @property

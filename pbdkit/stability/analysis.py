@@ -470,7 +470,7 @@ class Analysis:
         return [*self.obstructions(), *self.left_out]
 
     def obstructions(self) -> list[str]:
-        """Return what prevents convergence, with the remedy."""
+        """Return the reasons why steps do not converge, with remedies."""
         anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
         parts = [] if anchored or self.scene.barriers else self.parts_without_leader
         message = "leaders: a part of {} particles (with number {}) is not constrained by any"

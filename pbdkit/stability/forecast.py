@@ -94,7 +94,7 @@ class Forecast:
     exact
         True if the analysis holds for the whole run. False if it is a linearisation at the start.
     estimated
-        Whether the spectrum is an estimate, in which 1 - ρ is accurate to 1 %.
+        True if the spectrum is an estimate. The accuracy of 1 - ρ is then 1 %.
     lag, lag_reached
         Largest distance of a follower from its equilibrium in the steps in which the leaders move
         fastest, in lattice units. `lag` is the constant distance that is reached after long motion

@@ -159,9 +159,9 @@ def _numpy_seconds(scene: Scene) -> float:
 
 
 def _max_steps(scene: Scene) -> float:
-    """Return the largest number of steps: that of the run or, for a run until convergence, the
-    estimate (2n)² (2/π)² ln(1 / tolerance) for the barycentre rule on a body of n cells with one
-    fixed end."""
+    """Return an upper estimate of the number of steps. It is the number of steps of the run. For a
+    run until convergence it is (2n)² (2/π)² ln(1 / tolerance), the estimate for the barycentre rule
+    on a body of n cells with one fixed end."""
     steps, criterion = float(scene.experiment.steps), scene.experiment.stepping.settle
     if criterion is None:
         return steps

@@ -95,8 +95,8 @@ class State:
         return replace(over, step=self.step, starts=self.starts)
 
     def fits(self, other: State) -> bool:
-        """Return whether both states can belong to one scene, by the data types and shapes of their
-        arrays."""
+        """Return whether both states can belong to the same scene. The data types and the shapes of
+        their arrays are compared."""
         layouts = [[(a.dtype, a.shape) for a in state.arrays()] for state in (self, other)]
         return layouts[0] == layouts[1] and len(self.starts) == len(other.starts)
 
@@ -175,8 +175,8 @@ def _displace(scene: Scene, u: Floats) -> None:
 
 
 def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Values) -> None:
-    """Draw the random initial values of the state variables of a component, without those of frame
-    points."""
+    """Draw the random initial values of the state variables of a component. No values are drawn for
+    frame points."""
     part: FractureModel | FollowerRule = getattr(scene.experiment, field)
     if not (numbers and isinstance(part, Draws)):
         return

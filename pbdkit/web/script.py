@@ -248,8 +248,8 @@ def _bounds(experiment: Experiment, name: str) -> tuple[float, float]:
 NEVER = 2**62 - 1
 """Last step of a session without end."""
 MADE = "-live"
-"""Suffix of the names of saved sessions. The names of their results then differ from those of the
-experiment's results."""
+"""Suffix of the names of saved sessions. With it the results of a session do not get the name of
+the experiment's result."""
 Parts = dict[str, Any]
 
 

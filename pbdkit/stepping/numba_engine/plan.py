@@ -451,8 +451,8 @@ def load_plugin_kernel(
     arguments: tuple[Any, ...],
     more: Mapping[str, Callable[..., Any]] | None = None,
 ) -> Any:
-    """Return the kernel. `more` are functions in addition to those of the components. The message
-    of a compiler error contains the name of the component that causes it."""
+    """Return the kernel. `more` are further functions, which do not belong to components. The
+    message of a compiler error contains the name of the component that causes it."""
     with attributing_errors(levels):
         return load_kernel(source, functions_of(levels) | dict(more or {}), arguments)
 

@@ -2,10 +2,10 @@
 
 For particles that have all their neighbours the code is written slot by slot. Rest offsets, index
 offsets and weights are literals in it, so that the compiler removes terms that cancel. For all
-other particles the code is a loop over slots. These are particles with missing neighbours or cut
-cells, of which there are few, and they are computed one after the other. There may be thousands of
-slots, too many to write code for each of them. Then the loop over slots is used for all particles,
-and all particles of a row are computed slot after slot.
+other particles the code is a loop over slots. These are the few particles with missing neighbours
+or cut cells; they are computed one after the other. There may be thousands of slots, too many to
+write code for each of them. Then the loop over slots is used for all particles, and all particles
+of a row are computed slot after slot.
 
 If the rule computes the forces of torn cells, the few particles next to damaged cells are marked in
 an array. The sweep moves all other particles as if no bond could break, and then computes the
