@@ -31,17 +31,18 @@ JUMPS = [n for n in TORN if SHIPPED[n].get("solver", {}).get("type") == "equilib
 STEPS = [n for n in TORN if n not in JUMPS and n != "modelling/ageing"]
 """A bar that has aged is in two halves at once, of which nothing holds one against sliding."""
 STEPPED = "solver={type: stepping, relaxation: 0.2, memory: 0.8}"
+OVERDAMPED = "solver={type: stepping, memory: 0.6}"
 SWINGING = "solver={type: stepping, memory: 0.9}"
 SWINGING_LONG = "solver={type: stepping, memory: 0.95}"
 SMALLER = {
-    "material/bar": ["lattice.a=0.2", SWINGING],
+    "material/bar": ["lattice.a=0.2", OVERDAMPED],
     "material/dogbone": ["lattice.a=1.0", "solver.memory=0.95"]
     + [
         f"leaders.{n}.motion={{type: velocity, velocity: [{x}, 0.0], steps: 260}}"
         for n, x in enumerate((-8e-4, 8e-4))
     ],
-    "modelling/ageing": [SWINGING],
-    "modelling/rollers": [SWINGING],
+    "modelling/ageing": [OVERDAMPED],
+    "modelling/rollers": [OVERDAMPED],
     "modelling/strip": ["units.length=3.125 mm", SWINGING_LONG],
     "material/cantilever": ["lattice.a=0.25", "solver={type: stepping, memory: 0.7}"],
     "material/hole": ["lattice.a=0.2"],
@@ -55,7 +56,7 @@ SMALLER = {
     "modelling/dogbone-to-failure": ["lattice.a=2.5", SWINGING_LONG],
     "modelling/inclusion": ["lattice.a=1.0", SWINGING],
     "modelling/graded-bar": ["lattice.a=1.0", SWINGING],
-    "modelling/composite-plate": ["lattice.a=5.0", "solver={type: stepping, memory: 0.97}"],
+    "modelling/composite-plate": ["lattice.a=5.0", SWINGING_LONG],
     "modelling/weakest-place": ["body.columns=8", SWINGING],
     "material/gradient-layer": ["lattice.a=0.1", STEPPED],
     "start": ["body={type: grid, columns: 12, rows: 6}"],
