@@ -102,7 +102,7 @@ class Track(Diagnostic):
     type: Literal["track"] = "track"
     numbers: Annotated[
         tuple[Annotated[int, Field(ge=1, lt=2**62)], ...], Field(strict=False, min_length=1)
-    ] = Field(description="The particles to follow, by number.", examples=[[3, 1]])
+    ] = Field(description="Numbers of the particles that are tracked.", examples=[[3, 1]])
 
     every_step: ClassVar[bool] = True
 
@@ -516,7 +516,7 @@ class StressStrain(Diagnostic):
         examples=[((0.0, 0.0), (1.0, 0.0))],
     )
     numbers: TwoNumbers | None = Field(
-        None, description="Ends of the gauge length by number.", examples=[(1, 30)]
+        None, description="Ends of the gauge length, as numbers of particles.", examples=[(1, 30)]
     )
 
     needs: ClassVar[frozenset[Need]] = frozenset({"forces"})

@@ -277,7 +277,7 @@ def _in_triangle(slot: Slot, c: Stiffness, turn: int) -> Floats:
 
 Factor = Annotated[
     float,
-    Field(ge=1e-9, le=1e9, description="Factor on the material's stiffness.", examples=[10.0]),
+    Field(ge=1e-9, le=1e9, description="Factor of the stiffness.", examples=[10.0]),
 ]
 """Type of a factor on the stiffness of the material."""
 

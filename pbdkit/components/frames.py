@@ -52,7 +52,7 @@ class CopyingFrame(LayeredFrame):
     """Base class of the frame policies in which points copy the nearest body particles."""
 
     lag: Annotated[int, Field(ge=0, le=1)] = Field(
-        0, description="Delay in steps; 1 copies displacements of the last step.", examples=[1]
+        0, description="Delay in steps; 1 uses displacements of the last step.", examples=[1]
     )
 
 

@@ -15,7 +15,7 @@ Spacing = Annotated[float, Field(ge=1e-100, le=1e100), LENGTH]
 
 A = Field(description="Distance of the sites along a row (lattice units).", examples=[1.0])
 """Field of the lattice constant along a row."""
-B = Field(description="The other edge of the rectangle (lattice units).", examples=[1.3])
+B = Field(description="Length of the second edge of the rectangle (lattice units).", examples=[1.3])
 """Field of the second edge of a rectangular cell."""
 
 
@@ -48,7 +48,7 @@ class Oblique(Lattice):
     type: Literal["oblique"] = "oblique"
     a: Spacing = A
     b: Spacing = Field(
-        description="Distance of the sites up the slanted line (lattice units).", examples=[0.9]
+        description="Distance of the sites along the slanted line (lattice units).", examples=[0.9]
     )
     angle: Annotated[float, Field(gt=0.0, lt=180.0)] = Field(
         description="Angle between row and slanted line (degrees).", examples=[65.0]
