@@ -288,7 +288,10 @@ kernels do as numpy does is tested with the engine."""
     ("name", "engine"),
     [*((name, "numpy") for name in CASES), *((name, "compiled") for name in COMPILED)],
 )
-def test_every_kind_of_scene(name, engine, tmp_path):
+def test_every_kind_of_scene(name, engine, tmp_path, request):
+    """Kernels of runs of a few steps are interpreted, and compiled in the profile `long`."""
+    if engine == "compiled" and name != "settling":
+        request.getfixturevalue("compiled_at_length")
     parts = CASES[name]
     solver = NUMPY | parts.get("solver", {}) | {"engine": engine}
     compare(sheet(**parts | {"solver": solver}), tmp_path, 3)
