@@ -48,7 +48,7 @@ class Change:
     def place(self, x: Any) -> list[float]:
         return (self.vector(x) + np.array(self.shift)).tolist()
 
-    def way(self, v: Any) -> list[float]:
+    def rotated(self, v: Any) -> list[float]:
         return self.vector(v).tolist()
 
     def vector(self, v: Any) -> Floats:
@@ -250,9 +250,9 @@ class _Changed:
         change, found = self.change, dict(motion)
         for name in ("displacement", "velocity", "amplitude", "force"):
             if name in motion:
-                found[name] = change.way(motion[name])
+                found[name] = change.rotated(motion[name])
         if "displacements" in motion:
-            found["displacements"] = [change.way(v) for v in motion["displacements"]]
+            found["displacements"] = [change.rotated(v) for v in motion["displacements"]]
         if "points" in motion:
             found["points"] = [change.place(x) for x in motion["points"]]
         if motion["type"] == "rotation":
@@ -263,7 +263,7 @@ class _Changed:
     def load(self, load: Tree) -> Tree:
         found = load | {"select": self.select(load["select"])}
         if "force" in load:
-            found["force"] = self.change.way(load["force"])
+            found["force"] = self.change.rotated(load["force"])
         if "body_force" in load:
             force = np.array(self.change.turned(load["body_force"]))
             found["body_force"] = (force / self.change.factor).tolist()

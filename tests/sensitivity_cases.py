@@ -160,7 +160,7 @@ class Plain:
         self.free, self._start = np.flatnonzero(free), np.zeros(np.count_nonzero(free))
         for _ in range(MOST if not self.experiment.rule.linear else 1):  # Newton's
             self._slope = self._slope_at(scene, self._start)
-            before, self._start = self._start, self._settled(scene)
+            before, self._start = self._start, self._equilibrium(scene)
             if np.abs(self._start - before).max() < 1e-13:
                 break
 
@@ -168,7 +168,7 @@ class Plain:
         """The displacements of the scene of an experiment, frame and leaders too, (axis, place)."""
         scene = build_scene(pbdkit.Experiment(**given))
         moves, u = self._moves_of(scene)
-        moves(self._settled(scene))
+        moves(self._equilibrium(scene))
         flat = u.reshape(2, -1)
         if scene.frame:
             scene.frame.follow(flat, flat)
@@ -214,7 +214,7 @@ class Plain:
             columns.append((here - moves(there)) / h)
         return np.linalg.inv(np.stack(columns, axis=1))
 
-    def _settled(self, scene):
+    def _equilibrium(self, scene):
         """Find the equilibrium from the previous one, as near as rounding permits."""
         moves, _ = self._moves_of(scene)
         x, best = self._start.copy(), np.inf

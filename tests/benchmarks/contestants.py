@@ -85,7 +85,7 @@ def own(name: str) -> Contestant:
         if problem is VARYING:
             stiffen(scene, cells)
         built = time.process_time()
-        state = settled(scene) if name == STEPPING else equilibrium_state(scene)[0]
+        state = converged(scene) if name == STEPPING else equilibrium_state(scene)[0]
         ended = time.process_time()
         return Solved(built - begun, ended - built, lambda: error_of(problem, cells, scene, state))
 
@@ -100,7 +100,7 @@ def stiffen(scene: Scene, cells: int) -> None:
     share *= modulus(*((corner + 0.5) / cells))
 
 
-def settled(scene: Scene) -> State:
+def converged(scene: Scene) -> State:
     run = Simulation.of_scene(scene)
     for _ in run:
         pass

@@ -37,7 +37,7 @@ def cost() -> dict[str, Any]:
     found["setup_ns_a_particle"] = _setup()
     found["file_ms"] = _run(10, {"steps": 1})[0] * 1e3
     found["record_ns_a_particle"] = _record()
-    found["foretold"] = [_foretold(found, engine, k) for engine in SIZES for k in (4, 12)]
+    found["foretold"] = [_predicted(found, engine, k) for engine in SIZES for k in (4, 12)]
     return found
 
 
@@ -101,7 +101,7 @@ def _run(size: int, parts: dict[str, Any], turns: int = 7) -> tuple[float, int]:
     return found, scene.raster.count
 
 
-def _foretold(model: dict[str, Any], engine: str, neighbours: int) -> dict[str, Any]:
+def _predicted(model: dict[str, Any], engine: str, neighbours: int) -> dict[str, Any]:
     size, steps, every = (600, 300, 30) if engine == "compiled" else (250, 60, 20)
     solver = {"type": "stepping", "engine": engine, "threads": 1}
     parts = {"steps": steps, "record": {"every": every}, "neighbours": NEIGHBOURS[neighbours]}

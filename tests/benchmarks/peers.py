@@ -31,7 +31,7 @@ def peers() -> list[dict[str, Any]]:
     for _ in range(3):
         for size in SIZES:
             for name, (_, script) in PEERS.items():
-                for what, ns in _ask(pythons[name], script, size).items():
+                for what, ns in _run_peer(pythons[name], script, size).items():
                     _keep(found, name, what, size, ns)
             for precision in ("float64", "float32"):
                 _keep(found, "pbdkit", f"barycentre, {precision}", size, _own(size, precision))
@@ -68,7 +68,7 @@ def python_with(*packages: str) -> str:
     return str(python)
 
 
-def _ask(python: str, script: str, size: int) -> dict[str, Any]:
+def _run_peer(python: str, script: str, size: int) -> dict[str, Any]:
     if not python:
         return {"": "does not install"}
     call = [python, str(HERE / script), str(size)]

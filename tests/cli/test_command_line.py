@@ -95,14 +95,14 @@ def test_check_with_warnings_exits_with_zero(call: Call) -> None:
     assert (result.code, "warning: leaders: the experiment has neither" in result.out) == (0, True)
 
 
-def said_by_check(call: Call, *arguments: str) -> dict[str, str]:
+def rows_of_check(call: Call, *arguments: str) -> dict[str, str]:
     """The lines by their first word, after the first."""
     lines = call("check", *arguments).out.splitlines()[1:]
     return {title: text for title, _, text in (line.strip().partition(" ") for line in lines)}
 
 
 def test_check_starts_with_groups_and_events(call: Call) -> None:
-    said = {title: text.strip() for title, text in said_by_check(call, "e.json").items()}
+    said = {title: text.strip() for title, text in rows_of_check(call, "e.json").items()}
     assert said["body"] == "12 particles over 3 × 2 lattice units, and 18 of the frame"
     assert said["supports"] == "leaders.0, 3 particles (edge left)"
     assert said["leaders"] == "leaders.1, 3 particles (edge right) by velocity until step 3"
@@ -116,7 +116,7 @@ def test_check_starts_with_groups_and_events(call: Call) -> None:
 
 
 def test_check_lists_loads_and_regions(call: Call) -> None:
-    said = said_by_check(call, "modelling/composite-plate")
+    said = rows_of_check(call, "modelling/composite-plate")
     assert said["regions"].strip() == "steel, 197 particles"
     assert said["loads"].strip().startswith("loads.0, 41 particles (edge right) force [")
     assert said["supports"].strip() == (
@@ -131,18 +131,18 @@ def test_check_lists_only_some_of_many_groups(call: Call) -> None:
         f"{{select: {{numbers: [{n}]}}, motion: {{type: hold}}}}" for n in (7, 8, 9, 12, 13)
     )
     setting = f"leaders=[{held}]"
-    said = said_by_check(call, "e.json", "--set", setting)["supports"]
+    said = rows_of_check(call, "e.json", "--set", setting)["supports"]
     assert said.strip().endswith("leaders.2, 1 particle; and 2 more")
-    assert "leaders.4" in said_by_check(call, "e.json", "--verbose", "--set", setting)["supports"]
+    assert "leaders.4" in rows_of_check(call, "e.json", "--verbose", "--set", setting)["supports"]
 
 
 def test_check_predicts_divergence_and_sufficient_length(call: Call) -> None:
-    said = said_by_check(call, "e.json", "--set", "solver.relaxation=3")
+    said = rows_of_check(call, "e.json", "--set", "solver.relaxation=3")
     assert said["stable"].strip().startswith("NO, some modes grow (spectral radius ")
     assert "converges" not in said
-    said = said_by_check(call, "e.json", "--set", "steps=100000")
+    said = rows_of_check(call, "e.json", "--set", "steps=100000")
     assert said["converges"].endswith("the run of 100000 steps reaches 1e-6")
-    said = said_by_check(call, "e.json", "--set", "solver.settle.tolerance=1e-3")
+    said = rows_of_check(call, "e.json", "--set", "solver.settle.tolerance=1e-3")
     assert said["converges"].endswith("once it has converged, or after 10 steps")
 
 

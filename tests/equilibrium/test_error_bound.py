@@ -24,13 +24,13 @@ PULLED = [HOLD_LEFT, pull_right(0.1, 0.05)]
 LAST = {"at": [0]}
 
 
-def settling(tolerance, **parts):
+def steady_state_solver(tolerance, **parts):
     return {"type": "stepping", "settle": {"tolerance": tolerance}} | parts
 
 
 def sheet(columns=7, rows=5, tolerance=1e-4, solver=None, **parts):
     base = {"leaders": PULLED, "steps": 20_000, "record": LAST}
-    asked = settling(tolerance, **(solver or {}))
+    asked = steady_state_solver(tolerance, **(solver or {}))
     return experiment(columns, rows, **(base | parts)) | {"solver": asked}
 
 

@@ -171,7 +171,7 @@ class Alternates(Following):
         return FrameMap(points, body[chosen], np.ones(len(points)))
 
 
-class SaysItIsLocal(Following):
+class ClaimsToBeLocal(Following):
     """Follows the body's first particle, wherever that is."""
 
     type: Literal["says-it-is-local"] = "says-it-is-local"
@@ -195,7 +195,7 @@ class Shrinks(Following):
         return replace(found, weight=0.9 * found.weight)
 
 
-class SaysItAnchors(Anchors, Following):
+class ClaimsToAnchor(Anchors, Following):
     """Declares that it ties the body to its place, and does not."""
 
     type: Literal["says-it-anchors"] = "says-it-anchors"

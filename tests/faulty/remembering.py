@@ -312,7 +312,7 @@ class Tired(RenewsParticles, Sound):
         return (here.own.way + np.abs(total[0].x / total[1]),)
 
 
-class ForgetsTheWay(Tired):
+class ForgetsThePath(Tired):
     """Returns none of the numbers that it declares to change."""
 
     type: Literal["forgets-the-way"] = "forgets-the-way"
@@ -322,7 +322,7 @@ class ForgetsTheWay(Tired):
         return ()
 
 
-class WayAndMove(Tired):
+class PathAndMove(Tired):
     """Returns the move beside what it remembers."""
 
     type: Literal["way-and-move"] = "way-and-move"
@@ -332,7 +332,7 @@ class WayAndMove(Tired):
         return here.own.way + np.abs(total[0].x), total[0].x
 
 
-class WritesTheWay(Tired):
+class WritesThePath(Tired):
     """Adds to the way where it lies."""
 
     type: Literal["writes-the-way"] = "writes-the-way"
@@ -344,7 +344,7 @@ class WritesTheWay(Tired):
         return (way,)
 
 
-class SharesTheWay(Tired):
+class SharesThePath(Tired):
     """Remembers the mean way of all."""
 
     type: Literal["shares-the-way"] = "shares-the-way"

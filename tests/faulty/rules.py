@@ -416,12 +416,12 @@ class Chooses(Sound):
         raise pbdkit.ExperimentError("'chooses' works on no lattice at all")
 
 
-def homeless() -> Any:
+def without_location() -> Any:
     """A rule with a class that cannot be imported."""
 
-    class Homeless(Sound):
+    class WithoutLocation(Sound):
         """Is defined within a function."""
 
         type: Literal["homeless"] = "homeless"
 
-    return Homeless()
+    return WithoutLocation()

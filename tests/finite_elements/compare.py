@@ -113,7 +113,7 @@ def seconds_at(points: list[Point], error: float, *, setup: bool, clock: str = "
     return np.nan
 
 
-def tell(name: str, found: Curves) -> None:
+def print_row(name: str, found: Curves) -> None:
     for kind, points in found.items():
         for p in points:
             print(
@@ -142,7 +142,7 @@ def main() -> None:
     found = {}
     for problem in (BAR, CANTILEVER, HOLE):
         found[problem.name] = curves(problem)
-        tell(problem.name, found[problem.name])
+        print_row(problem.name, found[problem.name])
     draw(PICTURE, found, tuple(ELEMENTS))
 
 

@@ -170,27 +170,27 @@ def moved() -> tuple[Estimate, Estimate]:
 def main() -> None:
     """Print all results in lines."""
     for side, end in ends().items():
-        print(f"{side}: strain {told(end.strain, 1e6)}e-6, {told(end.modulus, 1e-3)} GPa")
+        print(f"{side}: strain {text_of(end.strain, 1e6)}e-6, {text_of(end.modulus, 1e-3)} GPa")
     found = fall()
     for name in ("between", "whole", "left", "right"):
-        print(f"strain falls from end to end, {name}: {told(getattr(found, name), 1e6)}e-6")
+        print(f"strain falls from end to end, {name}: {text_of(getattr(found, name), 1e6)}e-6")
     for name in ("without", "found", "apart"):
         fit = getattr(found, name)
-        print(f"fit, {name}: ν {told(fit.poisson)}, E {told(fit.young, 1e-3)} GPa, "
+        print(f"fit, {name}: ν {text_of(fit.poisson)}, E {text_of(fit.young, 1e-3)} GPa, "
               f"residual {fit.ratio:.3f} of the noise")  # fmt: skip
     for side, end in straightened(found.found.strengths[0].value).items():
-        print(f"{side}, straightened: {told(end.modulus, 1e-3)} GPa")
+        print(f"{side}, straightened: {text_of(end.modulus, 1e-3)} GPa")
     for by_axis in (False, True):
         for rigid in (False, True):
             held = clamped(by_axis=by_axis, rigid=rigid)
             print(f"clamped{', axes apart' * by_axis}{', moved as a whole' * rigid}: "
-                  f"E {told(held.young, 1e-3)} GPa, ν {told(held.poisson)}, "
+                  f"E {text_of(held.young, 1e-3)} GPa, ν {text_of(held.poisson)}, "
                   f"leaves {1e3 * held.left:.2f} µm")  # fmt: skip
     for side, ux in zip(WINDOWS, moved(), strict=True):
-        print(f"ux near the {side} end: {told(ux, 1e3)} µm")
+        print(f"ux near the {side} end: {text_of(ux, 1e3)} µm")
 
 
-def told(of: Estimate, unit: float = 1.0) -> str:
+def text_of(of: Estimate, unit: float = 1.0) -> str:
     """Return the text "value ± error"."""
     return f"{of.value * unit:.4g} ± {of.error * unit:.2g}"
 

@@ -30,7 +30,7 @@ def make(problem: Problem) -> None:
         solution = solve(problem, elements)
         found[:, sites] = solution.at(x[sites], y[sites])
         off = np.nan if before is None else _relative(problem, before, found)
-        _tell(problem, elements, solution, off)
+        _print_row(problem, elements, solution, off)
         before = found.copy()
     path = DATA / f"{problem.name}.npz"
     scalars = {"reaction": solution.reaction, "energy": solution.energy, "error": off / GAIN}
@@ -44,7 +44,7 @@ def _relative(problem: Problem, rough, fine) -> float:
     return float(np.sqrt(np.nansum((rough - fine) ** 2) / np.nansum(fine**2)))
 
 
-def _tell(problem: Problem, elements: int, solution: Solution, off: float) -> None:
+def _print_row(problem: Problem, elements: int, solution: Solution, off: float) -> None:
     print(
         f"{problem.name:14} {elements:4} {len(solution.u):7} dofs, from the mesh before {off:.2e}, "
         f"reaction {solution.reaction:.11f}, energy {solution.energy:.11f}",

@@ -168,7 +168,7 @@ def alike(n: int, *, plain: bool, terms: Terms | None = None) -> Found:
             return (seen + beside @ z[ends.stop :] - wanted) / NOISE
 
         found = least_squares(differences, z, **how)
-        carried, gradient = _carried(model, modes, found.x)
+        carried, gradient = _reaction(model, modes, found.x)
     else:
 
         def answers(z):
@@ -184,7 +184,7 @@ def alike(n: int, *, plain: bool, terms: Terms | None = None) -> Found:
         at, gradient = answers(found.x), np.zeros(len(z))
         carried = float(at.carried @ found.x[ends])
         gradient[0], gradient[ends] = at.carried_slope, at.carried
-    return _told(found, carried, gradient, model.states, ends.stop)
+    return _estimates(found, carried, gradient, model.states, ends.stop)
 
 
 Terms = Callable[[np.ndarray], np.ndarray]
@@ -192,17 +192,17 @@ Terms = Callable[[np.ndarray], np.ndarray]
 
 def bend(points: np.ndarray) -> np.ndarray:
     """x² along x, (number, 1), of x from -1 to 1 over the points' box."""
-    along = ways(points)
+    along = relative_positions(points)
     return np.concatenate([along**2, np.zeros(len(along))])[:, None]
 
 
-def ways(points: np.ndarray) -> np.ndarray:
+def relative_positions(points: np.ndarray) -> np.ndarray:
     """x from -1 to 1."""
     x = points[:, 0]
     return np.asarray(2.0 * (x - x.min()) / np.ptp(x) - 1.0)
 
 
-def _told(found: Any, carried: float, gradient: np.ndarray, states: int, first: int) -> Found:
+def _estimates(found: Any, carried: float, gradient: np.ndarray, states: int, first: int) -> Found:
     """Errors are those of an M-estimator; scipy's Jacobian counts the loss in, which is undone."""
     counted = (1.0 + np.square(found.fun / SCALE)) ** 0.75
     covariance, ratio = _of_loss(found.jac * counted[:, None], found.fun)
@@ -227,7 +227,7 @@ def _of_loss(jacobian: np.ndarray, residuals: np.ndarray) -> tuple[np.ndarray, f
     return np.linalg.inv(jacobian.T @ jacobian) * factor * max(1.0, ratio) ** 2, ratio
 
 
-def _carried(model: Model, modes: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
+def _reaction(model: Model, modes: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
     """The force on the right end and its derivatives; it is linear in the coefficients."""
     gradient, step = np.zeros(len(z)), 1e-4
     ends = modes @ z[1:-1]

@@ -314,12 +314,12 @@ def test_resumed_on_another_number_of_processes(sizes, tmp_path, monkeypatch):
     def begin(ranks):
         return written(given_, several, ranks, stopping_after(3)).status
 
-    def go_on(ranks):
+    def resume(ranks):
         found = resumption(several, Watch(), execution=ranks)
         return found.record().outcome.status
 
     assert set(on(sizes[0], begin)) == {"interrupted"}
-    assert set(on(sizes[1], go_on)) == {"complete"}
+    assert set(on(sizes[1], resume)) == {"complete"}
     assert_same(one, several)
 
     def longer(ranks):
@@ -340,12 +340,12 @@ def test_damaged_state_is_reported_in_all_processes(tmp_path):
         assert changed.rowcount == 1
         store.commit()
 
-    def go_on(ranks):
+    def resume(ranks):
         with pytest.raises(pbdkit.StorageError, match="is damaged"):
             resumption(path, Watch(), execution=ranks)
         return True
 
-    assert on_ranks(3, go_on) == [True] * 3
+    assert on_ranks(3, resume) == [True] * 3
 
 
 def on(size, work):

@@ -159,7 +159,7 @@ def test_partitions_of_every_shape(name, tmp_path):
 SENT_BACK = re.compile("run it in one process$|too few for")
 
 
-def certified(path):
+def solution_and_bound(path):
     found = pbdkit.open(path)
     return found.u.values[-1], json.loads(found.attrs["certificate"])
 
@@ -172,7 +172,10 @@ def test_error_bound_holds(tmp_path):
     grids = {"type": "equilibrium", "method": "multigrid"}
     sought, path = given_ | {"solver": grids}, tmp_path / "several.nc"
     outcomes = on_ranks(2, lambda ranks: written(sought, path, ranks))
-    (right, _), (u, error_bound) = certified(tmp_path / "exact.nc"), certified(path)
+    (right, _), (u, error_bound) = (
+        solution_and_bound(tmp_path / "exact.nc"),
+        solution_and_bound(path),
+    )
     assert {one.status for one in outcomes} == {"complete"}
     assert error_bound["method"] == "multigrid, conjugate-gradients"
     assert np.hypot(*(u - right).T).max() <= error_bound["distance"] <= 1e-8
@@ -313,11 +316,11 @@ def test_interrupted_and_resumed_on_another_number_of_processes(sizes, tmp_path)
     def begin(ranks):
         return written(given_, several, ranks, stopping_after(3)).status
 
-    def go_on(ranks):
+    def resume(ranks):
         return resumption(several, Watch(), execution=ranks).record().outcome.status
 
     assert set(on(sizes[0], begin)) == {"interrupted"}
-    assert set(on(sizes[1], go_on)) == {"complete"}
+    assert set(on(sizes[1], resume)) == {"complete"}
     assert_same(one, several)
 
 

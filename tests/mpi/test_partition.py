@@ -168,7 +168,7 @@ class Copied(FramePolicy):
         return of_the_first(frame)
 
 
-class SaysItIsLocal(FramePolicy):
+class ClaimsToBeLocal(FramePolicy):
     """And does the same."""
 
     type: Literal["says-it-is-local"] = "says-it-is-local"
@@ -182,7 +182,7 @@ class SaysItIsLocal(FramePolicy):
         return of_the_first(frame)
 
 
-@pytest.mark.parametrize("frame", [Copied(), SaysItIsLocal()])
+@pytest.mark.parametrize("frame", [Copied(), ClaimsToBeLocal()])
 def test_frames_with_distant_particles_are_built_whole_everywhere(frame):
     experiment = pbdkit.Experiment(
         **sheet(body={"type": "grid", "columns": 400, "rows": 3}) | {"frame": frame}

@@ -66,7 +66,7 @@ def drawn(ax):
     return [line.get_xydata().T for line in ax.lines]
 
 
-def told(ax):
+def legend_texts(ax):
     legend = ax.get_legend()
     return [" ".join(t.get_text().split()) for t in legend.get_texts()] if legend else []
 
@@ -110,7 +110,7 @@ def test_history_matches_the_dataset(torn):
     for line, number in zip(drawn(ax), (19, 20), strict=True):
         np.testing.assert_array_equal(line, [torn.time, torn.pe1.sel(particle=number)])
     i, j = torn.site.sel(particle=19).values
-    assert told(ax)[0] == f"19 (i {i}, j {j})"
+    assert legend_texts(ax)[0] == f"19 (i {i}, j {j})"
     (line,) = drawn(torn.pbd.history("pe1", i=i, j=j))
     np.testing.assert_array_equal(line[1], torn.pe1.sel(particle=19))
     assert (ax.get_xlabel(), ax.get_ylabel()) == (
@@ -127,7 +127,7 @@ def test_displacements_are_available_whether_recorded_or_not(torn, pulled):
         np.testing.assert_allclose(across[1], u.sel(particle=20, axis="x"), atol=1e-15)
         np.testing.assert_allclose(up[1], u.sel(particle=20, axis="y"), atol=1e-15)
         assert [line.get_linestyle() for line in ax.lines] == ["-", "--"]
-        assert [name[-3:] for name in told(ax)] == [", x", ", y"]
+        assert [name[-3:] for name in legend_texts(ax)] == [", x", ", y"]
         assert ax.get_ylabel() == "displacement (lattice unit)"
         (alone,) = drawn(ds.pbd.history("u_y", particle=20))
         np.testing.assert_array_equal(alone, up)
@@ -263,7 +263,7 @@ def test_curves_are_in_physical_units_if_known():
 
 def test_energies_are_sums_over_the_body(torn, pulled):
     ax = torn.pbd.curve(kind="energies")
-    assert [name.replace(", sum over the body", "") for name in told(ax)] == [
+    assert [name.replace(", sum over the body", "") for name in legend_texts(ax)] == [
         "pseudo-energy PE1", "pseudo-energy PE1 of intact bonds",
     ]  # fmt: skip
     body = torn.isel(particle=torn.role.values == 0)
@@ -300,7 +300,7 @@ def test_curves_draw_into_given_axes(pulled):
 def test_crack_maps_keep_their_legend_within_given_axes(torn):
     figure, ax = plt.subplots()
     assert torn.pbd.crack(ax=ax) is ax
-    assert told(ax) == ["broken from the start"]
+    assert legend_texts(ax) == ["broken from the start"]
     plt.close(figure)
 
 
@@ -349,11 +349,11 @@ def test_without_matplotlib_the_extra_is_named(torn, draw, monkeypatch):
 
 def test_sweep_has_one_line_per_member(swept):
     ax = swept.pbd.curve(kind="energies")
-    assert told(ax) == ["relaxation 0.4", "relaxation 0.7", "relaxation 1"]
+    assert legend_texts(ax) == ["relaxation 0.4", "relaxation 0.7", "relaxation 1"]
     for line, relaxation in zip(drawn(ax), swept.relaxation, strict=True):
         np.testing.assert_allclose(line[1], swept.pe1.sel(relaxation=relaxation).sum("particle"))
     ax = swept.pbd.history("u_x", particle=20)
-    assert told(ax) == ["relaxation 0.4", "relaxation 0.7", "relaxation 1"]
+    assert legend_texts(ax) == ["relaxation 0.4", "relaxation 0.7", "relaxation 1"]
     many = swept.isel(relaxation=np.arange(15) % 3).assign_coords(relaxation=np.arange(15.0))
     ax = many.pbd.curve(y="pe1")
     assert len(ax.lines) == 15
@@ -368,7 +368,7 @@ def test_loads_of_a_sweep_have_one_line_per_member():
     )  # fmt: skip
     found = pbdkit.sweep(loaded, vary={"solver.relaxation": [0.5, 1.0]}, workers=1, progress=False)
     ax = found.pbd.curve()
-    assert told(ax) == ["relaxation 0.5", "relaxation 1"]
+    assert legend_texts(ax) == ["relaxation 0.5", "relaxation 1"]
     across = {"load": 0, "axis": "y", "relaxation": 0.5}
     np.testing.assert_array_equal(drawn(ax)[0][1], -found.load_resultant.sel(across))
 
@@ -387,7 +387,7 @@ def test_members_are_labelled_by_the_types_of_their_components():
         experiment(leaders=[HELD, pull_right(0.1, 0.0)], diagnostics=[{"type": "pe1"}], steps=2),
         vary={"rule": rules}, workers=1, progress=False,
     )  # fmt: skip
-    assert told(found.pbd.curve(y="pe1")) == ["rule barycentre", "rule mean-displacement"]
+    assert legend_texts(found.pbd.curve(y="pe1")) == ["rule barycentre", "rule mean-displacement"]
 
 
 # Cracks

@@ -39,7 +39,7 @@ from tests.components.test_elasticity import NATURAL
 pytestmark = pytest.mark.filterwarnings("ignore:frame. under 'mean'")
 
 
-def course(steps, values):
+def time_dependent(steps, values):
     return {"steps": steps, "values": values}
 
 
@@ -58,30 +58,30 @@ SHEET = {
     "steps": 30,
     "record": {"every": 3},
 }
-FORCE = [{"select": {"edge": "top"}, "force": [0.0, course([2, 20], [0.0, 0.02])]}]
-BREAKING = {"type": "strain", "failure": course([3, 25], [0.3, 0.02])}
+FORCE = [{"select": {"edge": "top"}, "force": [0.0, time_dependent([2, 20], [0.0, 0.02])]}]
+BREAKING = {"type": "strain", "failure": time_dependent([3, 25], [0.3, 0.02])}
 CHANGING = {
-    "relaxation": {"solver": {"relaxation": course([4, 20], [0.3, 1.0])}},
-    "memory": {"solver": {"memory": course([0, 9, 20], [0.5, 0.9, 0.0])}},
+    "relaxation": {"solver": {"relaxation": time_dependent([4, 20], [0.3, 1.0])}},
+    "memory": {"solver": {"memory": time_dependent([0, 9, 20], [0.5, 0.9, 0.0])}},
     "limits": {"fracture": BREAKING},
     "thresholds": {
-        "fracture": {"type": "threshold", "thresholds": [course([3, 25], [1.6, 1.43])]},
+        "fracture": {"type": "threshold", "thresholds": [time_dependent([3, 25], [1.6, 1.43])]},
     },
-    "both": {"fracture": BREAKING, "solver": {"relaxation": course([9, 10], [1.0, 0.4])}},
-    "parameter": {"rule": {"type": "mixed-coordinate", "K": course([1, 9], [0.0, 0.01])}},
+    "both": {"fracture": BREAKING, "solver": {"relaxation": time_dependent([9, 10], [1.0, 0.4])}},
+    "parameter": {"rule": {"type": "mixed-coordinate", "K": time_dependent([1, 9], [0.0, 0.01])}},
     "weights": {
-        "rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4])},
+        "rule": {"type": "elastic", "poisson_ratio": time_dependent([2, 15], [0.1, 0.4])},
         "solver": {"relaxation": 0.5},
     },
     "moves of another": {
         "rule": {"type": "strain-gradient", "poisson_ratio": 0.2,
-                 "length": course([2, 15], [0.1, 0.6])},
+                 "length": time_dependent([2, 15], [0.1, 0.6])},
         "solver": {"relaxation": 0.2},
     },
     "force": {"loads": FORCE, "frame": NATURAL},
     "with a field": {
         "regions": {"soft": {"type": "rectangle", "width": 4.0, "height": 9.0}},
-        "rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4]),
+        "rule": {"type": "elastic", "poisson_ratio": time_dependent([2, 15], [0.1, 0.4]),
                  "stiffness": {"otherwise": 1.0, "soft": 0.3}},
         "solver": {"relaxation": 0.5},
         "frame": NATURAL,
@@ -127,26 +127,26 @@ knots = st.lists(
 @given(knots)
 def test_schedule_is_linear_between_steps_and_constant_beyond(known):
     steps, values = zip(*known, strict=True)
-    course = TimeDependent[float](steps=steps, values=values)
-    assert [course.at(step) for step in steps] == list(values)
-    assert course.at(0) == values[0] or steps[0] == 0
-    assert course.at(1000) == course.last == values[-1]
+    time_dependent = TimeDependent[float](steps=steps, values=values)
+    assert [time_dependent.at(step) for step in steps] == list(values)
+    assert time_dependent.at(0) == values[0] or steps[0] == 0
+    assert time_dependent.at(1000) == time_dependent.last == values[-1]
     for a, b in pairwise(steps):
-        middle = (course.at(a) + course.at(b)) / 2
-        assert course.at((a + b) / 2) == pytest.approx(middle, abs=1e-12)
+        middle = (time_dependent.at(a) + time_dependent.at(b)) / 2
+        assert time_dependent.at((a + b) / 2) == pytest.approx(middle, abs=1e-12)
 
 
 @given(knots, st.integers(0, 70))
 def test_the_next_change_is_the_next_step_with_another_value(known, step):
     steps, values = zip(*known, strict=True)
-    course = TimeDependent[float](steps=steps, values=values)
-    later = [n for n in range(step + 1, 100) if course.at(n) != course.at(step)]
-    assert course.next_change(step) <= (later[0] if later else math.inf)
-    if course.next_change(step) < math.inf and later:
-        stays = [course.at(n) for n in range(step, int(course.next_change(step)))]
-        assert set(stays) == {course.at(step)}
-    assert max(course.breakpoints, default=0) >= max(
-        (n for n in range(1, 100) if course.at(n) != course.at(n - 1)), default=0
+    time_dependent = TimeDependent[float](steps=steps, values=values)
+    later = [n for n in range(step + 1, 100) if time_dependent.at(n) != time_dependent.at(step)]
+    assert time_dependent.next_change(step) <= (later[0] if later else math.inf)
+    if time_dependent.next_change(step) < math.inf and later:
+        stays = [time_dependent.at(n) for n in range(step, int(time_dependent.next_change(step)))]
+        assert set(stays) == {time_dependent.at(step)}
+    assert max(time_dependent.breakpoints, default=0) >= max(
+        (n for n in range(1, 100) if time_dependent.at(n) != time_dependent.at(n - 1)), default=0
     )
 
 
@@ -249,10 +249,10 @@ def test_bar_that_ages_breaks_when_its_strength_equals_its_strain(aged):
 def test_equilibria_use_the_last_numbers():
     bar = SHEET | {
         "rule": {"type": "elastic", "poisson_ratio": 0.0,
-                 "stiffness": course([0, 20], [1.0, 0.5])},
+                 "stiffness": time_dependent([0, 20], [1.0, 0.5])},
         "frame": NATURAL,
         "leaders": [HELD],
-        "loads": [{"select": {"edge": "right"}, "force": [course([0, 30], [0, 0.1]), 0]}],
+        "loads": [{"select": {"edge": "right"}, "force": [time_dependent([0, 30], [0, 0.1]), 0]}],
         "solver": {"type": "equilibrium", "tolerance": 1e-11},
         "diagnostics": [{"type": "reaction", "youngs_modulus": 1.0}],
     }  # fmt: skip
@@ -283,7 +283,7 @@ def test_increasing_loads_follow_their_path():
             given_ | {"loads": [{"select": {"edge": "right"}, "force": [force, 0.01]}]},
             progress=False,
         )
-        for force in (0.4, course([0, 10, 20], [0.0, 0.1, 0.4]))
+        for force in (0.4, time_dependent([0, 10, 20], [0.0, 0.1, 0.4]))
     ]
     np.testing.assert_allclose(ends[0].position[-1], ends[1].position[-1], atol=1e-7)
 
@@ -293,7 +293,7 @@ def test_measurements_of_a_step_use_its_values():
     half."""
     stretched = SHEET | {
         "rule": {"type": "elastic", "poisson_ratio": 0.0,
-                 "stiffness": course([0, 30], [1.0, 0.5])},
+                 "stiffness": time_dependent([0, 30], [1.0, 0.5])},
         "frame": NATURAL,
         "leaders": [HELD, {"select": {"edge": "right"}, "motion": {"type": "hold"}}],
         "initial": {"type": "affine", "gradient": [[0.01, 0.0], [0.0, 0.0]]},
@@ -309,7 +309,7 @@ def test_measurements_of_a_step_use_its_values():
 
 def test_mass_is_accelerated_by_the_force_of_each_step():
     """So heavy that what neighbours exert counts for nothing: u = Σ Σ F / m."""
-    force = course([1, 9], [0.0, 0.8])
+    force = time_dependent([1, 9], [0.0, 0.8])
     mass = {"type": "newton", "mass": 1e9, "force": [force, 0.0]}
     moved = {"select": {"edge": "right"}, "motion": mass}
     ds = pbdkit.run(SHEET | {"frame": NATURAL, "leaders": [HELD, moved]}, progress=False)
@@ -322,7 +322,7 @@ def test_check_warns_of_values_that_diverge_during_the_run(call, tmp_path):
     bad = SHEET | {
         "solver": {
             "type": "stepping",
-            "relaxation": course([0, 10, 20], [1.0, 5.0, 1.0]),
+            "relaxation": time_dependent([0, 10, 20], [1.0, 5.0, 1.0]),
         }
     }
     (tmp_path / "bad.yaml").write_text(json.dumps(bad))
@@ -333,7 +333,7 @@ def test_check_warns_of_values_that_diverge_during_the_run(call, tmp_path):
 
 def test_runs_do_not_converge_before_the_last_change():
     settling = {"type": "stepping", "settle": {"tolerance": 1e-3}}
-    late = {"select": {"edge": "right"}, "force": [course([0, 400], [0, 0.1]), 0]}
+    late = {"select": {"edge": "right"}, "force": [time_dependent([0, 400], [0, 0.1]), 0]}
     given_ = SHEET | {"frame": NATURAL, "leaders": [HELD], "loads": [late], "solver": settling}
     scene = build_scene(pbdkit.Experiment(**(given_ | {"steps": 5000})))
     assert last_event(scene) == 400
@@ -343,7 +343,7 @@ def test_runs_do_not_converge_before_the_last_change():
 
 
 def test_members_of_a_sweep_are_distinguished_by_their_schedules():
-    rises = [course([0, 10], [0.5, last]) for last in (0.8, 0.9)]
+    rises = [time_dependent([0, 10], [0.5, last]) for last in (0.8, 0.9)]
     vary = {"solver.relaxation": rises}
     found = pbdkit.sweep(sheet(solver={"relaxation": 1.0}), vary=vary, workers=1, progress=False)
     ends = [found.position.isel(relaxation=n, time=-1) for n in (0, 1)]
@@ -351,30 +351,30 @@ def test_members_of_a_sweep_are_distinguished_by_their_schedules():
 
 
 WRONG = {
-    "order": ({"fracture": {"type": "strain", "failure": course([5, 5], [1, 2])}},
+    "order": ({"fracture": {"type": "strain", "failure": time_dependent([5, 5], [1, 2])}},
               r"fracture\.failure: steps should increase, but 5 follows 5"),
-    "count": ({"fracture": {"type": "strain", "failure": course([5], [1, 2])}},
+    "count": ({"fracture": {"type": "strain", "failure": time_dependent([5], [1, 2])}},
               r"fracture\.failure: 1 steps have 2 values"),
-    "value": ({"fracture": {"type": "strain", "failure": course([1, 5], [1, -2])}},
+    "value": ({"fracture": {"type": "strain", "failure": time_dependent([1, 5], [1, -2])}},
               r"fracture\.failure: the last value: should be greater than 0, got -2"),
-    "text": ({"fracture": {"type": "strain", "failure": course([1, 5], [1, "x"])}},
+    "text": ({"fracture": {"type": "strain", "failure": time_dependent([1, 5], [1, "x"])}},
              r"fracture\.failure: values: 1: should be a valid number"),
     "no values": ({"fracture": {"type": "strain", "failure": {"steps": [1, 5]}}},
                   r"fracture\.failure: values: is missing"),
     "drawn": ({"fracture": BREAKING | {"scatter": 0.1}}, r"fracture\.failure: 'strain' draws"),
-    "relaxation": ({"solver": {"type": "stepping", "relaxation": course([1, 2], [1, 0])}},
+    "relaxation": ({"solver": {"type": "stepping", "relaxation": time_dependent([1, 2], [1, 0])}},
                    r"solver\.relaxation\.values\.1: should be greater than 0"),
     "in a field": ({"regions": {"a": {"type": "disc", "radius": 1.0, "centre": [0.0, 0.0]}},
                     "rule": {"type": "elastic", "poisson_ratio": 0.3, "stiffness":
                              {"otherwise": 1.0, "a": {"steps": [1], "values": [2.0]}}}},
                    r"rule\.stiffness: 'a' should be a number: values by region cannot vary"),
     "auto": ({"solver": {"type": "stepping", "relaxation": "auto",
-                         "memory": course([1, 2], [0.1, 0.2])}},
+                         "memory": time_dependent([1, 2], [0.1, 0.2])}},
              r"'auto' requires constant parameters"),
-    "force": ({"loads": [{"select": {"edge": "top"}, "force": [0, course([1, 2], [0])]}],
+    "force": ({"loads": [{"select": {"edge": "top"}, "force": [0, time_dependent([1, 2], [0])]}],
                "frame": NATURAL}, r"loads\.0\.force\.1: 2 steps have 1 values"),
     "a motion": ({"leaders": [{"select": {"edge": "left"}, "motion":
-                               {"type": "rotation", "angle": course([0], [1]),
+                               {"type": "rotation", "angle": time_dependent([0], [1]),
                                 "centre": [0, 0], "steps": 5}}]}, r"leaders\.0\.motion\.angle"),
 }  # fmt: skip
 
@@ -399,7 +399,7 @@ def test_schedule_without_effect_gives_a_warning():
     scene = build_scene(
         pbdkit.Experiment(
             **SHEET | {"regions": {"far": far, "idle": far}, "rule": soft, "frame": NATURAL}
-            | {"fracture": {"type": "strain", "failure": course([0, 99], [1.0, 0.5])}}
+            | {"fracture": {"type": "strain", "failure": time_dependent([0, 99], [1.0, 0.5])}}
             | {"solver": {"type": "equilibrium"}}
         )
     )  # fmt: skip
@@ -438,13 +438,13 @@ class Leaning(pbdkit.FramePolicy):
 
 
 FOLLOWING = {
-    "parameter": {"rule": {"type": "mixed-coordinate", "K": course([1, 9], [0.0, 0.05])}},
+    "parameter": {"rule": {"type": "mixed-coordinate", "K": time_dependent([1, 9], [0.0, 0.05])}},
     "weights": {
-        "rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4])},
+        "rule": {"type": "elastic", "poisson_ratio": time_dependent([2, 15], [0.1, 0.4])},
         "solver": {"relaxation": 0.5},
     },
     "limits": CHANGING["limits"]
-    | {"rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4])}},
+    | {"rule": {"type": "elastic", "poisson_ratio": time_dependent([2, 15], [0.1, 0.4])}},
 }
 """Time-dependent parameters under a frame that reads the rule."""
 
@@ -489,7 +489,7 @@ class Behind(StrainGradient):
 
 
 def test_kernels_leave_inner_rules_with_scheduled_weights_to_numpy():
-    rule = Behind(poisson_ratio=0.2, length=course([2, 15], [0.1, 0.4]))
+    rule = Behind(poisson_ratio=0.2, length=time_dependent([2, 15], [0.1, 0.4]))
     scene = build_scene(pbdkit.Experiment(**sheet(rule=rule)))
     assert kernel_obstacle(scene) == "constants of kernels are time-dependent"
 
@@ -505,7 +505,7 @@ def test_spectrum_during_the_run_uses_the_current_frame():
 def test_equilibrium_uses_the_final_frame(fracture):
     """Numbers still change when the run ends, in increments where bonds can break."""
     parts = {
-        "rule": {"type": "elastic", "poisson_ratio": course([0, 60], [0.1, 0.4])},
+        "rule": {"type": "elastic", "poisson_ratio": time_dependent([0, 60], [0.1, 0.4])},
         "solver": {"type": "equilibrium", "tolerance": 1e-12},
         "fracture": {"type": "none"} if fracture == "none" else BREAKING | {"failure": 9.0},
     }
@@ -551,7 +551,7 @@ def test_sensitivities_use_the_values_of_the_last_step(frame):
     run ends."""
     moved = {"type": "displace", "displacement": [0.1, 0.2]}
     sheet_ = SHEET | {
-        "rule": {"type": "elastic", "poisson_ratio": course([1, 9], [0.1, 0.45])},
+        "rule": {"type": "elastic", "poisson_ratio": time_dependent([1, 9], [0.1, 0.45])},
         "frame": {"type": frame},
         "leaders": [HELD, {"select": {"edge": "right"}, "motion": moved}],
         "steps": 4,
@@ -577,9 +577,9 @@ def experiment_of(parts):
 
 
 def test_check_evaluates_no_time_after_the_run():
-    late = {"solver": {"relaxation": course([0, 20, 60, 80], [0.5, 0.8, 5.0, 0.5])}}
+    late = {"solver": {"relaxation": time_dependent([0, 20, 60, 80], [0.5, 0.8, 5.0, 0.5])}}
     assert not any("diverge" in w for w in forecast(build_scene(experiment_of(late))).warnings)
-    late["solver"]["relaxation"] = course([0, 60], [5.0, 0.5])
+    late["solver"]["relaxation"] = time_dependent([0, 60], [5.0, 0.5])
     told = forecast(build_scene(experiment_of(late))).warnings
     assert any("at step 30 steps diverge, with solver.relaxation 2.75" in w for w in told)
 
@@ -631,7 +631,7 @@ def test_states_and_measurements_of_each_step_use_its_values(kind, number):
     again for each step."""
     part = {"type": kind} | GIVEN.get(kind, {})
     begins = part.get(number, 1.0)
-    part[number] = course([1, 4], [begins, 1.2 * begins])
+    part[number] = time_dependent([1, 4], [begins, 1.2 * begins])
     rules = Registry().spellings(FollowerRule, installed=False)
     field = "rule" if kind in {rule.type_name() for rule in rules} else "fracture"
     calibrated = number != "placement" and kind != "mixed-coordinate"

@@ -223,7 +223,7 @@ def _unfinished() -> None:
     assert code == 9, (code, said)
 
 
-def _go_on() -> list[str]:
+def _resume() -> list[str]:
     """After a fault of a run: resumed where anything is kept, else run."""
     return ["resume", "out.nc"] if Path("out.nc.run").exists() else [*RUN, "--force"]
 
@@ -280,9 +280,9 @@ def commands() -> dict[str, Command]:
     """Every command that writes, by a name."""
     found = {
         "run": Command([*RUN, "--force"], "out.nc", _earlier_run, lambda: often(1e9), _same_run),
-        "store": Command(RUN, "out.nc", _experiment, _each_step, _same_run, _go_on),
+        "store": Command(RUN, "out.nc", _experiment, _each_step, _same_run, _resume),
         "resume": Command(
-            ["resume", "out.nc"], "out.nc", _unfinished, _each_step, _same_run, _go_on
+            ["resume", "out.nc"], "out.nc", _unfinished, _each_step, _same_run, _resume
         ),
         "longer": Command(LONGER, "out.nc", _finished, _each_step, _same_run, lambda: LONGER),
         "sweep": Command(
@@ -369,7 +369,7 @@ class Bench:
         elif earlier.exists() and not output.exists():
             yield "the earlier file is gone"
         if code == 6 and self.command.again:
-            yield from self._gone_on(self.command.again(), output, whole)
+            yield from self._resumed(self.command.again(), output, whole)
 
     def _left(self) -> list[str]:
         """Return the files in the folder that the undisturbed command does not leave."""
@@ -378,7 +378,7 @@ class Bench:
         ]
         return sorted(names[0] - names[1])
 
-    def _gone_on(self, words: list[str], output: Path, whole: Path) -> Iterator[str]:
+    def _resumed(self, words: list[str], output: Path, whole: Path) -> Iterator[str]:
         """The next command comes to the same result."""
         code, said = quietly(*words, before=self.command.before)
         if code:

@@ -176,7 +176,7 @@ def repeat(name: str, seed: int, trial: int, loss: str) -> list[tuple[float, flo
     return [(e.value, e.error) if e.identifiable else (np.nan, np.nan) for e in estimates]
 
 
-def told(name: str, found: np.ndarray) -> bool:
+def report(name: str, found: np.ndarray) -> bool:
     """Prints a row for each unknown of (trial, unknown, value and error); whether none misses its
     goal by more than sampling explains."""
     count, good = len(found), True
@@ -214,7 +214,7 @@ def main() -> int:
             repeat(name, given.seed, 0, given.loss)  # compiles what all of them use
             one = partial(repeat, name, given.seed, loss=given.loss)
             found = np.array(list(pool.map(one, range(given.trials), chunksize=10)))
-            good &= told(name, found)
+            good &= report(name, found)
     return 0 if good else 1
 
 

@@ -62,7 +62,7 @@ def begun(parts: dict[str, Any], output: Path, own: Components, watch: Watch) ->
     return record(Simulation.of_scene(build_scene(experiment), watch=watch), OverlappingSink(sink))
 
 
-def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any]) -> RunReport:
+def resumed(output: Path, own: Components, watch: Watch, engine: dict[str, Any]) -> RunReport:
     """The unfinished run of an output, by an engine of its own, as `pbdkit resume` does it."""
     left = UnfinishedRun.open(output, writing=True)
     try:
@@ -115,7 +115,7 @@ def resumed_otherwise(
         while is_unfinished(output):
             stops += 1
             watch = Looks(draw.randint(1, most) if stops < MOST_STOPS else 2**60)
-            report = gone_on(output, own, watch, draw.choice(engines))
+            report = resumed(output, own, watch, draw.choice(engines))
     finally:
         drivers.MAX_CALL_S = often_enough
     del report

@@ -163,7 +163,7 @@ def by_others(strains: BondStrains, loads: Any) -> dict[str, list[list[float]]]:
     return {"Wald": wald.tolist(), "profile": held.tolist()}
 
 
-def told(law: str, found: Any, how: str, judged: bool = True) -> bool:
+def report(law: str, found: Any, how: str, judged: bool = True) -> bool:
     """Print rows of (trial, parameter, (value, low, high)); return whether the goals are met,
     except for chance."""
     found, fine = np.array(found), True
@@ -193,7 +193,7 @@ def drawn(law: str, trials: int, count: int, numbers: Any) -> bool:
     how = f"{law}, {count} specimens"
     fine = True
     for name, rows in found.items():
-        fine &= told(law, rows, f"{how}, {name}", name == "integrated")
+        fine &= report(law, rows, f"{how}, {name}", name == "integrated")
     return fine
 
 
@@ -229,7 +229,7 @@ def torn(law: str, trials: int, count: int, numbers: Any) -> bool:
         step = np.where(ds.broken_step > 0, ds.broken_step, STEPS)
         first = np.array([step[row == j].min() for j in np.unique(row)])
         found.append(estimated(law, strains, (first - 0.5) / STEPS))
-    return told(law, found, f"{law}, {count} chains torn")
+    return report(law, found, f"{law}, {count} chains torn")
 
 
 def simulated(law: str, trials: int, count: int, numbers: Any) -> bool:
@@ -242,7 +242,7 @@ def simulated(law: str, trials: int, count: int, numbers: Any) -> bool:
         peaks = [source.tear(seeded(experiment, seed)).peak.force for seed in seeds]
         fit = described(law, peaks, method="simulation", seed=n + 1)
         found.append(_rows(fit_strength_of(fit, experiment)))
-    return told(law, found, f"{law}, {count} specimens, simulation")
+    return report(law, found, f"{law}, {count} specimens, simulation")
 
 
 @dataclass(frozen=True)
@@ -272,7 +272,7 @@ def closed(law: str, trials: int, count: int, numbers: Any) -> bool:
         fit = described(law, peaks, method="simulation", seed=n + 1)
         draws = strength_simulation.fit_by_simulation(fit, experiment, source)
         found.append(_rows(fitted_strength(fit, LAWS[law].paths, draws, "simulation", LAWS[law])))
-    return told(law, found, f"{law}, {count} chains, simulation")
+    return report(law, found, f"{law}, {count} chains, simulation")
 
 
 def main() -> None:

@@ -185,15 +185,15 @@ def bar(**more: Any) -> dict[str, Any]:
     } | more
 
 
-def doubted(**more: Any) -> list[str]:
+def scene_warnings(**more: Any) -> list[str]:
     return [*build_scene(pbdkit.Experiment(**bar(**more))).warnings]
 
 
 def test_crack_that_crosses_no_bond_gives_a_warning() -> None:
     crack = {"type": "strain", "failure": 0.02, "cracks": [[[6.5, 0.0], [6.5, 2.5]]]}
-    assert doubted(fracture=crack) == []
+    assert scene_warnings(fracture=crack) == []
     crack["cracks"] = [[[6.5, 0.0], [6.5, 2.5]], [[60.5, 0.0], [60.5, 2.5]]]
-    (warning,) = doubted(fracture=crack)
+    (warning,) = scene_warnings(fracture=crack)
     assert warning.startswith("fracture.cracks.1: it crosses no bond of the body")
 
 
@@ -213,7 +213,7 @@ IN_PERCENT = [
 
 @pytest.mark.parametrize(("fracture", "fields"), IN_PERCENT)
 def test_strains_in_percent_give_a_warning(fracture: dict[str, Any], fields: list[str]) -> None:
-    found = doubted(fracture=fracture)
+    found = scene_warnings(fracture=fracture)
     assert len(found) == len(fields)
     assert all(w.startswith(field) for w, field in zip(found, fields, strict=True))
 
@@ -221,14 +221,14 @@ def test_strains_in_percent_give_a_warning(fracture: dict[str, Any], fields: lis
 def test_load_on_leaders_alone_gives_a_warning() -> None:
     told = "loads.0: acts only on leaders, so that it has no effect on the body"
     on_the_left = [{"select": {"edge": "left"}, "force": [1e-3, 0.0]}]
-    assert doubted(loads=on_the_left) == [told]
+    assert scene_warnings(loads=on_the_left) == [told]
     rollers = [{"select": {"edge": "left"}, "motion": HOLD, "axes": ["x"]}]
-    assert doubted(loads=on_the_left, leaders=rollers) == [told]
+    assert scene_warnings(loads=on_the_left, leaders=rollers) == [told]
     upwards = [{"select": {"edge": "left"}, "force": [1e-3, 1e-3]}]
-    assert doubted(loads=upwards, leaders=rollers) == []
+    assert scene_warnings(loads=upwards, leaders=rollers) == []
     for_a_time = [{"select": {"edge": "left"}, "motion": HOLD, "until": 10}]
-    assert doubted(loads=on_the_left, leaders=for_a_time) == []
-    assert doubted(loads=[{"select": {"edge": "bottom"}, "force": [1e-3, 0.0]}]) == []
+    assert scene_warnings(loads=on_the_left, leaders=for_a_time) == []
+    assert scene_warnings(loads=[{"select": {"edge": "bottom"}, "force": [1e-3, 0.0]}]) == []
 
 
 PLACES = [(60.0, 0.0, True), (60.0, -2.0, False), (14.0, 0.0, False)]
@@ -240,7 +240,7 @@ def test_obstacle_that_never_approaches_gives_a_warning(
 ) -> None:
     motion = {"type": "velocity", "velocity": [velocity, 0.0], "steps": 20}
     obstacle = {"shape": {"type": "disc", "radius": 1.0, "centre": [x, 3.0]}, "motion": motion}
-    found = doubted(obstacles=[obstacle], loads=[])
+    found = scene_warnings(obstacles=[obstacle], loads=[])
     assert [w.split(":")[0] for w in found] == ["obstacles.0"] * far
 
 

@@ -36,7 +36,7 @@ def bar(mass, length=LENGTH, height=HEIGHT, steps=200, axes=("x",), **newton):
     }
 
 
-def way_of_mass(data):
+def path_of_mass(data):
     """(step,): how far the mass at the end has gone."""
     x = pbdkit.run(pbdkit.Experiment(**data), progress=False).track.values[:, 0, 0]
     return x - x[0]
@@ -53,7 +53,7 @@ def test_mass_on_a_bar_equals_the_chain_of_columns():
         u[-1] += v
         u[1:-1] += DIFFUSION * (u[:-2] - 2 * u[1:-1] + u[2:])
         found.append(u[-1])
-    assert np.abs(way_of_mass(data) - found).max() < 1e-13
+    assert np.abs(path_of_mass(data) - found).max() < 1e-13
 
 
 def test_period_and_decay_of_a_mass_on_a_fast_bar():
@@ -62,7 +62,7 @@ def test_period_and_decay_of_a_mass_on_a_fast_bar():
     mass = (period / (2 * math.pi)) ** 2 * height / length
     data = bar(mass / 2, length, height, 2000, damping=damping / 2, velocity=[0.01, 0.0])
     data["solver"] = {"type": "stepping", "engine": "numpy"}
-    u = way_of_mass(data)[100::50]
+    u = path_of_mass(data)[100::50]
     a, b = np.linalg.lstsq(np.stack([u[1:-1], u[:-2]], axis=1), u[2:])[0]
     s = np.log(np.roots([1.0, -a, -b]).astype(complex))[0] / 50
     exact = np.roots([mass, damping, height / length])[0]
@@ -87,7 +87,7 @@ def test_mass_on_a_slow_bar_matches_the_continuum():
     mass = (period / (2 * math.pi)) ** 2 * height / length
     drag = height * (1 / (2 * DIFFUSION) + 1)
     data = bar(mass / 2, length, height, period, damping=drag / 2, velocity=[speed, 0.0])
-    found = way_of_mass(data)
+    found = path_of_mass(data)
 
     def transform(s):
         q = np.sqrt(s / DIFFUSION)

@@ -435,7 +435,7 @@ class Onlooker:
     def do(self, **command):
         self.socket.send(json.dumps(command))
 
-    def hear(self, kind, seconds=10.0):
+    def receive(self, kind, seconds=10.0):
         while True:
             message = self.socket.recv(timeout=seconds)
             if isinstance(message, bytes):
@@ -486,7 +486,7 @@ def address(tmp_path_factory):
         yield found
 
 
-def asked(address, headers=()):
+def response_of(address, headers=()):
     """The status of a page."""
     request = urllib.request.Request(address, headers=dict(headers))
     try:
@@ -522,7 +522,7 @@ def strange(address, query, headers):
 
 @pytest.mark.parametrize("who", STRANGERS)
 def test_requests_without_token_get_no_page(address, who):
-    assert asked(*strange(address, *STRANGERS[who])) == 403
+    assert response_of(*strange(address, *STRANGERS[who])) == 403
 
 
 @pytest.mark.parametrize("who", [*STRANGERS, "no page at all"])
@@ -565,8 +565,8 @@ def test_request_with_token_gets_the_page_and_nothing_else(address):
     nonce = re.search(r"script-src 'nonce-([^']+)'", policy)[1]
     assert f'nonce="{nonce}"' in text
     assert "default-src 'none'" in policy
-    assert asked(address.replace("127.0.0.1", "localhost")) == 200
-    assert asked(address.replace("/?", "/etc/passwd?")) == 404
+    assert response_of(address.replace("127.0.0.1", "localhost")) == 200
+    assert response_of(address.replace("/?", "/etc/passwd?")) == 404
 
 
 def test_shutdown_waits_for_no_page(tmp_path):
@@ -656,7 +656,7 @@ def test_cuts_at_the_coordinate_limits_are_safe(tmp_path):
 
 def test_invalid_messages_are_answered_and_the_session_continues(address):
     with Onlooker(address) as page, Onlooker(address) as other:
-        assert page.hear("scene")["count"] == 144
+        assert page.receive("scene")["count"] == 144
         for nonsense in (
             "",
             "{",
@@ -668,23 +668,23 @@ def test_invalid_messages_are_answered_and_the_session_continues(address):
             b"\xff",
         ):
             page.socket.send(nonsense)
-            assert "invalid command" in page.hear("error")["text"]
+            assert "invalid command" in page.receive("error")["text"]
         other.socket.send("x" * (MAX_COMMAND_BYTES + 1))
         with pytest.raises(ConnectionClosed, match="1009"):
-            other.hear("nothing")
+            other.receive("nothing")
         page.do(do="seen")
         page.do(do="step")
-        assert len(page.hear("picture")) >= 48 + 8 * 144
+        assert len(page.receive("picture")) >= 48 + 8 * 144
 
 
 def test_page_gets_the_newest_picture_when_it_is_ready(tmp_path):
     session, _ = session_of("paper/a", tmp_path)
     with served(session) as there, Onlooker(there) as page:
-        first = page.hear("picture")
+        first = page.receive("picture")
         page.do(do="play", on=True)
         time.sleep(0.5)
         page.do(do="seen")
-        second = page.hear("picture")
+        second = page.receive("picture")
         made = [int.from_bytes(picture[12:16], "little") for picture in (first, second)]
         assert made[1] - made[0] > 5
 

@@ -39,7 +39,7 @@ def kernel(tmp_path_factory):
 
 
 @pytest.fixture
-def kept_kernel(cache, kernel):
+def cached_kernel(cache, kernel):
     """The cache folder of a test, with a kernel that another process left there."""
     shutil.copytree(kernel, cache)
     cache.chmod(kernel.stat().st_mode)
@@ -74,19 +74,19 @@ def kernel_is_right():
     return out[0] == halved(3.0)
 
 
-def kept(folder):
+def cached_files(folder):
     """Every file that is kept, by what it is."""
     (kernel,) = folder.iterdir()
     files = [file for file in kernel.rglob("*") if file.is_file()]
     return {file.suffix: file for file in files}
 
 
-def test_damaged_files_are_rebuilt(kept_kernel):
-    cache = kept_kernel
+def test_damaged_files_are_rebuilt(cached_kernel):
+    cache = cached_kernel
     assert kernel_is_right()
-    assert set(kept(cache)) == {".py", ".json", ".nbi", ".nbc"}
+    assert set(cached_files(cache)) == {".py", ".json", ".nbi", ".nbc"}
     for suffix in (".py", ".json", ".nbi", ".nbc"):
-        file = kept(cache)[suffix]
+        file = cached_files(cache)[suffix]
         whole = file.read_bytes()
         flipped = whole[: len(whole) // 2] + bytes([whole[len(whole) // 2] ^ 4])
         file.write_bytes(flipped + whole[len(flipped) :] if suffix == ".nbc" else whole[:100])
@@ -95,14 +95,14 @@ def test_damaged_files_are_rebuilt(kept_kernel):
     assert len(list(cache.iterdir())) == 1
 
 
-def test_complete_kernel_is_read_and_not_rebuilt(kept_kernel, monkeypatch):
-    cache = kept_kernel
+def test_complete_kernel_is_read_and_not_rebuilt(cached_kernel, monkeypatch):
+    cache = cached_kernel
     assert kernel_is_right()
-    before = {file: file.stat().st_mtime_ns for file in kept(cache).values()}
+    before = {file: file.stat().st_mtime_ns for file in cached_files(cache).values()}
     monkeypatch.setattr(kernel_cache, "_digests", counted := Counted(kernel_cache._digests))
     assert kernel_is_right()
     assert counted.calls == 1
-    assert before == {file: file.stat().st_mtime_ns for file in kept(cache).values()}
+    assert before == {file: file.stat().st_mtime_ns for file in cached_files(cache).values()}
 
 
 class Counted:
@@ -127,14 +127,14 @@ def test_full_disk_is_not_blamed_on_the_rule_and_leaves_nothing(cache, monkeypat
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX systems")
-def test_directory_writable_by_others_is_not_used(kept_kernel):
-    cache = kept_kernel
-    kept(cache)[".py"].write_text("raise SystemExit('planted')")
+def test_directory_writable_by_others_is_not_used(cached_kernel):
+    cache = cached_kernel
+    cached_files(cache)[".py"].write_text("raise SystemExit('planted')")
     cache.chmod(0o777)
     assert kernel_cache.cache_folder() is None
-    before = kept(cache)[".json"].read_bytes()
+    before = cached_files(cache)[".json"].read_bytes()
     assert kernel_is_right()
-    assert kept(cache)[".json"].read_bytes() == before
+    assert cached_files(cache)[".json"].read_bytes() == before
 
 
 def test_without_a_directory_kernels_are_compiled_in_memory(cache):
