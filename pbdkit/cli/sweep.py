@@ -74,8 +74,10 @@ def _client(address: str | None) -> Iterator[Any]:
     # Log messages about lost connections, with tracebacks, would hide the messages of the program.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
-        # type: ignore[no-untyped-call]  # distributed is untyped
-        client: Any = distributed.Client(address, timeout=CONNECT_S)
+        # The package distributed is untyped.
+        client: Any = distributed.Client(  # type: ignore[no-untyped-call]
+            address, timeout=CONNECT_S
+        )
     except (OSError, ValueError, ImportError) as error:
         raise ExperimentError(f"--dask {address}: no scheduler responds: {error}") from None
     with client:
