@@ -243,7 +243,7 @@ def test_bond_breaks_if_both_cells_are_broken():
 
 
 TORN = {
-    "body": {"type": "grid", "columns": 9, "rows": 7},
+    "body": {"type": "grid", "columns": 6, "rows": 6},
     "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 10}],
     "leaders": [
         HOLD,

@@ -82,11 +82,11 @@ def test_a_chain_with_a_weak_bond_follows_the_exact_law(extension, way):
 
 
 def test_damage_remains_after_unloading():
-    motion = {"type": "path", "steps": [1000, 2000, 3000],
+    motion = {"type": "path", "steps": [500, 1000, 1500],
               "displacements": [[0.7, 0.0], [0.1, 0.0], [0.1, 0.0]]}  # fmt: skip
     leaders = [LEFT, {"select": {"edge": "right"}, "motion": motion}]
     model = Weakest(onset=ONSET * 1.2, weak=1 / 1.2, failure=FAILURE)
-    ds = run(chain(BONDS, fracture=model, leaders=leaders, steps=3_000, record={"every": 250}))
+    ds = run(chain(BONDS, fracture=model, leaders=leaders, steps=1_500, record={"every": 125}))
     damage = ds.damage.isel(bond=2)
     assert (np.diff(damage) >= 0).all()
     assert damage[-1] == damage[5] > 0.7
