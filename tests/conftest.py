@@ -79,6 +79,7 @@ def _memory_is_given_back() -> Iterator[None]:
     yield
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         gc.collect()
+        gc.freeze()  # What survives a module belongs to libraries and caches.
         trim(0)
 
 
