@@ -109,7 +109,7 @@ class Soft(pbdkit.FollowerRule):
 
 
 @pytest.mark.parametrize("engine", ["numpy", "compiled"])
-def test_two_phase_rule_has_its_interface_at_the_specified_place(engine):
+def test_two_phase_rule_has_its_interface_at_the_specified_place(engine, interpreted):
     """Against the mean displacement, of which it makes half to the right of x = 102."""
     given = {
         "name": "phases",
