@@ -184,7 +184,7 @@ BODIES = {
 def test_slow_analyses_are_omitted_with_a_warning(parts: Any, said: str) -> None:
     found, took = checked(diagnostics=[], **parts)
     assert took < 2 * SOON_S
-    assert found.spectral_radius is found.distance is None
+    assert found.spectral_radius is found.lag is None
     (warning,) = [w for w in found.warnings if "omitted" in w]
     assert warning.startswith(
         "analysis: the spectrum and the distance from equilibrium are omitted, "

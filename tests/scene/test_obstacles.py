@@ -249,8 +249,8 @@ def test_scenes_without_obstacles_have_kernels_without_contact(monkeypatch: Any)
             CompiledStepper(build_scene(pbdkit.Experiment(**block(obstacles=obstacles))))
     (bare, _), (held, _) = sources
     assert "wall" not in bare
-    assert "leave" not in bare
-    assert "leave" in held
+    assert "contact_correction" not in bare
+    assert "contact_correction" in held
 
 
 def test_distant_particles_stay_exactly_at_rest() -> None:
