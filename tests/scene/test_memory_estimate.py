@@ -126,7 +126,7 @@ for name in json.load(sys.stdin):
 from pbdkit.simulation import peak_memory
 print(peak_memory())
 """
-EQUILIBRIA = {"factors": (80, [*CALIBRATED, "solver.method=lu"]), "grids": (500, [])}
+EQUILIBRIA = {"factors": (80, [*CALIBRATED, "solver.method=lu"]), "grids": (800, [])}
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system tells no peak")
